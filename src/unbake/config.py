@@ -1,0 +1,223 @@
+"""The settings of a fit: frozen dataclasses, read from and written to TOML.
+
+Every field cites the section of the paper (or says that the choice is ours). Unknown keys and wrong
+types are errors, so that a misspelt setting is never silently ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from .errors import UserError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Estimator = Literal["split-halves", "two-pass"]
+MethodName = Literal["ours", "one-bounce", "direct"]
+PresetName = Literal["cpu", "paper", "release"]
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """A multiresolution hash grid over the unit cube (Sec. 5.3; Müller et al. 2022)."""
+
+    levels: int = 8  #: number of resolutions
+    features: int = 2  #: features of each level
+    table_log2: int = 15  #: log2 of the largest number of entries of a level
+    base_resolution: int = 4  #: cells along an axis of the coarsest level
+    growth: float = 2.0  #: ratio of resolutions of neighbouring levels
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """A multilayer perceptron on top of a hash grid (Sec. 5.3)."""
+
+    grid: GridConfig = field(default_factory=GridConfig)
+    width: int = 32  #: neurons of a hidden layer
+    hidden: int = 2  #: number of hidden layers
+
+
+@dataclass(frozen=True)
+class TransportConfig:
+    """How light is sampled (Sec. 4.2, 7)."""
+
+    max_specular: int = 8  #: longest chain of mirrors, glass and cut-outs followed (Sec. 7)
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Everything that decides what a fit does, apart from its data set."""
+
+    preset: PresetName = "cpu"
+    method: MethodName = "ours"
+    seed: int = 0
+
+    steps: int = 2000  #: training steps (Table 1)
+    seconds: float = 0.0  #: stop after this much training time instead (0: count steps)
+    pixels: int = 1024  #: batch size in pixels (Table 1)
+    spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
+
+    learning_rate: float = 5e-3  #: Adam, materials (Sec. 5.4: 5e-4)
+    radiance_learning_rate: float = 5e-3  #: Adam, radiance network (Sec. 5.4: 5e-4)
+    final_learning_rate: float = 0.02  #: factor reached at the end, decaying exponentially (1: constant)
+    warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
+    estimator: Estimator = "split-halves"  #: unbiased squared error (Sec. 5.2)
+    loss_epsilon: float = 0.01  #: added to the denominator of the relative L2 loss (Sec. 5.4)
+
+    materials: NetworkConfig = field(default_factory=lambda: NetworkConfig(hidden=1))
+    shared_material_network: bool = True  #: one network for albedo and roughness (Sec. 5.1: two)
+    radiance: NetworkConfig = field(default_factory=NetworkConfig)
+    transport: TransportConfig = field(default_factory=TransportConfig)
+
+    checkpoint_seconds: float = 60.0  #: time between checkpoints
+    preview_seconds: float = 30.0  #: time between preview pictures
+
+    def __post_init__(self) -> None:
+        _check(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
+        for name in ("steps", "pixels"):
+            _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+        for name in ("learning_rate", "radiance_learning_rate", "final_learning_rate"):
+            _check(getattr(self, name) > 0, name, "positive", getattr(self, name))
+        for name in ("seconds", "warm_up", "checkpoint_seconds", "preview_seconds", "seed"):
+            _check(getattr(self, name) >= 0, name, "0 or more", getattr(self, name))
+        _check(self.loss_epsilon > 0, "loss_epsilon", "positive", self.loss_epsilon)
+
+    @property
+    def samples_per_step(self) -> int:
+        """Camera samples of a training step."""
+        return self.pixels * self.spp
+
+
+def _check(good: bool, key: str, wanted: str, value: object) -> None:
+    if not good:
+        raise UserError(f"must be {wanted}, not {value!r}", where=key)
+
+
+def _paper() -> FitConfig:
+    """Sec. 5.3, 5.4 and Table 1 (STAIRCASE): resolutions 2^1 … 2^16, table 2^17, Adam 5e-4."""
+    grid = GridConfig(levels=16, features=2, table_log2=17, base_resolution=2, growth=2.0)
+    return FitConfig(
+        preset="paper",
+        steps=18_000,
+        pixels=16_384,
+        spp=16,
+        learning_rate=5e-4,
+        radiance_learning_rate=5e-4,
+        final_learning_rate=1.0,
+        warm_up=0,
+        estimator="two-pass",
+        materials=NetworkConfig(grid=grid, width=256, hidden=1),
+        shared_material_network=False,
+        radiance=NetworkConfig(grid=grid, width=256, hidden=3),
+    )
+
+
+def _release() -> FitConfig:
+    """The settings of the authors' public release: 17 levels, base 2, scale 1.5, table 2^18."""
+    grid = GridConfig(levels=17, features=2, table_log2=18, base_resolution=2, growth=1.5)
+    return dataclasses.replace(
+        _paper(),
+        preset="release",
+        materials=NetworkConfig(grid=grid, width=256, hidden=1),
+        radiance=NetworkConfig(grid=grid, width=256, hidden=3),
+    )
+
+
+def preset(name: PresetName) -> FitConfig:
+    """The settings of a preset: `cpu` (ours, two cores), `paper` (Sec. 5) or `release`."""
+    match name:
+        case "cpu":
+            return FitConfig()
+        case "paper":
+            return _paper()
+        case "release":
+            return _release()
+    raise UserError(f"no preset named {name!r}", remedy="Presets are cpu, paper and release")
+
+
+# ---------------------------------------------------------------------------------------------- TOML
+
+
+def to_toml(config: FitConfig) -> str:
+    """The settings as TOML text; `from_toml` gives the same settings back."""
+    lines: list[str] = []
+    _write_table(dataclasses.asdict(config), (), lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _write_table(table: dict, path: tuple[str, ...], lines: list[str]) -> None:
+    if path:
+        lines += ["", f"[{'.'.join(path)}]"]
+    for key, value in table.items():
+        if not isinstance(value, dict):
+            lines.append(f"{key} = {json.dumps(value)}")
+    for key, value in table.items():
+        if isinstance(value, dict):
+            _write_table(value, (*path, key), lines)
+
+
+def from_toml(text: str, where: str = "config.toml") -> FitConfig:
+    """Settings from TOML text; keys that are absent keep the value of the named preset.
+
+    Raises:
+        UserError: the text is not TOML, a key is unknown, or a value has the wrong type or range.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"not valid TOML ({error})", where=where) from None
+    base = preset(table.get("preset", "cpu"))
+    try:
+        return _update(base, table, ())
+    except UserError as error:
+        raise UserError(error.what, where=f"{where}: {error.where}", remedy=error.remedy) from None
+
+
+def read_toml(path: Path) -> FitConfig:
+    """Settings from a TOML file; see `from_toml`."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"cannot be read ({error})", where=path) from None
+    return from_toml(text, str(path))
+
+
+def _update(config, table: dict, path: tuple[str, ...]):
+    hints = typing.get_type_hints(type(config))
+    changes = {}
+    for key, value in table.items():
+        dotted = ".".join((*path, key))
+        if key not in hints:
+            known = ", ".join(hints)
+            raise UserError("unknown key", where=dotted, remedy=f"Known keys: {known}")
+        current = getattr(config, key)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, dict):
+                raise UserError("must be a table", where=dotted)
+            changes[key] = _update(current, value, (*path, key))
+        else:
+            changes[key] = _typed(value, hints[key], dotted)
+    return dataclasses.replace(config, **changes)
+
+
+def _typed(value: object, hint: type, where: str) -> object:
+    if typing.get_origin(hint) in (Literal, types.UnionType):
+        choices = typing.get_args(hint)
+        if value not in choices:
+            raise UserError(f"{value!r} is none of {', '.join(choices)}", where=where)
+        return value
+    if hint is float and type(value) is int:
+        return float(value)
+    if type(value) is not hint:
+        raise UserError(f"must be {hint.__name__}, not {type(value).__name__}", where=where)
+    return value

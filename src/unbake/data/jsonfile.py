@@ -1,0 +1,74 @@
+"""Typed access to hand-written JSON: every mistake becomes a `UserError` that names its place."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unbake.errors import UserError
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file.
+
+    Raises:
+        UserError: the file is missing, unreadable, or not JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError("the file does not exist", path, "Check the path") from None
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"the file is not readable JSON ({reason})", path, "Repair it") from None
+
+
+def number(keys: dict[str, Any], key: str, where: str) -> float:
+    """The number at a key; `where` (file and entry) goes into the error message."""
+    value = _value(keys, key, where)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise UserError(f"{key!r} is not a number", where, f"It is a {type(value).__name__}")
+    try:
+        return float(value)
+    except OverflowError:
+        raise UserError(f"{key!r} is too large", where, "Correct it") from None
+
+
+def integer(keys: dict[str, Any], key: str, where: str) -> int:
+    """The whole number at a key; floats such as 512.0 count, which some converters write."""
+    value = number(keys, key, where)
+    if not value.is_integer():
+        raise UserError(f"{key!r} is {value:g}, not a whole number", where, "Correct it")
+    return int(value)
+
+
+def array(keys: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """The nested list of numbers at a key as a float64 array of that shape."""
+    value = _value(keys, key, where)
+    try:
+        # Texts such as "1" would convert, but whoever wrote them meant something else
+        result = np.array(value)
+        numeric = np.issubdtype(result.dtype, np.number)
+    except (TypeError, ValueError):
+        result, numeric = np.empty(0), False
+    if result.shape != shape or not numeric:
+        size = " x ".join(str(n) for n in shape)
+        raise UserError(f"{key!r} is not an array of {size} numbers", where, "Correct it")
+    return result.astype(np.float64)
+
+
+def text(keys: dict[str, Any], key: str, where: str) -> str:
+    """The text at a key, not empty."""
+    value = _value(keys, key, where)
+    if not isinstance(value, str) or not value:
+        raise UserError(f"{key!r} is not a text", where, "Correct it")
+    return value
+
+
+def _value(keys: dict[str, Any], key: str, where: str) -> Any:
+    if key not in keys:
+        raise UserError(f"the key {key!r} is missing", where, "Add it to the file")
+    return keys[key]

@@ -1,0 +1,62 @@
+"""The built-in scenes: a demo room, the Cornell box, the paper's cube and a furnace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...errors import UserError
+from . import closed, cornell, demo
+from .cameras import Camera
+
+__all__ = ["SCENES", "Camera", "default_cameras", "write_scene"]
+
+SCENES = ("demo", "cornell", "cube", "furnace")
+
+
+def write_scene(name: str, folder: Path, *, albedo: float = 0.5) -> Path:
+    """Write a built-in scene as a self-contained Mitsuba 3 scene and return the path of its XML.
+
+    `folder` gets `scene.xml`, `meshes/*.ply` and `textures/*.exr` (linear, raw); lengths are
+    metres in `demo`, half widths of the box elsewhere; z is up. `albedo` in [0, 1) is that of the
+    walls of `cube` and `furnace`, the other scenes ignore it. Needs a Mitsuba variant to be set.
+
+    Raises UserError for an unknown name or an albedo out of range.
+    """
+    _check(name)
+    if not 0.0 <= albedo < 1.0:
+        raise UserError(f"albedo {albedo:g} is out of range", name, "Choose 0 <= albedo < 1")
+    folder = Path(folder)
+    match name:
+        case "demo":
+            return demo.write(folder)
+        case "cornell":
+            return cornell.write(folder)
+        case "cube":
+            return closed.write_cube(folder, albedo)
+        case _:
+            return closed.write_furnace(folder, albedo)
+
+
+def default_cameras(name: str, views: int, held_out: int) -> list[Camera]:
+    """Cameras made for a built-in scene: `views` for training, then `held_out` others.
+
+    World units, z up, horizontal field of view in degrees (square images). Fewer views are a
+    prefix of more. No camera stands inside an object, and no two of them are alike.
+
+    Raises UserError for an unknown name or a negative number.
+    """
+    _check(name)
+    if views < 0 or held_out < 0:
+        raise UserError("the number of views is negative", name, "Ask for at least one view")
+    match name:
+        case "demo":
+            return demo.cameras(views, held_out)
+        case "cornell":
+            return cornell.cameras(views, held_out)
+        case _:
+            return closed.cameras(views, held_out)
+
+
+def _check(name: str) -> None:
+    if name not in SCENES:
+        raise UserError(f"there is no built-in scene {name!r}", None, f"Choose {', '.join(SCENES)}")

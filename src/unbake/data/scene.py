@@ -1,0 +1,177 @@
+"""Load a Mitsuba scene, find its unknown materials and put fields in their place.
+
+Everything works on Mitsuba's own parsed form of a scene (`mi.parser`), never on its text.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..errors import UserError
+
+#: Wrappers that a material may stand in.
+WRAPPERS = ("twosided", "mask", "bumpmap", "normalmap")
+
+
+@dataclass
+class ParsedScene:
+    """A scene before it is instantiated: Mitsuba's nodes, free to be changed."""
+
+    path: Path
+    config: mi.parser.ParserConfig
+    state: mi.parser.ParserState
+
+    def instantiate(self) -> mi.Scene:
+        """Make the scene; the nodes are used up.
+
+        Equal materials become one and meshes of one material one mesh: tracing a step costs time for
+        each object that a ray may meet.
+
+        Raises:
+            UserError: Mitsuba cannot make it.
+        """
+        try:
+            mi.parser.transform_merge_equivalent(self.config, self.state)
+            mi.parser.transform_merge_meshes(self.config, self.state)
+            scene = mi.parser.instantiate(self.config, self.state)
+        except RuntimeError as error:
+            raise UserError(f"Mitsuba cannot make this scene: {_first_line(error)}", self.path) from None
+        return scene[0] if isinstance(scene, list) else scene
+
+    def principled_nodes(self) -> list:
+        """The nodes whose albedo and roughness are (or stand for) unknowns."""
+        return [n for n in self.state.nodes if n.props.plugin_name() == "principled"]
+
+
+def parse(path: Path) -> ParsedScene:
+    """Parse a Mitsuba XML scene and resolve its references.
+
+    Raises:
+        UserError: the file is missing or is not a Mitsuba scene, or has a number that is not finite.
+    """
+    if not path.is_file():
+        raise UserError("no such scene file", where=path)
+    config = mi.parser.ParserConfig(mi.variant())
+    try:
+        state = mi.parser.parse_file(config, str(path))
+        mi.parser.transform_upgrade(config, state)
+        mi.parser.transform_resolve(config, state)
+    except RuntimeError as error:
+        raise UserError(f"not a scene that Mitsuba can read: {_first_line(error)}", path) from None
+    scene = ParsedScene(path, config, state)
+    _require_finite(scene)
+    _resolve_files(scene)
+    return scene
+
+
+def to_principled(scene: ParsedScene) -> int:
+    """Turn every `diffuse` and rough plastic BSDF into `principled`, as the paper did (Sec. 6).
+
+    Diffuse becomes roughness 0.9; rough plastic keeps its colour, with roughness √α, the perceptual
+    roughness of the same microfacet width.
+
+    Returns:
+        The number of BSDFs changed.
+    """
+    changed = 0
+    for node in scene.state.nodes:
+        props = node.props
+        match props.plugin_name():
+            case "diffuse":
+                colour, roughness = _take(props, "reflectance", 0.5), 0.9
+            case "roughplastic":
+                colour = _take(props, "diffuse_reflectance", 0.5)
+                roughness = math.sqrt(_take(props, "alpha", 0.1))
+            case _:
+                continue
+        for key in list(props.keys()):
+            del props[key]
+        props.set_plugin_name("principled")
+        props["base_color"] = colour
+        props["roughness"] = roughness
+        changed += 1
+    return changed
+
+
+def set_textures(scene: ParsedScene, albedo: object, roughness: object) -> None:
+    """Give every `principled` BSDF these textures; all its other parameters stay.
+
+    Raises:
+        UserError: there is no such BSDF, so nothing could be fitted.
+    """
+    nodes = scene.principled_nodes()
+    if not nodes:
+        raise UserError(
+            "no material to fit: no shape has a principled, diffuse or roughplastic BSDF",
+            where=scene.path,
+        )
+    for node in nodes:
+        node.props["base_color"] = albedo
+        node.props["roughness"] = roughness
+
+
+def show_roughness_as_albedo(scene: ParsedScene) -> None:
+    """Put each material's roughness in the place of its base colour (to render what it is)."""
+    for node in scene.principled_nodes():
+        props = node.props
+        props["base_color"] = props["roughness"] if "roughness" in props else 0.5
+
+
+def write(scene: ParsedScene, folder: Path) -> Path:
+    """Write the scene and copies of all its files into a folder, as `scene.xml`.
+
+    Raises:
+        UserError: a file that the scene names is missing.
+    """
+    try:
+        mi.parser.transform_relocate(scene.config, scene.state, str(folder))
+        mi.parser.write_file(scene.state, str(folder / "scene.xml"))
+    except RuntimeError as error:
+        raise UserError(f"cannot be copied: {_first_line(error)}", scene.path) from None
+    return folder / "scene.xml"
+
+
+def require_emitters(scene: mi.Scene, path: Path) -> None:
+    """Raise a `UserError` if nothing in the scene emits light."""
+    if not scene.emitters():
+        raise UserError("the scene has no light source", path, "Add an area light or environment map")
+
+
+def _resolve_files(scene: ParsedScene) -> None:
+    """Make the names of files absolute: Mitsuba would look for them in the working directory."""
+    folder = scene.path.parent.resolve()
+    for node in scene.state.nodes:
+        for key in node.props.keys():
+            value = node.props[key]
+            if not isinstance(value, str):
+                continue
+            file = folder / value
+            if value and file.is_file():
+                node.props[key] = str(file)
+            elif key == "filename":
+                where = mi.parser.file_location(scene.state, node)
+                raise UserError(f"the file {value!r} does not exist", where=where)
+
+
+def _take(props: mi.Properties, key: str, default: float) -> object:
+    return props[key] if key in props else default
+
+
+def _require_finite(scene: ParsedScene) -> None:
+    for node in scene.state.nodes:
+        for key in node.props.keys():
+            value = node.props[key]
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UserError(
+                    f"{node.props.plugin_name()}.{key} is {value}",
+                    where=mi.parser.file_location(scene.state, node),
+                )
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__

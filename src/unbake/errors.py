@@ -1,0 +1,23 @@
+"""The one exception that reaches a user: what is wrong, where, and the remedy."""
+
+
+class UserError(Exception):
+    """Bad input or an unusable machine, told in one line.
+
+    Args:
+        what: what is wrong, as a sentence without full stop.
+        where: the file, key, view or option it was found in.
+        remedy: what the user can do about it.
+
+    The command line prints it and exits with status 2; it never shows a traceback.
+    """
+
+    def __init__(self, what: str, where: object | None = None, remedy: str | None = None) -> None:
+        self.what = what
+        self.where = None if where is None else str(where)
+        self.remedy = remedy
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        text = self.what if self.where is None else f"{self.where}: {self.what}"
+        return text if self.remedy is None else f"{text}. {self.remedy}"

@@ -1,0 +1,40 @@
+"""The unit cube in which all fields live."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Maps world positions into [0,1]³ by one uniform scale about the centre of the scene's box.
+
+    A per-axis scale would stretch the grid's cells in long, thin rooms.
+    """
+
+    centre: tuple[float, float, float]
+    extent: float  #: side of the cube, in world units
+
+    @staticmethod
+    def unit() -> Domain:
+        """The unit cube itself."""
+        return Domain((0.5, 0.5, 0.5), 1.0)
+
+    @staticmethod
+    def of(box: mi.BoundingBox3f) -> Domain:
+        """The domain of a scene's bounding box, with a margin of one percent."""
+        lower, upper = np.ravel(box.min).tolist(), np.ravel(box.max).tolist()
+        centre = tuple((a + b) / 2 for a, b in zip(lower, upper))
+        return Domain(centre, 1.01 * max(b - a for a, b in zip(lower, upper)))
+
+    def to_unit(self, p: mi.Point3f, valid: mi.Bool) -> mi.Point3f:
+        """World positions to [0,1]³; lanes that are not valid get the centre.
+
+        A single position at infinity, as a ray that hit nothing has, would poison the grid for good.
+        """
+        unit = (mi.Point3f(p) - mi.Point3f(*self.centre)) / self.extent + 0.5
+        return dr.clip(dr.select(valid, unit, 0.5), 0, 1)

@@ -1,0 +1,67 @@
+"""The radiance network L_θ(x, ω): reflected radiance at surface points (Sec. 3.1, 5.3)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..config import NetworkConfig
+from .domain import Domain
+from .network import Engine, Network
+
+
+class RadianceField:
+    """Reflected radiance as a function of position, direction, normal and albedo.
+
+    Emission is not part of it: the rendering equation's E is known and added analytically.
+
+    Args:
+        scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good one.
+
+    Paper: Sec. 3.1, 5.3.
+    """
+
+    def __init__(self, config: NetworkConfig, domain: Domain, *, scale: float, seed: int) -> None:
+        self.domain = domain
+        self.scale = scale
+        self.network = Network(config, extra=12, outputs=3, seed=seed)
+
+    def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The trainable arrays θ by name."""
+        return self.network.parameters()
+
+    def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
+        """Use these arrays from now on."""
+        self.network.assign(parameters)
+
+    def evaluate(
+        self,
+        p: mi.Point3f,
+        w: mi.Vector3f,
+        n: mi.Normal3f,
+        albedo: mi.Color3f,
+        valid: mi.Bool,
+        engine: Engine = "tensor",
+    ) -> mi.Color3f:
+        """L_θ at world positions `p` towards `w`.
+
+        Args:
+            p: positions, world units.
+            w: unit directions that point away from the surface, world space.
+            n: unit shading normals on the side of `w`, world space.
+            albedo: linear RGB; taken as a constant.
+            valid: lanes to evaluate; the others return zero.
+
+        Returns:
+            Linear RGB radiance, never negative, with a gradient that never vanishes.
+        """
+        unit = self.domain.to_unit(p, valid)
+        extra = [*(2 * unit - 1), *w, *n, *dr.detach(albedo)]
+        extra = [dr.select(valid, x, 0) for x in extra]
+        raw = self.network(unit, extra, engine)
+        return mi.Color3f([dr.select(valid, self.scale * _squareplus(x), 0) for x in raw])
+
+
+def _squareplus(x: mi.Float) -> mi.Float:
+    """(x + √(x² + 4)) / 2: positive, 1 at zero, linear above, with a live gradient everywhere."""
+    return 0.5 * (x + dr.sqrt(dr.fma(x, x, 4)))

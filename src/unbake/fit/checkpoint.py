@@ -1,0 +1,112 @@
+"""Checkpoints: written whole or not at all, and found again after any crash.
+
+A checkpoint is one safetensors file with the parameters, the optimisers' moments and the counters. It
+is written under another name, flushed to disk, and renamed. The newest file that can be read counts.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from ..errors import UserError
+from ..fields.network import from_numpy
+from .step import State
+
+FORMAT = "unbake-checkpoint-1"
+#: Checkpoints kept in a run folder.
+KEEP = 3
+
+
+@dataclass
+class Progress:
+    """How far a fit has come."""
+
+    step: int = 0
+    seconds: float = 0.0  #: of training, without previews and checkpoints
+    samples: int = 0
+
+
+def save_checkpoint(folder: Path, state: State, progress: Progress) -> Path:
+    """Write a checkpoint and delete all but the newest few.
+
+    Raises:
+        UserError: it cannot be written; older checkpoints are untouched.
+    """
+    arrays = {}
+    for name, optimizer in state.optimizers():
+        for key, (value, _, _, extra) in optimizer.state.items():
+            count, first, second, _ = extra
+            arrays[f"{name}.{key}"] = value.numpy()
+            arrays[f"{name}.{key}:m"] = first.numpy()
+            arrays[f"{name}.{key}:v"] = second.numpy()
+            arrays[f"{name}.{key}:t"] = np.asarray(count).astype(np.uint32).ravel()[:1]
+    metadata = {
+        "format": FORMAT,
+        "step": str(progress.step),
+        "seconds": repr(progress.seconds),
+        "samples": str(progress.samples),
+    }
+    path = folder / f"step-{progress.step:07d}.safetensors"
+    partial = path.with_suffix(".partial")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb") as file:
+            file.write(save(arrays, metadata))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise UserError(f"the checkpoint cannot be written ({error.strerror})", path) from None
+    for old in sorted(folder.glob("step-*.safetensors"))[:-KEEP]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def load_checkpoint(folder: Path, state: State) -> Progress | None:
+    """Put the newest readable checkpoint into the state; None if there is none.
+
+    Raises:
+        UserError: the checkpoint belongs to other settings.
+    """
+    for path in sorted(folder.glob("step-*.safetensors"), reverse=True):
+        try:
+            with safe_open(path, "numpy") as file:
+                metadata = file.metadata() or {}
+                arrays = {key: file.get_tensor(key) for key in file.keys()}
+        except (SafetensorError, OSError):
+            continue
+        if metadata.get("format") != FORMAT:
+            continue
+        _restore(state, arrays, path)
+        return Progress(
+            int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"])
+        )
+    return None
+
+
+def _restore(state: State, arrays: dict[str, np.ndarray], path: Path) -> None:
+    for name, optimizer in state.optimizers():
+        for key, (value, promoted, rate, _) in list(optimizer.state.items()):
+            full = f"{name}.{key}"
+            if full not in arrays or arrays[full].shape != tuple(value.shape):
+                raise UserError(
+                    f"does not fit the settings: {full} is missing or has another shape",
+                    where=path,
+                    remedy="Resume with the settings that the run was started with",
+                )
+            first, second = (from_numpy(mi.Float, arrays[f"{full}:{x}"]) for x in "mv")
+            count = dr.opaque(mi.UInt32, int(arrays[f"{full}:t"][0]))
+            new = from_numpy(mi.Float, arrays[full])
+            if dr.is_tensor_v(value):
+                new = mi.TensorXf(new, value.shape)
+            dr.enable_grad(new)
+            optimizer.state[key] = (new, promoted, rate, (count, first, second, None))

@@ -1,0 +1,208 @@
+"""The training loop, top to bottom."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+
+from ..config import FitConfig, read_toml, to_toml
+from ..data.views import Dataset
+from ..errors import UserError
+from .checkpoint import Progress, load_checkpoint, save_checkpoint
+from .monitor import Monitor, memory_mb
+from .preview import Preview
+from .problem import camera_warnings, make_problem, training_pixels
+from .step import TrainingStep, initial_state
+
+#: Steps between readings of the loss; reading waits for the machine.
+READ_EVERY = 20
+#: Consecutive steps without a finite loss after which a fit gives up.
+GIVE_UP_AFTER = 100
+
+
+def fit(
+    data: Path,
+    run: Path,
+    config: FitConfig,
+    *,
+    resume: bool = False,
+    clip_negative: bool = False,
+    console: Console | None = None,
+) -> Progress:
+    """Recover the materials of a scene from its photographs.
+
+    Args:
+        data: a data set's folder, with `transforms.json`.
+        run: the folder to write: settings, log, checkpoints and previews.
+        config: what to do; ignored, but for `steps` and `seconds`, when resuming.
+        resume: go on with the run's newest checkpoint.
+        clip_negative: take negative pixels as zero.
+
+    Returns:
+        How far the fit came. Ctrl-C ends it early, with a checkpoint.
+
+    Raises:
+        UserError: the data set or the run's folder cannot be used, or the loss does not stay finite.
+
+    Paper: Sec. 4, 5.4.
+    """
+    console = console or Console()
+    dataset = Dataset.load(data, clip_negative=clip_negative)
+    pixels, mean_radiance = training_pixels(dataset, clip_negative=clip_negative)
+    if resume:
+        config = _resumed_config(run, config)
+    problem = make_problem(dataset.scene, dataset.background, config, mean_radiance)
+    for warning in camera_warnings(dataset, problem.world.scene):
+        console.print(f"warning: {warning}", style="yellow", markup=False)
+
+    state = initial_state(problem)
+    progress = Progress()
+    if resume:
+        progress = load_checkpoint(run / "checkpoints", state) or progress
+    else:
+        _new_run(run)
+    _write_settings(run, data, config, mean_radiance)
+
+    step = TrainingStep(problem, pixels, config)
+    preview = Preview(problem, dataset, run / "previews")
+    total = config.seconds or config.steps
+    saved_at = shown_at = progress.seconds
+    recent: list[dict[str, mi.Float]] = []
+    skipped = 0
+    with Monitor(run / "log.jsonl", console, total) as monitor, _stop_on_interrupt() as stop:
+        clock = time.perf_counter() - progress.seconds
+        while _done(config, progress) < total and not stop:
+            # Rates depend on how much is done: on steps, or on time where time is the limit.
+            phi_rate, theta_rate = learning_rates(config, progress.step, _done(config, progress) / total)
+            recent.append(step(state, progress.step, phi_rate, theta_rate))
+            progress.step += 1
+            progress.samples += config.samples_per_step
+            last = _done(config, progress) >= total or bool(stop)
+
+            if progress.step % READ_EVERY == 0 or last or config.seconds:
+                dr.sync_thread()
+                progress.seconds = time.perf_counter() - clock
+                last = _done(config, progress) >= total or bool(stop)
+            if progress.step % READ_EVERY and not last:
+                continue
+
+            entry = _log_entry(recent, progress, phi_rate)
+            skipped = skipped + entry["skipped"] if entry["skipped"] == len(recent) else 0
+            recent.clear()
+            monitor.record(_done(config, progress), entry)
+            if skipped >= GIVE_UP_AFTER:
+                raise UserError(
+                    f"the loss was not finite in the last {skipped} steps",
+                    where=run,
+                    remedy="Lower learning_rate, or look for extreme pixels in the images",
+                )
+            # What follows is not training: the clock stands still.
+            if last or progress.seconds - saved_at >= config.checkpoint_seconds:
+                save_checkpoint(run / "checkpoints", state, progress)
+                saved_at = progress.seconds
+            if last or progress.seconds - shown_at >= config.preview_seconds:
+                state.publish(problem)
+                for line in preview.show(progress):
+                    monitor.validation(line)
+                shown_at = progress.seconds
+            clock = time.perf_counter() - progress.seconds
+    if stop:
+        console.print(f"stopped at step {progress.step}; go on with --resume", highlight=False)
+    return progress
+
+
+def learning_rates(config: FitConfig, step: int, done: float) -> tuple[float, float]:
+    """Adam's rates for φ and θ.
+
+    Both decay exponentially to a fraction of where they start. The materials' rate first rises, so
+    that L_θ is never far behind: while it is wrong, albedo would run into its bounds.
+
+    Args:
+        step: steps taken so far.
+        done: fraction of the fit that is done, [0,1].
+    """
+    decay = config.final_learning_rate ** min(done, 1.0)
+    rise = min(1.0, (step + 1) / (config.warm_up + 1))
+    return config.learning_rate * decay * rise, config.radiance_learning_rate * decay
+
+
+def _done(config: FitConfig, progress: Progress) -> float:
+    return progress.seconds if config.seconds else progress.step
+
+
+def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: float) -> dict:
+    """A line of the log: means over the steps since the last one."""
+    entry: dict = {
+        "step": progress.step,
+        "seconds": progress.seconds,
+        "samples": progress.samples,
+    }
+    for term in recent[0]:
+        values = [float(losses[term][0]) for losses in recent]
+        if term == "skipped":
+            entry[term] = int(sum(values))
+            continue
+        finite = [v for v in values if math.isfinite(v)]
+        entry[term] = sum(finite) / len(finite) if finite else math.nan
+    entry |= {
+        "samples_per_second": progress.samples / max(progress.seconds, 1e-9),
+        "memory_mb": memory_mb(),
+        "learning_rate": rate,
+    }
+    return entry
+
+
+def _new_run(run: Path) -> None:
+    """Make the folder; refuse to mix two runs in one."""
+    if (run / "config.toml").exists():
+        raise UserError(
+            "there is a run in this folder already",
+            where=run,
+            remedy="Go on with --resume, or give another --out",
+        )
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"the folder cannot be made ({error.strerror})", run) from None
+
+
+def _write_settings(run: Path, data: Path, config: FitConfig, mean_radiance: float) -> None:
+    (run / "config.toml").write_text(to_toml(config), encoding="utf-8")
+    origin = {"data": str(data.resolve()), "mean_radiance": mean_radiance}
+    (run / "origin.json").write_text(json.dumps(origin, indent=1), encoding="utf-8")
+
+
+def _resumed_config(run: Path, config: FitConfig) -> FitConfig:
+    """The settings a run was started with, but for how long it should go on."""
+    if not (run / "config.toml").is_file():
+        raise UserError("no run to resume: there is no config.toml", run)
+    stored = read_toml(run / "config.toml")
+    return dataclasses.replace(stored, steps=config.steps, seconds=config.seconds)
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[list[bool]]:
+    """A list that fills on Ctrl-C or SIGTERM; a second Ctrl-C ends the program at once."""
+    stop: list[bool] = []
+
+    def handler(number: int, frame: object) -> None:
+        if stop:
+            raise KeyboardInterrupt
+        stop.append(True)
+
+    previous = {s: signal.signal(s, handler) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for s, old in previous.items():
+            signal.signal(s, old)

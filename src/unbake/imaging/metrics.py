@@ -1,0 +1,74 @@
+"""How far a picture is from its ground truth, in decibels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from unbake.errors import UserError
+
+
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio of a picture in dB, with peak 1, on linear and unclamped values.
+
+    PSNR = 10 log10(1 / MSE), where MSE is the mean of (image − reference)² over the masked pixels
+    and all channels, summed in double precision. Values above 1 count in full: nothing is clamped,
+    tone-mapped or rescaled.
+
+    Args:
+        image: (H, W) or (H, W, C), linear.
+        reference: the ground truth, same shape and space.
+        mask: (H, W) bool, True where a pixel counts; None counts every pixel.
+
+    Returns:
+        dB; `inf` where the two agree exactly.
+
+    Raises:
+        UserError: the shapes differ, no pixel counts, or a pixel that counts is not finite.
+
+    Source: PSNR as reported in Paper: Sec. 6, Fig. 6.
+    """
+    image, reference = np.asarray(image), np.asarray(reference)
+    if image.shape != reference.shape or image.ndim not in (2, 3):
+        raise UserError(
+            f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}",
+            remedy="Both must be (H, W) or (H, W, C) with equal sizes",
+        )
+    if mask is not None:
+        image, reference = _select(image, mask), _select(reference, mask)
+    if image.size == 0:
+        raise UserError("no pixel to compare: the mask is empty")
+    finite = np.isfinite(image) & np.isfinite(reference)
+    if not finite.all():
+        bad = int(np.count_nonzero(~finite))
+        raise UserError(f"{bad} of {finite.size} compared values are not finite")
+    mse = float(np.mean(np.square(image.astype(np.float64) - reference.astype(np.float64))))
+    return math.inf if mse == 0 else -10 * math.log10(mse)
+
+
+def mean_psnr(values: Iterable[float | None]) -> float | None:
+    """Mean over views of their PSNR, in dB.
+
+    Args:
+        values: one dB value a view; None for a view without ground truth, which is left out.
+
+    Returns:
+        The arithmetic mean of the dB values (not the PSNR of the pooled error), or None where no
+        view has a value. One view that agrees exactly makes the mean `inf`.
+    """
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None
+
+
+def _select(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The (N,) or (N, C) pixels that count."""
+    mask = np.asarray(mask)
+    if mask.dtype != np.bool_ or mask.shape != picture.shape[:2]:
+        raise UserError(
+            f"a {mask.dtype} mask of shape {mask.shape} does not fit a picture "
+            f"of {picture.shape[0]} x {picture.shape[1]} pixels",
+            remedy="A mask is (H, W) and boolean",
+        )
+    return picture[mask]

@@ -1,0 +1,137 @@
+"""The objective, and THE table of which of its terms trains what (Sec. 4.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import drjit as dr
+import mitsuba as mi
+
+from .image import Needs, PathSample, lhs, rhs
+from .prior import first_residual, residual_norm, second_residual
+
+
+@dataclass(frozen=True)
+class Live:
+    """Which edges of a term pass gradients."""
+
+    materials: bool = False  #: the BSDF at x₁, to φ
+    lhs: bool = False  #: L_θ on the left-hand side, to θ
+    rhs: bool = False  #: L_θ on the right-hand side, to θ
+
+
+PHOTOMETRIC, PRIOR, EXTRA, LHS = "photometric", "prior", "prior_extra", "lhs"
+
+#: Method → term → what it trains. A term that is absent is not part of the method.
+#: Photometric: Eq. 5 with Eq. 12. Prior: Eq. 10. Extra: the same at x₂. LHS: Eq. 14.
+METHODS: Mapping[str, Mapping[str, Live]] = MappingProxyType(
+    {
+        "ours": {
+            PHOTOMETRIC: Live(materials=True),
+            PRIOR: Live(lhs=True),
+            EXTRA: Live(lhs=True),
+            LHS: Live(lhs=True),
+        },
+        "one-bounce": {
+            PHOTOMETRIC: Live(materials=True),
+            PRIOR: Live(lhs=True),
+            LHS: Live(lhs=True),
+        },
+        "direct": {PHOTOMETRIC: Live(materials=True)},
+    }
+)
+
+
+def needs(terms: Mapping[str, Live]) -> Needs:
+    """What a method's path samples must hold."""
+    return Needs(radiance=len(terms) > 1, second_bounce=EXTRA in terms)
+
+
+def objective(
+    terms: Mapping[str, Live],
+    sample: PathSample,
+    target: mi.Color3f,
+    spp: int,
+    epsilon: float,
+    primal: mi.Color3f | None = None,
+) -> dict[str, mi.Float]:
+    """Every term of the objective; their sum is what is minimised.
+
+    Args:
+        terms: a row of `METHODS`.
+        sample: path samples, `spp` consecutive lanes a pixel.
+        target: the photographs' pixels, linear RGB.
+        spp: camera samples a pixel.
+        epsilon: of the relative L2 loss.
+        primal: an independent, detached estimate of the same pixels for the two-pass estimator; None:
+            the split-halves estimator.
+
+    Paper: Eq. 5, Eq. 11, Eq. 14, Sec. 4.1.
+    """
+    values: dict[str, mi.Float] = {}
+    L1, L2 = sample.L1, sample.L2
+    for term, live in terms.items():
+        seen = L1 if live.lhs else dr.detach(L1)
+        incoming = L2 if live.rhs else dr.detach(L2)
+        match term:
+            case "photometric":
+                pixels = rhs(sample, mi.Color3f(0) if L2 is None else incoming)
+                pixels = pixels if live.materials else dr.detach(pixels)
+                values[term] = relative_l2(pixels, target, spp, epsilon, primal)
+            case "prior":
+                sample1 = sample if live.materials else dr.detach(sample)
+                residual = first_residual(sample1, seen, incoming)
+                values[term] = residual_norm(residual, L1, epsilon)
+            case "prior_extra":
+                residual = second_residual(sample, L2 if live.lhs else dr.detach(L2), sample.L3)
+                values[term] = residual_norm(residual, L2, epsilon)
+            case "lhs":
+                pixels = lhs(sample, seen)
+                values[term] = relative_l2(pixels, target, spp, epsilon, None)
+    return values
+
+
+def relative_l2(
+    samples: mi.Color3f,
+    target: mi.Color3f,
+    spp: int,
+    epsilon: float,
+    primal: mi.Color3f | None = None,
+) -> mi.Float:
+    """Relative squared error of pixels, (I − G)² / (G² + ε), whose gradient is unbiased.
+
+    The gradient 2 (I − G) ∂I of a squared error is biased if both factors come from the same noisy
+    samples. Without `primal` the samples of each pixel are split in halves A and B: the expectation of
+    (I_A − G)(I_B − G) is the squared error of the expected image, and so for its gradient. With
+    `primal`, an estimate from other random numbers, the factors are that one and ∂I.
+
+    Args:
+        samples: linear RGB, `spp` consecutive lanes a pixel.
+        target: G, linear RGB, one lane a pixel.
+        primal: I from an independent pass, one lane a pixel.
+
+    Returns:
+        Mean over pixels and channels.
+
+    Paper: Sec. 5.2, Sec. 5.4.
+    """
+    weight = dr.rcp(dr.square(target) + epsilon)
+    if primal is not None:
+        image = pixel_means(samples, spp)
+        error = dr.detach(primal) - target
+        # The value is the squared error of the primal image, the gradient 2 (primal − G) ∂I.
+        loss = dr.replace_grad(dr.square(error), 2 * dr.detach(error) * image)
+    else:
+        halves = pixel_means(samples, spp // 2)
+        even = 2 * dr.arange(mi.UInt32, dr.width(target))
+        a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
+        loss = (a - target) * (b - target)
+    return dr.mean(dr.mean(loss * weight))
+
+
+def pixel_means(samples: mi.Color3f, spp: int) -> mi.Color3f:
+    """Mean of each run of `spp` lanes: pixels from their camera samples."""
+    dr.eval(samples)
+    return mi.Color3f([dr.block_sum(c, spp) / spp for c in samples])

@@ -1,0 +1,85 @@
+"""The transport operator T: one bounce by emitter and BSDF sampling with MIS (Eq. 1, 8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..fields.materials import carry
+from .vertex import Scattering, Vertex, World, find_vertex, mis_weight
+
+
+@dataclass
+class Bounce:
+    """One sample of T at a vertex.
+
+    T(L) ≈ direct + weight · (next.emitted + next.throughput · L(next)); see `transported`.
+    """
+
+    direct: mi.Color3f  # light of emitters, by emitter sampling, MIS weighted
+    weight: mi.Color3f  # BSDF · cosine / density of the sampled direction
+    next: Vertex
+
+
+def attach_material(world: World, vertex: Vertex, engine: str = "tensor") -> Vertex:
+    """Evaluate the material fields at a vertex, once, and put them on its surface interaction.
+
+    Gradients arrive in φ wherever the BSDF is evaluated afterwards. Without fields the scene's own
+    textures stay in charge and only the albedo is looked up.
+    """
+    si = vertex.si
+    if world.materials is None:
+        albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(si, vertex.valid))
+        return replace(vertex, albedo=dr.detach(albedo))
+    material = world.materials.evaluate(si.p, vertex.valid, engine)
+    si = mi.SurfaceInteraction3f(si)
+    carry(si, material)
+    return replace(vertex, si=si, albedo=dr.detach(material.albedo))
+
+
+def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
+    """Sample T at a vertex: one emitter sample and one BSDF sample, combined by MIS.
+
+    Sampling is detached; the BSDF is evaluated with gradients (value / detached density).
+
+    Paper: Eq. 1, Sec. 4.2, 5.2.
+    """
+    scene, si, bsdf, active = world.scene, vertex.si, vertex.bsdf, vertex.valid
+    # A cut-out stopped the ray with probability `opacity`, so that only its material scatters here.
+    ctx = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null))
+    solid = dr.rcp(vertex.opacity) if world.has_chains else mi.Float(1)
+
+    # -------------------------------- Emitter sampling --------------------------------
+
+    ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
+    active_em = active & (ds.pdf != 0)
+    bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
+    mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf_em))
+    direct = dr.select(active_em, bsdf_em * em_weight * mis_em * solid, 0)
+
+    # ----------------------------- Detached BSDF sampling -----------------------------
+
+    with dr.suspend_grad():
+        bs, bs_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        goes_on = active & (bs.pdf > 0) & (dr.max(bs_weight) > 0)
+
+    value = bsdf.eval(ctx, si, bs.wo, goes_on & ~delta)
+    smooth = value * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0) * solid
+    weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
+
+    # Evaluated here, all together: reductions further on would each compute them again.
+    dr.eval(direct, weight, ray, goes_on, bs.pdf, delta, sampler)
+    origin = Scattering(dr.detach(si), bs.pdf, delta)
+    return Bounce(direct, weight, find_vertex(world, ray, goes_on, sampler, origin=origin))
+
+
+def transported(step: Bounce, radiance: mi.Color3f) -> mi.Color3f:
+    """One sample of T(L) from a bounce and the reflected radiance L at its next vertex.
+
+    Paper: Eq. 1, Eq. 12.
+    """
+    return step.direct + step.weight * (step.next.emitted + step.next.throughput * radiance)

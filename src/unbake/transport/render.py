@@ -1,0 +1,114 @@
+"""Whole pictures of a world: its radiance and its materials."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .operator import attach_material
+from .series import path_traced
+from .vertex import World, find_vertex
+
+#: Camera rays through pixels: pixel numbers and positions inside the pixels to world space rays.
+RayGenerator = Callable[[mi.UInt32, mi.Point2f], mi.Ray3f]
+
+#: Camera samples in flight at once; bounds the memory.
+WAVEFRONT = 1 << 18
+
+
+def render_radiance(
+    world: World,
+    through: RayGenerator,
+    pixels: int,
+    spp: int,
+    *,
+    seed: int,
+    max_depth: int,
+    rr_depth: int,
+    see_environment: bool,
+) -> np.ndarray:
+    """Path trace pixels with full global illumination (box filter).
+
+    Returns:
+        Linear RGB, float32, shape (pixels, 3).
+
+    Paper: Eq. 2, Sec. 6.
+    """
+    image = np.zeros((pixels, 3), np.float32)
+    for part, ray, part_seed in parts_of(through, pixels, spp, seed):
+        radiance = path_traced(
+            world,
+            ray,
+            part_seed,
+            max_depth=max_depth,
+            rr_depth=rr_depth,
+            see_environment=see_environment,
+        )
+        image[part] = np.stack([_pixel_means(c, spp) for c in radiance], -1)
+    return image
+
+
+def render_materials(
+    world: World, through: RayGenerator, pixels: int, spp: int, *, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the materials are at the surfaces that pixels see (cut-outs let rays pass).
+
+    Returns:
+        Albedo (pixels, 3), linear RGB; roughness (pixels,), perceptual; and coverage (pixels,), the
+        fraction of samples that see a material which is sought: not an emitter, a mirror or glass, nor
+        background. Materials are means over those samples, zero where there are none.
+    """
+    albedo = np.zeros((pixels, 3), np.float32)
+    roughness, coverage = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
+    sampler = mi.load_dict({"type": "independent"})
+    sought = _sought(world.scene)
+    for part, ray, part_seed in parts_of(through, pixels, spp, seed):
+        sampler.seed(dr.opaque(mi.UInt32, part_seed), dr.width(ray))
+        with dr.suspend_grad():
+            v = attach_material(world, find_vertex(world, ray, mi.Bool(True), sampler))
+            shape = dr.reinterpret_array(mi.UInt32, v.si.shape)
+            counted = v.valid & v.direct_view
+            counted &= dr.gather(mi.Bool, sought, shape, counted)
+            rough = v.si.dn_dv.x if world.materials is not None else mi.Float(0)
+            weighted = [dr.select(counted, x, 0) for x in (*v.albedo, rough, mi.Float(1))]
+            dr.eval(weighted)
+        *colour, rough, weight = [_pixel_means(x, spp) for x in weighted]
+        share = np.maximum(weight, 1e-6)
+        albedo[part] = np.stack(colour, -1) / share[:, None]
+        roughness[part], coverage[part] = rough / share, weight
+    return albedo, roughness, coverage
+
+
+def parts_of(
+    through: RayGenerator, pixels: int, spp: int, seed: int
+) -> Iterator[tuple[slice, mi.Ray3f, int]]:
+    """Runs of pixels that fit the wavefront, with the rays of all their samples."""
+    step = max(1, WAVEFRONT // spp)
+    sampler = mi.load_dict({"type": "independent"})
+    for first in range(0, pixels, step):
+        last = min(first + step, pixels)
+        part_seed = int(np.random.SeedSequence([seed, first]).generate_state(1)[0])
+        sampler.seed(dr.opaque(mi.UInt32, part_seed ^ 0x5BD1E995), (last - first) * spp)
+        lane = dr.arange(mi.UInt32, (last - first) * spp)
+        pixel = lane // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
+        ray = through(pixel, sampler.next_2d())
+        dr.eval(ray)
+        yield slice(first, last), ray, part_seed
+
+
+def _pixel_means(samples: mi.Float, spp: int) -> np.ndarray:
+    return np.array(dr.block_sum(samples, spp)) / spp
+
+
+def _sought(scene: mi.Scene) -> mi.Bool:
+    """For each shape, by its number in Dr.Jit's registry, whether its material is sought."""
+    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in scene.shapes()]
+    table = np.zeros(max(numbers) + 1, bool)
+    for number, shape in zip(numbers, scene.shapes(), strict=True):
+        # The printed form names the BSDF inside wrappers, which Mitsuba gives no other access to.
+        principled = shape.bsdf() is not None and "Principled BSDF" in str(shape.bsdf())
+        table[number] = principled and shape.emitter() is None
+    return mi.Bool(table)

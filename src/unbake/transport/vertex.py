@@ -1,0 +1,195 @@
+"""From a ray to the first surface that is not specular, where the radiance field can be asked (Sec. 7).
+
+Symbols follow Mitsuba: `si` surface interaction, `pi` its preliminary form, `ds` a direction sample,
+β throughput. Directions point away from the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..fields.materials import Materials
+
+
+@dataclass(frozen=True)
+class World:
+    """What light travels through.
+
+    Args:
+        scene: geometry, emitters and BSDFs.
+        materials: fields that stand in for the unknown materials; None: the scene's own are used.
+        max_specular: longest chain of specular interactions followed; longer ones end in black.
+        has_chains: whether any surface of the scene is specular or cut out (found by `of`).
+    """
+
+    scene: mi.Scene
+    materials: Materials | None
+    max_specular: int
+    has_chains: bool
+
+    @staticmethod
+    def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> World:
+        """The world of a scene; looks at every BSDF once."""
+        flags = [int(shape.bsdf().flags()) for shape in scene.shapes() if shape.bsdf() is not None]
+        chains = any(not f & int(mi.BSDFFlags.Smooth) or f & int(mi.BSDFFlags.Null) for f in flags)
+        return World(scene, materials, max_specular, chains)
+
+    def with_scene(self, scene: mi.Scene) -> World:
+        """The same world around this handle of its scene (frozen functions bring their own)."""
+        return replace(self, scene=scene)
+
+
+@dataclass
+class Vertex:
+    """A point on a surface that is not specular, and what was met on the way to it.
+
+    All colours are linear RGB radiance, W·sr⁻¹·m⁻².
+    """
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    valid: mi.Bool  # there is such a point
+    emitted: mi.Color3f  # emission met on the way, weighted
+    throughput: mi.Color3f  # of the specular chain
+    opacity: mi.Float  # probability with which a cut-out stopped the ray here
+    direct_view: mi.Bool  # no mirror or glass on the way
+    albedo: mi.Color3f  # of the material at the point, linear RGB
+
+    @property
+    def w(self) -> mi.Vector3f:
+        """Unit direction back along the ray, world space."""
+        return self.si.to_world(self.si.wi)
+
+    @property
+    def n(self) -> mi.Normal3f:
+        """Shading normal on the side of `w`, world space."""
+        n = self.si.sh_frame.n
+        return mi.Normal3f(dr.select(self.si.wi.z < 0, -n, n))
+
+
+@dataclass
+class Scattering:
+    """The BSDF sample that made a ray: needed for the MIS weight of emission that it meets."""
+
+    si: mi.SurfaceInteraction3f
+    pdf: mi.Float  # solid angle
+    delta: mi.Bool
+
+
+def find_vertex(
+    world: World,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+    sampler: mi.Sampler,
+    *,
+    origin: Scattering | None = None,
+    see_environment: bool = True,
+) -> Vertex:
+    """Follow a ray through mirrors, glass and cut-outs to the first surface that scatters.
+
+    Args:
+        origin: the BSDF sample that made the ray; None for a ray from the camera.
+        see_environment: whether the environment adds light if the ray leaves the scene at once.
+
+    Returns:
+        The vertex, evaluated and without gradients; its material is not yet attached.
+
+    Paper: Sec. 7.
+    """
+    with dr.suspend_grad():
+        ray, active = mi.Ray3f(ray), mi.Bool(active)
+        pi = world.scene.ray_intersect_preliminary(ray, origin is None, active)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        seen = active & (si.is_valid() | see_environment)
+        emitted = _emission_weight(world, si, origin, active) * si.emitter(world.scene).eval(si, seen)
+        valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
+        direct_view = mi.Bool(valid)
+        if world.has_chains:
+            pi, ray, β, chain, opacity, specular = _follow_chain(world, pi, ray, valid, sampler)
+            direct_view &= ~specular
+            emitted += chain
+            valid = valid & pi.is_valid()
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid)
+        vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, dr.zeros(mi.Color3f))
+        dr.eval(vertex, sampler)
+    return vertex
+
+
+def _emission_weight(
+    world: World, si: mi.SurfaceInteraction3f, origin: Scattering | None, active: mi.Bool
+) -> mi.Float:
+    """MIS weight of emission that a BSDF sample met; 1 for the camera and for delta lobes."""
+    if origin is None:
+        return mi.Float(1)
+    emitter = si.emitter(world.scene, active)
+    lit = active & (emitter != None) & ~origin.delta  # noqa: E711
+    ds = mi.DirectionSample3f(world.scene, si, origin.si)
+    pdf = world.scene.pdf_emitter_direction(origin.si, ds, lit)
+    return dr.select(lit, mis_weight(origin.pdf, pdf), 1)
+
+
+@dr.syntax
+def _follow_chain(
+    world: World,
+    pi: mi.PreliminaryIntersection3f,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+    sampler: mi.Sampler,
+):
+    """Follow specular and cut-out surfaces, as long as there are any.
+
+    Returns:
+        Where the chain ends (an invalid `pi`: nowhere), its last ray, its throughput, the emission met
+        on the way, the probability with which a cut-out stopped it at the end, and whether there was
+        anything specular.
+    """
+    scene, limit, ctx = world.scene, world.max_specular, mi.BSDFContext()
+    pi = mi.PreliminaryIntersection3f(pi)
+    active = mi.Bool(active)
+    β = mi.Color3f(1)
+    emitted = mi.Color3f(0)
+    opacity = mi.Float(1)
+    any_specular = mi.Bool(False)
+    depth = mi.UInt32(0)
+
+    while dr.hint(active, label="specular chain"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        bsdf = si.bsdf()
+        flags = bsdf.flags()
+        smooth = mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+        # A cut-out lets the ray pass, or stops it, with the probability of its opacity.
+        cut_out = active & smooth & mi.has_flag(flags, mi.BSDFFlags.Null)
+        opacity = dr.select(cut_out, 1 - dr.mean(bsdf.eval_null_transmission(si, cut_out)), 1)
+        passes = cut_out & (sampler.next_1d() >= opacity)
+
+        specular = active & ~smooth
+        any_specular |= specular
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), specular)
+        β = dr.select(specular, β * weight, β)
+
+        # A chain that outgrows the limit, or is absorbed, ends in black.
+        active = passes | specular
+        black = active & ((depth >= limit) | (dr.max(β) <= 0))
+        active &= ~black
+        ray_next = si.spawn_ray(dr.select(passes, ray.d, si.to_world(bs.wo)))
+        ray = dr.select(active, ray_next, ray)
+        pi_next = scene.ray_intersect_preliminary(ray, False, active)
+        pi = dr.select(active, pi_next, pi)
+        pi.t = dr.select(black, dr.inf, pi.t)
+
+        si_next = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        emitted += β * si_next.emitter(scene, active).eval(si_next, active)
+        active &= pi.is_valid()
+        depth += 1
+
+    return pi, ray, β, emitted, opacity, any_specular
+
+
+def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
+    """Power heuristic, β = 2: the weight of a sample drawn with density `pdf_a` (Veach 1997)."""
+    a2 = dr.square(pdf_a)
+    return dr.detach(dr.select(pdf_a > 0, a2 / dr.fma(pdf_b, pdf_b, a2), 0))
