@@ -1,5 +1,8 @@
 """One Mitsuba variant for the whole session, and what tests of several folders share."""
 
+import sys
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -8,6 +11,9 @@ from unbake import backend
 from unbake.errors import UserError
 
 ROOT = Path(__file__).parents[1]
+
+# Test modules import `support`; pytest's importlib mode puts no folder on the path.
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 def pytest_addoption(parser):
@@ -56,3 +62,65 @@ def scenes_dir(request) -> Path:
     if not folder.is_dir():
         pytest.skip(f"no scenes in {folder}: give their folder with --scenes")
     return folder
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command line did: exit status, and what it printed where."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def unbake(monkeypatch, capfd):
+    """Call the command line in this process: `unbake("fit", data, "--out", run)`."""
+    from unbake import cli
+
+    def call(*words) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["unbake", *map(str, words)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        return Outcome(stop.value.code, *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def cornell(tmp_path_factory) -> Path:
+    """A captured data set, to be read alone: two views and a held-out one, 16 x 16 pixels."""
+    from unbake.data.capture import CaptureSettings, capture
+
+    folder = tmp_path_factory.mktemp("captured") / "cornell"
+    small = CaptureSettings(views=2, held_out=1, resolution=16, spp=8, max_depth=6)
+    capture("cornell", folder, small, tell=lambda line: None)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory) -> Path:
+    """A settings file of a fit that takes seconds: small networks, few samples, 30 steps."""
+    grid = "levels = 2\ntable_log2 = 8\nbase_resolution = 2\n"
+    networks = "".join(
+        f"[{name}]\nwidth = 8\nhidden = 1\n[{name}.grid]\n{grid}"
+        for name in ("albedo", "roughness", "radiance")
+    )
+    file = tmp_path_factory.mktemp("settings") / "tiny.toml"
+    file.write_text("steps = 30\npixels = 64\nspp = 4\nwarm_up = 0\n" + networks)
+    return file
+
+
+@pytest.fixture(scope="session")
+def built_in(tmp_path_factory):
+    """Write a built-in scene, once for each albedo: `built_in(name, albedo)` is its path."""
+    from unbake.data import procedural
+
+    folder = tmp_path_factory.mktemp("built-in")
+
+    @cache
+    def write(name: str, albedo: float = 0.5) -> Path:
+        return procedural.write_scene(name, folder / f"{name}-{albedo}", albedo=albedo)
+
+    return write

@@ -155,7 +155,16 @@ def activate(variant: str | None = None) -> str:
         _check_loaded_llvm()
     if mi.variant() != wanted:
         mi.set_variant(wanted)
+    _keep_two_threads()
     return wanted
+
+
+def _keep_two_threads() -> None:
+    """Give Dr.Jit two threads also on one core: Mitsuba's OpenEXR waits forever for the second."""
+    import drjit as dr
+
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
 
 
 def _wanted(variant: str | None) -> str | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import sys
 import types
 import typing
@@ -23,8 +24,11 @@ else:
     import tomli as tomllib
 
 Estimator = Literal["split-halves", "two-pass"]
+Reference = Literal["radiance", "photograph"]
 MethodName = Literal["ours", "one-bounce", "direct"]
 PresetName = Literal["cpu", "paper", "release"]
+
+_FINEST = "base_resolution * growth^(levels - 1) is 2^24 or less"
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,16 @@ class GridConfig:
     base_resolution: int = 4  #: cells along an axis of the coarsest level
     growth: float = 2.0  #: ratio of resolutions of neighbouring levels
 
+    def __post_init__(self) -> None:
+        _check(self.levels >= 1, "levels", "1 or more", self.levels)
+        _check(self.features in (2, 4, 8), "features", "2, 4 or 8", self.features)
+        _check(4 <= self.table_log2 <= 28, "table_log2", "4 to 28", self.table_log2)
+        _check(self.base_resolution >= 1, "base_resolution", "1 or more", self.base_resolution)
+        _check(self.growth >= 1, "growth", "1 or more", self.growth)
+        # Cells of a finer level than that are smaller than single precision tells positions apart.
+        finest = math.log2(self.base_resolution) + (self.levels - 1) * math.log2(self.growth)
+        _check(finest <= 24, "levels", f"such that {_FINEST}", self.levels)
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -46,12 +60,19 @@ class NetworkConfig:
     width: int = 32  #: neurons of a hidden layer
     hidden: int = 2  #: number of hidden layers
 
+    def __post_init__(self) -> None:
+        for name in ("width", "hidden"):
+            _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+
 
 @dataclass(frozen=True)
 class TransportConfig:
     """How light is sampled (Sec. 4.2, 7)."""
 
     max_specular: int = 8  #: longest chain of mirrors, glass and cut-outs followed (Sec. 7)
+
+    def __post_init__(self) -> None:
+        _check(self.max_specular >= 0, "max_specular", "0 or more", self.max_specular)
 
 
 @dataclass(frozen=True)
@@ -69,13 +90,14 @@ class FitConfig:
 
     learning_rate: float = 5e-3  #: Adam, materials (Sec. 5.4: 5e-4)
     radiance_learning_rate: float = 5e-3  #: Adam, radiance network (Sec. 5.4: 5e-4)
-    final_learning_rate: float = 0.02  #: factor reached at the end, decaying exponentially (1: constant)
+    final_learning_rate: float = 0.02  #: factor reached at the end, exponentially (1: constant)
     warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
     estimator: Estimator = "split-halves"  #: unbiased squared error (Sec. 5.2)
+    loss_reference: Reference = "radiance"  #: what errors are relative to (Sec. 5.4: photograph)
     loss_epsilon: float = 0.01  #: added to the denominator of the relative L2 loss (Sec. 5.4)
 
-    materials: NetworkConfig = field(default_factory=lambda: NetworkConfig(hidden=1))
-    shared_material_network: bool = True  #: one network for albedo and roughness (Sec. 5.1: two)
+    albedo: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(7), hidden=1))
+    roughness: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(5), 16, 1))
     radiance: NetworkConfig = field(default_factory=NetworkConfig)
     transport: TransportConfig = field(default_factory=TransportConfig)
 
@@ -83,6 +105,9 @@ class FitConfig:
     preview_seconds: float = 30.0  #: time between preview pictures
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float):
+                _check(math.isfinite(value), name, "a finite number", value)
         _check(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
         for name in ("steps", "pixels"):
             _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
@@ -116,8 +141,9 @@ def _paper() -> FitConfig:
         final_learning_rate=1.0,
         warm_up=0,
         estimator="two-pass",
-        materials=NetworkConfig(grid=grid, width=256, hidden=1),
-        shared_material_network=False,
+        loss_reference="photograph",
+        albedo=NetworkConfig(grid=grid, width=256, hidden=1),
+        roughness=NetworkConfig(grid=grid, width=256, hidden=1),
         radiance=NetworkConfig(grid=grid, width=256, hidden=3),
     )
 
@@ -128,7 +154,8 @@ def _release() -> FitConfig:
     return dataclasses.replace(
         _paper(),
         preset="release",
-        materials=NetworkConfig(grid=grid, width=256, hidden=1),
+        albedo=NetworkConfig(grid=grid, width=256, hidden=1),
+        roughness=NetworkConfig(grid=grid, width=256, hidden=1),
         radiance=NetworkConfig(grid=grid, width=256, hidden=3),
     )
 
@@ -145,7 +172,7 @@ def preset(name: PresetName) -> FitConfig:
     raise UserError(f"no preset named {name!r}", remedy="Presets are cpu, paper and release")
 
 
-# ---------------------------------------------------------------------------------------------- TOML
+# --------------------------------------------------------------------------------------------- TOML
 
 
 def to_toml(config: FitConfig) -> str:
@@ -176,9 +203,9 @@ def from_toml(text: str, where: str = "config.toml") -> FitConfig:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"not valid TOML ({error})", where=where) from None
-    base = preset(table.get("preset", "cpu"))
     try:
-        return _update(base, table, ())
+        name = _typed(table.get("preset", "cpu"), PresetName, "preset")
+        return _update(preset(name), table, ())
     except UserError as error:
         raise UserError(error.what, where=f"{where}: {error.where}", remedy=error.remedy) from None
 
@@ -187,8 +214,10 @@ def read_toml(path: Path) -> FitConfig:
     """Settings from a TOML file; see `from_toml`."""
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"cannot be read ({error})", where=path) from None
+    except OSError as error:
+        raise UserError(f"cannot be read ({error.strerror})", path, "Check the path") from None
+    except UnicodeDecodeError:
+        raise UserError("is not UTF-8 text", path, "Save it as UTF-8") from None
     return from_toml(text, str(path))
 
 
@@ -207,16 +236,19 @@ def _update(config, table: dict, path: tuple[str, ...]):
             changes[key] = _update(current, value, (*path, key))
         else:
             changes[key] = _typed(value, hints[key], dotted)
-    return dataclasses.replace(config, **changes)
+    try:
+        return dataclasses.replace(config, **changes)
+    except UserError as error:
+        raise UserError(error.what, ".".join((*path, str(error.where))), error.remedy) from None
 
 
 def _typed(value: object, hint: type, where: str) -> object:
     if typing.get_origin(hint) in (Literal, types.UnionType):
         choices = typing.get_args(hint)
         if value not in choices:
-            raise UserError(f"{value!r} is none of {', '.join(choices)}", where=where)
+            raise UserError(f"must be one of {', '.join(choices)}, not {value!r}", where=where)
         return value
-    if hint is float and type(value) is int:
+    if hint is float and type(value) is int and abs(value) < 1 << 53:
         return float(value)
     if type(value) is not hint:
         raise UserError(f"must be {hint.__name__}, not {type(value).__name__}", where=where)

@@ -17,8 +17,8 @@ from .camera import Camera
 class CameraRays:
     """Camera rays through the pixels of several views.
 
-    Pixels of all views are numbered row by row, view after view. An object of this class is a PyTree:
-    it can be handed to frozen functions.
+    Pixels of all views are numbered row by row, view after view. An object of this class is a
+    PyTree: it can be handed to frozen functions.
     """
 
     views: int
@@ -58,7 +58,8 @@ class CameraRays:
         view -= 1
         n = dr.width(pixel)
         pixel = pixel - dr.gather(mi.UInt32, self._first, view)
-        width = dr.gather(mi.UInt32, self._width, view)
+        # Lanes that only fill up a vector divide as well, by the zero that they gather.
+        width = dr.maximum(dr.gather(mi.UInt32, self._width, view), 1)
         fx, fy, cx, cy = dr.gather(mi.ArrayXf, self._lens, view, shape=(4, n))
         m = dr.gather(mi.ArrayXf, self._pose, view, shape=(12, n))
         x = (mi.Float(pixel % width) + offset.x - cx) / fx
@@ -129,6 +130,7 @@ class PixelSource:
         return Batch(dr.gather(mi.Color3f, self._rgb, pixel), ray)
 
     def _pixel(self, slot: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-        # 32 random bits times the count, upper half: uniform also over hundreds of millions of pixels.
-        bits, _ = mi.sample_tea_32(slot, seed)
+        # 32 random bits times the count, upper half: uniform even over hundreds of millions.
+        # Of neighbouring slots, the usual 4 rounds draw some pixels far more often than others.
+        bits, _ = mi.sample_tea_32(slot, seed, rounds=8)
         return dr.gather(mi.UInt32, self._chosen, dr.mul_hi(bits, self._count))

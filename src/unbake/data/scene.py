@@ -6,15 +6,15 @@ Everything works on Mitsuba's own parsed form of a scene (`mi.parser`), never on
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..errors import UserError
-
-#: Wrappers that a material may stand in.
-WRAPPERS = ("twosided", "mask", "bumpmap", "normalmap")
 
 
 @dataclass
@@ -28,8 +28,8 @@ class ParsedScene:
     def instantiate(self) -> mi.Scene:
         """Make the scene; the nodes are used up.
 
-        Equal materials become one and meshes of one material one mesh: tracing a step costs time for
-        each object that a ray may meet.
+        Equal materials become one and meshes of one material one mesh: tracing a step costs time
+        for each object that a ray may meet.
 
         Raises:
             UserError: Mitsuba cannot make it.
@@ -39,8 +39,16 @@ class ParsedScene:
             mi.parser.transform_merge_meshes(self.config, self.state)
             scene = mi.parser.instantiate(self.config, self.state)
         except RuntimeError as error:
-            raise UserError(f"Mitsuba cannot make this scene: {_first_line(error)}", self.path) from None
-        return scene[0] if isinstance(scene, list) else scene
+            # Lights that were made, but whose shapes were not, would end the process in the next
+            # virtual call. They live as long as the nodes, which this error keeps alive.
+            self.state = mi.parser.ParserState()
+            reason = _reason(error)
+            raise UserError(f"Mitsuba cannot make this scene: {reason}", self.path) from None
+        scene = scene[0] if isinstance(scene, list) else scene
+        box = np.ravel([scene.bbox().min, scene.bbox().max])
+        if not np.isfinite(box).all():
+            raise UserError("the scene has no shapes, or one without end", self.path)
+        return scene
 
     def principled_nodes(self) -> list:
         """The nodes whose albedo and roughness are (or stand for) unknowns."""
@@ -51,7 +59,8 @@ def parse(path: Path) -> ParsedScene:
     """Parse a Mitsuba XML scene and resolve its references.
 
     Raises:
-        UserError: the file is missing or is not a Mitsuba scene, or has a number that is not finite.
+        UserError: the file is missing or is not a Mitsuba scene, or has a number that is not
+            finite.
     """
     if not path.is_file():
         raise UserError("no such scene file", where=path)
@@ -61,7 +70,7 @@ def parse(path: Path) -> ParsedScene:
         mi.parser.transform_upgrade(config, state)
         mi.parser.transform_resolve(config, state)
     except RuntimeError as error:
-        raise UserError(f"not a scene that Mitsuba can read: {_first_line(error)}", path) from None
+        raise UserError(f"not a scene that Mitsuba can read: {_reason(error)}", path) from None
     scene = ParsedScene(path, config, state)
     _require_finite(scene)
     _resolve_files(scene)
@@ -131,14 +140,14 @@ def write(scene: ParsedScene, folder: Path) -> Path:
         mi.parser.transform_relocate(scene.config, scene.state, str(folder))
         mi.parser.write_file(scene.state, str(folder / "scene.xml"))
     except RuntimeError as error:
-        raise UserError(f"cannot be copied: {_first_line(error)}", scene.path) from None
+        raise UserError(f"cannot be copied: {_reason(error)}", scene.path) from None
     return folder / "scene.xml"
 
 
 def require_emitters(scene: mi.Scene, path: Path) -> None:
     """Raise a `UserError` if nothing in the scene emits light."""
     if not scene.emitters():
-        raise UserError("the scene has no light source", path, "Add an area light or environment map")
+        raise UserError("the scene has no light source", path, "Add a light or environment map")
 
 
 def _resolve_files(scene: ParsedScene) -> None:
@@ -164,14 +173,27 @@ def _take(props: mi.Properties, key: str, default: float) -> object:
 def _require_finite(scene: ParsedScene) -> None:
     for node in scene.state.nodes:
         for key in node.props.keys():
-            value = node.props[key]
-            if isinstance(value, float) and not math.isfinite(value):
+            if not _is_finite(node.props[key]):
                 raise UserError(
-                    f"{node.props.plugin_name()}.{key} is {value}",
-                    where=mi.parser.file_location(scene.state, node),
+                    f"{node.props.plugin_name()}.{key} has a number that is not finite",
+                    mi.parser.file_location(scene.state, node),
+                    "Correct it",
                 )
 
 
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__
+def _is_finite(value: object) -> bool:
+    if hasattr(value, "wavelengths"):  # a spectrum: its class has no name of its own
+        value = value.values
+    elif dr.is_array_v(value):
+        value = np.array(value)
+    elif isinstance(value, mi.ScalarAffineTransform4d):
+        value = np.array(value.matrix)
+    elif not isinstance(value, float):
+        return True
+    return bool(np.isfinite(value).all())
+
+
+def _reason(error: Exception) -> str:
+    """What Mitsuba says, on one line, without the places in its own source."""
+    text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
+    return text[:300] or type(error).__name__

@@ -1,4 +1,4 @@
-"""The views of a data folder: posed HDR images, checked on entry, read when they are needed."""
+"""The views of a data folder: posed HDR images, each read once and checked when it is."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ BACKGROUNDS = ("visible", "hidden")
 
 _HDR_SUFFIXES = (".exr", ".hdr", ".pfm", ".rgbe")
 _LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".webp", ".gif", ".tif", ".tiff", ".ppm")
+_HEAD = 1 << 16  # bytes of a file that are read to know its size
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
 _NEED_HDR = "Give linear HDR images (OpenEXR); tone-mapped 8-bit images hold no radiance"
+_MAKE_DATA = "Render a data set from a scene with `unbake capture SCENE --out DATA`"
 _REPLACE = "Write the image again, or remove its frame from transforms.json"
 
 
@@ -82,19 +85,21 @@ class Dataset:
         return tuple(view for view in self.views if view.split == "heldout")
 
     @classmethod
-    def load(cls, folder: Path, *, clip_negative: bool = False) -> Dataset:
-        """Read a data folder and check all of it, pixels included.
+    def load(cls, folder: Path) -> Dataset:
+        """Read a data folder and check all of it but the pixels: those when they are read.
 
         Args:
             folder: has a nerfstudio `transforms.json`; frames without "split" are for training.
-            clip_negative: take negative pixels as zero instead of refusing them.
 
         Raises:
-            UserError: anything is missing, malformed, outside the folder, or not a valid camera
-                or HDR image. It names the file and the remedy.
+            UserError: anything is missing, malformed, outside the folder, or not a valid camera,
+                or an image is not HDR or of another size than its frame says. It names the file
+                and the remedy.
         """
         folder = Path(folder)
         file = folder / TRANSFORMS
+        if folder.is_file():
+            raise UserError("is a file, not a data folder", folder, _MAKE_DATA)
         if not folder.is_dir():
             raise UserError("the data folder does not exist", folder, "Check the path")
         if not file.is_file():
@@ -107,7 +112,9 @@ class Dataset:
             raise UserError("the scene file does not exist", scene, f"Set 'scene' in {file}")
         views = _read_views(folder, file, top)
         for view in views:
-            _check_view(view, clip_negative)
+            for image in (view.image, view.albedo, view.roughness):
+                if image is not None:
+                    _check_header(image, view.camera.width, view.camera.height)
         return cls(folder, scene, _background(top, file), views, *_provenance(top, file))
 
     def save(self, folder: Path) -> None:
@@ -179,14 +186,8 @@ def read_image(path: Path, width: int, height: int, clip_negative: bool = False)
         UserError: it is missing, unreadable, no HDR image, of another size, or has pixels that
             are NaN, infinite, or (without `clip_negative`) negative.
     """
-    if path.suffix.lower() in _LDR_SUFFIXES:
-        raise UserError("the image is low dynamic range", path, _NEED_HDR)
-    if not path.is_file():
-        raise UserError("the image does not exist", path, _REPLACE)
-    if path.suffix.lower() not in _HDR_SUFFIXES:
-        raise UserError(f"unknown image format {path.suffix!r}", path, _NEED_HDR)
     # The header first: a damaged one may ask for more memory than there is
-    _check_size(_exr_size(path), width, height, path)
+    _check_header(path, width, height)
     try:
         bitmap = mi.Bitmap(str(path))
         size = tuple(bitmap.size())
@@ -263,14 +264,6 @@ def _read_view(folder: Path, frame: dict[str, Any], top: dict[str, Any], where: 
     )
 
 
-def _check_view(view: View, clip_negative: bool) -> None:
-    width, height = view.camera.width, view.camera.height
-    read_image(view.image, width, height, clip_negative)
-    for truth in (view.albedo, view.roughness):
-        if truth is not None:
-            read_image(truth, width, height)
-
-
 def _valid_pixels(pixels: np.ndarray, path: Path, clip_negative: bool) -> np.ndarray:
     count = int((~np.isfinite(pixels)).any(axis=1).sum())
     if count:
@@ -289,6 +282,29 @@ def _valid_pixels(pixels: np.ndarray, path: Path, clip_negative: bool) -> np.nda
     return np.maximum(pixels, 0)
 
 
+def _check_header(path: Path, width: int, height: int) -> None:
+    """Refuse what cannot be an HDR image of that size, without reading its pixels."""
+    if path.suffix.lower() in _LDR_SUFFIXES:
+        raise UserError("the image is low dynamic range", path, _NEED_HDR)
+    if not path.is_file():
+        raise UserError("the image does not exist", path, _REPLACE)
+    if path.suffix.lower() not in _HDR_SUFFIXES:
+        raise UserError(f"unknown image format {path.suffix!r}", path, _NEED_HDR)
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError as error:
+        raise UserError(f"the image cannot be read ({error.strerror})", path, _REPLACE) from None
+    size = _exr_size(head)
+    if path.suffix.lower() == ".exr" and size is None:
+        # A long header, full of a renderer's notes, may tell the size later on
+        if not head.startswith(_EXR_MAGIC):
+            raise UserError("the image cannot be read (it is not OpenEXR)", path, _REPLACE)
+        if len(head) < _HEAD:
+            raise UserError("the image cannot be read (it is cut off)", path, _REPLACE)
+    _check_size(size, width, height, path)
+
+
 def _check_size(size: tuple[int, int] | None, width: int, height: int, path: Path) -> None:
     if size is not None and size != (width, height):
         raise UserError(
@@ -298,13 +314,11 @@ def _check_size(size: tuple[int, int] | None, width: int, height: int, path: Pat
         )
 
 
-def _exr_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in an OpenEXR header, None where the file has no such header."""
-    with path.open("rb") as file:
-        head = file.read(1 << 16)
+def _exr_size(head: bytes) -> tuple[int, int] | None:
+    """Width and height in an OpenEXR header, None where it is not there or comes later."""
     key = b"dataWindow\0box2i\0\x10\0\0\0"
     at = head.find(key)
-    if not head.startswith(b"\x76\x2f\x31\x01") or at < 0 or len(head) < at + len(key) + 16:
+    if not head.startswith(_EXR_MAGIC) or at < 0 or len(head) < at + len(key) + 16:
         return None
     left, top, right, bottom = struct.unpack_from("<4i", head, at + len(key))
     return right - left + 1, bottom - top + 1

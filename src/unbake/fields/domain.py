@@ -28,13 +28,14 @@ class Domain:
     def of(box: mi.BoundingBox3f) -> Domain:
         """The domain of a scene's bounding box, with a margin of one percent."""
         lower, upper = np.ravel(box.min).tolist(), np.ravel(box.max).tolist()
-        centre = tuple((a + b) / 2 for a, b in zip(lower, upper))
-        return Domain(centre, 1.01 * max(b - a for a, b in zip(lower, upper)))
+        centre = tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
+        return Domain(centre, 1.01 * max(b - a for a, b in zip(lower, upper, strict=True)))
 
     def to_unit(self, p: mi.Point3f, valid: mi.Bool) -> mi.Point3f:
         """World positions to [0,1]³; lanes that are not valid get the centre.
 
-        A single position at infinity, as a ray that hit nothing has, would poison the grid for good.
+        A single position at infinity, as a ray that hit nothing has, would poison the grid for
+        good.
         """
         unit = (mi.Point3f(p) - mi.Point3f(*self.centre)) / self.extent + 0.5
         return dr.clip(dr.select(valid, unit, 0.5), 0, 1)

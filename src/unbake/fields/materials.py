@@ -16,28 +16,28 @@ ROUGHNESS_FLOOR = 0.02  #: below it, the microfacet density overflows single pre
 
 @dataclass
 class Material:
-    """Albedo (linear RGB, [0,1]) and perceptual roughness (α_GGX = roughness², [0.02,1]) at points."""
+    """Albedo (linear RGB, [0,1]) and perceptual roughness (α_GGX = roughness², [0.02,1])."""
 
     albedo: mi.Color3f
     roughness: mi.Float
 
 
 class Materials:
-    """Albedo and roughness fields.
+    """Albedo and roughness fields, a network for each.
 
-    One network for each, as in the paper, or one for both, which costs half as much.
+    Roughness shows far less in photographs than albedo does, so that its network may well be
+    coarser.
 
     Paper: Sec. 5.1, 5.3.
     """
 
-    def __init__(self, config: NetworkConfig, *, shared: bool, seed: int) -> None:
-        #: Set once the scene's extent is known, before the first evaluation. (The scene is made with
-        #: textures of these materials in it.)
+    def __init__(self, albedo: NetworkConfig, roughness: NetworkConfig, *, seed: int) -> None:
+        #: Set once the scene's extent is known, before the first evaluation. (The scene is made
+        #: with textures of these materials in it.)
         self.domain = Domain.unit()
-        outputs = {"material": 4} if shared else {"albedo": 3, "roughness": 1}
         self.networks = {
-            name: Network(config, extra=0, outputs=n, seed=seed + i)
-            for i, (name, n) in enumerate(outputs.items())
+            "albedo": Network(albedo, extra=0, outputs=3, seed=seed),
+            "roughness": Network(roughness, extra=0, outputs=1, seed=seed + 1),
         }
         #: Whether textures read the values put on the surface interaction by `carry`. It must not
         #: change between an evaluation and its differentiation, which calls the textures again.
@@ -65,9 +65,10 @@ class Materials:
     def evaluate(self, p: mi.Point3f, valid: mi.Bool, engine: Engine = "tensor") -> Material:
         """The materials at world positions `p`; see `Network.__call__` for the engines."""
         unit = self.domain.to_unit(p, valid)
-        raw = [x for network in self.networks.values() for x in network(unit, [], engine)]
-        albedo = mi.Color3f([_sigmoid(x) for x in raw[:3]])
-        return Material(albedo, dr.fma(_sigmoid(raw[3]), 1 - ROUGHNESS_FLOOR, ROUGHNESS_FLOOR))
+        albedo = [_sigmoid(x) for x in self.networks["albedo"](unit, [], engine)]
+        (roughness,) = self.networks["roughness"](unit, [], engine)
+        roughness = dr.fma(_sigmoid(roughness), 1 - ROUGHNESS_FLOOR, ROUGHNESS_FLOOR)
+        return Material(mi.Color3f(albedo), roughness)
 
 
 def carry(si: mi.SurfaceInteraction3f, material: Material) -> None:

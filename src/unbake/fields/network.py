@@ -1,8 +1,9 @@
 """A hash grid with a multilayer perceptron on top, evaluated by either of two engines.
 
-The *tensor* engine multiplies matrices over all points at once. It is the fast one on LLVM, forward and
-backward, but needs evaluated arrays: it cannot run inside virtual calls or symbolic loops. The
-*cooperative vector* engine runs anywhere, also inside a BSDF, and is the fast one on CUDA.
+The *tensor* engine multiplies matrices over all points at once. It is the fast one on LLVM,
+forward and backward, but needs evaluated arrays: it cannot run inside virtual calls or symbolic
+loops. The *cooperative vector* engine runs anywhere, also inside a BSDF, and is the fast one on
+CUDA.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ class Network:
 
         sizes = [self.inputs, *[config.width] * config.hidden, outputs]
         self.layers: list[tuple[mi.TensorXf, mi.TensorXf]] = []
-        for last, (fan_in, fan_out) in zip([False] * config.hidden + [True], zip(sizes, sizes[1:])):
-            bound = math.sqrt(6 / fan_in) * (0.1 if last else 1)
+        for layer, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+            bound = math.sqrt(6 / fan_in) * (0.1 if layer == config.hidden else 1)
             weights = from_numpy(mi.Float, rng.uniform(-bound, bound, fan_out * fan_in))
             weights = mi.TensorXf(weights, (fan_out, fan_in))
             self.layers.append((weights, dr.zeros(mi.TensorXf, (fan_out, 1))))
@@ -112,18 +113,19 @@ class Network:
     def pack(self) -> None:
         """Lay the layers out for cooperative vectors.
 
-        Needed once after `assign`, and before any evaluation inside a virtual call or loop, where it
-        can no longer be done.
+        Needed once after `assign`, and before any evaluation inside a virtual call or loop, where
+        it can no longer be done.
         """
         flat = [a if a.shape[1] > 1 else mi.TensorXf(a.array) for pair in self.layers for a in pair]
         views = nn.pack(*flat, layout="training")
-        self._packed = list(zip(views[::2], views[1::2]))
+        self._packed = list(zip(views[::2], views[1::2], strict=True))
 
 
 def from_numpy(array_type: type, values: np.ndarray) -> mi.Float | mi.UInt32:
     """A flat copy of an array in Dr.Jit's own memory.
 
-    The array type's constructor would map NumPy's memory, whose release no frozen function can record.
+    The array type's constructor would map NumPy's memory, whose release no frozen function can
+    record.
     """
     mapped = array_type(np.asarray(values).ravel())
     own = mapped * dr.opaque(array_type, 1)

@@ -16,7 +16,8 @@ class RadianceField:
     Emission is not part of it: the rendering equation's E is known and added analytically.
 
     Args:
-        scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good one.
+        scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good
+            one.
 
     Paper: Sec. 3.1, 5.3.
     """
@@ -24,7 +25,7 @@ class RadianceField:
     def __init__(self, config: NetworkConfig, domain: Domain, *, scale: float, seed: int) -> None:
         self.domain = domain
         self.scale = scale
-        self.network = Network(config, extra=12, outputs=3, seed=seed)
+        self.network = Network(config, extra=12, outputs=6, seed=seed)
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays θ by name."""
@@ -58,8 +59,9 @@ class RadianceField:
         unit = self.domain.to_unit(p, valid)
         extra = [*(2 * unit - 1), *w, *n, *dr.detach(albedo)]
         extra = [dr.select(valid, x, 0) for x in extra]
-        raw = self.network(unit, extra, engine)
-        return mi.Color3f([dr.select(valid, self.scale * _squareplus(x), 0) for x in raw])
+        raw = [self.scale * _squareplus(x) for x in self.network(unit, extra, engine)]
+        diffuse, rest = mi.Color3f(raw[:3]), mi.Color3f(raw[3:])
+        return dr.select(valid, 1.5 * dr.detach(albedo) * diffuse + 0.25 * rest, 0)
 
 
 def _squareplus(x: mi.Float) -> mi.Float:

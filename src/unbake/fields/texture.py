@@ -1,4 +1,4 @@
-"""A field as a Mitsuba texture, so that any stock BSDF and any stock integrator runs on it (Sec. 5.1)."""
+"""A field as a Mitsuba texture, so that stock BSDFs and stock integrators run on it (Sec. 5.1)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from .materials import Material, Materials
 def material_textures(materials: Materials) -> tuple[mi.Texture, mi.Texture]:
     """Two textures, for the albedo and for the roughness of a `principled` BSDF.
 
-    They read what `carry` put on the surface interaction. After `materials.stand_alone()` they evaluate
-    the field at the interaction's position instead, with cooperative vectors, so that any integrator of
-    Mitsuba can render the recovered scene.
+    They read what `carry` put on the surface interaction. After `materials.stand_alone()` they
+    evaluate the field at the interaction's position instead, with cooperative vectors, so that any
+    integrator of Mitsuba can render the recovered scene.
 
     Paper: Sec. 5.1.
     """

@@ -1,12 +1,16 @@
 """Checkpoints: written whole or not at all, and found again after any crash.
 
-A checkpoint is one safetensors file with the parameters, the optimisers' moments and the counters. It
-is written under another name, flushed to disk, and renamed. The newest file that can be read counts.
+A checkpoint is one safetensors file with the parameters, the optimisers' moments and the counters.
+It is written under another name, flushed to disk, and renamed. The newest file that can be read
+counts.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,6 +58,7 @@ def save_checkpoint(folder: Path, state: State, progress: Progress) -> Path:
         "seconds": repr(progress.seconds),
         "samples": str(progress.samples),
     }
+    metadata["crc"] = str(_checksum(arrays, metadata))
     path = folder / f"step-{progress.step:07d}.safetensors"
     partial = path.with_suffix(".partial")
     try:
@@ -64,33 +69,49 @@ def save_checkpoint(folder: Path, state: State, progress: Progress) -> Path:
             os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink()
         raise UserError(f"the checkpoint cannot be written ({error.strerror})", path) from None
-    for old in sorted(folder.glob("step-*.safetensors"))[:-KEEP]:
+    # A fit that was killed while it wrote leaves its half behind.
+    leftover = folder.glob("step-*.partial")
+    for old in [*sorted(folder.glob("step-*.safetensors"))[:-KEEP], *leftover]:
         old.unlink(missing_ok=True)
     return path
 
 
 def load_checkpoint(folder: Path, state: State) -> Progress | None:
-    """Put the newest readable checkpoint into the state; None if there is none.
+    """Put the newest readable checkpoint into the state; None if none was written yet.
 
     Raises:
-        UserError: the checkpoint belongs to other settings.
+        UserError: the checkpoint belongs to other settings, or all checkpoints are damaged.
     """
-    for path in sorted(folder.glob("step-*.safetensors"), reverse=True):
+    written = sorted(folder.glob("step-*.safetensors"), reverse=True)
+    for path in written:
         try:
             with safe_open(path, "numpy") as file:
                 metadata = file.metadata() or {}
                 arrays = {key: file.get_tensor(key) for key in file.keys()}
-        except (SafetensorError, OSError):
+        except (SafetensorError, OSError, ValueError, TypeError, MemoryError):
             continue
-        if metadata.get("format") != FORMAT:
+        crc = metadata.pop("crc", None)
+        if metadata.get("format") != FORMAT or crc != str(_checksum(arrays, metadata)):
             continue
         _restore(state, arrays, path)
         return Progress(
             int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"])
         )
+    if written:
+        raise UserError("no checkpoint in this folder can be read", folder, "Fit again")
     return None
+
+
+def _checksum(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> int:
+    """CRC-32 of all that a checkpoint holds: safetensors itself would not notice a flipped bit."""
+    crc = zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
+    for key in sorted(arrays):
+        crc = zlib.crc32(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode(), crc)
+        crc = zlib.crc32(np.ascontiguousarray(arrays[key]), crc)
+    return crc
 
 
 def _restore(state: State, arrays: dict[str, np.ndarray], path: Path) -> None:

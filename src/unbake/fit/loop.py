@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import signal
 import time
@@ -18,10 +17,12 @@ from rich.console import Console
 from ..config import FitConfig, read_toml, to_toml
 from ..data.views import Dataset
 from ..errors import UserError
+from ..imaging.pictures import write_atomically
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
-from .monitor import Monitor, memory_mb
+from .monitor import Monitor, forget_after, memory_mb
 from .preview import Preview
 from .problem import camera_warnings, make_problem, training_pixels
+from .recovered import Origin, read_origin, write_origin
 from .step import TrainingStep, initial_state
 
 #: Steps between readings of the loss; reading waits for the machine.
@@ -52,38 +53,45 @@ def fit(
         How far the fit came. Ctrl-C ends it early, with a checkpoint.
 
     Raises:
-        UserError: the data set or the run's folder cannot be used, or the loss does not stay finite.
+        UserError: the data set or the run's folder cannot be used, or the loss does not stay
+            finite.
 
     Paper: Sec. 4, 5.4.
     """
     console = console or Console()
-    dataset = Dataset.load(data, clip_negative=clip_negative)
+    config = _resumed_config(run, config) if resume else _refuse_second_run(run, config)
+    dataset = Dataset.load(data)
+    clip_negative = clip_negative or (resume and read_origin(run).clip_negative)
     pixels, mean_radiance = training_pixels(dataset, clip_negative=clip_negative)
     if resume:
-        config = _resumed_config(run, config)
+        _require_same_photographs(run, data, mean_radiance)
     problem = make_problem(dataset.scene, dataset.background, config, mean_radiance)
     for warning in camera_warnings(dataset, problem.world.scene):
-        console.print(f"warning: {warning}", style="yellow", markup=False)
+        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
     state = initial_state(problem)
     progress = Progress()
     if resume:
         progress = load_checkpoint(run / "checkpoints", state) or progress
-    else:
-        _new_run(run)
-    _write_settings(run, data, config, mean_radiance)
-
+        console.print(f"going on after step {progress.step}", highlight=False)
     step = TrainingStep(problem, pixels, config)
     preview = Preview(problem, dataset, run / "previews")
+    # Here all input is known to be good, and the folder is made.
+    _write_settings(run, config, Origin(str(data.resolve()), mean_radiance, clip_negative))
+    forget_after(run / "log.jsonl", progress.step)
+
     total = config.seconds or config.steps
     saved_at = shown_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
     skipped = 0
     with Monitor(run / "log.jsonl", console, total) as monitor, _stop_on_interrupt() as stop:
         clock = time.perf_counter() - progress.seconds
-        while _done(config, progress) < total and not stop:
+        # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
+        last = _done(config, progress) >= total
+        while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
-            phi_rate, theta_rate = learning_rates(config, progress.step, _done(config, progress) / total)
+            done = _done(config, progress) / total
+            phi_rate, theta_rate = learning_rates(config, progress.step, done)
             recent.append(step(state, progress.step, phi_rate, theta_rate))
             progress.step += 1
             progress.samples += config.samples_per_step
@@ -92,7 +100,7 @@ def fit(
             if progress.step % READ_EVERY == 0 or last or config.seconds:
                 dr.sync_thread()
                 progress.seconds = time.perf_counter() - clock
-                last = _done(config, progress) >= total or bool(stop)
+                last = last or _done(config, progress) >= total
             if progress.step % READ_EVERY and not last:
                 continue
 
@@ -162,32 +170,40 @@ def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: floa
     return entry
 
 
-def _new_run(run: Path) -> None:
-    """Make the folder; refuse to mix two runs in one."""
+def _refuse_second_run(run: Path, config: FitConfig) -> FitConfig:
+    """The settings as they are; an error rather than two runs mixed in one folder."""
     if (run / "config.toml").exists():
         raise UserError(
             "there is a run in this folder already",
             where=run,
             remedy="Go on with --resume, or give another --out",
         )
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"the folder cannot be made ({error.strerror})", run) from None
+    return config
 
 
-def _write_settings(run: Path, data: Path, config: FitConfig, mean_radiance: float) -> None:
-    (run / "config.toml").write_text(to_toml(config), encoding="utf-8")
-    origin = {"data": str(data.resolve()), "mean_radiance": mean_radiance}
-    (run / "origin.json").write_text(json.dumps(origin, indent=1), encoding="utf-8")
+def _write_settings(run: Path, config: FitConfig, origin: Origin) -> None:
+    write_origin(run, origin)
+    text = to_toml(config)
+    write_atomically(run / "config.toml", lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def _resumed_config(run: Path, config: FitConfig) -> FitConfig:
     """The settings a run was started with, but for how long it should go on."""
     if not (run / "config.toml").is_file():
-        raise UserError("no run to resume: there is no config.toml", run)
+        raise UserError("there is no run to resume in this folder", run, "Leave out --resume")
     stored = read_toml(run / "config.toml")
     return dataclasses.replace(stored, steps=config.steps, seconds=config.seconds)
+
+
+def _require_same_photographs(run: Path, data: Path, mean_radiance: float) -> None:
+    """A data set may have moved; another one would ruin what was learned without a word."""
+    origin = read_origin(run)
+    if not math.isclose(origin.mean_radiance, mean_radiance, rel_tol=1e-4):
+        raise UserError(
+            f"these are not the photographs that the run {run} was started with",
+            where=data,
+            remedy=f"Give {origin.data}, or start another run",
+        )
 
 
 @contextmanager

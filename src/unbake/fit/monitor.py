@@ -11,6 +11,9 @@ from typing import IO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ..errors import UserError
+from ..imaging.pictures import write_atomically
+
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
 
@@ -23,6 +26,21 @@ def memory_mb() -> float:
     except OSError:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def forget_after(log: Path, step: int) -> None:
+    """Drop the lines of a log that lie after a step, and what a killed fit left half-written.
+
+    A resumed fit takes those steps again.
+    """
+    kept = []
+    for line in log.read_text(encoding="utf-8").splitlines() if log.is_file() else ():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
+        except (ValueError, KeyError, TypeError):
+            continue
+    write_atomically(log, lambda path: path.write_text("".join(kept), encoding="utf-8"))
 
 
 class Monitor:
@@ -58,7 +76,7 @@ class Monitor:
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
-        self._console.print(line, highlight=False, markup=False)
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def record(self, done: float, entry: dict) -> None:
         """Show and log the state after a step.
@@ -89,5 +107,8 @@ class Monitor:
 
     def _write(self, entry: dict) -> None:
         rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in entry.items()}
-        self._file.write(json.dumps(rounded) + "\n")
-        self._file.flush()
+        try:
+            self._file.write(json.dumps(rounded) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise UserError(f"the log cannot be written ({error.strerror})", self._path) from None

@@ -46,9 +46,7 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
     parsed = scenes.parse(scene)
     scenes.to_principled(parsed)
     seeds = np.random.SeedSequence(config.seed).generate_state(2)
-    materials = Materials(
-        config.materials, shared=config.shared_material_network, seed=int(seeds[0])
-    )
+    materials = Materials(config.albedo, config.roughness, seed=int(seeds[0]))
     scenes.set_textures(parsed, *material_textures(materials))
     loaded = parsed.instantiate()
     scenes.require_emitters(loaded, scene)
@@ -74,7 +72,7 @@ def training_pixels(
     views = dataset.train
     if not views:
         raise UserError(
-            "no training view", dataset.folder, 'Give some frames of transforms.json "split": "train"'
+            "no training view", dataset.folder, 'Give frames of transforms.json "split": "train"'
         )
     rgb, alpha = load_pixels(views, clip_negative)
     hidden = dataset.background == "hidden"

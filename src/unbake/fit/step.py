@@ -1,13 +1,15 @@
 """One training step, recorded once and replayed.
 
-Tracing a step in Python takes longer than computing it. So it is a frozen function (`dr.freeze`): all
-that changes from step to step comes in as an argument, and after the first steps nothing is traced or
-compiled again.
+Tracing a step in Python takes longer than computing it. So it is a frozen function (`dr.freeze`):
+all that changes from step to step comes in as an argument, and after the first steps nothing is
+traced or compiled again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import gc
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import drjit as dr
@@ -17,7 +19,14 @@ import numpy as np
 from ..config import FitConfig
 from ..data.batches import PixelSource
 from ..transport.image import PathSample, rhs, trace
-from ..transport.objective import METHODS, Live, needs, objective, pixel_means
+from ..transport.objective import (
+    METHODS,
+    Live,
+    RelativeL2,
+    needs,
+    objective,
+    pixel_means,
+)
 from .problem import Problem
 
 
@@ -73,6 +82,7 @@ class TrainingStep:
         self._pixels = pixels
         self._config = config
         self._terms: Mapping[str, Live] = METHODS[config.method]
+        self._loss = RelativeL2(config.loss_epsilon, config.loss_reference)
         self._sampler = mi.load_dict({"type": "independent"})
         self._frozen = dr.freeze(self._step)
 
@@ -88,10 +98,9 @@ class TrainingStep:
         """
         state.set_learning_rates(phi_rate, theta_rate)
         seed = np.random.SeedSequence([self._config.seed, step]).generate_state(1)[0]
-        p = self._problem
-        return self._frozen(
-            p.world.scene, self._sampler, self._pixels, state, dr.opaque(mi.UInt32, int(seed))
-        )
+        p, number = self._problem, dr.opaque(mi.UInt32, int(seed))
+        with _no_garbage_collection():
+            return self._frozen(p.world.scene, self._sampler, self._pixels, state, number)
 
     def recordings(self) -> int:
         """How often the step was traced."""
@@ -103,7 +112,12 @@ class TrainingStep:
         return self._step(p.world.scene, self._sampler, self._pixels, state, seed)
 
     def _step(
-        self, scene: mi.Scene, sampler: mi.Sampler, pixels: PixelSource, state: State, seed: mi.UInt32
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        pixels: PixelSource,
+        state: State,
+        seed: mi.UInt32,
     ) -> dict[str, mi.Float]:
         p, config = self._problem, self._config
         state.publish(p)
@@ -115,9 +129,7 @@ class TrainingStep:
                 again = pixels.draw(seed, sampler, config.pixels, config.spp)
                 primal = self._image(self._trace(scene, again.ray, sampler))
         sample = self._trace(scene, batch.ray, sampler)
-        terms = objective(
-            self._terms, sample, batch.target, config.spp, config.loss_epsilon, primal
-        )
+        terms = objective(self._terms, sample, batch.target, config.spp, self._loss, primal)
         loss = sum(terms.values())
         dr.backward(loss)
 
@@ -137,6 +149,22 @@ class TrainingStep:
     def _image(self, sample: PathSample) -> mi.Color3f:
         radiance = mi.Color3f(0) if sample.L2 is None else sample.L2
         return pixel_means(rhs(sample, radiance), self._config.spp)
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Put the garbage collector off.
+
+    Were it to free a scene or a step of an earlier fit while this one is recorded, Dr.Jit would
+    abort the process.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _drop_broken_gradients(optimizer: mi.ad.Adam) -> None:

@@ -3,8 +3,9 @@
     L(x, ω) = E(x, ω) + T(L)(x, ω)
      LHS         RHS
 
-`trace` walks two surface vertices behind the camera and gathers all that every loss term needs, each
-piece evaluated once. Which of the pieces pass gradients is decided elsewhere, in `objective.py`.
+`trace` walks two surface vertices behind the camera and gathers all that every loss term needs,
+each piece evaluated once. Which of the pieces pass gradients is decided elsewhere, in
+`objective.py`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .vertex import Vertex, World, find_vertex
 
 @dataclass
 class PathSample:
-    """One camera sample a lane: vertices x₁, x₂ with one bounce from each, and L_θ where it is needed.
+    """One camera sample a lane: vertices x₁, x₂, a bounce from each, and L_θ where it is needed.
 
     The radiance at x₁ and x₂ passes gradients to θ, the bounce at x₁ to φ. The bounce at x₂ passes
     none.
@@ -76,7 +77,7 @@ def trace(
 
 
 def reflected_radiance(radiance: RadianceField, *vertices: Vertex) -> list[mi.Color3f]:
-    """L_θ at several vertices, towards where each was seen from, in one evaluation of the network."""
+    """L_θ at several vertices, towards where each was seen from, in one evaluation of it."""
     v = vertices
     if len(v) == 1:
         return [radiance.evaluate(v[0].si.p, v[0].w, v[0].n, v[0].albedo, v[0].valid)]

@@ -44,9 +44,32 @@ METHODS: Mapping[str, Mapping[str, Live]] = MappingProxyType(
 )
 
 
+@dataclass(frozen=True)
+class RelativeL2:
+    """The relative L2 loss: squared errors divided by a squared reference plus ε.
+
+    The paper divides by the photograph. A photograph that is too dark by chance then weighs more
+    than one that is too bright, and the optimum is darker than the scene: with noisy photographs a
+    few percent, which is as much as roughness does. The radiance field's picture of the same pixels
+    has no such noise.
+
+    Paper: Sec. 5.4.
+    """
+
+    epsilon: float
+    reference: str  #: "photograph" or "radiance", the field's own picture where there is a field
+
+    def weight(self, sample: PathSample, target: mi.Color3f, spp: int) -> mi.Color3f:
+        """1 / (reference² + ε) of each pixel, without gradient."""
+        reference = target
+        if self.reference == "radiance" and sample.L1 is not None:
+            reference = pixel_means(dr.detach(lhs(sample, sample.L1)), spp)
+        return dr.detach(dr.rcp(dr.square(reference) + self.epsilon))
+
+
 def needs(terms: Mapping[str, Live]) -> Needs:
     """What a method's path samples must hold."""
-    return Needs(radiance=len(terms) > 1, second_bounce=EXTRA in terms)
+    return Needs(radiance=set(terms) != {PHOTOMETRIC}, second_bounce=EXTRA in terms)
 
 
 def objective(
@@ -54,7 +77,7 @@ def objective(
     sample: PathSample,
     target: mi.Color3f,
     spp: int,
-    epsilon: float,
+    loss: RelativeL2,
     primal: mi.Color3f | None = None,
 ) -> dict[str, mi.Float]:
     """Every term of the objective; their sum is what is minimised.
@@ -64,71 +87,72 @@ def objective(
         sample: path samples, `spp` consecutive lanes a pixel.
         target: the photographs' pixels, linear RGB.
         spp: camera samples a pixel.
-        epsilon: of the relative L2 loss.
-        primal: an independent, detached estimate of the same pixels for the two-pass estimator; None:
-            the split-halves estimator.
+        loss: what errors are relative to.
+        primal: an independent, detached estimate of the same pixels for the two-pass estimator;
+            None: the split-halves estimator.
 
     Paper: Eq. 5, Eq. 11, Eq. 14, Sec. 4.1.
     """
     values: dict[str, mi.Float] = {}
-    L1, L2 = sample.L1, sample.L2
+    # Without a radiance field no light arrives from x₂.
+    L1, L2 = (mi.Color3f(0) if L is None else L for L in (sample.L1, sample.L2))
+    weight = loss.weight(sample, target, spp)
     for term, live in terms.items():
         seen = L1 if live.lhs else dr.detach(L1)
         incoming = L2 if live.rhs else dr.detach(L2)
+        scattered = sample if live.materials else dr.detach(sample)
         match term:
             case "photometric":
-                pixels = rhs(sample, mi.Color3f(0) if L2 is None else incoming)
-                pixels = pixels if live.materials else dr.detach(pixels)
-                values[term] = relative_l2(pixels, target, spp, epsilon, primal)
+                pixels = rhs(scattered, incoming)
+                values[term] = squared_error(pixels, target, spp, weight, primal)
             case "prior":
-                sample1 = sample if live.materials else dr.detach(sample)
-                residual = first_residual(sample1, seen, incoming)
-                values[term] = residual_norm(residual, L1, epsilon)
+                residual = first_residual(scattered, seen, incoming)
+                values[term] = residual_norm(residual, L1, loss.epsilon)
             case "prior_extra":
                 residual = second_residual(sample, L2 if live.lhs else dr.detach(L2), sample.L3)
-                values[term] = residual_norm(residual, L2, epsilon)
+                values[term] = residual_norm(residual, L2, loss.epsilon)
             case "lhs":
                 pixels = lhs(sample, seen)
-                values[term] = relative_l2(pixels, target, spp, epsilon, None)
+                values[term] = squared_error(pixels, target, spp, weight, None)
     return values
 
 
-def relative_l2(
+def squared_error(
     samples: mi.Color3f,
     target: mi.Color3f,
     spp: int,
-    epsilon: float,
+    weight: mi.Color3f,
     primal: mi.Color3f | None = None,
 ) -> mi.Float:
-    """Relative squared error of pixels, (I − G)² / (G² + ε), whose gradient is unbiased.
+    """Weighted squared error of pixels, w (I − G)², whose gradient is unbiased.
 
     The gradient 2 (I − G) ∂I of a squared error is biased if both factors come from the same noisy
-    samples. Without `primal` the samples of each pixel are split in halves A and B: the expectation of
-    (I_A − G)(I_B − G) is the squared error of the expected image, and so for its gradient. With
+    samples. Without `primal` the samples of each pixel are split in halves A and B: the expectation
+    of (I_A − G)(I_B − G) is the squared error of the expected image, and so for its gradient. With
     `primal`, an estimate from other random numbers, the factors are that one and ∂I.
 
     Args:
         samples: linear RGB, `spp` consecutive lanes a pixel.
         target: G, linear RGB, one lane a pixel.
+        weight: of each pixel and channel, a constant.
         primal: I from an independent pass, one lane a pixel.
 
     Returns:
         Mean over pixels and channels.
 
-    Paper: Sec. 5.2, Sec. 5.4.
+    Paper: Sec. 5.2.
     """
-    weight = dr.rcp(dr.square(target) + epsilon)
     if primal is not None:
         image = pixel_means(samples, spp)
         error = dr.detach(primal) - target
         # The value is the squared error of the primal image, the gradient 2 (primal − G) ∂I.
-        loss = dr.replace_grad(dr.square(error), 2 * dr.detach(error) * image)
+        squared = dr.square(error) + 2 * error * (image - dr.detach(image))
     else:
         halves = pixel_means(samples, spp // 2)
         even = 2 * dr.arange(mi.UInt32, dr.width(target))
         a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
-        loss = (a - target) * (b - target)
-    return dr.mean(dr.mean(loss * weight))
+        squared = (a - target) * (b - target)
+    return dr.mean(dr.mean(squared * weight))
 
 
 def pixel_means(samples: mi.Color3f, spp: int) -> mi.Color3f:

@@ -47,33 +47,39 @@ def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
     Paper: Eq. 1, Sec. 4.2, 5.2.
     """
     scene, si, bsdf, active = world.scene, vertex.si, vertex.bsdf, vertex.valid
+    ctx = mi.BSDFContext()
     # A cut-out stopped the ray with probability `opacity`, so that only its material scatters here.
-    ctx = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null))
-    solid = dr.rcp(vertex.opacity) if world.has_chains else mi.Float(1)
+    # Mitsuba scales that material's value and density by the opacity, and samples it where the
+    # first random number is below the opacity. (A context without the `Null` lobe does the
+    # opposite of what it should: it lets every ray pass.)
+    opacity = vertex.opacity if world.has_chains else mi.Float(1)
+    solid = dr.rcp(opacity)
 
     # -------------------------------- Emitter sampling --------------------------------
 
     ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
     active_em = active & (ds.pdf != 0)
     bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
-    mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf_em))
+    mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf_em * solid))
     direct = dr.select(active_em, bsdf_em * em_weight * mis_em * solid, 0)
 
     # ----------------------------- Detached BSDF sampling -----------------------------
 
     with dr.suspend_grad():
-        bs, bs_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        lobe = sampler.next_1d() * opacity
+        bs, bs_weight = bsdf.sample(ctx, si, lobe, sampler.next_2d(), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
         goes_on = active & (bs.pdf > 0) & (dr.max(bs_weight) > 0)
+        goes_on &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
     value = bsdf.eval(ctx, si, bs.wo, goes_on & ~delta)
-    smooth = value * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0) * solid
+    smooth = value * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
     weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
 
     # Evaluated here, all together: reductions further on would each compute them again.
     dr.eval(direct, weight, ray, goes_on, bs.pdf, delta, sampler)
-    origin = Scattering(dr.detach(si), bs.pdf, delta)
+    origin = Scattering(dr.detach(si), bs.pdf * solid, delta)
     return Bounce(direct, weight, find_vertex(world, ray, goes_on, sampler, origin=origin))
 
 

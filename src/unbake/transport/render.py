@@ -58,8 +58,8 @@ def render_materials(
 
     Returns:
         Albedo (pixels, 3), linear RGB; roughness (pixels,), perceptual; and coverage (pixels,), the
-        fraction of samples that see a material which is sought: not an emitter, a mirror or glass, nor
-        background. Materials are means over those samples, zero where there are none.
+        fraction of samples that see a material which is sought: not an emitter, a mirror or glass,
+        nor background. Materials are means over those samples, zero where there are none.
     """
     albedo = np.zeros((pixels, 3), np.float32)
     roughness, coverage = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)

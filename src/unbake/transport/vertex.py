@@ -1,7 +1,7 @@
-"""From a ray to the first surface that is not specular, where the radiance field can be asked (Sec. 7).
+"""From a ray to the first surface that is not specular, where L_θ can be asked (Sec. 7).
 
-Symbols follow Mitsuba: `si` surface interaction, `pi` its preliminary form, `ds` a direction sample,
-β throughput. Directions point away from the surface.
+Symbols follow Mitsuba: `si` surface interaction, `pi` its preliminary form, `ds` a direction
+sample, β throughput. Directions point away from the surface.
 """
 
 from __future__ import annotations
@@ -104,7 +104,8 @@ def find_vertex(
         pi = world.scene.ray_intersect_preliminary(ray, origin is None, active)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         seen = active & (si.is_valid() | see_environment)
-        emitted = _emission_weight(world, si, origin, active) * si.emitter(world.scene).eval(si, seen)
+        emitted = _emission_weight(world, si, origin, active)
+        emitted = emitted * si.emitter(world.scene).eval(si, seen)
         valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
         direct_view = mi.Bool(valid)
         if world.has_chains:
@@ -113,7 +114,8 @@ def find_vertex(
             emitted += chain
             valid = valid & pi.is_valid()
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid)
-        vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, dr.zeros(mi.Color3f))
+        unknown = dr.zeros(mi.Color3f)
+        vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, unknown)
         dr.eval(vertex, sampler)
     return vertex
 
@@ -142,9 +144,9 @@ def _follow_chain(
     """Follow specular and cut-out surfaces, as long as there are any.
 
     Returns:
-        Where the chain ends (an invalid `pi`: nowhere), its last ray, its throughput, the emission met
-        on the way, the probability with which a cut-out stopped it at the end, and whether there was
-        anything specular.
+        Where the chain ends (an invalid `pi`: nowhere), its last ray, its throughput, the emission
+        met on the way, the probability with which a cut-out stopped it at the end, and whether
+        there was anything specular.
     """
     scene, limit, ctx = world.scene, world.max_specular, mi.BSDFContext()
     pi = mi.PreliminaryIntersection3f(pi)
@@ -179,7 +181,7 @@ def _follow_chain(
         ray = dr.select(active, ray_next, ray)
         pi_next = scene.ray_intersect_preliminary(ray, False, active)
         pi = dr.select(active, pi_next, pi)
-        pi.t = dr.select(black, dr.inf, pi.t)
+        pi.valid &= ~black
 
         si_next = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         emitted += β * si_next.emitter(scene, active).eval(si_next, active)

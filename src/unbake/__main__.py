@@ -1,0 +1,5 @@
+"""`python -m unbake`."""
+
+from .cli import main
+
+main()

@@ -1,0 +1,293 @@
+"""The command line: one function a command."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.text import Text
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from . import backend, config
+from .errors import UserError
+
+Scene = Annotated[str, arg(metavar="SCENE")]
+Data = Annotated[Path, arg(metavar="DATA")]
+Run = Annotated[Path, arg(metavar="RUN")]
+Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]
+#: Where None stands for what preset or settings file say, "default: None" would tell nothing.
+Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
+Seconds = Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")]
+File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
+Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
+Preset = Annotated[
+    config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
+]
+Method = Annotated[
+    config.MethodName | None, arg(metavar="{ours,one-bounce,direct}", help_behavior_hint="")
+]
+Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
+
+
+def main() -> None:
+    """Entry point of `unbake`; exits with 2 on bad input and 130 if interrupted."""
+    commands = {
+        "capture": capture,
+        "fit": fit,
+        "evaluate": evaluate,
+        "report": report,
+        "bench": bench,
+        "doctor": doctor,
+    }
+    try:
+        status = tyro.extras.subcommand_cli_from_dict(
+            commands,
+            prog="unbake",
+            description="Recovers the materials of a scene with known geometry from posed HDR "
+            "photographs, with the global illumination taken out of them.\n\n"
+            "From nothing to a result: unbake capture demo --out DATA; unbake fit DATA --out RUN; "
+            "unbake evaluate RUN; unbake report RUN --out report.html",
+        )
+    except UserError as error:
+        _fail(str(error))
+    except OSError as error:
+        # A full disk, a file taken away: nothing that a traceback would explain.
+        _fail(f"{error.filename or 'a file'}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(status or 0)
+
+
+def capture(
+    scene: Positional[Scene],
+    /,
+    out: Path,
+    views: int = 24,
+    held_out: int = 4,
+    cameras: File = None,
+    resolution: int = 128,
+    spp: int = 100,
+    max_depth: int = 64,
+    seed: int = 0,
+) -> None:
+    """Render a data set from a Mitsuba scene: photographs, cameras, and the true materials.
+
+    Args:
+        scene: A Mitsuba 3 XML file, or a built-in scene: demo, cornell, cube or furnace.
+        out: Folder to write; it must not exist.
+        views: Views to learn from. Cameras are placed automatically.
+        held_out: Further views that are kept apart, to judge results by.
+        cameras: Camera file (or transforms.json) to use instead of --views and --held-out.
+        resolution: Width and height of the images in pixels.
+        spp: Samples per pixel: more mean less noise, and more time.
+        max_depth: Longest light path; too short a limit looks like darker materials.
+        seed: Seed of all random numbers.
+    """
+    _require("views", views, 1)
+    _require("held-out", held_out, 0)
+    _require("resolution", resolution, 2)
+    _require("spp", spp, 1)
+    _require("max-depth", max_depth, 1)
+    _require("seed", seed, 0)
+    backend.activate()
+    from .data.capture import CaptureSettings
+    from .data.capture import capture as run
+
+    settings = CaptureSettings(
+        views=views,
+        held_out=held_out,
+        resolution=resolution,
+        spp=spp,
+        max_depth=max_depth,
+        seed=seed,
+    )
+    start = time.perf_counter()
+    run(scene, out, settings, cameras=cameras, tell=_say)
+    _say(f"wrote {out} in {time.perf_counter() - start:.0f} s; next: unbake fit {out} --out RUN")
+
+
+def fit(
+    data: Positional[Data],
+    /,
+    out: Path,
+    steps: Count = None,
+    seconds: Seconds = None,
+    spp: Count = None,
+    batch: Count = None,
+    preset: Preset = None,
+    method: Method = None,
+    seed: Count = None,
+    settings: File = None,
+    resume: Flag = False,
+    clip_negative: Flag = False,
+) -> int:
+    """Recover albedo and roughness from the photographs of a data set.
+
+    Ctrl-C stops after the present step and keeps what was learned; --resume goes on from there.
+
+    Args:
+        data: Folder of the data set, with its transforms.json.
+        out: Folder to write the run to: settings, log, checkpoints, previews.
+        steps: Length of the fit in training steps (cpu: 2000, paper and release: 18000).
+        seconds: Length of the fit in seconds of training, instead of steps.
+        spp: Samples per pixel in a step, an even number (cpu: 8, paper and release: 16).
+        batch: Pixels in a step (cpu: 1024, paper and release: 16384).
+        preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
+        method: ours (default), one-bounce (prior at the first vertex), direct (no indirect light).
+        seed: Seed of weights and samples (default: 0).
+        settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
+        resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
+        clip_negative: Take negative pixels as zero instead of refusing them.
+    """
+    start: dict[str, object] = {"preset": preset, "settings": settings}
+    length: dict[str, object] = {"steps": steps, "seconds": seconds}
+    other: dict[str, object] = {"spp": spp, "batch": batch, "method": method, "seed": seed}
+    if resume:
+        _exclude("resume", start | other)
+        if not (out / "config.toml").is_file():
+            raise UserError("there is no run to resume in this folder", out, "Leave out --resume")
+        chosen = config.read_toml(out / "config.toml")
+    else:
+        if settings is not None:
+            _exclude("settings", {"preset": preset})
+        chosen = config.read_toml(settings) if settings else config.preset(preset or "cpu")
+    chosen = _overridden(chosen, length | other)
+    backend.activate()
+    from .fit.loop import fit as run
+
+    console = Console(highlight=False)
+    progress = run(data, out, chosen, resume=resume, clip_negative=clip_negative, console=console)
+    if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
+        return 130
+    _say(
+        f"{progress.step} steps, {progress.samples / 1e6:.1f} M samples in "
+        f"{progress.seconds:.0f} s; next: unbake evaluate {out}"
+    )
+    return 0
+
+
+def evaluate(
+    run: Positional[Run],
+    /,
+    spp: int = 64,
+    max_depth: int = 64,
+    train_views: int = 4,
+    clip_negative: Flag = False,
+) -> None:
+    """Render views with the recovered materials and measure them against the truth.
+
+    Writes pictures and metrics.json to RUN/evaluation.
+
+    Args:
+        run: Folder that `unbake fit` wrote.
+        spp: Samples per pixel: more mean less noise, and more time.
+        max_depth: Longest light path.
+        train_views: How many of the views learned from to render, beside all held-out ones.
+        clip_negative: Take negative pixels of photographs as zero, as in a fit with this option.
+    """
+    _require("spp", spp, 1)
+    _require("max-depth", max_depth, 1)
+    _require("train-views", train_views, 0)
+    backend.activate()
+    from .results.evaluate import EvaluationSettings
+    from .results.evaluate import evaluate as go
+
+    settings = EvaluationSettings(
+        spp=spp, max_depth=max_depth, train_views=train_views, clip_negative=clip_negative
+    )
+    metrics = go(run, settings, tell=_say)
+    for split in ("heldout", "train"):
+        values = {k: v for k, v in metrics[split].items() if k != "views"}
+        shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in values.items())
+        _say(f"{split} ({metrics[split]['views']} views): {shown}")
+    _say(f"wrote {run / 'evaluation'}; next: unbake report {run} --out report.html")
+
+
+def report(runs: Positional[Runs], /, out: Path) -> None:
+    """Write one HTML page that shows evaluated runs of a data set side by side.
+
+    Args:
+        runs: Folders of runs, each after `unbake evaluate`.
+        out: The page to write, such as report.html. It needs no other file.
+    """
+    if not runs:
+        raise UserError("no run given", remedy="unbake report RUN [RUN ...] --out report.html")
+    backend.activate()
+    from .results.report import write_report
+
+    _say(f"wrote {write_report(runs, out)}")
+
+
+def bench(
+    what: Positional[Literal["step"]] = "step",
+    /,
+    data: Folder = None,
+    method: config.MethodName = "ours",
+    steps: int = 100,
+    out: File = None,
+) -> None:
+    """Measure the training step: samples a second, and where the time goes.
+
+    Args:
+        what: What to measure.
+        data: Folder of a data set; by default a small capture of the demo scene.
+        method: Method whose step is measured.
+        steps: Steps to take the median of, after warm-up.
+        out: JSON file to write the numbers to.
+    """
+    _require("steps", steps, 10)
+    backend.activate()
+    from .results.bench import bench_step
+
+    bench_step(data, method, steps, out, Console(highlight=False))
+
+
+def doctor() -> int:
+    """Show what unbake runs on here, and what to install if it cannot."""
+    from . import doctor as module
+
+    return module.main()
+
+
+def _overridden(settings: config.FitConfig, given: dict[str, object]) -> config.FitConfig:
+    """Settings with the options that were given; errors name the option."""
+    if given["steps"] is not None and given["seconds"] is not None:
+        _exclude("seconds", {"steps": given["steps"]})
+    if given["steps"] is not None:
+        settings = dataclasses.replace(settings, seconds=0.0)
+    for option, value in given.items():
+        key = "pixels" if option == "batch" else option
+        try:
+            settings = dataclasses.replace(settings, **{key: value} if value is not None else {})
+        except UserError as error:
+            raise UserError(error.what, f"--{option}", error.remedy) from None
+    return settings
+
+
+def _exclude(option: str, others: dict[str, object]) -> None:
+    """Refuse options that make no sense beside another one."""
+    for name, value in others.items():
+        if value is not None:
+            raise UserError(f"cannot be given together with --{option}", where=f"--{name}")
+
+
+def _require(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise UserError(f"must be {least} or more, not {value}", where=f"--{name}")
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _fail(message: str) -> None:
+    """Tell what is wrong, on one line whatever the width of the terminal, and exit."""
+    line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
+    Console(stderr=True).print(line, soft_wrap=True)
+    sys.exit(2)

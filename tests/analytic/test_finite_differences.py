@@ -1,0 +1,145 @@
+"""Gradients of the right-hand side image against finite differences of the same estimator.
+
+Sampling is detached: the estimator is f(φ)/p(φ₀), where only the value moves with φ. So the
+finite differences need a BSDF that samples with φ₀ and evaluates with φ, which `Held` is. With
+common random numbers and a linear objective nothing else separates the two.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
+
+from unbake.fields.texture import material_textures
+from unbake.transport.image import Needs, rhs, trace
+from unbake.transport.vertex import World
+
+ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
+SPP = 64
+
+
+@pytest.fixture(scope="module")
+def held_plugin():
+    """Register the BSDF that samples as one material and evaluates as another."""
+
+    class Held(mi.BSDF):
+        def __init__(self, props):
+            super().__init__(props)
+            self.sampled, self.evaluated = props["sampled"], props["evaluated"]
+            count = self.sampled.component_count()
+            self.m_components = [self.sampled.flags(i) for i in range(count)]
+            self.m_flags = self.sampled.flags()
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            return self.sampled.sample(ctx, si, sample1, sample2, active)
+
+        def eval(self, ctx, si, wo, active=True):
+            return self.evaluated.eval(ctx, si, wo, active)
+
+        def pdf(self, ctx, si, wo, active=True):
+            return self.sampled.pdf(ctx, si, wo, active)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def eval_diffuse_reflectance(self, si, active=True):
+            return mi.Color3f(0)
+
+    mi.register_bsdf("held_sampling", lambda props: Held(props))
+
+
+def principled(colour, roughness):
+    if not isinstance(colour, mi.Texture):
+        colour = {"type": "rgb", "value": [float(c) for c in colour]}
+    return {"type": "principled", "base_color": colour, "roughness": roughness}
+
+
+def room(bsdf):
+    """A floor, a wall and a lamp: light comes directly and off the other surface."""
+    to_world = mi.ScalarTransform4f
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": to_world().translate([0, 0, -1]),
+                "bsdf": bsdf,
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": to_world().look_at([0, 1, 0], [0, 0, 0], [0, 0, 1]),
+                "bsdf": bsdf,
+            },
+            "lamp": {
+                "type": "rectangle",
+                "to_world": to_world().look_at([0.3, 0, 0.9], [0, 0, -1], [0, 1, 0]).scale(0.4),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [5, 4, 3]}},
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            },
+        }
+    )
+
+
+class VaryingRadiance:
+    """Some smooth radiance field that does not depend on the materials."""
+
+    def evaluate(self, p, w, n, albedo, valid, engine="tensor"):
+        value = mi.Color3f(1 + dr.sin(3 * p.x), 1 + 0.5 * w.y, 0.5 + dr.square(p.z))
+        return dr.select(valid, value, 0)
+
+
+def objective(world):
+    """A weighted sum of the pixels of the right-hand side, always with the same random numbers."""
+    cameras = built_in_cameras("cornell", 12)
+    ray = pixel_rays(cameras, SPP, seed=1)
+    field = VaryingRadiance()
+    sample = trace(world, field, ray, seeded(2, dr.width(ray)), Needs(True, False), True)
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, (3, dr.width(ray) // SPP))
+    weights = mi.Color3f(np.repeat(weights, SPP, axis=1).astype(np.float32))
+    return weights * rhs(sample, sample.L2)
+
+
+def total(values):
+    return np.array(dr.detach(values)).astype(np.float64).mean()
+
+
+def solid(bsdf):
+    return bsdf
+
+
+def cut_out(bsdf):
+    return {"type": "mask", "opacity": 0.6, "bsdf": bsdf}
+
+
+@pytest.mark.parametrize("wrap", [solid, cut_out])
+@pytest.mark.parametrize("parameter", ["red", "green", "blue", "roughness"])
+def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, parameter):
+    materials = ConstantMaterials(mi.Color3f(*ALBEDO), ROUGHNESS)
+    albedo, roughness = material_textures(materials)
+    live = World.of(room(wrap(principled(albedo, roughness))), materials, 8)
+    dr.enable_grad(materials.albedo, materials.roughness)
+    image = objective(live)
+    dr.backward(dr.mean(dr.mean(image)))
+    gradients = [*dr.grad(materials.albedo), dr.grad(materials.roughness)]
+    index = ["red", "green", "blue", "roughness"].index(parameter)
+    gradient = float(gradients[index][0])
+
+    def moved(offset):
+        values = [*ALBEDO, ROUGHNESS]
+        values[index] += offset
+        bsdf = {
+            "type": "held_sampling",
+            "sampled": principled(ALBEDO, ROUGHNESS),
+            "evaluated": principled(values[:3], values[3]),
+        }
+        return total(objective(World.of(room(wrap(bsdf)), None, 8)))
+
+    # Fourth-order differences: the step may be large enough for single precision.
+    h = 0.02
+    difference = (8 * (moved(h) - moved(-h)) - (moved(2 * h) - moved(-2 * h))) / (12 * h)
+    print(f"{parameter}: gradient {gradient:.6f}, finite difference {difference:.6f}")
+    np.testing.assert_allclose(moved(0), total(image), rtol=1e-5)
+    assert abs(difference) > 1e-3, "a gradient of zero proves nothing"
+    np.testing.assert_allclose(gradient, difference, rtol=1e-3)
+

@@ -1,0 +1,170 @@
+"""A closed box whose walls emit E = 1 and reflect ρ: the radiance is 1/(1 − ρ) everywhere.
+
+The field is trained by the residual alone: it sees no photograph, and starts far from the answer.
+"""
+
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import (
+    ConstantMaterials,
+    ConstantRadiance,
+    built_in_cameras,
+    pixel_rays,
+    seeded,
+)
+
+from unbake.config import GridConfig, NetworkConfig
+from unbake.data import scene as scenes
+from unbake.data.batches import CameraRays
+from unbake.fields.domain import Domain
+from unbake.fields.radiance import RadianceField
+from unbake.fields.texture import material_textures
+from unbake.transport.image import Needs, lhs, rhs, trace
+from unbake.transport.objective import EXTRA, PRIOR, Live, RelativeL2, objective
+from unbake.transport.prior import first_residual, second_residual
+from unbake.transport.vertex import World
+
+SMALL = NetworkConfig(
+    grid=GridConfig(levels=2, features=2, table_log2=10, base_resolution=2), width=16, hidden=1
+)
+ONE_BOUNCE = {PRIOR: Live(lhs=True)}
+EXTRA_BOUNCE = {PRIOR: Live(lhs=True), EXTRA: Live(lhs=True)}
+LANES = 2048
+
+
+def train(world, field, terms, steps, rate, final_rate):
+    """Minimise the residual, and nothing else, over what the training cameras see."""
+    rays = CameraRays.of(built_in_cameras("furnace", 16, views=8))
+    adam = mi.ad.Adam(rate, field.parameters(), mask_updates=True)
+    black, loss = dr.zeros(mi.Color3f, LANES // 2), RelativeL2(0.01, "radiance")
+
+    def step(scene, sampler, rays, adam, black, seed):
+        field.assign(dict(adam.items()))
+        sampler.seed(seed, LANES)
+        pixel = mi.UInt32(sampler.next_1d() * 0.99999 * rays.pixels)
+        ray = rays.through(pixel, sampler.next_2d())
+        sample = trace(world.with_scene(scene), field, ray, sampler, Needs(True, True), True)
+        value = sum(objective(terms, sample, black, 2, loss).values())
+        dr.backward(value)
+        adam.step(eval=False)
+        dr.eval(adam, value)
+        return value
+
+    # A scene that is freed while a frozen function is recorded would end it.
+    gc.collect()
+    frozen, sampler = dr.freeze(step), mi.load_dict({"type": "independent"})
+    for i in range(steps):
+        now = rate * (final_rate / rate) ** (i / steps)
+        adam.set_learning_rate({k: dr.opaque(mi.Float, now) for k in adam})
+        frozen(world.scene, sampler, rays, adam, black, dr.opaque(mi.UInt32, 7919 * i))
+    field.assign(dict(adam.items()))
+
+
+def pictures(world, field, spp):
+    """LHS and RHS of views between the training views, (pixels, 3) each."""
+    cameras = built_in_cameras("furnace", 8, views=12)[8:]
+    ray = pixel_rays(cameras, spp, seed=99)
+    sample = trace(world, field, ray, seeded(5, dr.width(ray)), Needs(True, False), True)
+    both = lhs(sample, sample.L1), rhs(sample, sample.L2)
+    return [np.array(x).reshape(3, -1, spp).mean(-1).T for x in both]
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+# The untrained field's radiance, `scale`, is far from ρ/(1 − ρ) in each row. The closer ρ is to 1,
+# the slower the residual contracts: by a factor ρ in each of Picard's iterations.
+@pytest.mark.parametrize(
+    ("albedo", "terms", "scale", "steps", "rate", "final_rate"),
+    [
+        (0.0, EXTRA_BOUNCE, 1.0, 600, 0.1, 5e-4),
+        (0.3, EXTRA_BOUNCE, 2.0, 500, 0.03, 5e-4),
+        (0.5, EXTRA_BOUNCE, 3.0, 500, 0.03, 5e-4),
+        (0.8, EXTRA_BOUNCE, 1.0, 500, 0.03, 5e-4),
+        (0.8, ONE_BOUNCE, 1.0, 500, 0.03, 5e-4),
+        (0.97, EXTRA_BOUNCE, 4.0, 1400, 0.02, 2e-3),
+    ],
+)
+def test_the_residual_alone_finds_the_radiance(
+    built_in, albedo, terms, scale, steps, rate, final_rate
+):
+    scene = mi.load_file(str(built_in("furnace", albedo)))
+    world = World.of(scene, None, 8)
+    field = RadianceField(SMALL, Domain.of(scene.bbox()), scale=scale, seed=1)
+    truth = 1 / (1 - albedo)
+
+    untrained, _ = pictures(world, field, 4)
+    assert np.abs(untrained / truth - 1).min() > 0.2, "it must not know the answer beforehand"
+    train(world, field, terms, steps, rate, final_rate)
+
+    seen, computed = pictures(world, field, 256)
+    for name, image in (("LHS", seen), ("RHS", computed)):
+        error = image / truth - 1
+        print(f"{albedo} {name}: mean {error.mean():+.4f}, rms {rms(error):.4f}")
+        assert abs(error.mean()) < 0.01
+        assert rms(error) < 0.01
+
+
+def exact_sample(scene, albedo, factor=1.0, lanes_spp=64):
+    """Path samples with the true reflected radiance ρ/(1 − ρ), times `factor`, everywhere."""
+    world = World.of(scene, None, 8)
+    field = ConstantRadiance(factor * albedo / (1 - albedo))
+    ray = pixel_rays(built_in_cameras("furnace", 16, views=8), lanes_spp, seed=3)
+    return trace(world, field, ray, seeded(4, dr.width(ray)), Needs(True, True), True)
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.8])
+def test_the_residual_of_the_exact_radiance_is_zero_and_of_no_other(built_in, albedo):
+    scene = mi.load_file(str(built_in("furnace", albedo)))
+
+    def residuals(factor):
+        s = exact_sample(scene, albedo, factor)
+        both = first_residual(s, s.L1, s.L2), second_residual(s, s.L2, s.L3)
+        return [np.array(r)[0].astype(np.float64) for r in both]
+
+    for residual in residuals(1.0):
+        assert abs(residual.mean()) < 3.5 * residual.std() / np.sqrt(len(residual))
+    # (1 + δ) L leaves δ (1 − ρ) L = δ ρ: linear in δ, its norm quadratic. The same random numbers
+    # serve for all δ, so that the difference has no noise but rounding.
+    for exact, off in zip(residuals(1.0), residuals(1.1), strict=True):
+        np.testing.assert_allclose((off - exact).mean(), 0.1 * albedo, rtol=2e-3)
+
+
+# ------------------------------------------------------------ the gradient with one live bounce
+
+
+@pytest.fixture(scope="module")
+def learnable(built_in):
+    """The furnace with Lambertian walls whose albedo is read from a stand-in for the fields."""
+    materials = ConstantMaterials(0.5)
+    parsed = scenes.parse(built_in("furnace"))
+    albedo, _ = material_textures(materials)
+    for node in parsed.state.nodes:
+        if node.props.plugin_name() == "diffuse":
+            node.props["reflectance"] = albedo
+    return World.of(parsed.instantiate(), materials, 8)
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.5, 0.8, 0.97])
+def test_one_live_bounce_gives_one_minus_albedo_of_the_true_gradient(learnable, albedo):
+    materials = learnable.materials
+    materials.albedo = mi.Color3f(albedo)
+    dr.enable_grad(materials.albedo)
+    ray = pixel_rays(built_in_cameras("furnace", 16, views=8), 64, seed=5)
+    cache = ConstantRadiance(albedo / (1 - albedo))
+    sample = trace(learnable, cache, ray, seeded(6, dr.width(ray)), Needs(True, False), True)
+    image = rhs(sample, sample.L2)
+    value = np.array(dr.mean(dr.detach(image), axis=1)).ravel()
+    dr.backward(dr.sum(dr.mean(image, axis=1)))
+    gradient = np.array(dr.grad(materials.albedo)).ravel()
+
+    true_gradient = 1 / (1 - albedo) ** 2
+    print(f"{albedo}: image {value}, gradient {gradient}, true {true_gradient}")
+    np.testing.assert_allclose(value, 1 / (1 - albedo), rtol=5e-3)
+    # E + ρE/(1 − ρ): what the first bounce reflects, by the albedo that reflects it.
+    np.testing.assert_allclose(gradient, (1 - albedo) * true_gradient, rtol=5e-3)

@@ -1,0 +1,268 @@
+"""Runs that end early: what was learned stays, and goes on where it ended."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from unbake import cli
+from unbake.config import read_toml
+from unbake.fit.monitor import forget_after
+from unbake.fit.step import TrainingStep
+from unbake.imaging.pictures import read_exr, write_exr
+
+
+@pytest.fixture
+def fit(unbake, cornell, tiny, tmp_path):
+    """Fit with the cheapest method: `fit("--steps", 3)`, `fit("--resume")`."""
+
+    def run(*words, name="run", method="direct"):
+        start = () if "--resume" in words else ("--settings", tiny, "--method", method)
+        return unbake("fit", cornell, "--out", tmp_path / name, *start, *words)
+
+    return run
+
+
+@pytest.fixture
+def started(cornell, tiny, tmp_path):
+    """A fit in a process of its own which would take an hour, once its first lines are logged."""
+    settings = tmp_path / "often.toml"
+    settings.write_text("checkpoint_seconds = 0\n" + tiny.read_text())
+    run = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "unbake", "fit", cornell, "--out", run, "--settings", settings,
+         "--method", "direct", "--seconds", "3600"],
+        env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while len(list((run / "checkpoints").glob("*.safetensors"))) < 3:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def steps_logged(run):
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    return [line["step"] for line in lines if "validation" not in line]
+
+
+def checkpoints(run):
+    return sorted((run / "checkpoints").iterdir())
+
+
+def step_of(checkpoint):
+    return int(checkpoint.stem.removeprefix("step-"))
+
+
+def interrupt_at(monkeypatch, step):
+    """Press Ctrl-C during a step, once."""
+    plain, pressed = TrainingStep.__call__, []
+
+    def call(self, state, number, *rates):
+        if number == step and not pressed:
+            pressed.append(True)
+            signal.raise_signal(signal.SIGINT)
+        return plain(self, state, number, *rates)
+
+    monkeypatch.setattr(TrainingStep, "__call__", call)
+
+
+@contextmanager
+def one_thread(monkeypatch):
+    """Train on one thread, so that sums have one order and results agree bit by bit.
+
+    From the first step on: Mitsuba reads no OpenEXR without a second thread.
+    """
+    plain, threads = TrainingStep.__call__, dr.thread_count()
+
+    def call(self, *words):
+        dr.set_thread_count(1)
+        return plain(self, *words)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingStep, "__call__", call)
+        try:
+            yield
+        finally:
+            dr.set_thread_count(threads)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_fit_with_a_checkpoint(number, started, fit, tmp_path):
+    run = tmp_path / "run"
+    started.send_signal(number)
+    out, err = started.communicate(timeout=60)
+    assert started.returncode == 130 and err == ""
+    last = step_of(checkpoints(run)[-1])
+    assert f"stopped at step {last}; go on with --resume" in out
+    assert steps_logged(run)[-1] == last
+
+    outcome = fit("--resume", "--steps", last + 7)
+    assert outcome.status == 0 and f"going on after step {last}" in outcome.out
+    assert step_of(checkpoints(run)[-1]) == last + 7
+    logged = steps_logged(run)
+    assert logged[-1] == last + 7 and sorted(set(logged)) == logged
+
+
+def test_a_killed_fit_goes_on(started, fit, tmp_path):
+    run = tmp_path / "run"
+    started.kill()
+    started.communicate()
+    (run / "checkpoints" / "step-9999999.partial").write_bytes(b"half a checkpoint")
+    with (run / "log.jsonl").open("a") as log:
+        log.write('{"step": 99999, "sec')
+    last = step_of([p for p in checkpoints(run) if p.suffix == ".safetensors"][-1])
+    outcome = fit("--resume", "--steps", last + 3)
+    assert outcome.status == 0 and f"going on after step {last}" in outcome.out
+    logged = steps_logged(run)
+    assert logged[-1] == last + 3 and sorted(set(logged)) == logged
+    assert all(p.suffix == ".safetensors" for p in checkpoints(run))
+
+
+@pytest.mark.parametrize("method", ["direct", "ours"])
+def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(method, fit, tmp_path, monkeypatch):
+    with one_thread(monkeypatch):
+        assert fit("--steps", 12, name="whole", method=method).status == 0
+    interrupt_at(monkeypatch, 6)
+    with one_thread(monkeypatch):
+        outcome = fit("--steps", 12, name="parts", method=method)
+    assert outcome.status == 130 and "stopped at step 7" in outcome.out
+    with one_thread(monkeypatch):
+        assert fit("--resume", name="parts").status == 0
+    whole, parts = (load_file(checkpoints(tmp_path / name)[-1]) for name in ("whole", "parts"))
+    assert whole.keys() == parts.keys() and len(whole) >= 8
+    for key in whole:
+        assert np.array_equal(whole[key], parts[key]), key
+    settings = [read_toml(tmp_path / name / "config.toml") for name in ("whole", "parts")]
+    assert settings[0] == settings[1] and settings[0].steps == 12
+
+
+def test_a_resumed_fit_keeps_its_length_unless_told_otherwise(fit, tmp_path, monkeypatch):
+    interrupt_at(monkeypatch, 2)
+    assert fit("--steps", 9).status == 130
+    assert fit("--resume").status == 0
+    assert step_of(checkpoints(tmp_path / "run")[-1]) == 9
+    again = fit("--resume")
+    assert again.status == 0 and "9 steps" in again.out
+    assert fit("--resume", "--steps", 11).status == 0
+    assert step_of(checkpoints(tmp_path / "run")[-1]) == 11
+
+
+def test_a_length_in_seconds_replaces_one_in_steps_and_back(fit, tmp_path):
+    assert fit("--seconds", 0.01).status == 0
+    last = step_of(checkpoints(tmp_path / "run")[-1])
+    assert fit("--resume", "--steps", last + 2).status == 0
+    config = read_toml(tmp_path / "run" / "config.toml")
+    assert (config.steps, config.seconds) == (last + 2, 0)
+    assert step_of(checkpoints(tmp_path / "run")[-1]) == last + 2
+
+
+def test_a_run_is_not_mixed_with_another(fit, tmp_path):
+    assert fit("--steps", 1).status == 0
+    before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()}
+    outcome = fit("--steps", 1)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "there is a run in this folder already. Go on with --resume" in outcome.err
+    assert before == {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()}
+
+
+def test_there_must_be_a_run_to_resume(fit, tmp_path):
+    outcome = fit("--resume")
+    assert outcome.status == 2
+    assert "run: there is no run to resume in this folder. Leave out --resume" in outcome.err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("words", [("--batch", 9), ("--preset", "cpu"), ("--method", "ours")])
+def test_a_resumed_fit_keeps_its_settings(words, fit):
+    assert fit("--steps", 1).status == 0
+    outcome = fit("--resume", *words)
+    assert outcome.status == 2
+    assert outcome.err == f"error: {words[0]}: cannot be given together with --resume\n"
+
+
+def test_a_resumed_fit_keeps_its_photographs(unbake, fit, cornell, tmp_path):
+    assert fit("--steps", 1).status == 0
+    other = shutil.copytree(cornell, tmp_path / "other")
+    image = other / "images" / "train_000.exr"
+    write_exr(image, read_exr(image) * [2, 2, 2, 1])
+    outcome = unbake("fit", other, "--out", tmp_path / "run", "--resume", "--steps", 2)
+    assert outcome.status == 2
+    assert "other: these are not the photographs that the run" in outcome.err
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip"])
+def test_a_damaged_checkpoint_costs_only_the_steps_after_the_one_before(damage, fit, tmp_path):
+    assert fit("--steps", 4).status == 0
+    assert fit("--resume", "--steps", 6).status == 0
+    older, newest = checkpoints(tmp_path / "run")
+    content = bytearray(newest.read_bytes())
+    if damage == "cut":
+        del content[-100:]
+    else:
+        content[-100] ^= 1
+    newest.write_bytes(content)
+    outcome = fit("--resume", "--steps", 8)
+    assert outcome.status == 0 and f"going on after step {step_of(older)}" in outcome.out
+    assert step_of(checkpoints(tmp_path / "run")[-1]) == 8
+
+
+def test_no_checkpoint_that_can_be_read_is_an_error(unbake, fit, tmp_path):
+    assert fit("--steps", 1).status == 0
+    checkpoints(tmp_path / "run")[0].write_bytes(b"")
+    outcome = fit("--resume", "--steps", 2)
+    assert outcome.status == 2
+    assert "checkpoints: no checkpoint in this folder can be read" in outcome.err
+    outcome = unbake("evaluate", tmp_path / "run")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+
+
+def test_a_full_disk_is_one_line_and_older_checkpoints_stay(fit, tmp_path, monkeypatch):
+    assert fit("--steps", 2).status == 0
+    before = checkpoints(tmp_path / "run")[0].read_bytes()
+
+    def full(number):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        outcome = fit("--resume", "--steps", 4)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "the checkpoint cannot be written (No space left on device)" in outcome.err
+    (kept,) = checkpoints(tmp_path / "run")
+    assert kept.read_bytes() == before
+    outcome = fit("--resume", "--steps", 4)
+    assert outcome.status == 0 and "going on after step 2" in outcome.out
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_that_may_not_be_written(fit, tmp_path):
+    (tmp_path / "closed").mkdir(mode=0o555)
+    outcome = fit("--steps", 1, name="closed/run")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "Permission denied" in outcome.err
+
+
+def test_a_log_forgets_what_lies_after_a_step(tmp_path):
+    log = tmp_path / "log.jsonl"
+    lines = ['{"step": 20}', '{"step": 40}', '{"step": 40, "validation": {}}', '{"step": 60}']
+    log.write_text("\n".join([*lines, '{"step": 8']))
+    forget_after(log, 40)
+    assert log.read_text().splitlines() == lines[:3]
+    forget_after(log, 0)
+    assert log.read_text() == ""
+    forget_after(tmp_path / "new.jsonl", 0)
+    assert (tmp_path / "new.jsonl").read_text() == ""

@@ -1,0 +1,283 @@
+"""Networks are the same on both engines; fields are positive, alive and never poisoned."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import TINY, seeded
+
+from unbake.config import GridConfig, NetworkConfig
+from unbake.fields.domain import Domain
+from unbake.fields.materials import ROUGHNESS_FLOOR, Materials
+from unbake.fields.network import Network
+from unbake.fields.radiance import RadianceField
+
+LANES = 200
+WIDE = NetworkConfig(
+    grid=GridConfig(levels=3, features=4, table_log2=6, base_resolution=3, growth=1.6),
+    width=24,
+    hidden=3,
+)
+
+
+def points(lanes=LANES, seed=1):
+    sampler = seeded(seed, lanes)
+    p = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
+    dr.eval(p)
+    return p
+
+
+def randomised(network, seed=0):
+    """Large weights and features: the untrained ones are nearly zero."""
+    rng = np.random.default_rng(seed)
+    values = {
+        k: type(v)(rng.normal(0, 0.7, v.shape).astype(np.float32))
+        for k, v in network.parameters().items()
+    }
+    dr.enable_grad(values)
+    network.assign(values)
+    return values
+
+
+# ------------------------------------------------------------------------------ the two engines
+
+
+@pytest.mark.parametrize("config", [TINY, WIDE], ids=["tiny", "wide"])
+@pytest.mark.parametrize(("extra", "outputs"), [(0, 1), (0, 4), (12, 3)])
+def test_engines_agree_on_values_and_gradients(config, extra, outputs):
+    results = {}
+    for engine in ("tensor", "coopvec"):
+        network = Network(config, extra=extra, outputs=outputs, seed=3)
+        parameters = randomised(network)
+        more = [mi.Float(0.1 * i) + points().x for i in range(extra)]
+        dr.enable_grad(more)
+        values = network(points(), more, engine)
+        assert len(values) == outputs
+        dr.backward(sum((i + 1) * dr.sum(v * v) for i, v in enumerate(values)))
+        gradients = {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
+        gradients["inputs"] = np.array([np.array(dr.grad(m)) for m in more]).ravel()
+        results[engine] = np.array([np.array(v) for v in values]), gradients
+    (a, grad_a), (b, grad_b) = results["tensor"], results["coopvec"]
+    assert np.abs(a).max() > 0.1
+    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * np.abs(a).max())
+    assert grad_a.keys() == grad_b.keys() >= {"grid", "0.weights", "0.bias"}
+    for name, gradient in grad_a.items():
+        if gradient.size:
+            scale = np.abs(gradient).max()
+            assert scale > 0, name
+            np.testing.assert_allclose(gradient, grad_b[name], atol=1e-4 * scale, err_msg=name)
+
+
+def test_network_is_a_matrix_product_with_rectified_layers():
+    """Against NumPy, the features taken as they are."""
+    network = Network(WIDE, extra=2, outputs=3, seed=5)
+    randomised(network)
+    more = [points(seed=2).x, points(seed=3).y]
+    x = np.array([np.array(f) for f in [*network.grid(list(points())), *more]], np.float64)
+    for i, (weights, bias) in enumerate(network.layers):
+        x = np.array(weights, np.float64) @ x + np.array(bias, np.float64)
+        x = np.maximum(x, 0) if i < WIDE.hidden else x
+    values = np.array([np.array(v) for v in network(points(), more)])
+    np.testing.assert_allclose(values, x, rtol=1e-3, atol=1e-4 * np.abs(x).max())
+
+
+def test_grid_interpolates_between_the_corners_of_a_cell():
+    """One dense level of 2³ corners: its features are trilinear in the position."""
+    grid = GridConfig(levels=1, features=2, table_log2=10, base_resolution=2)
+    network = Network(NetworkConfig(grid=grid, width=4, hidden=1), extra=0, outputs=1, seed=0)
+    randomised(network)
+    a = np.array([0.1, 0.2, 0.15])
+    b = np.array([0.35, 0.2, 0.15])
+    t = np.linspace(0, 1, 5)
+    line = a[:, None] * (1 - t) + b[:, None] * t
+    position = mi.Point3f(*[mi.Float(row.astype(np.float32)) for row in line])
+    for feature in network.grid(list(position)):
+        values = np.array(feature)
+        assert np.ptp(values) > 1e-3
+        np.testing.assert_allclose(np.diff(values, 2), 0, atol=1e-5)
+
+
+def test_equal_seeds_give_equal_networks_and_others_do_not():
+    def flat(seed):
+        network = Network(TINY, extra=0, outputs=3, seed=seed)
+        return np.concatenate([np.array(v).ravel() for v in network.parameters().values()])
+
+    np.testing.assert_array_equal(flat(1), flat(1))
+    assert (flat(1) != flat(2)).any()
+
+
+def test_gradients_arrive_in_the_arrays_that_were_assigned():
+    network = Network(TINY, extra=0, outputs=1, seed=1)
+    given = {k: type(v)(v) for k, v in network.parameters().items()}
+    dr.enable_grad(given)
+    network.assign(given)
+    for engine in ("tensor", "coopvec"):
+        (value,) = network(points(), [], engine)
+        dr.backward(dr.sum(value))
+    assert all(np.any(np.array(dr.grad(v)) != 0) for v in given.values())
+
+
+# ------------------------------------------------------------------------------------ radiance
+
+
+def radiance(scale=2.0):
+    return RadianceField(TINY, Domain((1.0, 2.0, 3.0), 4.0), scale=scale, seed=1)
+
+
+def look(field, p, valid=True, engine="tensor"):
+    lanes = dr.width(p)
+    up = dr.zeros(mi.Vector3f, lanes)
+    up.z = 1
+    albedo = dr.full(mi.Color3f, 0.5, lanes)
+    valid = dr.full(mi.Bool, True, lanes) & valid
+    return field.evaluate(p, up, mi.Normal3f(up), albedo, valid, engine)
+
+
+def world_points(lanes=LANES):
+    return 4 * points(lanes) + mi.Point3f(-1, 0, 1)
+
+
+def test_untrained_radiance_is_its_scale():
+    value = np.array(look(radiance(2.5), world_points()))
+    np.testing.assert_allclose(value, 2.5, rtol=0.2)
+
+
+def test_radiance_engines_agree():
+    field = radiance()
+    randomised(field.network)
+    tensor = np.array(look(field, world_points(), engine="tensor"))
+    coopvec = np.array(look(field, world_points(), engine="coopvec"))
+    assert np.ptp(tensor) > 0.1
+    np.testing.assert_allclose(tensor, coopvec, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("raw", [-1000.0, -30.0, 0.0, 30.0])
+def test_radiance_is_positive_and_its_gradient_is_alive(raw):
+    """Whatever the network's output is: no sample can drive the field into a dead end."""
+    field = radiance(scale=1.0)
+    parameters = {k: dr.zeros(type(v), v.shape) for k, v in field.parameters().items()}
+    last = list(parameters)[-1]
+    shape = parameters[last].shape
+    assert shape == (field.network.outputs, 1)
+    parameters[last] = mi.TensorXf([raw] * shape[0], shape)
+    dr.enable_grad(parameters[last])
+    field.assign(parameters)
+    value = look(field, world_points(1))
+    dr.backward(dr.sum(dr.sum(value)))
+    slope = np.array(dr.grad(parameters[last]))
+    assert np.isfinite(np.array(value)).all() and np.isfinite(slope).all()
+    assert np.all(np.array(value) > 0) and np.all(slope > 0)
+    # Linear where it is large, so that no step explodes.
+    assert np.all(slope < 3)
+
+
+def test_radiance_takes_albedo_as_a_constant():
+    field = radiance()
+    albedo = dr.full(mi.Color3f, 0.5, LANES)
+    dr.enable_grad(albedo)
+    randomised(field.network)
+    up = mi.Vector3f(0, 0, 1)
+    value = field.evaluate(world_points(), up, mi.Normal3f(up), albedo, mi.Bool(True))
+    dr.backward(dr.sum(dr.sum(value)))
+    assert np.all(np.array(dr.grad(albedo)) == 0)
+
+
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan, 3e38])
+@pytest.mark.parametrize("engine", ["tensor", "coopvec"])
+def test_a_lane_that_hit_nothing_poisons_nothing(bad, engine):
+    """Its position and direction are whatever they are; the parameters must not learn from it."""
+
+    def gradients(p, w, valid):
+        field, n = radiance(), dr.zeros(mi.Normal3f, dr.width(p))
+        parameters = randomised(field.network)
+        value = field.evaluate(p, w, n, mi.Color3f(0.5), valid, engine)
+        dr.backward(dr.sum(dr.sum(dr.square(value))))
+        return np.array(value), {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
+
+    good = world_points(32)
+    hit = dr.arange(mi.UInt32, 32) % 4 != 1
+    p = dr.select(hit, good, mi.Point3f(bad))
+    w = dr.select(hit, mi.Vector3f(0, 0, 1), mi.Vector3f(bad))
+    value, found = gradients(p, w, hit)
+    assert np.isfinite(value).all()
+    assert np.all(value[:, ~np.array(hit)] == 0)
+    _, clean = gradients(good, dr.select(hit, mi.Vector3f(0, 0, 1), 0), hit)
+    for name in found:
+        np.testing.assert_allclose(found[name], clean[name], rtol=1e-4, atol=1e-4, err_msg=name)
+
+
+# ----------------------------------------------------------------------------------- materials
+
+
+def materials():
+    fields = Materials(TINY, TINY, seed=1)
+    fields.domain = Domain((0.0, 0.0, 0.0), 2.0)
+    return fields
+
+
+def test_materials_stay_in_their_ranges():
+    fields = materials()
+    for network in fields.networks.values():
+        values = randomised(network)
+        values = {k: 20 * v for k, v in values.items()}
+        network.assign(values)
+    found = fields.evaluate(2 * points(2000) - 1, mi.Bool(True))
+    albedo, roughness = np.array(found.albedo), np.array(found.roughness)
+    assert np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1
+    assert roughness.min() >= ROUGHNESS_FLOOR - 1e-6 and roughness.max() <= 1
+    # Both ends are reached, or the test would show nothing.
+    assert albedo.min() < 0.01 and albedo.max() > 0.99
+    assert roughness.min() < 0.03 and roughness.max() > 0.99
+
+
+def test_untrained_materials_are_grey():
+    found = materials().evaluate(2 * points() - 1, mi.Bool(True))
+    np.testing.assert_allclose(np.array(found.albedo), 0.5, atol=0.05)
+
+
+def test_material_engines_agree():
+    fields = materials()
+    for i, network in enumerate(fields.networks.values()):
+        randomised(network, i)
+    a, b = (fields.evaluate(2 * points() - 1, mi.Bool(True), e) for e in ("tensor", "coopvec"))
+    np.testing.assert_allclose(np.array(a.albedo), np.array(b.albedo), atol=1e-5)
+    np.testing.assert_allclose(np.array(a.roughness), np.array(b.roughness), atol=1e-5)
+
+
+def test_parameters_go_out_and_come_back():
+    one, other = materials(), Materials(TINY, TINY, seed=9)
+    other.domain = one.domain
+    other.assign(one.parameters())
+    p = 2 * points() - 1
+    a, b = one.evaluate(p, mi.Bool(True)), other.evaluate(p, mi.Bool(True))
+    np.testing.assert_array_equal(np.array(a.albedo), np.array(b.albedo))
+    np.testing.assert_array_equal(np.array(a.roughness), np.array(b.roughness))
+
+
+# -------------------------------------------------------------------------------------- domain
+
+
+def test_domain_is_one_uniform_scale_about_the_centre():
+    box = mi.BoundingBox3f(mi.ScalarPoint3f(-1, 2, 0), mi.ScalarPoint3f(7, 4, 1))
+    domain = Domain.of(box)
+    assert domain.centre == (3.0, 3.0, 0.5)
+    np.testing.assert_allclose(domain.extent, 8 * 1.01)
+
+    def unit(*p):
+        return np.array(domain.to_unit(mi.Point3f(*p), mi.Bool(True))).ravel()
+
+    np.testing.assert_allclose(unit(3, 3, 0.5), 0.5)
+    # The longest side spans the cube; the same distance along any axis is the same step.
+    np.testing.assert_allclose(unit(-1, 3, 0.5)[0], 0.5 - 0.5 / 1.01, atol=1e-6)
+    steps = [unit(3 + (i == 0), 3 + (i == 1), 0.5 + (i == 2))[i] - 0.5 for i in range(3)]
+    np.testing.assert_allclose(steps, 1 / domain.extent, rtol=1e-5)
+    corners = [unit(*c) for c in ((-1, 2, 0), (7, 4, 1))]
+    assert np.min(corners) > 0 and np.max(corners) < 1
+
+
+def test_positions_outside_and_masked_lanes_stay_in_the_cube():
+    x = mi.Float([9.0, -9.0, np.inf, np.nan, 0.0])
+    p = mi.Point3f(x, x, x)
+    valid = mi.Bool([True, True, False, False, True])
+    unit = np.array(Domain((0.0, 0.0, 0.0), 2.0).to_unit(p, valid))
+    np.testing.assert_allclose(unit, [[1, 0, 0.5, 0.5, 0.5]] * 3)

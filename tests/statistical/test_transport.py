@@ -1,0 +1,156 @@
+"""The right-hand side with an exact cache, and the Neumann series, against Mitsuba's `path`."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import (
+    ConstantMaterials,
+    PathTracedRadiance,
+    assert_same_expectation,
+    built_in_cameras,
+    pixel_rays,
+    seeded,
+    stock_path,
+)
+
+from unbake.data import scene as scenes
+from unbake.data.camera import Camera
+from unbake.fields.texture import material_textures
+from unbake.transport.image import Needs, lhs, rhs, trace
+from unbake.transport.prior import first_residual, second_residual
+from unbake.transport.series import path_traced
+from unbake.transport.vertex import World
+
+# Deep enough that what is cut off is far below the noise; mirrors count for `path`, not for us.
+DEPTH, STOCK_DEPTH, SPP = 24, 64, 1024
+
+
+def compare(
+    ours: World,
+    stock: mi.Scene,
+    cameras: list[Camera],
+    *,
+    see_environment: bool = True,
+    spp: int = SPP,
+) -> None:
+    """All three ways to an image: E + T(L) and E + L with an exact L, and the series."""
+    ray = pixel_rays(cameras, spp, seed=1)
+    hide = not see_environment
+    truth = stock_path(stock, ray, 3, max_depth=STOCK_DEPTH, hide_emitters=hide)
+    # The series brings its own random numbers, from another seed.
+    cache = PathTracedRadiance(ours, 4, DEPTH)
+    needs = Needs(radiance=True, second_bounce=False)
+    sample = trace(ours, cache, ray, seeded(5, dr.width(ray)), needs, see_environment)
+    assert_same_expectation(rhs(sample, sample.L2), truth, spp)
+    assert_same_expectation(lhs(sample, sample.L1), truth, spp)
+    series = path_traced(
+        ours, ray, 6, max_depth=DEPTH, rr_depth=5, see_environment=see_environment
+    )
+    assert_same_expectation(series, truth, spp)
+
+
+def load(path) -> mi.Scene:
+    return mi.load_file(str(path))
+
+
+def test_cornell_in_principled_paint(built_in):
+    scene = load(built_in("cornell"))
+    compare(World.of(scene, None, 8), scene, built_in_cameras("cornell", 12))
+
+
+def test_cube_with_a_light_that_reflects(built_in):
+    scene = load(built_in("cube"))
+    compare(World.of(scene, None, 8), scene, built_in_cameras("cube", 12))
+
+
+@pytest.mark.slow
+def test_demo_with_textures_a_mirror_and_hidden_lamps(built_in):
+    scene = load(built_in("demo"))
+    compare(World.of(scene, None, 8), scene, built_in_cameras("demo", 16), spp=2048)
+
+
+def test_fields_in_the_place_of_materials(built_in):
+    """The values carried to the BSDFs give what the same constants in the scene file give."""
+    colour, roughness = (0.7, 0.4, 0.2), 0.3
+    materials = ConstantMaterials(mi.Color3f(*colour), roughness)
+    ours, stock = scenes.parse(built_in("cornell")), scenes.parse(built_in("cornell"))
+    scenes.set_textures(ours, *material_textures(materials))
+    paint = mi.load_dict({"type": "rgb", "value": list(colour)})
+    scenes.set_textures(stock, paint, roughness)
+    world = World.of(ours.instantiate(), materials, 8)
+    compare(world, stock.instantiate(), built_in_cameras("cornell", 12))
+
+
+def test_the_residuals_of_the_exact_radiance_vanish(built_in):
+    """Both of them, at the vertices that cameras see and one bounce further."""
+    world = World.of(load(built_in("cornell")), None, 8)
+    ray = pixel_rays(built_in_cameras("cornell", 8), 4 * SPP, seed=7)
+    cache = PathTracedRadiance(world, 8, DEPTH)
+    sample = trace(world, cache, ray, seeded(9, dr.width(ray)), Needs(True, True), True)
+    first = first_residual(sample, sample.L1, sample.L2)
+    assert_same_expectation(sample.L1, sample.L1 - first, 4 * SPP)
+    second = second_residual(sample, sample.L2, sample.L3)
+    assert_same_expectation(sample.L2, sample.L2 - second, 4 * SPP)
+
+
+# ---------------------------------------------------------------------------- other lights
+
+
+def still_life(**lights) -> mi.Scene:
+    """A glossy ball on a floor."""
+    to_world = mi.ScalarTransform4f
+    paint = {"type": "principled", "base_color": {"type": "rgb", "value": [0.6, 0.5, 0.3]}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": to_world().scale(2),
+                "bsdf": {"type": "twosided", "bsdf": paint | {"roughness": 0.6}},
+            },
+            "ball": {
+                "type": "sphere",
+                "center": [0, 0, 0.6],
+                "radius": 0.5,
+                "bsdf": paint | {"roughness": 0.25},
+            },
+            **lights,
+        }
+    )
+
+
+CAMERA = ((0.0, -3.0, 1.6), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), 60.0)
+
+
+def sky() -> dict:
+    """An environment map with a bright spot."""
+    v, u = np.mgrid[0:16, 0:32] / 16
+    texels = np.stack([0.3 + 0.2 * u, 0.4 + 0 * u, 0.8 - 0.3 * v], -1)
+    texels[3:5, 4:6] = 30.0
+    to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "to_world": to_world}
+
+
+@pytest.mark.parametrize(
+    ("lights", "see_environment"),
+    [
+        ({"sky": sky}, True),
+        ({"sky": sky}, False),
+        ({"even": lambda: {"type": "constant", "radiance": 0.7}}, True),
+        ({"even": lambda: {"type": "constant", "radiance": 0.7}}, False),
+        ({"point": lambda: {"type": "point", "position": [1, -1, 2.5], "intensity": 8.0}}, True),
+        (
+            {
+                "point": lambda: {"type": "point", "position": [1, -1, 2.5], "intensity": 8.0},
+                "sky": sky,
+            },
+            True,
+        ),
+    ],
+    ids=["sky", "hidden sky", "even sky", "hidden even sky", "point", "point and sky"],
+)
+def test_lights_far_away_and_without_extent(lights, see_environment):
+    scene = still_life(**{name: make() for name, make in lights.items()})
+    camera = Camera.look_at(*CAMERA, 12, 12)
+    compare(World.of(scene, None, 8), scene, [camera], see_environment=see_environment)

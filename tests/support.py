@@ -1,0 +1,167 @@
+"""What tests of several folders share: small scenes and rays, stand-ins for fields, a Z-test.
+
+Import it from test modules alone, which are read once the Mitsuba variant is set.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from statistics import NormalDist
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unbake.config import FitConfig, GridConfig, NetworkConfig
+from unbake.data import procedural
+from unbake.data.batches import CameraRays, PixelSource
+from unbake.data.camera import Camera
+from unbake.fields.materials import Material
+from unbake.transport.series import path_traced
+from unbake.transport.vertex import find_vertex
+
+#: The smallest network that still has a hash table and a hidden layer.
+TINY = NetworkConfig(
+    grid=GridConfig(levels=2, features=2, table_log2=8, base_resolution=2), width=8, hidden=1
+)
+#: A fit of a few dozen pixels with tiny networks.
+TINY_FIT = dataclasses.replace(
+    FitConfig(),
+    pixels=32,
+    spp=4,
+    **{
+        f.name: TINY
+        for f in dataclasses.fields(FitConfig)
+        if isinstance(getattr(FitConfig(), f.name), NetworkConfig)
+    },
+)
+
+
+# ------------------------------------------------------------------------------------ rays
+
+
+def built_in_cameras(name: str, size: int, views: int = 1) -> list[Camera]:
+    """Training cameras of a built-in scene, `size` pixels square."""
+    return [
+        Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], size, size)
+        for c in procedural.default_cameras(name, views, 0)
+    ]
+
+
+def pixel_rays(cameras: list[Camera], spp: int, seed: int) -> mi.Ray3f:
+    """Jittered rays through every pixel, `spp` consecutive lanes a pixel."""
+    rays = CameraRays.of(cameras)
+    sampler = seeded(seed, rays.pixels * spp)
+    ray = rays.through(dr.arange(mi.UInt32, rays.pixels * spp) // spp, sampler.next_2d())
+    dr.eval(ray)
+    return ray
+
+
+def seeded(seed: int, lanes: int) -> mi.Sampler:
+    """A sampler that is ready to draw from."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, lanes)
+    return sampler
+
+
+def grey_photographs(cameras: list[Camera], value: float = 0.3) -> PixelSource:
+    """Training pixels with a little texture, as a fit wants them."""
+    count = sum(c.width * c.height for c in cameras)
+    rgb = value * np.random.default_rng(7).uniform(0.5, 1.5, (count, 3))
+    return PixelSource.of(cameras, rgb, np.ones(count), foreground_only=False)
+
+
+# ------------------------------------------------------------------------- stand-ins for fields
+
+
+class ConstantMaterials:
+    """The same albedo and roughness everywhere, as parameters: a stand-in for `Materials`."""
+
+    carried = True
+
+    def __init__(self, albedo: float | mi.Color3f, roughness: float | mi.Float = 0.5) -> None:
+        self.albedo, self.roughness = mi.Color3f(albedo), mi.Float(roughness)
+
+    def evaluate(self, p: mi.Point3f, valid: mi.Bool, engine: str = "tensor") -> Material:
+        lanes = dr.zeros(mi.Float, dr.width(p))
+        return Material(self.albedo + lanes, self.roughness + lanes)
+
+
+class ConstantRadiance:
+    """A radiance field that is the same everywhere: a stand-in for `RadianceField`."""
+
+    def __init__(self, value: float) -> None:
+        self.value = mi.Color3f(value)
+
+    def evaluate(self, p, w, n, albedo, valid, engine="tensor") -> mi.Color3f:
+        return dr.select(valid, self.value, 0)
+
+
+class PathTracedRadiance:
+    """The exact radiance field, one path a lookup: a stand-in for `RadianceField`."""
+
+    def __init__(self, world, seed: int, max_depth: int) -> None:
+        self.world, self.seed, self.max_depth = world, seed, max_depth
+
+    def evaluate(self, p, w, n, albedo, valid, engine="tensor") -> mi.Color3f:
+        # Look at the point from very near, and take away the light that it emits itself.
+        with dr.suspend_grad():
+            ray = mi.Ray3f(dr.select(valid, p + 1e-4 * w, 1e6), -w)
+            dr.eval(ray)
+            self.seed += 1
+            sees = find_vertex(self.world, ray, valid, seeded(0, dr.width(p)))
+            total = path_traced(
+                self.world,
+                ray,
+                self.seed,
+                max_depth=self.max_depth,
+                rr_depth=5,
+                see_environment=False,
+            )
+            return dr.select(valid, total - sees.emitted, 0)
+
+
+# ------------------------------------------------------------------------------------ statistics
+
+
+def stock_path(
+    scene: mi.Scene, ray: mi.Ray3f, seed: int, *, max_depth: int, hide_emitters: bool = False
+) -> mi.Color3f:
+    """Radiance along rays by Mitsuba's own `path`, one sample a lane."""
+    integrator = mi.load_dict(
+        {"type": "path", "max_depth": max_depth, "rr_depth": 5, "hide_emitters": hide_emitters}
+    )
+    with dr.suspend_grad():
+        ray = mi.RayDifferential3f(ray)
+        radiance, _, _ = integrator.sample(scene, seeded(seed, dr.width(ray)), ray, None, True)
+        dr.eval(radiance)
+    return mi.Color3f(radiance)
+
+
+def assert_same_expectation(ours: mi.Color3f, theirs: mi.Color3f, spp: int) -> None:
+    """Paired Z-test of every pixel and channel, and of the image as a whole.
+
+    As Mitsuba tests its renders: significance 1 % with Šidák's correction, at least 99.75 % of the
+    pixels accepted. The mean of the image, far less noisy, must agree within 3.5 σ.
+
+    Args:
+        ours, theirs: samples of the same rays from other random numbers, `spp` consecutive lanes a
+            pixel. (Where rays differ inside pixels, most of the noise is theirs.)
+    """
+    a, b = (np.array(x).reshape(3, -1, spp).astype(np.float64) for x in (ours, theirs))
+    assert np.isfinite(a).all() and np.isfinite(b).all()
+    assert a.max() > 0, "a black image proves nothing"
+    difference = (a - b).mean(-1)
+    variance = (a - b).var(-1, ddof=1) / spp
+    # Pixels without noise, such as black ones, must agree to rounding.
+    z = difference / np.sqrt(variance + (1e-5 * (a.mean(-1) + 1e-3)) ** 2)
+    alpha = 1 - (1 - 0.01) ** (1 / z.size)
+    accepted = (np.abs(z) < NormalDist().inv_cdf(1 - alpha / 2)).mean()
+    whole = difference.sum(-1) / np.sqrt(variance.sum(-1) + 1e-12)
+    report = (
+        f"accepted {accepted:.4%}, largest |z| {np.abs(z).max():.2f}, z of the image {whole}, "
+        f"means {a.mean((1, 2))} and {b.mean((1, 2))}, rms z {np.sqrt((z**2).mean()):.3f}"
+    )
+    print(report)
+    assert accepted >= 0.9975, report
+    assert np.abs(whole).max() < 3.5, report

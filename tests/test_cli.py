@@ -1,0 +1,260 @@
+"""The command line, the whole way, as a user walks it."""
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unbake import cli
+from unbake.config import preset, read_toml
+from unbake.imaging.pictures import read_exr
+
+SOURCE = str(Path(cli.__file__).parents[1])
+COMMANDS = ("capture", "fit", "evaluate", "report", "bench", "doctor")
+PSNRS = ("render_psnr", "albedo_psnr", "roughness_psnr")
+
+
+@pytest.fixture
+def walked(unbake, tiny, tmp_path, monkeypatch) -> dict:
+    """Outcomes of capture, fit, evaluate and report in an empty folder, by command."""
+    monkeypatch.chdir(tmp_path)
+    sizes = ("--views", 2, "--held-out", 1, "--resolution", 16, "--spp", 8, "--max-depth", 6)
+    return {
+        "capture": unbake("capture", "cornell", "--out", "data", *sizes),
+        "fit": unbake("fit", "data", "--out", "run", "--settings", tiny, "--seed", 3),
+        "evaluate": unbake("evaluate", "run", "--spp", 4, "--max-depth", 4, "--train-views", 1),
+        "report": unbake("report", "run", "--out", "page/report.html"),
+    }
+
+
+def test_from_a_scene_to_a_page(walked, tmp_path):
+    for command, outcome in walked.items():
+        assert outcome.status == 0, (command, outcome)
+        assert outcome.err == ""
+    assert "next: unbake fit data --out RUN" in walked["capture"].out
+    assert "next: unbake evaluate run" in walked["fit"].out
+    assert "next: unbake report run --out report.html" in walked["evaluate"].out
+    assert not list(tmp_path.rglob("*.partial")) and not list(tmp_path.rglob("*.tmp"))
+    check_data(tmp_path / "data")
+    check_run(tmp_path / "run")
+    check_metrics(tmp_path / "run" / "evaluation")
+    check_page(tmp_path / "page" / "report.html")
+
+
+def check_data(data: Path) -> None:
+    names = ["heldout_000", "train_000", "train_001"]
+    for folder in ("images", "truth/albedo", "truth/roughness"):
+        assert sorted(p.stem for p in (data / folder).iterdir()) == names
+        for path in (data / folder).iterdir():
+            pixels = read_exr(path)
+            assert pixels.shape == (16, 16, 4) and np.isfinite(pixels).all() and pixels.min() >= 0
+    content = json.loads((data / "transforms.json").read_text())
+    assert content["scene"] == "scene/scene.xml" and (data / content["scene"]).is_file()
+    assert content["background"] == "visible" and 0 < content["coverage"] <= 1
+    render = {"spp": 8, "max_depth": 6, "integrator": "path", "seed": 0}
+    assert render.items() <= content["render"].items()
+    assert {"mitsuba", "variant", "rr_depth"} <= content["render"].keys()
+    keys = {"file_path", "split", "w", "h", "fl_x", "fl_y", "cx", "cy", "transform_matrix"}
+    assert all(frame.keys() == keys for frame in content["frames"])
+
+
+def check_run(run: Path) -> None:
+    entries = {"config.toml", "origin.json", "log.jsonl", "checkpoints", "previews", "evaluation"}
+    assert {p.name for p in run.iterdir()} == entries
+    config = read_toml(run / "config.toml")
+    assert (config.steps, config.seed, config.method, config.albedo.width) == (30, 3, "ours", 8)
+    assert [p.name for p in (run / "checkpoints").iterdir()] == ["step-0000030.safetensors"]
+    assert [p.name for p in (run / "previews").iterdir()] == ["step-000030.png"]
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    steps = [line for line in lines if "validation" not in line]
+    assert [line["step"] for line in steps] == [20, 30]
+    terms = {"photometric", "prior", "lhs", "samples_per_second", "memory_mb", "learning_rate"}
+    for line in steps:
+        assert terms <= line.keys() and all(math.isfinite(line[key]) for key in terms)
+        assert line["samples"] == 256 * line["step"] and line["skipped"] == 0
+    (last,) = [line for line in lines if "validation" in line]
+    assert last["step"] == 30 and last["validation"]["split"] == "heldout"
+    assert all(math.isfinite(last["validation"][key]) for key in PSNRS[1:])
+
+
+def check_metrics(folder: Path) -> None:
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["method"] == "ours" and metrics["steps"] == 30
+    assert metrics["samples"] == 30 * 256 and metrics["seconds"] > 0
+    for split in ("heldout", "train"):
+        assert metrics[split]["views"] == 1
+        assert all(math.isfinite(metrics[split][key]) for key in PSNRS)
+    assert [row["name"] for row in metrics["per_view"]] == ["heldout_000", "train_000"]
+    assert metrics["render"] == {"spp": 4, "max_depth": 4}
+    assert {"psnr", "colour_space", "mask"} <= metrics["definitions"].keys()
+    assert Path(metrics["data"]).is_dir()
+    for row in metrics["per_view"]:
+        for kind in ("render", "albedo", "roughness"):
+            path = folder / row["split"] / f"{row['name']}_{kind}.exr"
+            assert np.isfinite(read_exr(path)).all() and path.with_suffix(".png").is_file()
+
+
+class Links(HTMLParser):
+    """Everything a page would load."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.found += [v for k, v in attributes if k in ("src", "href", "srcset", "data")]
+
+
+def check_page(page: Path) -> None:
+    text = page.read_text()
+    links = Links(text).found
+    assert links and all(link.startswith(("data:", "#")) for link in links)
+    assert "url(" not in text.replace("url(data:", "") and "@import" not in text
+    for word in ("run", "heldout_000", "train_000", "Photometric loss", "Albedo PSNR"):
+        assert word in text
+
+
+def test_the_installed_command_runs(tmp_path):
+    script = Path(sys.executable).with_name("unbake")
+    start = [script] if script.is_file() else [sys.executable, "-m", "unbake"]
+    done = subprocess.run(
+        [*start, "capture", "cube", "--out", "data", "--views", "1", "--held-out", "0",
+         "--resolution", "4", "--spp", "1"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": SOURCE}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stderr == "", done
+    assert (tmp_path / "data" / "images" / "train_000.exr").is_file()
+
+
+def test_python_m_unbake_without_a_command_tells_which_there_are(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "unbake"],
+        env=os.environ | {"PYTHONPATH": SOURCE}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stdout == ""
+    assert all(command in done.stderr for command in COMMANDS)
+    assert "Traceback" not in done.stderr
+
+
+def test_the_help_leads_from_nothing_to_a_result(unbake):
+    outcome = unbake("--help")
+    assert outcome.status == 0
+    text = " ".join(outcome.out.split())
+    for step in ("unbake capture demo --out DATA", "unbake fit DATA --out RUN",
+                 "unbake evaluate RUN", "unbake report RUN --out report.html"):  # fmt: skip
+        assert step in text
+    assert all(command in text for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_is_explained(command, unbake):
+    outcome = unbake(command, "--help")
+    assert outcome.status == 0
+    assert "None" not in outcome.out and "STR" not in outcome.out
+    text = re.sub(r"[│\s]+", " ", outcome.out)
+    options = re.findall(r"(--[a-z-]+)(?: [A-Z]+| \{[^}]*\})? (\S+ \S+)", text)
+    for option, explained in options:
+        assert re.match(r"[A-Za-z]", explained), option
+
+
+def test_the_help_of_fit_tells_what_the_presets_say(unbake):
+    text = re.sub(r"[│\s]+", " ", unbake("fit", "--help").out)
+    cpu, paper, release = preset("cpu"), preset("paper"), preset("release")
+    for key in ("steps", "pixels", "spp"):
+        assert getattr(paper, key) == getattr(release, key)
+        assert f"cpu: {getattr(cpu, key)}, paper and release: {getattr(paper, key)}" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--steps", "-3"), "--steps: must be 1 or more, not -3"),
+        (("--steps", "0"), "--steps: must be 1 or more"),
+        (("--seconds", "-1"), "--seconds: must be 0 or more"),
+        (("--seconds", "nan"), "--seconds: must be a finite number"),
+        (("--seconds", "inf"), "--seconds: must be a finite number"),
+        (("--spp", "3"), "--spp: must be an even number, 2 or more, not 3"),
+        (("--spp", "0"), "--spp: must be an even number"),
+        (("--batch", "0"), "--batch: must be 1 or more, not 0"),
+        (("--seed", "-1"), "--seed: must be 0 or more"),
+        (("--steps", "3", "--seconds", "4"), "--steps: cannot be given together with --seconds"),
+        (("--preset", "cpu", "--settings", "a.toml"), "--preset: cannot be given together"),
+        (("--settings", "none.toml"), "none.toml: cannot be read"),
+    ],
+)
+def test_a_wrong_option_of_fit_is_named(words, message, unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = unbake("fit", "data", "--out", "run", *words)
+    assert outcome.status == 2 and outcome.err.startswith(f"error: {message}")
+    assert outcome.err.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [
+        ("capture", "--views", 0),
+        ("capture", "--held-out", -1),
+        ("capture", "--resolution", 1),
+        ("capture", "--spp", 0),
+        ("capture", "--max-depth", 0),
+        ("capture", "--seed", -1),
+        ("evaluate", "--spp", 0),
+        ("evaluate", "--max-depth", -1),
+        ("evaluate", "--train-views", -1),
+        ("bench", "--steps", 1),
+    ],
+)
+def test_a_wrong_number_is_named(command, option, value, unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    place = {"capture": ("demo", "--out", "data"), "evaluate": ("run",), "bench": ()}[command]
+    outcome = unbake(command, *place, option, value)
+    assert outcome.status == 2 and outcome.err.startswith(f"error: {option}: must be")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("word", ["--stepz", "--method=best", "--preset=fast", "--steps=many"])
+def test_an_unknown_word_is_no_traceback(word, unbake, tmp_path):
+    outcome = unbake("fit", "data", "--out", tmp_path / "run", word)
+    assert outcome.status == 2 and "Traceback" not in outcome.err
+    assert word.split("=")[0] in outcome.err and not (tmp_path / "run").exists()
+
+
+def test_a_disk_error_is_one_line(unbake, tmp_path, monkeypatch):
+    def full(*words, **named):
+        raise OSError(28, "No space left on device", "data/images/train_000.exr")
+
+    monkeypatch.setattr("unbake.data.capture.capture", full)
+    outcome = unbake("capture", "demo", "--out", tmp_path / "data")
+    assert outcome.status == 2
+    assert outcome.err == "error: data/images/train_000.exr: No space left on device\n"
+
+
+def test_ctrl_c_while_nothing_is_written_yet(unbake, tmp_path, monkeypatch):
+    def interrupted(*words, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("unbake.data.capture.capture", interrupted)
+    outcome = unbake("capture", "demo", "--out", tmp_path / "data")
+    assert (outcome.status, outcome.err) == (130, "interrupted\n")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux alone pins processes")
+def test_one_core_is_enough(tmp_path):
+    """Mitsuba's OpenEXR used to wait forever for a second thread."""
+    cores = f"import os; os.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})"
+    words = ["unbake", "capture", "cube", "--out", "data", "--views", "1", "--held-out", "0",
+             "--resolution", "4", "--spp", "1"]  # fmt: skip
+    call = f"{cores}; import sys; sys.argv = {words}; from unbake.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", call], cwd=tmp_path, timeout=100,
+        env=os.environ | {"PYTHONPATH": SOURCE}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done

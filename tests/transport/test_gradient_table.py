@@ -1,0 +1,180 @@
+"""Who is trained by what, cell by cell: a gradient is exactly zero or it is there (Sec. 4.1)."""
+
+import itertools
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import TINY_FIT, built_in_cameras, pixel_rays, seeded
+
+from unbake.fit.problem import make_problem
+from unbake.transport.image import Needs, trace
+from unbake.transport.objective import (
+    EXTRA,
+    LHS,
+    METHODS,
+    PHOTOMETRIC,
+    PRIOR,
+    Live,
+    RelativeL2,
+    needs,
+    objective,
+)
+
+SPP = 4
+#: Term → flag of `Live` → the piece of a path sample that it makes live.
+EDGES = {
+    PHOTOMETRIC: {"materials": "bounce1", "rhs": "L2"},
+    PRIOR: {"materials": "bounce1", "lhs": "L1", "rhs": "L2"},
+    EXTRA: {"lhs": "L2"},
+    LHS: {"lhs": "L1"},
+}
+PIECES = ("bounce1", "L1", "L2")
+FLAGS = ("materials", "lhs", "rhs")
+SYNTHETIC = [
+    pytest.param(term, Live(**dict(zip(EDGES[term], on, strict=True))), id=f"{term}-{on}")
+    for term in EDGES
+    for on in itertools.product([False, True], repeat=len(EDGES[term]))
+]
+LOSSES = {name: RelativeL2(0.01, name) for name in ("photograph", "radiance")}
+
+
+@pytest.fixture(scope="module")
+def problem(built_in):
+    return make_problem(built_in("cornell"), "visible", TINY_FIT, 0.2)
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return pixel_rays(built_in_cameras("cornell", 6), SPP, seed=1)
+
+
+def traced(problem, rays, wanted=None):
+    wanted = wanted or Needs(radiance=True, second_bounce=True)
+    sampler = seeded(2, dr.width(rays))
+    radiance = problem.radiance if wanted.radiance else None
+    return trace(problem.world, radiance, rays, sampler, wanted, problem.see_environment)
+
+
+def photographs(rays):
+    return mi.Color3f(0.1 + 0.3 * dr.arange(mi.Float, dr.width(rays) // SPP) / 36)
+
+
+def non_zero(arrays):
+    """Of each array, whether any entry of its gradient is other than zero."""
+    gradients = [np.array(dr.grad(a)).ravel() for a in arrays]
+    assert all(np.isfinite(g).all() for g in gradients)
+    return [bool((g != 0).any()) for g in gradients]
+
+
+# ------------------------------------------------- pieces of a path sample, for rows yet to come
+
+
+def with_live_pieces(sample):
+    """A path sample whose pieces up to L(x₂) take gradients, and the arrays of each piece."""
+    sample = dr.detach(sample)
+    step = replace(sample.bounce1)
+    step.direct, step.weight = mi.Color3f(step.direct), mi.Color3f(step.weight)
+    sample = replace(sample, bounce1=step, L1=mi.Color3f(sample.L1), L2=mi.Color3f(sample.L2))
+    arrays = {"bounce1": [step.direct, step.weight], "L1": [sample.L1], "L2": [sample.L2]}
+    dr.enable_grad(arrays)
+    return sample, arrays
+
+
+def enable_gradients(problem):
+    """Make all parameters of both fields take gradients, from zero; φ and θ by name."""
+    φ, θ = problem.materials.parameters(), problem.radiance.parameters()
+    for parameters in (φ, θ):
+        dr.disable_grad(parameters)
+        dr.enable_grad(parameters)
+    problem.materials.assign(φ)
+    problem.radiance.assign(θ)
+    return φ, θ
+
+
+def test_nothing_beyond_the_second_vertex_passes_gradients(problem, rays):
+    enable_gradients(problem)
+    sample = traced(problem, rays)
+    for live in (sample.bounce1.direct, sample.bounce1.weight, sample.L1, sample.L2):
+        assert dr.grad_enabled(live)
+    for fixed in (sample.bounce2.direct, sample.bounce2.weight, sample.L3, sample.x1.albedo):
+        assert not dr.grad_enabled(fixed)
+
+
+@pytest.mark.parametrize("reference", LOSSES)
+@pytest.mark.parametrize(("term", "live"), SYNTHETIC)
+def test_a_row_makes_those_pieces_live_that_it_says(problem, rays, term, live, reference):
+    sample, arrays = with_live_pieces(traced(problem, rays))
+    values = objective({term: live}, sample, photographs(rays), SPP, LOSSES[reference])
+    assert list(values) == [term]
+    if dr.grad_enabled(values[term]):
+        dr.backward(values[term])
+    wanted = {piece for flag, piece in EDGES[term].items() if getattr(live, flag)}
+    for piece in PIECES:
+        assert non_zero(arrays[piece]) == [piece in wanted] * len(arrays[piece]), piece
+
+
+def test_live_edges_add_up(problem, rays):
+    """A term's gradient is the sum of those through each of its live edges."""
+
+    def gradients(live):
+        sample, arrays = with_live_pieces(traced(problem, rays))
+        dr.backward(
+            objective({PRIOR: live}, sample, photographs(rays), SPP, LOSSES["radiance"])[PRIOR]
+        )
+        return np.concatenate([np.ravel(dr.grad(a)) for p in PIECES for a in arrays[p]])
+
+    parts = [gradients(Live(**{flag: True})) for flag in FLAGS]
+    np.testing.assert_array_equal(sum(parts), gradients(Live(True, True, True)))
+
+
+# ------------------------------------------------------ parameters of the fields, for each method
+
+
+@pytest.mark.parametrize(
+    ("method", "term"), [(m, t) for m, row in METHODS.items() for t in row]
+)
+@pytest.mark.parametrize("reference", LOSSES)
+@pytest.mark.parametrize("two_pass", [False, True], ids=["split-halves", "two-pass"])
+def test_a_term_of_a_method_trains_what_the_table_says(
+    problem, rays, method, term, reference, two_pass
+):
+    row = METHODS[method]
+    φ, θ = enable_gradients(problem)
+    target = photographs(rays)
+    sample = traced(problem, rays, needs(row))
+    primal = target + 0.1 if two_pass else None
+    value = objective(row, sample, target, SPP, LOSSES[reference], primal)[term]
+    dr.backward(value)
+
+    live = [flag for flag in EDGES[term] if getattr(row[term], flag)]
+    trains_φ, trains_θ = "materials" in live, bool({"lhs", "rhs"} & set(live))
+    assert trains_φ or trains_θ, "a term that trains nothing has no place in the table"
+    assert non_zero(φ.values()) == [trains_φ] * len(φ)
+    assert non_zero(θ.values()) == [trains_θ] * len(θ)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_flags_without_an_edge_are_not_set(method):
+    """A row must not promise what the objective does not do."""
+    for term, live in METHODS[method].items():
+        for flag in set(FLAGS) - set(EDGES[term]):
+            assert not getattr(live, flag), f"{method}, {term}: {flag} has no effect"
+
+
+@pytest.mark.parametrize("method", ["ours", "one-bounce"])
+def test_the_paper_trains_materials_by_photographs_and_radiance_by_all_else(method):
+    """Sec. 4.1: the photometric loss trains φ alone, prior and LHS loss θ alone."""
+    row = METHODS[method]
+    assert row[PHOTOMETRIC] == Live(materials=True)
+    others = set(row) - {PHOTOMETRIC}
+    assert {PRIOR, LHS} <= others
+    assert all(row[term] == Live(lhs=True) for term in others)
+
+
+@pytest.mark.parametrize("row", [{PRIOR: Live(lhs=True)}, {EXTRA: Live(lhs=True)}])
+def test_a_row_of_a_single_residual_asks_for_the_radiance_field(row):
+    assert needs(row).radiance
+    assert needs(row).second_bounce == (EXTRA in row)
