@@ -142,4 +142,3 @@ def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, paramete
     np.testing.assert_allclose(moved(0), total(image), rtol=1e-5)
     assert abs(difference) > 1e-3, "a gradient of zero proves nothing"
     np.testing.assert_allclose(gradient, difference, rtol=1e-3)
-

@@ -158,9 +158,7 @@ def mirrors() -> mi.Scene:
             "type": "scene",
             "left": pane(mirror, (-0.5, 0, 0), (1, 0, 0), size=9.7),
             "right": pane(mirror, (0.5, 0, 0), (-1, 0, 0), size=9.7),
-            "lid": pane(
-                grey(0.0), (0, 0, 10), (0, 0, 0), (0, 1, 0), 5, emitter={"type": "area"}
-            ),
+            "lid": pane(grey(0.0), (0, 0, 10), (0, 0, 0), (0, 1, 0), 5, emitter={"type": "area"}),
         }
     )
 

@@ -44,9 +44,7 @@ def compare(
     sample = trace(ours, cache, ray, seeded(5, dr.width(ray)), needs, see_environment)
     assert_same_expectation(rhs(sample, sample.L2), truth, spp)
     assert_same_expectation(lhs(sample, sample.L1), truth, spp)
-    series = path_traced(
-        ours, ray, 6, max_depth=DEPTH, rr_depth=5, see_environment=see_environment
-    )
+    series = path_traced(ours, ray, 6, max_depth=DEPTH, rr_depth=5, see_environment=see_environment)
     assert_same_expectation(series, truth, spp)
 
 

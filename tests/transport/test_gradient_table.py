@@ -133,9 +133,7 @@ def test_live_edges_add_up(problem, rays):
 # ------------------------------------------------------ parameters of the fields, for each method
 
 
-@pytest.mark.parametrize(
-    ("method", "term"), [(m, t) for m, row in METHODS.items() for t in row]
-)
+@pytest.mark.parametrize(("method", "term"), [(m, t) for m, row in METHODS.items() for t in row])
 @pytest.mark.parametrize("reference", LOSSES)
 @pytest.mark.parametrize("two_pass", [False, True], ids=["split-halves", "two-pass"])
 def test_a_term_of_a_method_trains_what_the_table_says(
