@@ -24,7 +24,7 @@ else:
     import tomli as tomllib
 
 Estimator = Literal["split-halves", "two-pass"]
-Reference = Literal["radiance", "photograph"]
+Reference = Literal["smoothed", "photograph"]
 MethodName = Literal["ours", "one-bounce", "direct"]
 PresetName = Literal["cpu", "paper", "release"]
 
@@ -85,7 +85,7 @@ class FitConfig:
 
     steps: int = 2000  #: training steps (Table 1)
     seconds: float = 0.0  #: stop after this much training time instead (0: count steps)
-    pixels: int = 1024  #: batch size in pixels (Table 1)
+    pixels: int = 2048  #: batch size in pixels (Table 1)
     spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
 
     learning_rate: float = 5e-3  #: Adam, materials (Sec. 5.4: 5e-4)
@@ -93,11 +93,11 @@ class FitConfig:
     final_learning_rate: float = 0.02  #: factor reached at the end, exponentially (1: constant)
     warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
     estimator: Estimator = "split-halves"  #: unbiased squared error (Sec. 5.2)
-    loss_reference: Reference = "radiance"  #: what errors are relative to (Sec. 5.4: photograph)
-    loss_epsilon: float = 0.01  #: added to the denominator of the relative L2 loss (Sec. 5.4)
+    loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)
+    loss_epsilon: float = 0.001  #: added to the denominator of the relative L2 loss (release: 0.01)
 
     albedo: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(7), hidden=1))
-    roughness: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(5), 16, 1))
+    roughness: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(4), 16, 1))
     radiance: NetworkConfig = field(default_factory=NetworkConfig)
     transport: TransportConfig = field(default_factory=TransportConfig)
 
@@ -142,6 +142,7 @@ def _paper() -> FitConfig:
         warm_up=0,
         estimator="two-pass",
         loss_reference="photograph",
+        loss_epsilon=0.01,
         albedo=NetworkConfig(grid=grid, width=256, hidden=1),
         roughness=NetworkConfig(grid=grid, width=256, hidden=1),
         radiance=NetworkConfig(grid=grid, width=256, hidden=3),

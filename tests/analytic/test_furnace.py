@@ -40,7 +40,7 @@ def train(world, field, terms, steps, rate, final_rate):
     """Minimise the residual, and nothing else, over what the training cameras see."""
     rays = CameraRays.of(built_in_cameras("furnace", 16, views=8))
     adam = mi.ad.Adam(rate, field.parameters(), mask_updates=True)
-    black, loss = dr.zeros(mi.Color3f, LANES // 2), RelativeL2(0.01, "radiance")
+    black, loss = dr.zeros(mi.Color3f, LANES // 2), RelativeL2(0.01)
 
     def step(scene, sampler, rays, adam, black, seed):
         field.assign(dict(adam.items()))

@@ -75,6 +75,7 @@ class Batch:
     """Pixels and the camera rays of their samples."""
 
     target: mi.Color3f  # photographs, linear RGB, one lane a pixel
+    smoothed: mi.Color3f  # the same from photographs blurred over 5 x 5 pixels
     ray: mi.Ray3f  # `spp` consecutive lanes a pixel, world space
 
 
@@ -88,6 +89,7 @@ class PixelSource:
 
     rays: CameraRays
     _rgb: mi.Float  # linear RGB of all pixels
+    _smoothed: mi.Float  # the same, blurred
     _chosen: mi.UInt32  # numbers of the pixels that batches are drawn from
     _count: mi.UInt32  # of the chosen pixels, one lane
 
@@ -112,6 +114,7 @@ class PixelSource:
         return PixelSource(
             rays=CameraRays.of(cameras),
             _rgb=from_numpy(mi.Float, rgb),
+            _smoothed=from_numpy(mi.Float, _blurred(cameras, rgb)),
             _chosen=from_numpy(mi.UInt32, chosen),
             _count=dr.opaque(mi.UInt32, len(chosen)),
         )
@@ -127,10 +130,24 @@ class PixelSource:
         pixel = self._pixel(slot, seed)
         every_sample = self._pixel(dr.arange(mi.UInt32, pixels * spp) // spp, seed)
         ray = self.rays.through(every_sample, sampler.next_2d())
-        return Batch(dr.gather(mi.Color3f, self._rgb, pixel), ray)
+        target = dr.gather(mi.Color3f, self._rgb, pixel)
+        return Batch(target, dr.gather(mi.Color3f, self._smoothed, pixel), ray)
 
     def _pixel(self, slot: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
         # 32 random bits times the count, upper half: uniform even over hundreds of millions.
         # Of neighbouring slots, the usual 4 rounds draw some pixels far more often than others.
         bits, _ = mi.sample_tea_32(slot, seed, rounds=8)
         return dr.gather(mi.UInt32, self._chosen, dr.mul_hi(bits, self._count))
+
+
+def _blurred(cameras: Sequence[Camera], rgb: np.ndarray, radius: int = 2) -> np.ndarray:
+    """Each view's image, every pixel the mean of the (2 radius + 1)² pixels around it."""
+    parts, first = [], 0
+    for camera in cameras:
+        count = camera.width * camera.height
+        image = rgb[first : first + count].reshape(camera.height, camera.width, 3)
+        first += count
+        padded = np.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * radius + 1,) * 2, (0, 1))
+        parts.append(windows.mean((-2, -1), dtype=np.float32).reshape(count, 3))
+    return np.concatenate(parts)

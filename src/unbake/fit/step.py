@@ -82,7 +82,6 @@ class TrainingStep:
         self._pixels = pixels
         self._config = config
         self._terms: Mapping[str, Live] = METHODS[config.method]
-        self._loss = RelativeL2(config.loss_epsilon, config.loss_reference)
         self._sampler = mi.load_dict({"type": "independent"})
         self._frozen = dr.freeze(self._step)
 
@@ -129,11 +128,13 @@ class TrainingStep:
                 again = pixels.draw(seed, sampler, config.pixels, config.spp)
                 primal = self._image(self._trace(scene, again.ray, sampler))
         sample = self._trace(scene, batch.ray, sampler)
-        terms = objective(self._terms, sample, batch.target, config.spp, self._loss, primal)
-        loss = sum(terms.values())
-        dr.backward(loss)
+        smoothed = config.loss_reference == "smoothed"
+        loss = RelativeL2(config.loss_epsilon, batch.smoothed if smoothed else None)
+        terms = objective(self._terms, sample, batch.target, config.spp, loss, primal)
+        total = sum(terms.values())
+        dr.backward(total)
 
-        finite = dr.isfinite(loss)
+        finite = dr.isfinite(total)
         for _, optimizer in state.optimizers():
             _drop_broken_gradients(optimizer)
             optimizer.step(active=finite, eval=False)

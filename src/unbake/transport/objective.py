@@ -50,21 +50,23 @@ class RelativeL2:
 
     The paper divides by the photograph. A photograph that is too dark by chance then weighs more
     than one that is too bright, and the optimum is darker than the scene: with noisy photographs a
-    few percent, which is as much as roughness does. The radiance field's picture of the same pixels
-    has no such noise.
+    few percent, which is as much as roughness does. A smoothed photograph has next to no such
+    noise. (The radiance field's own picture would have none, but its samples are the error's.)
+
+    Args:
+        epsilon: added to the squared reference.
+        reference: linear RGB, one lane a pixel; None: the photograph itself.
 
     Paper: Sec. 5.4.
     """
 
     epsilon: float
-    reference: str  #: "photograph" or "radiance", the field's own picture where there is a field
+    reference: mi.Color3f | None = None
 
-    def weight(self, sample: PathSample, target: mi.Color3f, spp: int) -> mi.Color3f:
-        """1 / (reference² + ε) of each pixel, without gradient."""
-        reference = target
-        if self.reference == "radiance" and sample.L1 is not None:
-            reference = pixel_means(dr.detach(lhs(sample, sample.L1)), spp)
-        return dr.detach(dr.rcp(dr.square(reference) + self.epsilon))
+    def weight(self, target: mi.Color3f) -> mi.Color3f:
+        """1 / (reference² + ε) of each pixel."""
+        reference = target if self.reference is None else self.reference
+        return dr.rcp(dr.square(reference) + self.epsilon)
 
 
 def needs(terms: Mapping[str, Live]) -> Needs:
@@ -96,7 +98,7 @@ def objective(
     values: dict[str, mi.Float] = {}
     # Without a radiance field no light arrives from x₂.
     L1, L2 = (mi.Color3f(0) if L is None else L for L in (sample.L1, sample.L2))
-    weight = loss.weight(sample, target, spp)
+    weight = loss.weight(target)
     for term, live in terms.items():
         seen = L1 if live.lhs else dr.detach(L1)
         incoming = L2 if live.rhs else dr.detach(L2)
