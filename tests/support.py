@@ -82,6 +82,9 @@ class ConstantMaterials:
     def __init__(self, albedo: float | mi.Color3f, roughness: float | mi.Float = 0.5) -> None:
         self.albedo, self.roughness = mi.Color3f(albedo), mi.Float(roughness)
 
+    def albedo_at(self, p: mi.Point3f, valid: mi.Bool) -> mi.Color3f:
+        return self.evaluate(p, valid).albedo
+
     def evaluate(self, p: mi.Point3f, valid: mi.Bool, engine: str = "tensor") -> Material:
         lanes = dr.zeros(mi.Float, dr.width(p))
         return Material(self.albedo + lanes, self.roughness + lanes)

@@ -62,6 +62,11 @@ class Materials:
             network.pack()
         self.carried = False
 
+    def albedo_at(self, p: mi.Point3f, valid: mi.Bool) -> mi.Color3f:
+        """The albedo alone, where no BSDF will be asked."""
+        raw = self.networks["albedo"](self.domain.to_unit(p, valid), [])
+        return mi.Color3f([_sigmoid(x) for x in raw])
+
     def evaluate(self, p: mi.Point3f, valid: mi.Bool, engine: Engine = "tensor") -> Material:
         """The materials at world positions `p`; see `Network.__call__` for the engines."""
         unit = self.domain.to_unit(p, valid)

@@ -13,6 +13,9 @@ from .network import Engine, Network
 class RadianceField:
     """Reflected radiance as a function of position, direction, normal and albedo.
 
+    L_θ = s · (3/2 · albedo · a + 1/4 · b) with two network outputs a and b: what a surface reflects
+    diffusely has its texture, which need not be learned a second time.
+
     Emission is not part of it: the rendering equation's E is known and added analytically.
 
     Args:
@@ -66,4 +69,6 @@ class RadianceField:
 
 def _squareplus(x: mi.Float) -> mi.Float:
     """(x + √(x² + 4)) / 2: positive, 1 at zero, linear above, with a live gradient everywhere."""
-    return 0.5 * (x + dr.sqrt(dr.fma(x, x, 4)))
+    root = dr.sqrt(dr.fma(x, x, 4))
+    # The same below zero, without the cancellation of two large numbers.
+    return dr.select(x > 0, 0.5 * (x + root), 2 * dr.rcp(root - dr.minimum(x, 0)))

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..fields.radiance import RadianceField
-from .operator import Bounce, attach_material, bounce, transported
+from .operator import Bounce, attach_albedo, attach_material, bounce, transported
 from .vertex import Vertex, World, find_vertex
 
 
@@ -70,7 +70,7 @@ def trace(
         bounce2 = L3 = None
         if needs.second_bounce:
             bounce2 = bounce(world, x2, sampler)
-            bounce2.next = attach_material(world, bounce2.next)
+            bounce2.next = attach_albedo(world, bounce2.next)
             (L3,) = reflected_radiance(radiance, bounce2.next)
     L1, L2 = reflected_radiance(radiance, x1, x2)
     return PathSample(x1, bounce1, bounce2, L1, L2, L3)

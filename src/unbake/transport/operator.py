@@ -29,14 +29,22 @@ def attach_material(world: World, vertex: Vertex, engine: str = "tensor") -> Ver
     Gradients arrive in φ wherever the BSDF is evaluated afterwards. Without fields the scene's own
     textures stay in charge and only the albedo is looked up.
     """
-    si = vertex.si
     if world.materials is None:
-        albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(si, vertex.valid))
-        return replace(vertex, albedo=dr.detach(albedo))
+        return attach_albedo(world, vertex)
+    si = vertex.si
     material = world.materials.evaluate(si.p, vertex.valid, engine)
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
     return replace(vertex, si=si, albedo=dr.detach(material.albedo))
+
+
+def attach_albedo(world: World, vertex: Vertex) -> Vertex:
+    """Look up the albedo alone, where light goes no further and only L_θ wants to know it."""
+    if world.materials is None:
+        albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
+    else:
+        albedo = world.materials.albedo_at(vertex.si.p, vertex.valid)
+    return replace(vertex, albedo=dr.detach(albedo))
 
 
 def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
