@@ -2,7 +2,7 @@
 
     python scripts/gallery.py --view heldout_000 --out docs/demo.png RUN [RUN ...]
 
-Columns: rendering (or photograph), albedo, roughness. Rows: the truth, then the runs in the order given.
+Columns: rendering (or photograph), albedo, roughness. Rows: the truth, then the runs in order.
 """
 
 import argparse
@@ -38,7 +38,8 @@ def main() -> None:
     data = Path(json.loads((args.runs[0] / "evaluation" / "metrics.json").read_text())["data"])
     name = f"{args.view}.exr"
     truth = data / "truth"
-    rows = [row(data / "images" / name, truth / "albedo" / name, truth / "roughness" / name, args.zoom)]
+    files = [data / "images" / name, truth / "albedo" / name, truth / "roughness" / name]
+    rows = [row(*files, args.zoom)]
     for run in args.runs:
         folder = run / "evaluation" / split
         files = [folder / f"{args.view}_{kind}.exr" for kind in ("render", "albedo", "roughness")]

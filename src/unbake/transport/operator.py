@@ -52,7 +52,7 @@ def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
 
     Sampling is detached; the BSDF is evaluated with gradients (value / detached density).
 
-    Paper: Eq. 1, Sec. 4.2, 5.2.
+    Paper: Eq. 1, Eq. 8, Sec. 4.2, 5.2.
     """
     scene, si, bsdf, active = world.scene, vertex.si, vertex.bsdf, vertex.valid
     ctx = mi.BSDFContext()
