@@ -176,7 +176,7 @@ def evaluate(
     run: Positional[Run],
     /,
     spp: int = 64,
-    max_depth: int = 64,
+    max_depth: int = 48,
     train_views: int = 4,
     clip_negative: Flag = False,
 ) -> None:

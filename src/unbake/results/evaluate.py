@@ -26,12 +26,15 @@ DEFINITIONS = {
 }
 
 
+METRICS = ("render_psnr", "render_psnr_unclamped", "albedo_psnr", "roughness_psnr")
+
+
 @dataclass(frozen=True)
 class EvaluationSettings:
     """How the recovered scene is rendered."""
 
     spp: int = 64  #: camera samples a pixel
-    max_depth: int = 64  #: bounces, plus one; specular ones are not counted
+    max_depth: int = 48  #: bounces, plus one; specular ones are not counted
     rr_depth: int = 5  #: bounces before Russian roulette
     train_views: int = 4  #: training views to render; all held-out views are rendered
     material_spp: int = 16  #: camera samples a pixel of the albedo and roughness pictures
@@ -123,16 +126,23 @@ def _evaluate_view(
     row = {"name": view.name, "split": view.split}
     if view.albedo is None or view.roughness is None:
         mask = photograph[..., 3] >= 1
-        row["render_psnr"] = _finite(psnr(radiance, photograph[..., :3], mask))
+        row |= _render_psnr(radiance, photograph[..., :3], mask)
         return row | {"albedo_psnr": None, "roughness_psnr": None}
     true_albedo, true_roughness = _read(view.albedo, view), _read(view.roughness, view)
     mask = (true_albedo[..., 3] >= 1) & (alpha[..., 0] >= 1)
     if not mask.any():
-        return row | dict.fromkeys(("render_psnr", "albedo_psnr", "roughness_psnr"))
+        return row | dict.fromkeys(METRICS)
+    row |= _render_psnr(radiance, photograph[..., :3], mask)
     return row | {
-        "render_psnr": _finite(psnr(radiance, photograph[..., :3], mask)),
         "albedo_psnr": _finite(psnr(albedo, true_albedo[..., :3], mask)),
         "roughness_psnr": _finite(psnr(roughness, true_roughness[..., 0], mask)),
+    }
+
+
+def _render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> dict:
+    return {
+        "render_psnr": _finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)),
+        "render_psnr_unclamped": _finite(psnr(radiance, photograph, mask)),
     }
 
 
@@ -144,8 +154,7 @@ def _read(image: Path, view: View, clip_negative: bool = False) -> np.ndarray:
 
 def _summary(rows: list[dict], split: str) -> dict:
     chosen = [row for row in rows if row["split"] == split]
-    keys = ("render_psnr", "albedo_psnr", "roughness_psnr")
-    return {"views": len(chosen)} | {k: mean_psnr(row[k] for row in chosen) for k in keys}
+    return {"views": len(chosen)} | {k: mean_psnr(row[k] for row in chosen) for k in METRICS}
 
 
 def _finite(value: float) -> float | None:

@@ -16,7 +16,7 @@ from .vertex import World, find_vertex
 RayGenerator = Callable[[mi.UInt32, mi.Point2f], mi.Ray3f]
 
 #: Camera samples in flight at once; bounds the memory.
-WAVEFRONT = 1 << 18
+WAVEFRONT = 1 << 20
 
 
 def render_radiance(

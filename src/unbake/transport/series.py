@@ -6,7 +6,7 @@ It renders recovered materials with full global illumination. Mitsuba's `path` g
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +26,7 @@ def path_traced(
 ) -> mi.Color3f:
     """Radiance along rays, by path tracing; no gradients.
 
-    Paths that end are taken out of the wavefront after each bounce.
+    Paths that have ended are taken out of the wavefront whenever they are half of it.
 
     Args:
         ray: world space rays.
@@ -58,9 +58,10 @@ def path_traced(
             alive = dr.compress(keep)
             if len(alive) == 0:
                 break
-            v, β = _gather_vertex(v, alive), dr.gather(mi.Color3f, β, alive)
-            lane = dr.gather(mi.UInt32, lane, alive)
-            _reseed(sampler, seed, depth, len(alive))
+            v = replace(v, valid=keep)
+            if 2 * len(alive) <= dr.width(lane):
+                v, β, lane = _compacted(alive, v, β, lane)
+            _reseed(sampler, seed, depth, dr.width(lane))
 
             step = bounce(world, attach_material(world, v), sampler)
             dr.scatter_add(total, β * (step.direct + step.weight * step.next.emitted), lane)
@@ -74,6 +75,19 @@ def _reseed(sampler: mi.Sampler, seed: int, depth: int, lanes: int) -> None:
     sampler.seed(dr.opaque(mi.UInt32, (seed * 0x9E3779B1 + depth) & 0xFFFFFFFF), lanes)
 
 
-def _gather_vertex(v: Vertex, lanes: mi.UInt32) -> Vertex:
-    values = [getattr(v, f.name) for f in fields(Vertex)]
-    return Vertex(*[dr.gather(type(x), x, lanes) for x in values])
+def _compacted(
+    alive: mi.UInt32, v: Vertex, β: mi.Color3f, lane: mi.UInt32
+) -> tuple[Vertex, mi.Color3f, mi.UInt32]:
+    """Gather the lanes that are alive into a wavefront of half, a quarter, … of the size.
+
+    Kernels with matrix products are compiled for one size, so that there must be few sizes.
+    """
+    count, size = len(alive), dr.width(lane)
+    while 2 * count <= size and size > 1:
+        size = (size + 1) // 2
+    slot = dr.arange(mi.UInt32, size)
+    chosen = dr.gather(mi.UInt32, alive, dr.minimum(slot, dr.opaque(mi.UInt32, count - 1)))
+    values = {f.name: getattr(v, f.name) for f in fields(Vertex)}
+    v = Vertex(**{name: dr.gather(type(x), x, chosen) for name, x in values.items()})
+    v.valid &= slot < dr.opaque(mi.UInt32, count)
+    return v, dr.gather(mi.Color3f, β, chosen), dr.gather(mi.UInt32, lane, chosen)
