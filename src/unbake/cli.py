@@ -134,7 +134,7 @@ def fit(
     Args:
         data: Folder of the data set, with its transforms.json.
         out: Folder to write the run to: settings, log, checkpoints, previews.
-        steps: Length of the fit in training steps (cpu: 2000, paper and release: 18000).
+        steps: Length of the fit in training steps (cpu: 2400, paper and release: 18000).
         seconds: Length of the fit in seconds of training, instead of steps.
         spp: Samples per pixel in a step, an even number (cpu: 8, paper and release: 16).
         batch: Pixels in a step (cpu: 1024, paper and release: 16384).

@@ -94,10 +94,12 @@ def test_series_is_the_image_of_path(name):
     scene = box(THINGS[name])
     world = World.of(scene, None, 40)
     assert world.has_chains
-    ray = pixel_rays([CAMERA], SPP, seed=1)
+    # Caustics have heavy tails: with few samples a pixel's own variance is no measure of them.
+    spp = 4 * SPP if name == "glass ball" else SPP
+    ray = pixel_rays([CAMERA], spp, seed=1)
     truth = stock_path(scene, ray, 2, max_depth=64)
     series = path_traced(world, ray, 3, max_depth=16, rr_depth=5, see_environment=True)
-    assert_same_expectation(series, truth, SPP)
+    assert_same_expectation(series, truth, spp)
 
 
 @pytest.mark.parametrize("name", ["coloured mirror", "glass ball", "glass pane"])

@@ -122,7 +122,7 @@ def test_live_edges_add_up(problem, rays):
     def gradients(live):
         sample, arrays = with_live_pieces(traced(problem, rays))
         dr.backward(
-            objective({PRIOR: live}, sample, photographs(rays), SPP, LOSSES["radiance"])[PRIOR]
+            objective({PRIOR: live}, sample, photographs(rays), SPP, LOSSES["photograph"])[PRIOR]
         )
         return np.concatenate([np.ravel(dr.grad(a)) for p in PIECES for a in arrays[p]])
 

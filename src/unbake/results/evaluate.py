@@ -18,8 +18,10 @@ from ..imaging.pictures import tonemap, write_atomically, write_exr, write_png
 from ..transport.render import render_materials, render_radiance
 
 DEFINITIONS = {
-    "psnr": "10 log10(1 / MSE), peak 1, unclamped; MSE over unmasked pixels and channels of a "
-    "view; the value of a split is the mean over its views",
+    "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
+    "value of a split is the mean over its views. Renderings: both pictures clipped to [0,1], "
+    "because one caustic pixel of a photograph would decide all; render_psnr_unclamped does not. "
+    "Albedo and roughness are not clipped",
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "mask": "pixels all of whose samples see a material that is sought: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",

@@ -133,8 +133,8 @@ def _display(runs: list[Run], views: list[View]) -> Display:
     """Exposure and error scales that suit all pictures of the page at once.
 
     The exposure brings the ground truth's 95th percentile to 0.8, in half stops. The scale of an
-    error is rounded up to 1, 2 or 5 times 10^n from the geometric mean over runs of their 97th
-    percentile, so that one bad run does not turn all others black.
+    error is rounded up to 1, 2 or 5 times 10^n from the best run's 97th percentile, so that a bad
+    run does not turn all others black.
     """
     light: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
@@ -156,7 +156,7 @@ def _display(runs: list[Run], views: list[View]) -> Display:
 def _error_scale(errors: list[list[np.ndarray]]) -> float:
     high = np.array([_percentile(parts, 97) for parts in errors])
     high = high[high > 1e-6]  # a run that agrees up to rounding needs no scale
-    return _round_up(float(np.exp(np.log(high).mean()))) if len(high) else 0.01
+    return _round_up(float(high.min())) if len(high) else 0.01
 
 
 def _sample(values: np.ndarray, limit: int = 4096) -> np.ndarray:
