@@ -88,7 +88,7 @@ class FitConfig:
     pixels: int = 1024  #: batch size in pixels (Table 1)
     spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
 
-    learning_rate: float = 0.02  #: Adam, materials (Sec. 5.4: 5e-4)
+    learning_rate: float = 0.015  #: Adam, materials (Sec. 5.4: 5e-4)
     radiance_learning_rate: float = 0.01  #: Adam, radiance network (Sec. 5.4: 5e-4)
     final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)
     warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
