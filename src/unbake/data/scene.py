@@ -43,6 +43,9 @@ class ParsedScene:
             # virtual call. They live as long as the nodes, which this error keeps alive.
             self.state = mi.parser.ParserState()
             reason = _reason(error)
+            if "not been instantiated" in reason:
+                # Of errors met in parallel, Mitsuba may tell one that merely follows from another.
+                reason = _serial_reason(self.path) or reason
             raise UserError(f"Mitsuba cannot make this scene: {reason}", self.path) from None
         scene = scene[0] if isinstance(scene, list) else scene
         box = np.ravel([scene.bbox().min, scene.bbox().max])
@@ -53,6 +56,18 @@ class ParsedScene:
     def principled_nodes(self) -> list:
         """The nodes whose albedo and roughness are (or stand for) unknowns."""
         return [n for n in self.state.nodes if n.props.plugin_name() == "principled"]
+
+
+def _serial_reason(path: Path) -> str | None:
+    """Why a scene cannot be made, as one thread finds it; None if it can."""
+    scene = parse(path)
+    scene.config.parallel = False
+    try:
+        mi.parser.instantiate(scene.config, scene.state)
+    except RuntimeError as error:
+        scene.state = mi.parser.ParserState()
+        return _reason(error)
+    return None
 
 
 def parse(path: Path) -> ParsedScene:
