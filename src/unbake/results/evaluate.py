@@ -14,7 +14,7 @@ from ..data.batches import CameraRays
 from ..data.views import View, read_image
 from ..fit.recovered import Recovered, load_run
 from ..imaging.metrics import mean_psnr, psnr
-from ..imaging.pictures import tonemap, write_atomically, write_exr, write_png
+from ..imaging.pictures import to_bytes, tonemap, write_atomically, write_exr, write_png
 from ..transport.render import render_materials, render_radiance
 
 DEFINITIONS = {
@@ -120,7 +120,7 @@ def _evaluate_view(
         write_exr(folder / f"{view.name}_{name}.exr", np.concatenate([picture, alpha], -1))
         write_png(
             folder / f"{view.name}_{name}.png",
-            tonemap(picture) if name != "roughness" else np.uint8(255 * picture.clip(0, 1) + 0.5),
+            to_bytes(picture) if name == "roughness" else tonemap(picture),
         )
 
     clip = settings.clip_negative or recovered.clip_negative

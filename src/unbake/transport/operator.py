@@ -23,7 +23,7 @@ class Bounce:
     next: Vertex
 
 
-def attach_material(world: World, vertex: Vertex, engine: str = "tensor") -> Vertex:
+def attach_material(world: World, vertex: Vertex) -> Vertex:
     """Evaluate the material fields at a vertex, once, and put them on its surface interaction.
 
     Gradients arrive in φ wherever the BSDF is evaluated afterwards. Without fields the scene's own
@@ -32,7 +32,7 @@ def attach_material(world: World, vertex: Vertex, engine: str = "tensor") -> Ver
     if world.materials is None:
         return attach_albedo(world, vertex)
     si = vertex.si
-    material = world.materials.evaluate(si.p, vertex.valid, engine)
+    material = world.materials.evaluate(si.p, vertex.valid)
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
     return replace(vertex, si=si, albedo=dr.detach(material.albedo))
