@@ -23,9 +23,24 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Estimator = Literal["split-halves", "two-pass"]
+Estimator = Literal["auto", "split-halves", "two-pass"]
 Reference = Literal["smoothed", "photograph"]
-MethodName = Literal["ours", "one-bounce", "direct"]
+#: The last three are the steps of the ablation (Fig. 7, 8) between `direct` and `ours`, in order.
+MethodName = Literal[
+    "ours",
+    "no-prior",
+    "direct",
+    "ad-pt",
+    "prb",
+    "with-prior",
+    "with-stop-gradient",
+    "with-second-bounce",
+]
+PathMethodName = Literal["ad-pt", "prb"]
+PriorName = Literal["one-bounce", "extra-bounce"]
+Unknown = Literal["materials", "lighting", "materials+lighting", "emission"]
+Representation = Literal["neural", "grid", "bitmap"]
+RadianceRepresentation = Literal["neural", "grid"]
 PresetName = Literal["cpu", "paper", "release"]
 
 _FINEST = "base_resolution * growth^(levels - 1) is 2^24 or less"
@@ -76,11 +91,107 @@ class TransportConfig:
 
 
 @dataclass(frozen=True)
+class PathConfig:
+    """Paths of the methods that follow them to their end, `ad-pt` and `prb` (Sec. 6)."""
+
+    max_depth: int = 15  #: longest path in bounces, plus one (Mitsuba's meaning)
+    rr_depth: int = 5  #: bounces before Russian roulette, which goes on with 0.95 at most
+
+    def __post_init__(self) -> None:
+        for name in ("max_depth", "rr_depth"):
+            _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class DenseGridConfig:
+    """Dense 3D grids with trilinear interpolation over the scene's cube (Fig. 5)."""
+
+    albedo: int = 64  #: cells along an axis
+    roughness: int = 16  #: cells along an axis
+    radiance: int = 32  #: cells along an axis; L_θ without direction, as in Fig. 5
+    learning_rate: float = 0.1  #: Adam, albedo, in place of the networks' rate
+    roughness_learning_rate: float = 0.025  #: Adam, roughness
+    radiance_learning_rate: float = 0.05  #: Adam, radiance
+
+    def __post_init__(self) -> None:
+        for name in ("albedo", "roughness", "radiance"):
+            _check(1 <= getattr(self, name) <= 512, name, "1 to 512", getattr(self, name))
+        for name in ("learning_rate", "roughness_learning_rate", "radiance_learning_rate"):
+            _check(getattr(self, name) > 0, name, "positive", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class BitmapConfig:
+    """Bitmaps in the UV coordinates of each material (Sec. 8)."""
+
+    albedo: int = 128  #: pixels along an edge
+    roughness: int = 32  #: pixels along an edge
+    learning_rate: float = 0.15  #: Adam, albedo, in place of the networks' rate
+    roughness_learning_rate: float = 0.04  #: Adam, roughness
+
+    def __post_init__(self) -> None:
+        for name in ("albedo", "roughness"):
+            _check(1 <= getattr(self, name) <= 8192, name, "1 to 8192", getattr(self, name))
+        for name in ("learning_rate", "roughness_learning_rate"):
+            _check(getattr(self, name) > 0, name, "positive", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class LightingConfig:
+    """The unknown environment map and the unknown strength of lights (Sec. 5.1, Fig. 8).
+
+    Where materials are unknown as well and the environment is never seen directly, albedo and light
+    are known up to one factor a channel. It is then chosen such that the mean albedo of what the
+    training views see is `mean_albedo`.
+    """
+
+    resolution: int = 64  #: texels along an edge of the square that the sphere is mapped to
+    learning_rate: float = 0.02  #: Adam, log radiance
+    mean_albedo: float = 0.5  #: the convention, each channel (ours)
+    anchor: float = 1.0  #: weight of the squared deviation from it
+
+    def __post_init__(self) -> None:
+        known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
+        _check(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
+        _check(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
+        anchored = math.isfinite(self.anchor) and self.anchor >= 0
+        _check(anchored, "anchor", "0 or more", self.anchor)
+        _check(self.learning_rate > 0, "learning_rate", "positive", self.learning_rate)
+
+
+@dataclass(frozen=True)
+class RegularisationConfig:
+    """What is believed of materials where photographs say little; all off by default (ours)."""
+
+    roughness_smoothness: float = 0.0  #: weight of differences between near points
+    radius: float = 0.02  #: how near, as a fraction of the scene's (or the bitmap's) edge
+    albedo_ties_roughness: float = 0.0  #: weight of roughness differences at similar albedo
+    similarity: float = 0.1  #: distance of albedos (linear RGB) that still count as similar
+
+    def __post_init__(self) -> None:
+        for name in ("roughness_smoothness", "albedo_ties_roughness"):
+            value = getattr(self, name)
+            _check(math.isfinite(value) and value >= 0, name, "0 or more", value)
+        for name in ("radius", "similarity"):
+            value = getattr(self, name)
+            _check(math.isfinite(value) and value > 0, name, "positive", value)
+
+
+#: Bounces that can be differentiated before the radiance field takes over.
+MOST_BOUNCES = 16
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Everything that decides what a fit does, apart from its data set."""
 
     preset: PresetName = "cpu"
+    unknown: Unknown = "materials"
     method: MethodName = "ours"
+    bounces: int = 1  #: differentiable bounces before L_θ is asked (Sec. 6.3); `ours` only
+    prior: PriorName = "extra-bounce"  #: where the residual is taken (Sec. 4.2); `ours` only
+    representation: Representation = "neural"  #: of the materials (Sec. 5.1, Fig. 5, Sec. 8)
+    radiance_representation: RadianceRepresentation = "neural"  #: of L_θ (Sec. 5.3, Fig. 5)
     seed: int = 0
 
     steps: int = 2400  #: training steps (Table 1)
@@ -92,17 +203,23 @@ class FitConfig:
     radiance_learning_rate: float = 0.01  #: Adam, radiance network (Sec. 5.4: 5e-4)
     final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)
     warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
-    estimator: Estimator = "split-halves"  #: unbiased squared error (Sec. 5.2)
+    estimator: Estimator = "auto"  #: unbiased squared error (Sec. 5.2); see `halves`
     loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)
     loss_epsilon: float = 0.001  #: added to the denominator of the relative L2 loss (release: 0.01)
 
     albedo: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(7), hidden=1))
     roughness: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(4), 16, 1))
     radiance: NetworkConfig = field(default_factory=NetworkConfig)
+    grid: DenseGridConfig = field(default_factory=DenseGridConfig)
+    bitmap: BitmapConfig = field(default_factory=BitmapConfig)
+    lighting: LightingConfig = field(default_factory=LightingConfig)
+    regularisation: RegularisationConfig = field(default_factory=RegularisationConfig)
     transport: TransportConfig = field(default_factory=TransportConfig)
+    path: PathConfig = field(default_factory=PathConfig)
 
     checkpoint_seconds: float = 60.0  #: time between checkpoints
     preview_seconds: float = 30.0  #: time between preview pictures
+    score_seconds: float = 0.0  #: time between scores on all held-out views (0: never)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -113,9 +230,46 @@ class FitConfig:
             _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
         for name in ("learning_rate", "radiance_learning_rate", "final_learning_rate"):
             _check(getattr(self, name) > 0, name, "positive", getattr(self, name))
-        for name in ("seconds", "warm_up", "checkpoint_seconds", "preview_seconds", "seed"):
+        times = ("seconds", "checkpoint_seconds", "preview_seconds", "score_seconds")
+        for name in (*times, "warm_up", "seed"):
             _check(getattr(self, name) >= 0, name, "0 or more", getattr(self, name))
         _check(self.loss_epsilon > 0, "loss_epsilon", "positive", self.loss_epsilon)
+        _check(
+            1 <= self.bounces <= MOST_BOUNCES,
+            "bounces",
+            f"1 to {MOST_BOUNCES} (every bounce is kept in memory; prb follows longer paths)",
+            self.bounces,
+        )
+        if self.method != "ours":
+            _check(self.bounces == 1, "bounces", f"1 for the method {self.method}", self.bounces)
+            only = f"extra-bounce for the method {self.method}"
+            _check(self.prior == "extra-bounce", "prior", only, self.prior)
+
+    @property
+    def halves(self) -> bool:
+        """Whether squared errors come from split halves of a pixel's samples.
+
+        With `estimator = "auto"` every method has its usual one: split halves in one pass for ours
+        and its ablations, two decorrelated passes for `ad-pt` and `prb`, as in Mitsuba.
+        """
+        if self.estimator == "auto":
+            return not self.follows_paths
+        return self.estimator == "split-halves"
+
+    @property
+    def follows_paths(self) -> bool:
+        """Whether the method follows paths to their end, and has no radiance field."""
+        return self.method in typing.get_args(PathMethodName)
+
+    @property
+    def learns_materials(self) -> bool:
+        """Whether albedo and roughness are unknown."""
+        return self.unknown in ("materials", "materials+lighting")
+
+    @property
+    def learns_environment(self) -> bool:
+        """Whether the environment map is unknown."""
+        return self.unknown in ("lighting", "materials+lighting")
 
     @property
     def samples_per_step(self) -> int:

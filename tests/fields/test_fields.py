@@ -8,7 +8,7 @@ from support import TINY, seeded
 
 from unbake.config import GridConfig, NetworkConfig
 from unbake.fields.domain import Domain
-from unbake.fields.materials import ROUGHNESS_FLOOR, Materials
+from unbake.fields.materials import ROUGHNESS_FLOOR, Materials, Volume
 from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField
 
@@ -121,7 +121,8 @@ def test_gradients_arrive_in_the_arrays_that_were_assigned():
 
 
 def radiance(scale=2.0):
-    return RadianceField(TINY, Domain((1.0, 2.0, 3.0), 4.0), scale=scale, seed=1)
+    network = Network(TINY, extra=12, outputs=6, seed=1)
+    return RadianceField(network, Domain((1.0, 2.0, 3.0), 4.0), scale=scale)
 
 
 def look(field, p, valid=True, engine="tensor"):
@@ -144,7 +145,7 @@ def test_untrained_radiance_is_its_scale():
 
 def test_radiance_engines_agree():
     field = radiance()
-    randomised(field.network)
+    randomised(field.function)
     tensor = np.array(look(field, world_points(), engine="tensor"))
     coopvec = np.array(look(field, world_points(), engine="coopvec"))
     assert np.ptp(tensor) > 0.1
@@ -158,7 +159,7 @@ def test_radiance_is_positive_and_its_gradient_is_alive(raw):
     parameters = {k: dr.zeros(type(v), v.shape) for k, v in field.parameters().items()}
     last = list(parameters)[-1]
     shape = parameters[last].shape
-    assert shape == (field.network.outputs, 1)
+    assert shape == (field.function.outputs, 1)
     parameters[last] = mi.TensorXf([raw] * shape[0], shape)
     dr.enable_grad(parameters[last])
     field.assign(parameters)
@@ -175,7 +176,7 @@ def test_radiance_takes_albedo_as_a_constant():
     field = radiance()
     albedo = dr.full(mi.Color3f, 0.5, LANES)
     dr.enable_grad(albedo)
-    randomised(field.network)
+    randomised(field.function)
     up = mi.Vector3f(0, 0, 1)
     value = field.evaluate(world_points(), up, mi.Normal3f(up), albedo, mi.Bool(True))
     dr.backward(dr.sum(dr.sum(value)))
@@ -189,7 +190,7 @@ def test_a_lane_that_hit_nothing_poisons_nothing(bad, engine):
 
     def gradients(p, w, valid):
         field, n = radiance(), dr.zeros(mi.Normal3f, dr.width(p))
-        parameters = randomised(field.network)
+        parameters = randomised(field.function)
         value = field.evaluate(p, w, n, mi.Color3f(0.5), valid, engine)
         dr.backward(dr.sum(dr.sum(dr.square(value))))
         return np.array(value), {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
@@ -209,19 +210,27 @@ def test_a_lane_that_hit_nothing_poisons_nothing(bad, engine):
 # ----------------------------------------------------------------------------------- materials
 
 
-def materials():
-    fields = Materials(TINY, TINY, seed=1)
+def materials(seed=1):
+    albedo = Network(TINY, extra=0, outputs=3, seed=seed)
+    roughness = Network(TINY, extra=0, outputs=1, seed=seed + 1)
+    fields = Materials(Volume(albedo), Volume(roughness))
     fields.domain = Domain((0.0, 0.0, 0.0), 2.0)
     return fields
 
 
+def surface(p):
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    si.p = 2 * p - 1
+    return si
+
+
 def test_materials_stay_in_their_ranges():
     fields = materials()
-    for network in fields.networks.values():
-        values = randomised(network)
+    for field in fields.fields.values():
+        values = randomised(field)
         values = {k: 20 * v for k, v in values.items()}
-        network.assign(values)
-    found = fields.evaluate(2 * points(2000) - 1, mi.Bool(True))
+        field.assign(values)
+    found = fields.evaluate(surface(points(2000)), mi.Bool(True))
     albedo, roughness = np.array(found.albedo), np.array(found.roughness)
     assert np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1
     assert roughness.min() >= ROUGHNESS_FLOOR - 1e-6 and roughness.max() <= 1
@@ -231,25 +240,28 @@ def test_materials_stay_in_their_ranges():
 
 
 def test_untrained_materials_are_grey():
-    found = materials().evaluate(2 * points() - 1, mi.Bool(True))
+    found = materials().evaluate(surface(points()), mi.Bool(True))
     np.testing.assert_allclose(np.array(found.albedo), 0.5, atol=0.05)
 
 
 def test_material_engines_agree():
     fields = materials()
-    for i, network in enumerate(fields.networks.values()):
-        randomised(network, i)
-    a, b = (fields.evaluate(2 * points() - 1, mi.Bool(True), e) for e in ("tensor", "coopvec"))
+    for i, field in enumerate(fields.fields.values()):
+        randomised(field, i)
+    si = surface(points())
+    a, b = (fields.evaluate(si, mi.Bool(True), e) for e in ("tensor", "coopvec"))
     np.testing.assert_allclose(np.array(a.albedo), np.array(b.albedo), atol=1e-5)
     np.testing.assert_allclose(np.array(a.roughness), np.array(b.roughness), atol=1e-5)
+    np.testing.assert_allclose(
+        np.array(fields.albedo_at(si, mi.Bool(True))), np.array(a.albedo), atol=1e-6
+    )
 
 
 def test_parameters_go_out_and_come_back():
-    one, other = materials(), Materials(TINY, TINY, seed=9)
-    other.domain = one.domain
+    one, other = materials(), materials(seed=9)
     other.assign(one.parameters())
-    p = 2 * points() - 1
-    a, b = one.evaluate(p, mi.Bool(True)), other.evaluate(p, mi.Bool(True))
+    si = surface(points())
+    a, b = one.evaluate(si, mi.Bool(True)), other.evaluate(si, mi.Bool(True))
     np.testing.assert_array_equal(np.array(a.albedo), np.array(b.albedo))
     np.testing.assert_array_equal(np.array(a.roughness), np.array(b.roughness))
 

@@ -1,4 +1,4 @@
-"""The unit cube in which all fields live."""
+"""Coordinates of fields: the unit cube, and points on surfaces."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+
+@dataclass
+class SurfacePoint:
+    """Where a material is asked for, in every kind of coordinates that its fields may want."""
+
+    position: mi.Point3f  # [0,1]³
+    uv: mi.Point2f  # texture coordinates, as they are: without bounds, maybe not finite
+    slot: mi.UInt32  # number of the material, where materials have fields of their own
 
 
 @dataclass(frozen=True)

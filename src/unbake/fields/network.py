@@ -117,8 +117,24 @@ class Network:
         it can no longer be done.
         """
         flat = [a if a.shape[1] > 1 else mi.TensorXf(a.array) for pair in self.layers for a in pair]
-        views = nn.pack(*flat, layout="training")
+        if can_record_layout():
+            views = [nn.view(a) for a in flat]
+        else:
+            views = nn.pack(*flat, layout="training")
         self._packed = list(zip(views[::2], views[1::2], strict=True))
+
+
+def can_record_layout() -> bool:
+    """Whether a frozen function can lay layers out for cooperative vectors.
+
+    LLVM takes them as they are. The layout that CUDA wants is made by a call that is not recorded.
+    """
+    return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+
+
+def sigmoid(x: mi.Float) -> mi.Float:
+    """1 / (1 + exp(−x))."""
+    return dr.rcp(1 + dr.exp(-x))
 
 
 def from_numpy(array_type: type, values: np.ndarray) -> mi.Float | mi.UInt32:

@@ -1,42 +1,45 @@
-"""The radiance network L_θ(x, ω): reflected radiance at surface points (Sec. 3.1, 5.3)."""
+"""The radiance field L_θ(x, ω): reflected radiance at surface points (Sec. 3.1, 5.3)."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from ..config import NetworkConfig
+from ..config import FitConfig
 from .domain import Domain
+from .grid import DenseGrid
 from .network import Engine, Network
 
 
 class RadianceField:
     """Reflected radiance as a function of position, direction, normal and albedo.
 
-    L_θ = s · (3/2 · albedo · a + 1/4 · b) with two network outputs a and b: what a surface reflects
-    diffusely has its texture, which need not be learned a second time.
+    L_θ = s · (3/2 · albedo · a + 1/4 · b) with two outputs a and b of the function that is learned:
+    what a surface reflects diffusely has its texture, which need not be learned a second time. On a
+    grid a and b depend on the position alone.
 
     Emission is not part of it: the rendering equation's E is known and added analytically.
 
     Args:
+        function: six outputs, of a position and twelve further inputs.
         scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good
             one.
 
     Paper: Sec. 3.1, 5.3.
     """
 
-    def __init__(self, config: NetworkConfig, domain: Domain, *, scale: float, seed: int) -> None:
+    def __init__(self, function: Network | DenseGrid, domain: Domain, *, scale: float) -> None:
         self.domain = domain
         self.scale = scale
-        self.network = Network(config, extra=12, outputs=6, seed=seed)
+        self.function = function
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays θ by name."""
-        return self.network.parameters()
+        return self.function.parameters()
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
         """Use these arrays from now on."""
-        self.network.assign(parameters)
+        self.function.assign(parameters)
 
     def evaluate(
         self,
@@ -62,9 +65,22 @@ class RadianceField:
         unit = self.domain.to_unit(p, valid)
         extra = [*(2 * unit - 1), *w, *n, *dr.detach(albedo)]
         extra = [dr.select(valid, x, 0) for x in extra]
-        raw = [self.scale * _squareplus(x) for x in self.network(unit, extra, engine)]
+        raw = [self.scale * _squareplus(x) for x in self.function(unit, extra, engine)]
         diffuse, rest = mi.Color3f(raw[:3]), mi.Color3f(raw[3:])
         return dr.select(valid, 1.5 * dr.detach(albedo) * diffuse + 0.25 * rest, 0)
+
+
+def make_radiance(config: FitConfig, domain: Domain, *, scale: float, seed: int) -> RadianceField:
+    """A fresh radiance field in the representation that the settings name.
+
+    Paper: Sec. 5.3, Fig. 5.
+    """
+    match config.radiance_representation:
+        case "neural":
+            function = Network(config.radiance, extra=12, outputs=6, seed=seed)
+        case "grid":
+            function = DenseGrid(config.grid.radiance, outputs=6)
+    return RadianceField(function, domain, scale=scale)
 
 
 def _squareplus(x: mi.Float) -> mi.Float:

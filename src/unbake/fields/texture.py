@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import re
+
 import mitsuba as mi
 
-from .materials import Material, Materials
+from .materials import Material, Materials, registry_number
 
 
-def material_textures(materials: Materials) -> tuple[mi.Texture, mi.Texture]:
+def material_textures(materials: Materials, slot: int = 0) -> tuple[mi.Texture, mi.Texture]:
     """Two textures, for the albedo and for the roughness of a `principled` BSDF.
 
     They read what `carry` put on the surface interaction. After `materials.stand_alone()` they
-    evaluate the field at the interaction's position instead, with cooperative vectors, so that any
-    integrator of Mitsuba can render the recovered scene.
+    evaluate the field at the interaction instead, with cooperative vectors, so that any integrator
+    of Mitsuba can render the recovered scene.
+
+    Args:
+        slot: number of the material, where materials have fields of their own; see `slots_of`.
 
     Paper: Sec. 5.1.
     """
@@ -26,7 +31,7 @@ def material_textures(materials: Materials) -> tuple[mi.Texture, mi.Texture]:
         def lookup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Material:
             if materials.carried:
                 return Material(mi.Color3f(si.dn_du), si.dn_dv.x)
-            return materials.evaluate(si.p, mi.Bool(active), engine="coopvec")
+            return materials.evaluate(si, mi.Bool(active), engine="coopvec")
 
         def eval(self, si, active=True):
             material = self.lookup(si, active)
@@ -40,6 +45,9 @@ def material_textures(materials: Materials) -> tuple[mi.Texture, mi.Texture]:
 
         def eval_3(self, si, active=True):
             return self.eval(si, active)
+
+        def traverse(self, callback):
+            callback.put("slot", slot, mi.ParamFlags.NonDifferentiable)
 
         def mean(self):
             return mi.Float(0.5)
@@ -59,3 +67,36 @@ def material_textures(materials: Materials) -> tuple[mi.Texture, mi.Texture]:
         props["channel"] = channel
         textures.append(FieldTexture(props))
     return textures[0], textures[1]
+
+
+def slots_of(scene: mi.Scene) -> dict[int, int]:
+    """The number of the material of each shape, as the textures of its BSDF were told.
+
+    A shape whose BSDF holds several materials, as a blend does, has the first. Shapes without such
+    textures are left out.
+
+    Returns:
+        Numbers of materials by the shapes' numbers in Dr.Jit's registry.
+    """
+    slots = {registry_number(shape): _slot_of(shape) for shape in _shapes(scene)}
+    return {shape: slot for shape, slot in slots.items() if slot is not None}
+
+
+def painted_meshes_without_uv(scene: mi.Scene) -> list[str]:
+    """The names of meshes that have textures of fields, but no texture coordinates."""
+    meshes = [shape for shape in _shapes(scene) if shape.is_mesh() and _slot_of(shape) is not None]
+    bare = [mesh for mesh in meshes if not mesh.has_vertex_texcoords()]
+    # Mitsuba tells the names of meshes in their printed form alone.
+    names = [re.search(r'^  name = "(.*)"', str(mesh), re.MULTILINE) for mesh in bare]
+    return [name[1] if name else "a mesh" for name in names]
+
+
+def _shapes(scene: mi.Scene) -> list[mi.Shape]:
+    """All shapes of a scene, those that are only seen through instances too."""
+    return [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
+
+
+def _slot_of(shape: mi.Shape) -> int | None:
+    bsdf = shape.bsdf()
+    found = [] if bsdf is None else mi.traverse(bsdf).items()
+    return next((value for key, value in found if key.endswith("base_color.slot")), None)

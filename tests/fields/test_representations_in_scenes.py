@@ -1,0 +1,291 @@
+"""Materials in scenes: each shape has its bitmap, stock integrators see them, steps train them."""
+
+import dataclasses
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import TINY_FIT, built_in_cameras, grey_photographs, pixel_rays, seeded
+
+from unbake.config import BitmapConfig, DenseGridConfig
+from unbake.data import scene as scenes
+from unbake.errors import UserError
+from unbake.fields.materials import make_materials
+from unbake.fields.texture import material_textures, slots_of
+from unbake.fit.problem import make_problem
+from unbake.fit.step import TrainingStep, initial_state
+from unbake.transport.operator import attach_albedo, attach_material
+from unbake.transport.vertex import World, find_vertex
+
+REPRESENTATIONS = ["neural", "grid", "bitmap"]
+
+
+def settings(representation="neural", radiance="neural"):
+    return dataclasses.replace(
+        TINY_FIT,
+        representation=representation,
+        radiance_representation=radiance,
+        grid=DenseGridConfig(albedo=5, roughness=3, radiance=4),
+        bitmap=BitmapConfig(albedo=6, roughness=4),
+    )
+
+
+def randomised(fields, seed=0, scale=0.7):
+    """Fill the parameters of fields at random; returns them, with gradients enabled."""
+    rng = np.random.default_rng(seed)
+    values = {
+        k: type(v)(rng.normal(0, scale, v.shape).astype(np.float32))
+        for k, v in fields.parameters().items()
+    }
+    dr.enable_grad(values)
+    fields.assign(values)
+    return values
+
+
+def assign_values(bitmaps, values):
+    """Give bitmaps these values, (materials, size, size, channels)."""
+    logits = np.log(values / (1 - values))
+    bitmaps.assign({"texels": mi.Float(logits.astype(np.float32).ravel())})
+
+
+# ---------------------------------------------------------------------------- slots in a scene
+
+SCENE = """<scene version="3.0.0">
+  <bsdf type="twosided" id="Wall"><bsdf type="principled" id="wall"/></bsdf>
+  <bsdf type="principled" id="red"/>
+  <bsdf type="mask" id="Masked"><float name="opacity" value="1"/>
+    <bsdf type="twosided"><bsdf type="diffuse" id="masked"/></bsdf></bsdf>
+  <shape type="rectangle"><ref id="Wall"/></shape>
+  <shape type="cube"><ref id="Wall"/>
+    <transform name="to_world"><translate x="3"/></transform></shape>
+  <shape type="cube"><ref id="red"/>
+    <transform name="to_world"><translate x="6"/></transform></shape>
+  <shape type="sphere"><bsdf type="dielectric"/>
+    <transform name="to_world"><translate x="9"/></transform></shape>
+  <shape type="cube"><ref id="red"/>
+    <transform name="to_world"><translate x="12"/></transform></shape>
+  <shape type="sphere"><bsdf type="principled" id="copper"/>
+    <transform name="to_world"><translate x="15"/></transform></shape>
+  <shape type="cube"><ref id="Masked"/>
+    <transform name="to_world"><translate x="18"/></transform></shape>
+  <shape type="shapegroup" id="group"><shape type="sphere"><ref id="red"/></shape></shape>
+  <shape type="instance"><ref id="group"/>
+    <transform name="to_world"><translate x="21"/></transform></shape>
+  <emitter type="constant"/>
+</scene>"""
+#: Material of what stands at x = 0, 3, 6, …; None: not a material that is sought.
+STANDING = ["wall", "wall", "red", None, "red", "copper", "masked", "red"]
+
+
+@pytest.fixture
+def with_slots(tmp_path):
+    """A world of several materials with bitmaps of one texel; its materials have the colours."""
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    parsed = scenes.parse(path)
+    scenes.to_principled(parsed)
+    names = scenes.material_names(parsed)
+    config = dataclasses.replace(settings("bitmap"), bitmap=BitmapConfig(albedo=1, roughness=1))
+    fields = make_materials(config, names, seed=0)
+    each = [material_textures(fields, slot) for slot in range(len(names))]
+    scenes.set_own_textures(parsed, each)
+    scene = parsed.instantiate()
+    fields.slots = slots_of(scene)
+    colours = {name: 0.2 + 0.15 * i for i, name in enumerate(names)}
+    assign_values(
+        fields.fields["albedo"],
+        np.repeat(list(colours.values()), 3).reshape(-1, 1, 1, 3),
+    )
+    return World.of(scene, fields, 4), colours
+
+
+def rays_from_above():
+    x = 3 * dr.arange(mi.Float, len(STANDING))
+    ray = mi.Ray3f(mi.Point3f(x + 0.4, 0.3, 8), mi.Vector3f(0, 0, -1))
+    dr.eval(ray)
+    return ray
+
+
+def test_every_shape_has_the_bitmap_of_its_material(with_slots):
+    world, colours = with_slots
+    assert set(colours) == {"wall", "red", "copper", "masked"}
+    expected = [colours.get(name) for name in STANDING]
+    sought = np.array([e is not None for e in expected])
+    v = find_vertex(world, rays_from_above(), mi.Bool(True), seeded(0, len(STANDING)))
+    for attach in (attach_material, attach_albedo):
+        found = np.array(attach(world, v).albedo)[:, sought]
+        np.testing.assert_allclose(found, [[e for e in expected if e]] * 3, atol=1e-5)
+
+
+def test_textures_find_their_bitmap_inside_virtual_calls(with_slots):
+    world, colours = with_slots
+    world.materials.stand_alone()
+    si = world.scene.ray_intersect(rays_from_above())
+    found = np.array(si.bsdf().eval_diffuse_reflectance(si))
+    for i, name in enumerate(STANDING):
+        if name is not None:
+            np.testing.assert_allclose(found[:, i], colours[name], atol=1e-5)
+
+
+def test_meshes_are_merged_within_a_material_alone(with_slots):
+    world, _ = with_slots
+    assert sum(shape.is_mesh() for shape in world.scene.shapes()) == 3  # wall, red twice, masked
+
+
+def test_materials_without_a_name_get_one_of_their_own(tmp_path):
+    path = tmp_path / "scene.xml"
+    bsdf = '<shape type="sphere"><bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>'
+    # A name that could be one of those given.
+    named = '<bsdf type="diffuse" id="material-1"/>'
+    path.write_text(f'<scene version="3.0.0">{named}{3 * bsdf}</scene>')
+    parsed = scenes.parse(path)
+    scenes.to_principled(parsed)
+    names = scenes.material_names(parsed)
+    assert len(set(names)) == 4 and all(names) and "material-1" in names
+
+
+def test_missing_texture_coordinates_are_told(tmp_path):
+    mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "full.ply"))
+    bare = mi.Mesh("bare", 3, 1)
+    parameters = mi.traverse(bare)
+    parameters["vertex_positions"] = [0, 0, 0, 1, 0, 0, 0, 1, 0]
+    parameters["faces"] = [0, 1, 2]
+    parameters.update()
+    bare.write_ply(str(tmp_path / "bare.ply"))
+
+    def problem(bsdf, representation):
+        files = ("bare", "full", "bare")
+        shapes = [
+            f'<shape type="ply"><string name="filename" value="{f}.ply"/>{b}</shape>'
+            for f, b in zip(files, (bsdf, '<bsdf type="diffuse"/>', bsdf), strict=True)
+        ]
+        path = tmp_path / "scene.xml"
+        path.write_text(
+            f'<scene version="3.0.0">{"".join(shapes)}<emitter type="constant"/></scene>'
+        )
+        return make_problem(path, "visible", settings(representation), 0.2)
+
+    with pytest.raises(UserError) as caught:
+        problem('<bsdf type="diffuse"/>', "bitmap")
+    assert "without texture coordinates cannot have bitmaps: bare.ply" in caught.value.what
+    assert "full" not in caught.value.what
+    assert "--representation neural or grid, or unwrap the mesh" in str(caught.value)
+    # Neither other representations nor other materials mind.
+    assert problem('<bsdf type="diffuse"/>', "grid")
+    assert problem('<bsdf type="conductor"/>', "bitmap")
+
+
+# ------------------------------------------------------------------------ in a scene, in training
+
+
+def cornell_problem(built_in, representation, radiance="neural"):
+    config = settings(representation, radiance)
+    return config, make_problem(built_in("cornell"), "visible", config, 0.2)
+
+
+def test_bitmaps_render_as_mitsubas_own(built_in):
+    """The same picture: bitmaps as arrays inside stock textures, and as fields."""
+    _, problem = cornell_problem(built_in, "bitmap")
+    randomised(problem.materials, scale=2)
+    problem.materials.stand_alone()
+
+    parsed = scenes.parse(built_in("cornell"))
+    scenes.to_principled(parsed)
+    names = scenes.material_names(parsed)
+    fields = problem.materials.fields
+    stock = []
+    for name in names:
+        albedo, roughness = (fields[k].to_arrays()[name] for k in ("albedo", "roughness"))
+        roughness = 0.02 + 0.98 * roughness
+        stock.append(
+            [
+                mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(a), "raw": True})
+                for a in (albedo, roughness)
+            ]
+        )
+    scenes.set_own_textures(parsed, stock)
+    scene = parsed.instantiate()
+    assert len(names) >= 3
+
+    ray = pixel_rays(built_in_cameras("cornell", 16), 4, seed=1)
+    a, b = (s.ray_intersect(ray) for s in (problem.world.scene, scene))
+    ours, theirs = (np.array(si.bsdf().eval_diffuse_reflectance(si)) for si in (a, b))
+    assert np.ptp(theirs) > 0.5
+    np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    path = mi.load_dict({"type": "path", "max_depth": 4})
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(built_in_cameras("cornell", 16)[0].to_world),
+            "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
+        }
+    )
+    pictures = [
+        np.array(mi.render(s, integrator=path, sensor=sensor, spp=32, seed=3))
+        for s in (problem.world.scene, scene)
+    ]
+    assert pictures[0].std() > 0.01
+    np.testing.assert_allclose(pictures[0], pictures[1], rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_fields_pass_gradients_inside_virtual_calls(built_in, representation):
+    """Stock integrators ask textures inside BSDFs, and differentiate them there."""
+    _, problem = cornell_problem(built_in, representation)
+    ray = pixel_rays(built_in_cameras("cornell", 8), 4, seed=1)
+    gradients = []
+    for carried in (True, False):
+        parameters = randomised(problem.materials)
+        if not carried:
+            problem.materials.stand_alone()
+        v = find_vertex(problem.world, ray, mi.Bool(True), seeded(0, dr.width(ray)))
+        v = attach_material(problem.world, v) if carried else v
+        wo = mi.Vector3f(0.2, 0.3, 0.9)
+        value = v.bsdf.eval(mi.BSDFContext(), v.si, dr.normalize(wo), v.valid)
+        dr.backward(dr.sum(dr.sum(value)))
+        gradients.append({k: np.array(dr.grad(p)).ravel() for k, p in parameters.items()})
+    for name, gradient in gradients[0].items():
+        scale = np.abs(gradient).max()
+        assert scale > 0, name
+        np.testing.assert_allclose(gradient, gradients[1][name], atol=2e-3 * scale, err_msg=name)
+
+
+def rates(i):
+    φ = 1e-2 * 0.9**i
+    return {"albedo": φ, "roughness": φ, "radiance": 5e-3}
+
+
+@pytest.mark.parametrize("radiance", ["neural", "grid"])
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_a_frozen_step_trains_every_representation(built_in, representation, radiance):
+    # Scenes of earlier tests, whose textures now stand alone, must not be around while one records.
+    gc.collect()
+    config, problem = cornell_problem(built_in, representation, radiance)
+    pixels = grey_photographs(built_in_cameras("cornell", 8, views=2))
+    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    optimizers = state.optimizers()
+    before = {(n, k): np.array(v).copy() for n, o in optimizers for k, v in o.items()}
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for i in range(3):
+            step(state, i, rates(i))
+        recorded = step.recordings()
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        for i in range(3, 7):
+            terms = step(state, i, rates(i))
+            assert float(terms["skipped"][0]) == 0
+        dr.sync_thread()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        dr.kernel_history_clear()
+    assert kernels and all(k["cache_hit"] and not k["cache_disk"] for k in kernels)
+    assert step.recordings() == recorded <= 3
+    for (name, key), old in before.items():
+        new = np.array(dict(optimizers)[name][key])
+        assert np.isfinite(new).all() and (new != old).any(), f"{name}.{key} was not trained"
+    # What was trained is what is seen.
+    state.publish(problem)
+    ray = pixel_rays(built_in_cameras("cornell", 8), 1, seed=1)
+    v = find_vertex(problem.world, ray, mi.Bool(True), seeded(0, dr.width(ray)))
+    assert np.ptp(np.array(attach_albedo(problem.world, v).albedo)) > 1e-3
