@@ -82,11 +82,13 @@ class ConstantMaterials:
     def __init__(self, albedo: float | mi.Color3f, roughness: float | mi.Float = 0.5) -> None:
         self.albedo, self.roughness = mi.Color3f(albedo), mi.Float(roughness)
 
-    def albedo_at(self, p: mi.Point3f, valid: mi.Bool) -> mi.Color3f:
-        return self.evaluate(p, valid).albedo
+    def albedo_at(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> mi.Color3f:
+        return self.evaluate(si, valid).albedo
 
-    def evaluate(self, p: mi.Point3f, valid: mi.Bool, engine: str = "tensor") -> Material:
-        lanes = dr.zeros(mi.Float, dr.width(p))
+    def evaluate(
+        self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: str = "tensor"
+    ) -> Material:
+        lanes = dr.zeros(mi.Float, dr.width(si.p))
         return Material(self.albedo + lanes, self.roughness + lanes)
 
 
@@ -119,7 +121,7 @@ class PathTracedRadiance:
                 self.seed,
                 max_depth=self.max_depth,
                 rr_depth=5,
-                see_environment=False,
+                see_lights=True,
             )
             return dr.select(valid, total - sees.emitted, 0)
 

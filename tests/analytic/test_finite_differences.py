@@ -94,10 +94,10 @@ def objective(world):
     cameras = built_in_cameras("cornell", 12)
     ray = pixel_rays(cameras, SPP, seed=1)
     field = VaryingRadiance()
-    sample = trace(world, field, ray, seeded(2, dr.width(ray)), Needs(True, False), True)
+    sample = trace(world, field, ray, seeded(2, dr.width(ray)), Needs(1, 1, lhs=True), True)
     weights = np.random.default_rng(3).uniform(0.5, 1.5, (3, dr.width(ray) // SPP))
     weights = mi.Color3f(np.repeat(weights, SPP, axis=1).astype(np.float32))
-    return weights * rhs(sample, sample.L2)
+    return weights * rhs(sample, sample.radiance[1])
 
 
 def total(values):

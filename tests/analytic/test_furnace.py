@@ -21,11 +21,21 @@ from unbake.config import GridConfig, NetworkConfig
 from unbake.data import scene as scenes
 from unbake.data.batches import CameraRays
 from unbake.fields.domain import Domain
+from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField
 from unbake.fields.texture import material_textures
 from unbake.transport.image import Needs, lhs, rhs, trace
-from unbake.transport.objective import EXTRA, PRIOR, Live, RelativeL2, objective
-from unbake.transport.prior import first_residual, second_residual
+from unbake.transport.objective import (
+    EXTRA,
+    METHODS,
+    PHOTOMETRIC,
+    PRIOR,
+    Live,
+    RelativeL2,
+    needs,
+    objective,
+)
+from unbake.transport.prior import residual
 from unbake.transport.vertex import World
 
 SMALL = NetworkConfig(
@@ -47,7 +57,7 @@ def train(world, field, terms, steps, rate, final_rate):
         sampler.seed(seed, LANES)
         pixel = mi.UInt32(sampler.next_1d() * 0.99999 * rays.pixels)
         ray = rays.through(pixel, sampler.next_2d())
-        sample = trace(world.with_scene(scene), field, ray, sampler, Needs(True, True), True)
+        sample = trace(world.with_scene(scene), field, ray, sampler, Needs(1, 2, lhs=True), True)
         value = sum(objective(terms, sample, black, 2, loss).values())
         dr.backward(value)
         adam.step(eval=False)
@@ -68,8 +78,8 @@ def pictures(world, field, spp):
     """LHS and RHS of views between the training views, (pixels, 3) each."""
     cameras = built_in_cameras("furnace", 8, views=12)[8:]
     ray = pixel_rays(cameras, spp, seed=99)
-    sample = trace(world, field, ray, seeded(5, dr.width(ray)), Needs(True, False), True)
-    both = lhs(sample, sample.L1), rhs(sample, sample.L2)
+    sample = trace(world, field, ray, seeded(5, dr.width(ray)), Needs(1, 1, lhs=True), True)
+    both = lhs(sample, sample.radiance[0]), rhs(sample, sample.radiance[1])
     return [np.array(x).reshape(3, -1, spp).mean(-1).T for x in both]
 
 
@@ -95,7 +105,8 @@ def test_the_residual_alone_finds_the_radiance(
 ):
     scene = mi.load_file(str(built_in("furnace", albedo)))
     world = World.of(scene, None, 8)
-    field = RadianceField(SMALL, Domain.of(scene.bbox()), scale=scale, seed=1)
+    network = Network(SMALL, extra=12, outputs=6, seed=1)
+    field = RadianceField(network, Domain.of(scene.bbox()), scale=scale)
     truth = 1 / (1 - albedo)
 
     untrained, _ = pictures(world, field, 4)
@@ -115,7 +126,7 @@ def exact_sample(scene, albedo, factor=1.0, lanes_spp=64):
     world = World.of(scene, None, 8)
     field = ConstantRadiance(factor * albedo / (1 - albedo))
     ray = pixel_rays(built_in_cameras("furnace", 16, views=8), lanes_spp, seed=3)
-    return trace(world, field, ray, seeded(4, dr.width(ray)), Needs(True, True), True)
+    return trace(world, field, ray, seeded(4, dr.width(ray)), Needs(1, 2, lhs=True), True)
 
 
 @pytest.mark.parametrize("albedo", [0.3, 0.8])
@@ -124,18 +135,18 @@ def test_the_residual_of_the_exact_radiance_is_zero_and_of_no_other(built_in, al
 
     def residuals(factor):
         s = exact_sample(scene, albedo, factor)
-        both = first_residual(s, s.L1, s.L2), second_residual(s, s.L2, s.L3)
+        both = [residual(s, i, s.radiance[i - 1], s.radiance[i]) for i in (1, 2)]
         return [np.array(r)[0].astype(np.float64) for r in both]
 
-    for residual in residuals(1.0):
-        assert abs(residual.mean()) < 3.5 * residual.std() / np.sqrt(len(residual))
+    for r in residuals(1.0):
+        assert abs(r.mean()) < 3.5 * r.std() / np.sqrt(len(r))
     # (1 + δ) L leaves δ (1 − ρ) L = δ ρ: linear in δ, its norm quadratic. The same random numbers
     # serve for all δ, so that the difference has no noise but rounding.
     for exact, off in zip(residuals(1.0), residuals(1.1), strict=True):
         np.testing.assert_allclose((off - exact).mean(), 0.1 * albedo, rtol=2e-3)
 
 
-# ------------------------------------------------------------ the gradient with one live bounce
+# ------------------------------------------------------------ the gradient with k live bounces
 
 
 @pytest.fixture(scope="module")
@@ -150,21 +161,45 @@ def learnable(built_in):
     return World.of(parsed.instantiate(), materials, 8)
 
 
+@pytest.mark.parametrize("bounces", [1, 2, 4, 8])
 @pytest.mark.parametrize("albedo", [0.3, 0.5, 0.8, 0.97])
-def test_one_live_bounce_gives_one_minus_albedo_of_the_true_gradient(learnable, albedo):
+def test_the_gradient_with_k_live_bounces_is_the_closed_form(learnable, albedo, bounces):
+    """Σ_{i<k} i ρⁱ⁻¹ E + k ρᵏ⁻¹ L; for k = 1 that is (1 − ρ) times the true gradient (Sec. 6.3)."""
     materials = learnable.materials
     materials.albedo = mi.Color3f(albedo)
     dr.enable_grad(materials.albedo)
     ray = pixel_rays(built_in_cameras("furnace", 16, views=8), 64, seed=5)
-    cache = ConstantRadiance(albedo / (1 - albedo))
-    sample = trace(learnable, cache, ray, seeded(6, dr.width(ray)), Needs(True, False), True)
-    image = rhs(sample, sample.L2)
+    cache, wanted = ConstantRadiance(albedo / (1 - albedo)), Needs(bounces, 1, lhs=True)
+    sample = trace(learnable, cache, ray, seeded(6, dr.width(ray)), wanted, True)
+    image = rhs(sample, sample.radiance[bounces], bounces)
     value = np.array(dr.mean(dr.detach(image), axis=1)).ravel()
     dr.backward(dr.sum(dr.mean(image, axis=1)))
     gradient = np.array(dr.grad(materials.albedo)).ravel()
 
-    true_gradient = 1 / (1 - albedo) ** 2
-    print(f"{albedo}: image {value}, gradient {gradient}, true {true_gradient}")
-    np.testing.assert_allclose(value, 1 / (1 - albedo), rtol=5e-3)
-    # E + ρE/(1 − ρ): what the first bounce reflects, by the albedo that reflects it.
-    np.testing.assert_allclose(gradient, (1 - albedo) * true_gradient, rtol=5e-3)
+    L = 1 / (1 - albedo)
+    series = sum(i * albedo ** (i - 1) for i in range(1, bounces))
+    expected = series + bounces * albedo ** (bounces - 1) * L
+    print(f"{albedo}, {bounces}: gradient {gradient / expected}, of the true {expected / L**2:.3f}")
+    np.testing.assert_allclose(value, L, rtol=5e-3)
+    np.testing.assert_allclose(gradient, expected, rtol=5e-3)
+
+
+def test_more_live_bounces_come_nearer_to_the_true_gradient(learnable):
+    """The photometric term of `ours` is what k changes: the objective passes it on."""
+    materials, albedo = learnable.materials, 0.8
+    ray = pixel_rays(built_in_cameras("furnace", 8, views=2), 16, seed=5)
+    found = []
+    for bounces in (1, 4):
+        materials.albedo = mi.Color3f(albedo)
+        dr.enable_grad(materials.albedo)
+        row = METHODS["ours"]
+        field = ConstantRadiance(albedo / (1 - albedo))
+        sampler = seeded(6, dr.width(ray))
+        sample = trace(learnable, field, ray, sampler, needs(row, bounces), True)
+        target = dr.full(mi.Color3f, 4.0, dr.width(ray) // 16)
+        loss = RelativeL2(0.01)
+        terms = objective(row, sample, target, 16, loss, bounces=bounces)
+        dr.backward(terms[PHOTOMETRIC])
+        found.append(float(dr.sum(dr.grad(materials.albedo))[0]))
+    closed = [sum(i * 0.8 ** (i - 1) for i in range(1, k)) + 5 * k * 0.8 ** (k - 1) for k in (1, 4)]
+    np.testing.assert_allclose(found[1] / found[0], closed[1] / closed[0], rtol=0.02)

@@ -59,7 +59,7 @@ def test_a_loaded_state_goes_on_like_the_saved_one(tmp_path):
     other = make_state(2)
     load_checkpoint(tmp_path, other)
     for one in (state, other):
-        one.set_learning_rates(0.01, 0.02)
+        one.set_learning_rates({"weights": 0.01, "grid": 0.01, "radiance": 0.02})
         for _, optimizer in one.optimizers():
             dr.backward(dr.sum(dr.sin(optimizer["weights"]), axis=None))
             optimizer.step()

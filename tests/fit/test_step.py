@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import os
+import re
 import subprocess
 import sys
 
@@ -13,7 +14,10 @@ import pytest
 from support import TINY_FIT, built_in_cameras, grey_photographs
 
 import unbake.fit.step as step_module
+from unbake.config import PathConfig
 from unbake.data.batches import PixelSource
+from unbake.errors import UserError
+from unbake.fit.memory import peak_bytes
 from unbake.fit.monitor import memory_mb
 from unbake.fit.problem import make_problem
 from unbake.fit.step import TrainingStep, initial_state
@@ -49,7 +53,8 @@ def moments(state):
 
 def rates(i):
     """Learning rates that are others in each step, as those of a fit are."""
-    return 2e-3 * 0.9**i, 5e-3 * 0.95**i
+    φ, θ = 2e-3 * 0.9**i, 5e-3 * 0.95**i
+    return {"albedo": φ, "roughness": φ, "environment": φ, "emission": φ, "radiance": θ}
 
 
 @pytest.fixture
@@ -64,17 +69,30 @@ def one_thread():
 # --------------------------------------------------------------------------------------- frozen
 
 
-@pytest.mark.parametrize("method", ["ours", "one-bounce", "direct"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"method": "ours"},
+        {"method": "ours", "prior": "one-bounce"},
+        {"method": "ours", "bounces": 2},
+        {"method": "direct"},
+        {"method": "ad-pt", "path": PathConfig(max_depth=4)},
+        {"method": "prb"},
+        {"method": "prb", "representation": "grid"},
+        {"method": "prb", "representation": "bitmap"},
+    ],
+    ids=lambda settings: ", ".join(map(str, settings.values())),
+)
 @pytest.mark.parametrize("estimator", ["split-halves", "two-pass"])
-def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, method, estimator):
-    config = dataclasses.replace(TINY_FIT, method=method, estimator=estimator)
+def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, settings, estimator):
+    config = dataclasses.replace(TINY_FIT, estimator=estimator, **settings)
     frozen, state_a = start(built_in, config)
     unfrozen, state_b = start(built_in, config)
     before = parameters(state_a)
     seen = []
     for i in range(5):
-        a = frozen(state_a, i, *rates(i))
-        state_b.set_learning_rates(*rates(i))
+        a = frozen(state_a, i, rates(i))
+        state_b.set_learning_rates(rates(i))
         seed = np.random.SeedSequence([config.seed, i]).generate_state(1)[0]
         b = unfrozen.unfrozen(state_b, dr.opaque(mi.UInt32, int(seed)))
         assert a.keys() == b.keys()
@@ -91,22 +109,102 @@ def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, method, es
     assert frozen.recordings() < 5
 
 
-def test_nothing_is_compiled_or_traced_after_the_third_step(built_in):
-    step, state = start(built_in)
+@pytest.mark.parametrize(
+    "settings",
+    [{"method": "ours"}, {"method": "prb"}, {"method": "prb", "representation": "grid"}],
+    ids=lambda settings: ", ".join(settings.values()),
+)
+def test_nothing_is_compiled_or_traced_after_the_third_step(built_in, settings):
+    step, state = start(built_in, dataclasses.replace(TINY_FIT, **settings))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for i in range(3):
-            step(state, i, *rates(i))
+            step(state, i, rates(i))
         recorded = step.recordings()
         dr.sync_thread()
         dr.kernel_history_clear()
         for i in range(3, 8):
-            step(state, i, *rates(i))
+            step(state, i, rates(i))
         dr.sync_thread()
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
         dr.kernel_history_clear()
     assert kernels, "the history was not recorded"
     assert all(k["cache_hit"] and not k["cache_disk"] for k in kernels)
     assert step.recordings() == recorded <= 3
+
+
+# ------------------------------------------------------------------------- paths to their end
+
+
+SHORT = {"representation": "grid", "path": PathConfig(max_depth=3, rr_depth=2)}
+
+
+@pytest.mark.parametrize("estimator", ["split-halves", "two-pass"])
+def test_ad_pt_and_prb_see_the_same_loss(built_in, estimator):
+    """They follow paths of one length, with other random numbers."""
+    means = []
+    for method in ("prb", "ad-pt"):
+        config = dataclasses.replace(TINY_FIT, method=method, estimator=estimator, spp=64, **SHORT)
+        step, state = start(built_in, config)
+        before = parameters(state)
+        # Rates so small that all losses are those of the start
+        rate = dict.fromkeys(rates(0), 1e-6)
+        losses = [float(step(state, i, rate)["photometric"][0]) for i in range(12)]
+        assert len(set(losses)) == len(losses)
+        assert all((v != before[k]).any() for k, v in parameters(state).items())
+        means.append(np.mean(losses))
+    print(f"{means[0]:.4f} and {means[1]:.4f}")
+    np.testing.assert_allclose(means[0], means[1], rtol=0.01)
+
+
+def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
+    config = dataclasses.replace(TINY_FIT, method="ad-pt", pixels=2048, **SHORT)
+    step, state = start(built_in, config)
+    before = parameters(state)
+    monkeypatch.setattr(step_module, "free_bytes", lambda: 100_000)
+    with pytest.raises(UserError) as error:
+        step(state, 0, rates(0))
+    message = str(error.value)
+    print(message)
+    needed = re.fullmatch(
+        r"ad-pt needs about (\S+) GB for a step of 8192 paths, 0\.0 GB are free\. "
+        r"Lower --batch or --spp or path\.max_depth, or use --method prb",
+        message,
+    )
+    assert needed and 0 <= float(needed[1]) < 5
+    # The probe leaves nothing behind, and with memory the step is taken.
+    after = parameters(state)
+    assert all((before[name] == after[name]).all() for name in before)
+    assert all(not np.array(dr.grad(v)).any() for v in state.phi.values())
+    for free in (None, 10**12):
+        monkeypatch.setattr(step_module, "free_bytes", lambda free=free: free)
+        step, state = start(built_in, config)
+        assert np.isfinite(float(step(state, 0, rates(0))["photometric"][0]))
+
+
+def test_the_estimate_of_memory_is_what_a_step_then_takes(built_in):
+    config = dataclasses.replace(TINY_FIT, method="ad-pt", pixels=32768, **SHORT)
+    step, state = start(built_in, config)
+    estimate = step._bytes_needed(state)
+    if estimate is None:
+        pytest.skip("nobody tells here how much memory was taken")
+    state.set_learning_rates(rates(0))
+    seed = dr.opaque(mi.UInt32, 1)
+    step.unfrozen(state, seed)
+    taken = peak_bytes(lambda: step.unfrozen(state, seed))
+    print(f"estimated {estimate / 1e6:.1f} MB, taken {taken / 1e6:.1f} MB")
+    assert 0.5 * taken < estimate < 2 * taken
+
+
+def test_dr_jit_running_out_of_memory_is_told_in_one_line(built_in, monkeypatch):
+    config = dataclasses.replace(TINY_FIT, method="prb", **SHORT)
+    step, state = start(built_in, config)
+
+    def fails(*arguments):
+        raise RuntimeError("jit_malloc(): out of memory! Could not allocate 8 bytes")
+
+    monkeypatch.setattr(step_module, "path_radiance", fails)
+    with pytest.raises(UserError, match="no memory for a step of 128 paths. Lower --batch"):
+        step(state, 0, rates(0))
 
 
 # ------------------------------------------------------------------------------------ NaN and inf
@@ -131,7 +229,7 @@ def test_a_gradient_that_is_not_finite_is_dropped_and_no_other(built_in, monkeyp
 
     def move(i):
         before = parameters(state)
-        state.set_learning_rates(1e-3, 1e-3)
+        state.set_learning_rates(dict.fromkeys(rates(0), 1e-3))
         terms = step.unfrozen(state, dr.opaque(mi.UInt32, i))
         assert float(terms["skipped"][0]) == 0
         after = parameters(state)
@@ -159,7 +257,7 @@ def test_a_step_without_a_finite_loss_changes_nothing_and_is_counted(built_in, b
     outcomes = []
     for i in range(16):
         before = parameters(state), moments(state)
-        terms = step(state, i, *rates(i))
+        terms = step(state, i, rates(i))
         after = parameters(state), moments(state)
         skipped = float(terms["skipped"][0])
         total = sum(float(v[0]) for k, v in terms.items() if k != "skipped")
@@ -185,10 +283,10 @@ def growth(step, state, warm_up, steps):
         return memory_mb(), dr.whos(as_string=True).count("\n")
 
     for i in range(warm_up):
-        step(state, i, *rates(i))
+        step(state, i, rates(i))
     before = now()
     for i in range(warm_up, warm_up + steps):
-        losses = step(state, i, *rates(i))
+        losses = step(state, i, rates(i))
         if i % 20 == 0:
             assert np.isfinite(float(losses["photometric"][0]))
     after = now()
@@ -226,7 +324,8 @@ def fit(steps):
     pixels = grey_photographs(built_in_cameras("cornell", 8, views=2))
     step, state = TrainingStep(problem, pixels, TINY_FIT), initial_state(problem)
     gc.enable()
-    losses = [step(state, i, 2e-3, 5e-3) for i in range(steps)]
+    rates = {"albedo": 2e-3, "roughness": 2e-3, "radiance": 5e-3}
+    losses = [step(state, i, rates) for i in range(steps)]
     values = [*state.phi.values(), *state.theta.values()]
     values += [v for loss in losses for v in loss.values()]
     return hashlib.sha256(b"".join(np.array(v).tobytes() for v in values)).hexdigest()

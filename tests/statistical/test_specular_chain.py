@@ -98,7 +98,7 @@ def test_series_is_the_image_of_path(name):
     spp = 4 * SPP if name == "glass ball" else SPP
     ray = pixel_rays([CAMERA], spp, seed=1)
     truth = stock_path(scene, ray, 2, max_depth=64)
-    series = path_traced(world, ray, 3, max_depth=16, rr_depth=5, see_environment=True)
+    series = path_traced(world, ray, 3, max_depth=16, rr_depth=5, see_lights=True)
     assert_same_expectation(series, truth, spp)
 
 
@@ -109,12 +109,12 @@ def test_both_sides_with_an_exact_cache_are_the_image_of_path(name):
     world = World.of(scene, None, 40)
     ray = pixel_rays([CAMERA], SPP, seed=4)
     truth = stock_path(scene, ray, 5, max_depth=64)
-    cache, needs = PathTracedRadiance(world, 6, 16), Needs(radiance=True, second_bounce=False)
+    cache, needs = PathTracedRadiance(world, 6, 16), Needs(bounces=1, residuals=1, lhs=True)
     sample = trace(world, cache, ray, seeded(7, dr.width(ray)), needs, True)
     flags = sample.x1.bsdf.flags()
     assert dr.all(mi.has_flag(flags, mi.BSDFFlags.Smooth) | ~sample.x1.valid)
-    assert_same_expectation(rhs(sample, sample.L2), truth, SPP)
-    assert_same_expectation(lhs(sample, sample.L1), truth, SPP)
+    assert_same_expectation(rhs(sample, sample.radiance[1]), truth, SPP)
+    assert_same_expectation(lhs(sample, sample.radiance[0]), truth, SPP)
 
 
 # ---------------------------------------------------------------------------- the chain's limit
@@ -179,6 +179,6 @@ def test_a_lane_in_black_stays_black_in_both_images():
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, 8), 0, 0), dr.normalize(mi.Vector3f(1, 0, 1)))
     world = World.of(scene, None, 4)
     cache = PathTracedRadiance(world, 1, 4)
-    sample = trace(world, cache, ray, seeded(2, 8), Needs(True, True), True)
-    assert dr.all(lhs(sample, sample.L1) == 0, axis=None)
-    assert dr.all(rhs(sample, sample.L2) == 0, axis=None)
+    sample = trace(world, cache, ray, seeded(2, 8), Needs(1, 2, lhs=True), True)
+    assert dr.all(lhs(sample, sample.radiance[0]) == 0, axis=None)
+    assert dr.all(rhs(sample, sample.radiance[1]) == 0, axis=None)

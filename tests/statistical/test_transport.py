@@ -18,7 +18,7 @@ from unbake.data import scene as scenes
 from unbake.data.camera import Camera
 from unbake.fields.texture import material_textures
 from unbake.transport.image import Needs, lhs, rhs, trace
-from unbake.transport.prior import first_residual, second_residual
+from unbake.transport.prior import residual
 from unbake.transport.series import path_traced
 from unbake.transport.vertex import World
 
@@ -31,20 +31,20 @@ def compare(
     stock: mi.Scene,
     cameras: list[Camera],
     *,
-    see_environment: bool = True,
+    see_lights: bool = True,
     spp: int = SPP,
 ) -> None:
     """All three ways to an image: E + T(L) and E + L with an exact L, and the series."""
     ray = pixel_rays(cameras, spp, seed=1)
-    hide = not see_environment
+    hide = not see_lights
     truth = stock_path(stock, ray, 3, max_depth=STOCK_DEPTH, hide_emitters=hide)
     # The series brings its own random numbers, from another seed.
     cache = PathTracedRadiance(ours, 4, DEPTH)
-    needs = Needs(radiance=True, second_bounce=False)
-    sample = trace(ours, cache, ray, seeded(5, dr.width(ray)), needs, see_environment)
-    assert_same_expectation(rhs(sample, sample.L2), truth, spp)
-    assert_same_expectation(lhs(sample, sample.L1), truth, spp)
-    series = path_traced(ours, ray, 6, max_depth=DEPTH, rr_depth=5, see_environment=see_environment)
+    needs = Needs(bounces=1, residuals=1, lhs=True)
+    sample = trace(ours, cache, ray, seeded(5, dr.width(ray)), needs, see_lights)
+    assert_same_expectation(rhs(sample, sample.radiance[1]), truth, spp)
+    assert_same_expectation(lhs(sample, sample.radiance[0]), truth, spp)
+    series = path_traced(ours, ray, 6, max_depth=DEPTH, rr_depth=5, see_lights=see_lights)
     assert_same_expectation(series, truth, spp)
 
 
@@ -85,11 +85,11 @@ def test_the_residuals_of_the_exact_radiance_vanish(built_in):
     world = World.of(load(built_in("cornell")), None, 8)
     ray = pixel_rays(built_in_cameras("cornell", 8), 4 * SPP, seed=7)
     cache = PathTracedRadiance(world, 8, DEPTH)
-    sample = trace(world, cache, ray, seeded(9, dr.width(ray)), Needs(True, True), True)
-    first = first_residual(sample, sample.L1, sample.L2)
-    assert_same_expectation(sample.L1, sample.L1 - first, 4 * SPP)
-    second = second_residual(sample, sample.L2, sample.L3)
-    assert_same_expectation(sample.L2, sample.L2 - second, 4 * SPP)
+    sample = trace(world, cache, ray, seeded(9, dr.width(ray)), Needs(1, 2, lhs=True), True)
+    first = residual(sample, 1, sample.radiance[0], sample.radiance[1])
+    assert_same_expectation(sample.radiance[0], sample.radiance[0] - first, 4 * SPP)
+    second = residual(sample, 2, sample.radiance[1], sample.radiance[2])
+    assert_same_expectation(sample.radiance[1], sample.radiance[1] - second, 4 * SPP)
 
 
 # ---------------------------------------------------------------------------- other lights
@@ -130,8 +130,20 @@ def sky() -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "to_world": to_world}
 
 
+def lamp_in_view():
+    """A lamp between the camera and all else, not in its way where it is hidden."""
+    origin, target = (np.array(x) for x in CAMERA[:2])
+    centre = origin + 0.5 * (target - origin)
+    return {
+        "type": "sphere",
+        "center": [float(x) for x in centre],
+        "radius": 0.1,
+        "emitter": {"type": "area", "radiance": 5.0},
+    }
+
+
 @pytest.mark.parametrize(
-    ("lights", "see_environment"),
+    ("lights", "see_lights"),
     [
         ({"sky": sky}, True),
         ({"sky": sky}, False),
@@ -145,10 +157,21 @@ def sky() -> dict:
             },
             True,
         ),
+        ({"lamp": lamp_in_view, "sky": sky}, True),
+        ({"lamp": lamp_in_view, "sky": sky}, False),
     ],
-    ids=["sky", "hidden sky", "even sky", "hidden even sky", "point", "point and sky"],
+    ids=[
+        "sky",
+        "hidden sky",
+        "even sky",
+        "hidden even sky",
+        "point",
+        "point and sky",
+        "lamp",
+        "hidden lamp",
+    ],
 )
-def test_lights_far_away_and_without_extent(lights, see_environment):
+def test_lights_far_away_and_without_extent(lights, see_lights):
     scene = still_life(**{name: make() for name, make in lights.items()})
     camera = Camera.look_at(*CAMERA, 12, 12)
-    compare(World.of(scene, None, 8), scene, [camera], see_environment=see_environment)
+    compare(World.of(scene, None, 8), scene, [camera], see_lights=see_lights)

@@ -123,7 +123,7 @@ def one_pixel(room, lanes, seed):
     ray = rays.through(dr.full(mi.UInt32, 9, lanes), sampler.next_2d())
     albedo = room.materials.albedo = dr.full(mi.Color3f, 0.5, lanes)
     dr.enable_grad(albedo)
-    return albedo, trace(room, ConstantRadiance(0.3), ray, sampler, Needs(True, False), True)
+    return albedo, trace(room, ConstantRadiance(0.3), ray, sampler, Needs(1, 1, lhs=True), True)
 
 
 def reference_gradient(room, target, weight, batches=12, lanes=1 << 17):
@@ -131,13 +131,13 @@ def reference_gradient(room, target, weight, batches=12, lanes=1 << 17):
     means = []
     for k in range(batches):
         _, sample = one_pixel(room, lanes, 1000 + k)
-        means.append(np.array(dr.detach(rhs(sample, sample.L2)), np.float64).mean(1))
+        means.append(np.array(dr.detach(rhs(sample, sample.radiance[1])), np.float64).mean(1))
     image = np.mean(means, 0)
     factor = mi.Color3f((2 / 3 * weight * (image - target)).tolist())
     gradients = []
     for k in range(batches):
         albedo, sample = one_pixel(room, lanes, 2000 + k)
-        dr.backward(dr.sum(dr.mean(factor * rhs(sample, sample.L2), axis=1)))
+        dr.backward(dr.sum(dr.mean(factor * rhs(sample, sample.radiance[1]), axis=1)))
         gradients.append(np.array(dr.grad(albedo), np.float64).sum(1))
     # The error of `image` is common to all and scales the gradient.
     relative = np.std(means, 0, ddof=1) / np.sqrt(batches) / np.abs(image - target)
@@ -155,16 +155,16 @@ def test_the_gradient_of_a_real_pixel_is_unbiased(room):
         primal = None
         if two_pass:
             _, again = one_pixel(room, repeats * spp, 77)
-            primal = dr.detach(pixel_means(rhs(again, again.L2), spp))
+            primal = dr.detach(pixel_means(rhs(again, again.radiance[1]), spp))
         albedo, sample = one_pixel(room, repeats * spp, 78)
         photographs = dr.repeat(mi.Color3f(target.tolist()), repeats)
         loss = RelativeL2(epsilon)
         if estimator is None:
-            row = {PHOTOMETRIC: Live(materials=True)}
+            row = {PHOTOMETRIC: Live(scene=True)}
             value = objective(row, sample, photographs, spp, loss, primal)[PHOTOMETRIC]
         else:
             weight = loss.weight(photographs)
-            value = estimator(rhs(sample, sample.L2), photographs, spp, weight)
+            value = estimator(rhs(sample, sample.radiance[1]), photographs, spp, weight)
         dr.backward(value)
         lanes = np.array(dr.grad(albedo), np.float64).reshape(3, repeats, spp)
         return repeats * lanes.sum(2).T
@@ -196,7 +196,7 @@ def step_gradients(built_in, config, steps, first=0):
     start = {k: np.array(v) for k, v in φ.items()}
     rows = []
     for i in range(first, first + steps):
-        step(state, i, 1.0, 0.0)
+        step(state, i, {"albedo": 1.0, "roughness": 1.0, "radiance": 0.0})
         rows.append([np.ravel(start[k] - np.array(state.phi[k])) for k in start])
         state.phi.update(φ)
     return np.array([np.concatenate(row) for row in rows], np.float64)

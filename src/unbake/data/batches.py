@@ -51,9 +51,7 @@ class CameraRays:
             offset: position inside the pixel, [0,1]², from its top left corner.
         """
         view = mi.UInt32(
-            dr.binary_search(
-                0, self.views, lambda i: dr.gather(mi.UInt32, self._first, i) <= pixel
-            )
+            dr.binary_search(0, self.views, lambda i: dr.gather(mi.UInt32, self._first, i) <= pixel)
         )
         view -= 1
         n = dr.width(pixel)

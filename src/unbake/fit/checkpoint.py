@@ -97,9 +97,7 @@ def load_checkpoint(folder: Path, state: State) -> Progress | None:
         if metadata.get("format") != FORMAT or crc != str(_checksum(arrays, metadata)):
             continue
         _restore(state, arrays, path)
-        return Progress(
-            int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"])
-        )
+        return Progress(int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"]))
     if written:
         raise UserError("no checkpoint in this folder can be read", folder, "Fit again")
     return None

@@ -22,7 +22,9 @@ from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .monitor import Monitor, forget_after, memory_mb
 from .preview import Preview
 from .problem import camera_warnings, make_problem, training_pixels
+from .rates import learning_rates
 from .recovered import Origin, read_origin, write_origin
+from .score import Score
 from .step import TrainingStep, initial_state
 
 #: Steps between readings of the loss; reading waits for the machine.
@@ -76,37 +78,49 @@ def fit(
         console.print(f"going on after step {progress.step}", highlight=False)
     step = TrainingStep(problem, pixels, config)
     preview = Preview(problem, dataset, run / "previews")
+    scored = config.learns_materials and config.score_seconds
+    score = Score(problem, dataset.heldout) if scored else None
+    step.require_memory(state)
     # Here all input is known to be good, and the folder is made.
     _write_settings(run, config, Origin(str(data.resolve()), mean_radiance, clip_negative))
     forget_after(run / "log.jsonl", progress.step)
 
     total = config.seconds or config.steps
-    saved_at = shown_at = progress.seconds
+    saved_at = shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
     skipped = 0
     with Monitor(run / "log.jsonl", console, total) as monitor, _stop_on_interrupt() as stop:
+        if score is not None and not progress.step:
+            monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
         clock = time.perf_counter() - progress.seconds
         # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
         last = _done(config, progress) >= total
         while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
             done = _done(config, progress) / total
-            phi_rate, theta_rate = learning_rates(config, progress.step, done)
-            recent.append(step(state, progress.step, phi_rate, theta_rate))
+            rates = learning_rates(config, progress.step, done)
+            recent.append(step(state, progress.step, rates))
             progress.step += 1
             progress.samples += config.samples_per_step
             last = _done(config, progress) >= total or bool(stop)
 
-            if progress.step % READ_EVERY == 0 or last or config.seconds:
+            full = len(recent) >= READ_EVERY
+            if full or last or config.seconds or score is not None:
                 dr.sync_thread()
                 progress.seconds = time.perf_counter() - clock
                 last = last or _done(config, progress) >= total
-            if progress.step % READ_EVERY and not last:
+            due = score is not None and progress.seconds - scored_at >= config.score_seconds
+            if not (full or last or due):
                 continue
 
-            entry = _log_entry(recent, progress, phi_rate)
+            entry = _log_entry(recent, progress, rates["albedo"])
             skipped = skipped + entry["skipped"] if entry["skipped"] == len(recent) else 0
             recent.clear()
+            # Scores, checkpoints and previews are not training: the clock stands still.
+            if score is not None and (due or last):
+                state.publish(problem)
+                entry["score"] = score.measure()
+                scored_at = progress.seconds
             monitor.record(_done(config, progress), entry)
             if skipped >= GIVE_UP_AFTER:
                 raise UserError(
@@ -114,7 +128,6 @@ def fit(
                     where=run,
                     remedy="Lower learning_rate, or look for extreme pixels in the images",
                 )
-            # What follows is not training: the clock stands still.
             if last or progress.seconds - saved_at >= config.checkpoint_seconds:
                 save_checkpoint(run / "checkpoints", state, progress)
                 saved_at = progress.seconds
@@ -129,21 +142,6 @@ def fit(
     return progress
 
 
-def learning_rates(config: FitConfig, step: int, done: float) -> tuple[float, float]:
-    """Adam's rates for φ and θ.
-
-    Both decay exponentially to a fraction of where they start. The materials' rate first rises, so
-    that L_θ is never far behind: while it is wrong, albedo would run into its bounds.
-
-    Args:
-        step: steps taken so far.
-        done: fraction of the fit that is done, [0,1].
-    """
-    decay = config.final_learning_rate ** min(done, 1.0)
-    rise = min(1.0, (step + 1) / (config.warm_up + 1))
-    return config.learning_rate * decay * rise, config.radiance_learning_rate * decay
-
-
 def _done(config: FitConfig, progress: Progress) -> float:
     return progress.seconds if config.seconds else progress.step
 
@@ -155,7 +153,7 @@ def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: floa
         "seconds": progress.seconds,
         "samples": progress.samples,
     }
-    for term in recent[0]:
+    for term in recent[0] if recent else ():
         values = [float(losses[term][0]) for losses in recent]
         if term == "skipped":
             entry[term] = int(sum(values))

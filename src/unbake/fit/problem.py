@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,55 +16,129 @@ from ..data.batches import PixelSource
 from ..data.views import Dataset, check_cameras, load_pixels
 from ..errors import UserError
 from ..fields.domain import Domain
-from ..fields.materials import Materials
-from ..fields.radiance import RadianceField
-from ..fields.texture import material_textures
+from ..fields.emission import Emission, emission_textures
+from ..fields.envmap import EnvironmentMap, environment_emitter
+from ..fields.materials import Materials, make_materials
+from ..fields.radiance import RadianceField, make_radiance
+from ..fields.texture import material_textures, slots_of
 from ..transport.objective import METHODS, needs
 from ..transport.vertex import World
+
+Parameters = Mapping[str, mi.Float | mi.TensorXf]
 
 
 @dataclass
 class Problem:
-    """A world with unknown materials, and its radiance field if the method has one."""
+    """A world with unknowns φ in it, and its radiance field if the method has one.
+
+    What is None is known, and as the scene says.
+    """
 
     world: World
-    materials: Materials
+    materials: Materials | None
+    environment: EnvironmentMap | None
+    emission: Emission | None
+    lights: list[str]  #: names of the lights whose strength is unknown
     radiance: RadianceField | None
-    see_environment: bool
+    see_lights: bool
+
+    def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The trainable arrays φ by name; the first word tells of which unknown."""
+        named: dict[str, mi.Float | mi.TensorXf] = {}
+        if self.materials is not None:
+            named |= self.materials.parameters()
+        for word, light in self._lighting():
+            named |= {f"{word}.{key}": value for key, value in light.parameters().items()}
+        return named
+
+    def assign(self, parameters: Parameters) -> None:
+        """Use these arrays from now on, whatever was derived from others."""
+        if self.materials is not None:
+            self.materials.assign(parameters)
+        for word, light in self._lighting():
+            light.assign({key: parameters[f"{word}.{key}"] for key in light.parameters()})
+            light.prepare()
+
+    def read_by_scene(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The arrays that the scene's textures and emitters look into."""
+        arrays: dict[str, mi.Float | mi.TensorXf] = {}
+        if self.materials is not None:
+            arrays |= self.materials.parameters()
+        if self.environment is not None:
+            arrays["environment"] = self.environment.texels
+        if self.emission is not None:
+            arrays |= {f"emission.{i}": c for i, c in enumerate(self.emission.values)}
+        return arrays
+
+    def _lighting(self) -> list[tuple[str, EnvironmentMap | Emission]]:
+        both = [("environment", self.environment), ("emission", self.emission)]
+        return [(word, light) for word, light in both if light is not None]
 
 
 def make_problem(scene: Path, background: str, config: FitConfig, scale: float) -> Problem:
-    """Put fresh fields in the place of a scene's materials.
+    """Put fresh fields in the place of what is unknown of a scene.
 
     Args:
-        scene: the Mitsuba scene; its albedo and roughness are ignored.
+        scene: the Mitsuba scene; what it says of the unknowns is ignored.
         background: `visible` or `hidden`.
-        scale: radiance of the untrained radiance field.
+        scale: radiance of the untrained radiance field, environment and lights.
 
     Raises:
-        UserError: the scene cannot be loaded, has no emitter or nothing to fit.
+        UserError: the scene cannot be loaded, has no emitter or nothing to fit, or has meshes
+            without the texture coordinates that bitmaps need.
     """
     parsed = scenes.parse(scene)
     scenes.to_principled(parsed)
     seeds = np.random.SeedSequence(config.seed).generate_state(2)
-    materials = Materials(config.albedo, config.roughness, seed=int(seeds[0]))
-    scenes.set_textures(parsed, *material_textures(materials))
+    materials = environment = emission = None
+    lights: list[str] = []
+    if config.learns_materials:
+        materials = _unknown_materials(parsed, config, int(seeds[0]))
+    if config.learns_environment:
+        environment = EnvironmentMap(config.lighting.resolution, scale=scale)
+        scenes.set_environment(parsed, environment_emitter(environment))
+    if config.unknown == "emission":
+        emission, lights = _unknown_emission(parsed, scale)
     loaded = parsed.instantiate()
     scenes.require_emitters(loaded, scene)
-    materials.domain = Domain.of(loaded.bbox())
+    domain = Domain.of(loaded.bbox())
+    if materials is not None:
+        materials.domain = domain
+        if config.representation == "bitmap":
+            scenes.require_unwrapped(loaded, scene)
+            materials.slots = slots_of(loaded)
 
     radiance = None
     if needs(METHODS[config.method]).radiance:
-        radiance = RadianceField(
-            config.radiance, materials.domain, scale=scale, seed=int(seeds[1])
-        )
+        radiance = make_radiance(config, domain, scale=scale, seed=int(seeds[1]))
     world = World.of(loaded, materials, config.transport.max_specular)
-    return Problem(world, materials, radiance, see_environment=background == "visible")
+    visible = background == "visible"
+    return Problem(world, materials, environment, emission, lights, radiance, visible)
 
 
-def training_pixels(
-    dataset: Dataset, *, clip_negative: bool
-) -> tuple[PixelSource, float]:
+def _unknown_materials(parsed: scenes.ParsedScene, config: FitConfig, seed: int) -> Materials:
+    names = scenes.material_names(parsed)
+    materials = make_materials(config, names, seed=seed)
+    if config.representation == "bitmap":
+        each = [material_textures(materials, slot) for slot in range(len(names))]
+        scenes.set_own_textures(parsed, each)
+    else:
+        scenes.set_textures(parsed, *material_textures(materials))
+    return materials
+
+
+def _unknown_emission(parsed: scenes.ParsedScene, scale: float) -> tuple[Emission, list[str]]:
+    made: list[Emission] = []
+
+    def textures(count: int) -> list[mi.Texture]:
+        made.append(Emission(count, scale=scale))
+        return emission_textures(made[0])
+
+    lights = scenes.set_emission(parsed, textures)
+    return made[0], [light.name for light in lights]
+
+
+def training_pixels(dataset: Dataset, *, clip_negative: bool) -> tuple[PixelSource, float]:
     """The pixels of the training views, and the mean of their radiance.
 
     Raises:

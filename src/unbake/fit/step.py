@@ -1,15 +1,15 @@
 """One training step, recorded once and replayed.
 
-Tracing a step in Python takes longer than computing it. So it is a frozen function (`dr.freeze`):
-all that changes from step to step comes in as an argument, and after the first steps nothing is
-traced or compiled again.
+Tracing a step in Python takes longer than computing it. So it is a frozen function (`dr.freeze`)
+wherever it can be one: all that changes from step to step comes in as an argument, and after the
+first steps nothing is traced or compiled again.
 """
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 
 import drjit as dr
@@ -17,17 +17,23 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..data.batches import PixelSource
+from ..data.batches import Batch, PixelSource
+from ..errors import UserError
+from ..fields.network import can_record_layout
+from ..transport.baselines import materials_along_paths, path_radiance, path_replay
 from ..transport.image import PathSample, rhs, trace
 from ..transport.objective import (
     METHODS,
-    Live,
+    PHOTOMETRIC,
     RelativeL2,
     needs,
     objective,
     pixel_means,
+    squared_error,
 )
+from .memory import free_bytes, peak_bytes
 from .problem import Problem
+from .regularise import beliefs
 
 
 @dataclass
@@ -42,17 +48,23 @@ class State:
         both = [("phi", self.phi), ("theta", self.theta)]
         return [(name, optimizer) for name, optimizer in both if optimizer is not None]
 
-    def set_learning_rates(self, phi_rate: float, theta_rate: float) -> None:
+    def set_learning_rates(self, rates: Mapping[str, float]) -> None:
         """Set Adam's rates, as arrays: a changed Python number would be traced anew.
 
         Each parameter gets an array of its own because Dr.Jit's Adam multiplies it in place.
+
+        Args:
+            rates: see `learning_rates`.
         """
-        for (_, optimizer), rate in zip(self.optimizers(), (phi_rate, theta_rate), strict=False):
-            optimizer.set_learning_rate({k: dr.opaque(mi.Float, rate) for k in optimizer})
+        named = {key: rates[key.partition(".")[0]] for key in self.phi}
+        self.phi.set_learning_rate({k: dr.opaque(mi.Float, r) for k, r in named.items()})
+        if self.theta is not None:
+            rate = rates["radiance"]
+            self.theta.set_learning_rate({k: dr.opaque(mi.Float, rate) for k in self.theta})
 
     def publish(self, problem: Problem) -> None:
         """Let the problem's fields look at the present parameters."""
-        problem.materials.assign(dict(self.phi.items()))
+        problem.assign(dict(self.phi.items()))
         if problem.radiance is not None:
             problem.radiance.assign(dict(self.theta.items()))
 
@@ -64,7 +76,7 @@ def initial_state(problem: Problem) -> State:
 
     Paper: Sec. 5.4.
     """
-    phi = mi.ad.Adam(1e-3, problem.materials.parameters(), mask_updates=True)
+    phi = mi.ad.Adam(1e-3, problem.parameters(), mask_updates=True)
     theta = None
     if problem.radiance is not None:
         theta = mi.ad.Adam(1e-3, problem.radiance.parameters(), mask_updates=True)
@@ -74,41 +86,69 @@ def initial_state(problem: Problem) -> State:
 class TrainingStep:
     """The training step of a method on a problem.
 
-    Paper: Eq. 11, Eq. 14, Sec. 4, 5.4.
+    Paper: Eq. 11, Eq. 14, Sec. 4, 5.4, 6.
     """
 
     def __init__(self, problem: Problem, pixels: PixelSource, config: FitConfig) -> None:
         self._problem = problem
         self._pixels = pixels
         self._config = config
-        self._terms: Mapping[str, Live] = METHODS[config.method]
+        transport = _Paths if config.method == "prb" else _Bounces
+        self._transport = transport(problem, config)
         self._sampler = mi.load_dict({"type": "independent"})
-        self._frozen = dr.freeze(self._step)
+        self._frozen = dr.freeze(self._step) if _can_be_recorded(config) else None
+        self._fits_memory = config.method != "ad-pt"
 
-    def __call__(
-        self, state: State, step: int, phi_rate: float, theta_rate: float
-    ) -> dict[str, mi.Float]:
+    def __call__(self, state: State, step: int, rates: Mapping[str, float]) -> dict[str, mi.Float]:
         """Take a step; returns the loss terms and `skipped` (1 if a term was not finite).
 
         Args:
             step: number of the step; with the seed of the settings it decides all random numbers.
-            phi_rate: Adam's learning rate for φ.
-            theta_rate: the same for θ.
+            rates: Adam's learning rates; see `learning_rates`.
+
+        Raises:
+            UserError: `ad-pt` would need more memory than there is.
         """
-        state.set_learning_rates(phi_rate, theta_rate)
+        self.require_memory(state)
+        state.set_learning_rates(rates)
         seed = np.random.SeedSequence([self._config.seed, step]).generate_state(1)[0]
-        p, number = self._problem, dr.opaque(mi.UInt32, int(seed))
-        with _no_garbage_collection():
-            return self._frozen(p.world.scene, self._sampler, self._pixels, state, number)
+        number = dr.opaque(mi.UInt32, int(seed))
+        step = self._step if self._frozen is None else self._frozen
+        try:
+            with _no_garbage_collection():
+                scene = self._problem.world.scene
+                return step(scene, self._sampler, self._pixels, state, number)
+        except RuntimeError as error:
+            if not _lacks_memory(error):
+                raise
+            lanes = self._config.samples_per_step
+            raise UserError(f"no memory for a step of {lanes} paths", None, _SMALLER) from None
+
+    def require_memory(self, state: State) -> None:
+        """Raise an error if a step would need more memory than there is, rather than be killed.
+
+        Only `ad-pt` asks, and only once: smaller batches, whose gradients are dropped, tell.
+
+        Raises:
+            UserError: it would.
+        """
+        if self._fits_memory:
+            return
+        need, free = self._bytes_needed(state), free_bytes()
+        if need is not None and free is not None and need > free:
+            what = f"ad-pt needs about {need / 1e9:.1f} GB for a step of"
+            what += f" {self._config.samples_per_step} paths, {free / 1e9:.1f} GB are free"
+            raise UserError(what, None, _SMALLER)
+        self._fits_memory = True
 
     def recordings(self) -> int:
-        """How often the step was traced."""
-        return self._frozen.n_recordings
+        """How often the step was traced to be replayed; 0 if it is traced each time."""
+        return 0 if self._frozen is None else self._frozen.n_recordings
 
     def unfrozen(self, state: State, seed: mi.UInt32) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
-        p = self._problem
-        return self._step(p.world.scene, self._sampler, self._pixels, state, seed)
+        scene = self._problem.world.scene
+        return self._step(scene, self._sampler, self._pixels, state, seed)
 
     def _step(
         self,
@@ -118,23 +158,8 @@ class TrainingStep:
         state: State,
         seed: mi.UInt32,
     ) -> dict[str, mi.Float]:
-        p, config = self._problem, self._config
-        state.publish(p)
-        sampler.seed(seed, config.samples_per_step)
-        batch = pixels.draw(seed, sampler, config.pixels, config.spp)
-        primal = None
-        if config.estimator == "two-pass":
-            with dr.suspend_grad():
-                again = pixels.draw(seed, sampler, config.pixels, config.spp)
-                primal = self._image(self._trace(scene, again.ray, sampler))
-        sample = self._trace(scene, batch.ray, sampler)
-        smoothed = config.loss_reference == "smoothed"
-        loss = RelativeL2(config.loss_epsilon, batch.smoothed if smoothed else None)
-        terms = objective(self._terms, sample, batch.target, config.spp, loss, primal)
-        total = sum(terms.values())
-        dr.backward(total)
-
-        finite = dr.isfinite(total)
+        terms = self._gradients(scene, sampler, pixels, state, seed, self._config.pixels)
+        finite = dr.isfinite(sum(terms.values()))
         for _, optimizer in state.optimizers():
             _drop_broken_gradients(optimizer)
             optimizer.step(active=finite, eval=False)
@@ -142,14 +167,150 @@ class TrainingStep:
         dr.eval(state, terms)
         return terms
 
-    def _trace(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> PathSample:
-        p, wanted = self._problem, needs(self._terms)
-        world = p.world.with_scene(scene)
-        return trace(world, p.radiance, ray, sampler, wanted, p.see_environment)
+    def _gradients(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        pixels: PixelSource,
+        state: State,
+        seed: mi.UInt32,
+        count: int,
+    ) -> dict[str, mi.Float]:
+        """The loss terms on a batch of `count` pixels; their gradients are left in the state."""
+        config, transport = self._config, self._transport
+        state.publish(self._problem)
+        sampler.seed(seed, count * config.spp)
+        batch = pixels.draw(seed, sampler, count, config.spp)
+        with transport.prepared():
+            primal = None
+            if not config.halves:
+                with dr.suspend_grad():
+                    again = pixels.draw(seed, sampler, count, config.spp)
+                    image = transport.image(scene, again.ray, sampler)
+                    primal = pixel_means(image, config.spp)
+            smoothed = config.loss_reference == "smoothed"
+            loss = RelativeL2(config.loss_epsilon, batch.smoothed if smoothed else None)
+            terms = transport.terms(scene, batch, sampler, loss, primal)
+            terms |= beliefs(self._problem, config, scene, batch.ray, sampler)
+            dr.backward(sum(terms.values()))
+        return terms
 
-    def _image(self, sample: PathSample) -> mi.Color3f:
-        radiance = mi.Color3f(0) if sample.L2 is None else sample.L2
-        return pixel_means(rhs(sample, radiance), self._config.spp)
+    def _bytes_needed(self, state: State) -> float | None:
+        """What a step will need, judged by two smaller batches; None where nobody can tell."""
+        config = self._config
+        few = max(1, min(config.pixels // 4, _PROBED_PATHS // config.spp))
+
+        def probe(count: int) -> None:
+            scene, seed = self._problem.world.scene, dr.opaque(mi.UInt32, 0)
+            terms = self._gradients(scene, self._sampler, self._pixels, state, seed, count)
+            for _, optimizer in state.optimizers():
+                dr.eval(terms, [dr.grad(value) for value in optimizer.values()])
+                dr.clear_grad(dict(optimizer.items()))
+
+        probe(few)  # compiles, which takes memory as well
+        fewer, more = (peak_bytes(lambda n=n: probe(n)) for n in (few, 2 * few))
+        if fewer is None or more is None:
+            return None
+        return more + max(0, more - fewer) * (config.pixels / few - 2)
+
+
+#: Paths of the smaller one of two batches that tell how much memory a batch takes.
+_PROBED_PATHS = 4096
+#: What helps where paths do not fit the memory.
+_SMALLER = "Lower --batch or --spp or path.max_depth, or use --method prb"
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    """Whether an error comes from Dr.Jit running out of memory, also while it records."""
+    while error is not None and "out of memory" not in str(error):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _can_be_recorded(config: FitConfig) -> bool:
+    """Whether a method's step can be frozen: not with every layout of cooperative vectors."""
+    if config.method == "prb" and config.learns_materials and config.representation == "neural":
+        return can_record_layout()
+    return True
+
+
+class _Bounces:
+    """A few bounces, then L_θ: the method of the paper and its ablations.
+
+    Also `ad-pt`: many bounces, all kept in memory, and nothing after them. (Mitsuba's `path` would
+    do, but asks textures, and so fields, inside virtual calls and several times a vertex: a step
+    took 8 to 60 times as long. Without a loop there is no Russian roulette either, which would save
+    nothing where all lanes wait for the longest path.)
+    """
+
+    def __init__(self, problem: Problem, config: FitConfig) -> None:
+        self._problem = problem
+        self._spp, self._bounces = config.spp, config.bounces
+        if config.method == "ad-pt":
+            self._bounces = config.path.max_depth - 1
+        one_bounce = config.prior == "one-bounce"
+        self._terms = METHODS["ours, one-bounce" if one_bounce else config.method]
+
+    def prepared(self) -> AbstractContextManager:
+        """A context that everything else needs."""
+        return nullcontext()
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Radiance of camera samples."""
+        sample = self._trace(scene, ray, sampler)
+        return rhs(sample, sample.radiance[self._bounces], self._bounces)
+
+    def terms(
+        self,
+        scene: mi.Scene,
+        batch: Batch,
+        sampler: mi.Sampler,
+        loss: RelativeL2,
+        primal: mi.Color3f | None,
+    ) -> dict[str, mi.Float]:
+        """The terms of the objective."""
+        sample = self._trace(scene, batch.ray, sampler)
+        target, bounces = batch.target, self._bounces
+        return objective(self._terms, sample, target, self._spp, loss, primal, bounces)
+
+    def _trace(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> PathSample:
+        p, wanted = self._problem, needs(self._terms, self._bounces)
+        world = p.world.with_scene(scene)
+        return trace(world, p.radiance, ray, sampler, wanted, p.see_lights)
+
+
+class _Paths:
+    """Paths to their end, by Mitsuba's `prb`."""
+
+    def __init__(self, problem: Problem, config: FitConfig) -> None:
+        self._problem = problem
+        self._spp = config.spp
+        # A hidden background was photographed without the lights in view, too.
+        hidden = not problem.see_lights
+        path = config.path
+        self._integrator = path_replay(path.max_depth, path.rr_depth, hidden)
+
+    def prepared(self) -> AbstractContextManager:
+        """A context that everything else needs, backpropagation too."""
+        return materials_along_paths(self._problem.world.materials)
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Radiance of camera samples."""
+        arrays = self._problem.read_by_scene()
+        return path_radiance(self._integrator, scene, sampler, ray, arrays)
+
+    def terms(
+        self,
+        scene: mi.Scene,
+        batch: Batch,
+        sampler: mi.Sampler,
+        loss: RelativeL2,
+        primal: mi.Color3f | None,
+    ) -> dict[str, mi.Float]:
+        """The terms of the objective: the photometric one."""
+        image = self.image(scene, batch.ray, sampler)
+        weight = loss.weight(batch.target)
+        return {PHOTOMETRIC: squared_error(image, batch.target, self._spp, weight, primal)}
 
 
 @contextmanager

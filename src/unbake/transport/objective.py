@@ -10,14 +10,14 @@ import drjit as dr
 import mitsuba as mi
 
 from .image import Needs, PathSample, lhs, rhs
-from .prior import first_residual, residual_norm, second_residual
+from .prior import residual, residual_norm
 
 
 @dataclass(frozen=True)
 class Live:
     """Which edges of a term pass gradients."""
 
-    materials: bool = False  #: the BSDF at x₁, to φ
+    scene: bool = False  #: materials at the first vertices, and lights, to φ
     lhs: bool = False  #: L_θ on the left-hand side, to θ
     rhs: bool = False  #: L_θ on the right-hand side, to θ
 
@@ -26,20 +26,41 @@ PHOTOMETRIC, PRIOR, EXTRA, LHS = "photometric", "prior", "prior_extra", "lhs"
 
 #: Method → term → what it trains. A term that is absent is not part of the method.
 #: Photometric: Eq. 5 with Eq. 12. Prior: Eq. 10. Extra: the same at x₂. LHS: Eq. 14.
+#: From `direct` to `ours` the rows are the ablation of Fig. 7 and 8, each with one thing more.
 METHODS: Mapping[str, Mapping[str, Live]] = MappingProxyType(
     {
+        "direct": {PHOTOMETRIC: Live(scene=True)},
+        "with-prior": {
+            PHOTOMETRIC: Live(scene=True),
+            PRIOR: Live(scene=True, lhs=True),
+        },
+        "with-stop-gradient": {
+            PHOTOMETRIC: Live(scene=True),
+            PRIOR: Live(lhs=True),
+        },
+        "with-second-bounce": {
+            PHOTOMETRIC: Live(scene=True),
+            PRIOR: Live(lhs=True),
+            EXTRA: Live(lhs=True),
+        },
         "ours": {
-            PHOTOMETRIC: Live(materials=True),
+            PHOTOMETRIC: Live(scene=True),
             PRIOR: Live(lhs=True),
             EXTRA: Live(lhs=True),
             LHS: Live(lhs=True),
         },
-        "one-bounce": {
-            PHOTOMETRIC: Live(materials=True),
+        "ours, one-bounce": {
+            PHOTOMETRIC: Live(scene=True),
             PRIOR: Live(lhs=True),
             LHS: Live(lhs=True),
         },
-        "direct": {PHOTOMETRIC: Live(materials=True)},
+        "no-prior": {
+            PHOTOMETRIC: Live(scene=True),
+            LHS: Live(lhs=True),
+        },
+        # Paths are followed to their end: all light is in the image, and there is no cache.
+        "ad-pt": {PHOTOMETRIC: Live(scene=True)},
+        "prb": {PHOTOMETRIC: Live(scene=True)},
     }
 )
 
@@ -69,9 +90,10 @@ class RelativeL2:
         return dr.rcp(dr.square(reference) + self.epsilon)
 
 
-def needs(terms: Mapping[str, Live]) -> Needs:
-    """What a method's path samples must hold."""
-    return Needs(radiance=set(terms) != {PHOTOMETRIC}, second_bounce=EXTRA in terms)
+def needs(terms: Mapping[str, Live], bounces: int = 1) -> Needs:
+    """What a method's path samples must hold, with so many differentiable bounces."""
+    residuals = 2 if EXTRA in terms else 1 if PRIOR in terms else 0
+    return Needs(bounces, residuals, LHS in terms)
 
 
 def objective(
@@ -81,6 +103,7 @@ def objective(
     spp: int,
     loss: RelativeL2,
     primal: mi.Color3f | None = None,
+    bounces: int = 1,
 ) -> dict[str, mi.Float]:
     """Every term of the objective; their sum is what is minimised.
 
@@ -92,29 +115,28 @@ def objective(
         loss: what errors are relative to.
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
             None: the split-halves estimator.
+        bounces: k, after which the image takes L_θ.
 
     Paper: Eq. 5, Eq. 11, Eq. 14, Sec. 4.1.
     """
     values: dict[str, mi.Float] = {}
-    # Without a radiance field no light arrives from x₂.
-    L1, L2 = (mi.Color3f(0) if L is None else L for L in (sample.L1, sample.L2))
     weight = loss.weight(target)
     for term, live in terms.items():
-        seen = L1 if live.lhs else dr.detach(L1)
-        incoming = L2 if live.rhs else dr.detach(L2)
-        scattered = sample if live.materials else dr.detach(sample)
+        scattered = sample if live.scene else dr.detach(sample)
+        seen = [L if live.lhs else dr.detach(L) for L in sample.radiance]
+        incoming = [L if live.rhs else dr.detach(L) for L in sample.radiance]
         match term:
             case "photometric":
-                pixels = rhs(scattered, incoming)
+                pixels = rhs(scattered, incoming[bounces], bounces)
                 values[term] = squared_error(pixels, target, spp, weight, primal)
             case "prior":
-                residual = first_residual(scattered, seen, incoming)
-                values[term] = residual_norm(residual, L1, loss.epsilon)
+                first = residual(scattered, 1, seen[0], incoming[1])
+                values[term] = residual_norm(first, seen[0], loss.epsilon)
             case "prior_extra":
-                residual = second_residual(sample, L2 if live.lhs else dr.detach(L2), sample.L3)
-                values[term] = residual_norm(residual, L2, loss.epsilon)
+                second = residual(scattered, 2, seen[1], incoming[2])
+                values[term] = residual_norm(second, seen[1], loss.epsilon)
             case "lhs":
-                pixels = lhs(sample, seen)
+                pixels = lhs(scattered, seen[0])
                 values[term] = squared_error(pixels, target, spp, weight, None)
     return values
 

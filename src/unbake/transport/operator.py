@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..fields.materials import carry
-from .vertex import Scattering, Vertex, World, find_vertex, mis_weight
+from .vertex import Scattering, Vertex, World, evaluate, find_vertex, mis_weight
 
 
 @dataclass
@@ -32,7 +32,7 @@ def attach_material(world: World, vertex: Vertex) -> Vertex:
     if world.materials is None:
         return attach_albedo(world, vertex)
     si = vertex.si
-    material = world.materials.evaluate(si.p, vertex.valid)
+    material = world.materials.evaluate(si, vertex.valid)
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
     return replace(vertex, si=si, albedo=dr.detach(material.albedo))
@@ -43,7 +43,7 @@ def attach_albedo(world: World, vertex: Vertex) -> Vertex:
     if world.materials is None:
         albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
     else:
-        albedo = world.materials.albedo_at(vertex.si.p, vertex.valid)
+        albedo = world.materials.albedo_at(vertex.si, vertex.valid)
     return replace(vertex, albedo=dr.detach(albedo))
 
 
@@ -86,7 +86,7 @@ def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
     weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
 
     # Evaluated here, all together: reductions further on would each compute them again.
-    dr.eval(direct, weight, ray, goes_on, bs.pdf, delta, sampler)
+    evaluate(sampler, direct, weight, ray, goes_on, bs.pdf, delta)
     origin = Scattering(dr.detach(si), bs.pdf * solid, delta)
     return Bounce(direct, weight, find_vertex(world, ray, goes_on, sampler, origin=origin))
 

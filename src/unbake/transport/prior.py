@@ -8,25 +8,21 @@ import mitsuba as mi
 from .operator import transported
 
 
-def first_residual(sample, L1: mi.Color3f, L2: mi.Color3f) -> mi.Color3f:
-    """L_θ(x₁) − T(L_θ)(x₁) at the vertices that cameras see: the one bounce prior.
+def residual(sample, number: int, L: mi.Color3f, L_next: mi.Color3f) -> mi.Color3f:
+    """L_θ(xᵢ) − T(L_θ)(xᵢ) at a vertex of path samples.
 
-    Emission is on both sides and cancels.
+    At x₁, the vertices that cameras see, it is the one bounce prior. At x₂ as well, the extra
+    bounce prior, it reaches surfaces that no camera sees. Emission is on both sides and cancels.
+
+    Args:
+        number: i, from 1.
+        L: L_θ(xᵢ).
+        L_next: L_θ(xᵢ₊₁).
 
     Paper: Eq. 3, Eq. 10, Sec. 4.2.
     """
-    return dr.select(sample.x1.valid, L1 - transported(sample.bounce1, L2), 0)
-
-
-def second_residual(sample, L2: mi.Color3f, L3: mi.Color3f) -> mi.Color3f:
-    """L_θ(x₂) − T(L_θ)(x₂) one bounce further: with it, the extra bounce prior.
-
-    It reaches surfaces that no camera sees.
-
-    Paper: Sec. 4.2.
-    """
-    x2 = sample.bounce1.next
-    return dr.select(x2.valid, L2 - transported(sample.bounce2, L3), 0)
+    valid = sample.vertex(number).valid
+    return dr.select(valid, L - transported(sample.bounces[number - 1], L_next), 0)
 
 
 def residual_norm(residual: mi.Color3f, reference: mi.Color3f, epsilon: float) -> mi.Float:

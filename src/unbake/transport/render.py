@@ -28,7 +28,7 @@ def render_radiance(
     seed: int,
     max_depth: int,
     rr_depth: int,
-    see_environment: bool,
+    see_lights: bool,
 ) -> np.ndarray:
     """Path trace pixels with full global illumination (box filter).
 
@@ -45,7 +45,7 @@ def render_radiance(
             part_seed,
             max_depth=max_depth,
             rr_depth=rr_depth,
-            see_environment=see_environment,
+            see_lights=see_lights,
         )
         image[part] = np.stack([_pixel_means(c, spp) for c in radiance], -1)
     return image
@@ -105,9 +105,11 @@ def _pixel_means(samples: mi.Float, spp: int) -> np.ndarray:
 
 def _sought(scene: mi.Scene) -> mi.Bool:
     """For each shape, by its number in Dr.Jit's registry, whether its material is sought."""
-    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in scene.shapes()]
+    # Shapes of groups, which rays meet through instances, are not among `scene.shapes()`.
+    shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
+    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in shapes]
     table = np.zeros(max(numbers) + 1, bool)
-    for number, shape in zip(numbers, scene.shapes(), strict=True):
+    for number, shape in zip(numbers, shapes, strict=True):
         # The printed form names the BSDF inside wrappers, which Mitsuba gives no other access to.
         principled = shape.bsdf() is not None and "Principled BSDF" in str(shape.bsdf())
         table[number] = principled and shape.emitter() is None

@@ -22,7 +22,7 @@ def path_traced(
     *,
     max_depth: int,
     rr_depth: int,
-    see_environment: bool,
+    see_lights: bool,
 ) -> mi.Color3f:
     """Radiance along rays, by path tracing; no gradients.
 
@@ -44,7 +44,7 @@ def path_traced(
     lanes = dr.width(ray)
     with dr.suspend_grad():
         _reseed(sampler, seed, 0, lanes)
-        v = find_vertex(world, ray, mi.Bool(True), sampler, see_environment=see_environment)
+        v = find_vertex(world, ray, mi.Bool(True), sampler, see_lights=see_lights)
         total = mi.Color3f(v.emitted)
         lane = dr.arange(mi.UInt32, lanes)
         β = mi.Color3f(v.throughput)

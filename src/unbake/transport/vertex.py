@@ -23,19 +23,22 @@ class World:
         materials: fields that stand in for the unknown materials; None: the scene's own are used.
         max_specular: longest chain of specular interactions followed; longer ones end in black.
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
+        has_lamps: whether any surface of the scene emits light (found by `of`).
     """
 
     scene: mi.Scene
     materials: Materials | None
     max_specular: int
     has_chains: bool
+    has_lamps: bool
 
     @staticmethod
     def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> World:
         """The world of a scene; looks at every BSDF once."""
         flags = [int(shape.bsdf().flags()) for shape in scene.shapes() if shape.bsdf() is not None]
         chains = any(not f & int(mi.BSDFFlags.Smooth) or f & int(mi.BSDFFlags.Null) for f in flags)
-        return World(scene, materials, max_specular, chains)
+        lamps = any(shape.emitter() is not None for shape in scene.shapes())
+        return World(scene, materials, max_specular, chains, lamps)
 
     def with_scene(self, scene: mi.Scene) -> World:
         """The same world around this handle of its scene (frozen functions bring their own)."""
@@ -86,38 +89,61 @@ def find_vertex(
     sampler: mi.Sampler,
     *,
     origin: Scattering | None = None,
-    see_environment: bool = True,
+    see_lights: bool = True,
 ) -> Vertex:
     """Follow a ray through mirrors, glass and cut-outs to the first surface that scatters.
 
     Args:
         origin: the BSDF sample that made the ray; None for a ray from the camera.
-        see_environment: whether the environment adds light if the ray leaves the scene at once.
+        see_lights: whether environment and surfaces that emit are met at once; otherwise the ray
+            passes them, as `hide_emitters` has it in Mitsuba.
 
     Returns:
-        The vertex, evaluated and without gradients; its material is not yet attached.
+        The vertex, evaluated; its material is not yet attached. Only `emitted` passes gradients, to
+        lights.
 
     Paper: Sec. 7.
     """
+    scene = world.scene
     with dr.suspend_grad():
         ray, active = mi.Ray3f(ray), mi.Bool(active)
-        pi = world.scene.ray_intersect_preliminary(ray, origin is None, active)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        seen = active & (si.is_valid() | see_environment)
-        emitted = _emission_weight(world, si, origin, active)
-        emitted = emitted * si.emitter(world.scene).eval(si, seen)
+        pi = scene.ray_intersect_preliminary(ray, origin is None, active)
+        if world.has_lamps and not see_lights:
+            pi, ray = _behind_lamps(scene, pi, ray, active)
+        first = si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        seen = active & (si.is_valid() | see_lights)
+        weight = _emission_weight(world, si, origin, active)
         valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
         direct_view = mi.Bool(valid)
         if world.has_chains:
-            pi, ray, β, chain, opacity, specular = _follow_chain(world, pi, ray, valid, sampler)
+            chain = _follow_chain(world, pi, ray, valid, sampler)
+            pi, ray, β, passed, opacity, specular, moved = chain
             direct_view &= ~specular
-            emitted += chain
             valid = valid & pi.is_valid()
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid)
-        unknown = dr.zeros(mi.Color3f)
-        vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, unknown)
-        dr.eval(vertex, sampler)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid | moved)
+
+    # The light that is met passes gradients: lighting may be unknown.
+    emitted = weight * first.emitter(scene).eval(first, seen)
+    if world.has_chains:
+        emitted += passed + β * si.emitter(scene, moved).eval(si, moved)
+    unknown = dr.zeros(mi.Color3f)
+    vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, unknown)
+    evaluate(sampler, vertex)
     return vertex
+
+
+def _behind_lamps(
+    scene: mi.Scene, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
+    """Where rays go that pass surfaces which emit light, and the rays from behind those."""
+    pi = mi.PreliminaryIntersection3f(pi)
+    lamp = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
+    ray = dr.select(lamp, si.spawn_ray(ray.d), ray)
+    # The helper of Mitsuba's integrators; which one it is makes no difference.
+    integrator = mi.load_dict({"type": "path"})
+    pi[lamp] = integrator.skip_area_emitters(scene, ray, True, lamp)
+    return pi, ray
 
 
 def _emission_weight(
@@ -145,8 +171,9 @@ def _follow_chain(
 
     Returns:
         Where the chain ends (an invalid `pi`: nowhere), its last ray, its throughput, the emission
-        met on the way, the probability with which a cut-out stopped it at the end, and whether
-        there was anything specular.
+        of surfaces passed on the way, the probability with which a cut-out stopped it at the end,
+        whether there was anything specular, and whether light met at the end comes in addition (the
+        ray has left its first surface and has not ended in black).
     """
     scene, limit, ctx = world.scene, world.max_specular, mi.BSDFContext()
     pi = mi.PreliminaryIntersection3f(pi)
@@ -155,6 +182,7 @@ def _follow_chain(
     emitted = mi.Color3f(0)
     opacity = mi.Float(1)
     any_specular = mi.Bool(False)
+    lost = mi.Bool(False)
     depth = mi.UInt32(0)
 
     while dr.hint(active, label="specular chain"):
@@ -170,6 +198,8 @@ def _follow_chain(
 
         specular = active & ~smooth
         any_specular |= specular
+        passed = (passes | specular) & (depth > 0)
+        emitted += β * si.emitter(scene, passed).eval(si, passed)
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), specular)
         β = dr.select(specular, β * weight, β)
 
@@ -182,13 +212,21 @@ def _follow_chain(
         pi_next = scene.ray_intersect_preliminary(ray, False, active)
         pi = dr.select(active, pi_next, pi)
         pi.valid &= ~black
-
-        si_next = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        emitted += β * si_next.emitter(scene, active).eval(si_next, active)
+        lost |= black
+        depth = dr.select(active, depth + 1, depth)
         active &= pi.is_valid()
-        depth += 1
 
-    return pi, ray, β, emitted, opacity, any_specular
+    return pi, ray, β, emitted, opacity, any_specular, (depth > 0) & ~lost
+
+
+def evaluate(sampler: mi.Sampler, *values: object) -> None:
+    """`dr.eval` for values and the state of a sampler, which `dr.eval` itself passes over.
+
+    A state that is not evaluated holds all that was traced since, and has it computed again with
+    the next number drawn.
+    """
+    sampler.schedule_state()
+    dr.eval(*values)
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:

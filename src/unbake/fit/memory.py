@@ -1,0 +1,53 @@
+"""How much memory this process needs for something, and how much it may still have (Linux)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+
+_PROCESS = Path("/proc/self")
+#: Where control groups, as containers are, state their limit and what is used of it.
+_LIMITS = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
+
+
+def peak_bytes(work: Callable[[], None]) -> int | None:
+    """By how much resident memory rises at most while `work` runs; None where nobody can tell."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    try:
+        # What was freed goes back to the system, or `work` would take it up unseen.
+        ctypes.CDLL(None).malloc_trim(0)
+        # Written to, this file makes the present size the peak again.
+        (_PROCESS / "clear_refs").write_text("5")
+        before = _status("VmRSS")
+        work()
+        dr.sync_thread()
+        return max(0, _status("VmHWM") - before)
+    except (OSError, AttributeError, ValueError, StopIteration):
+        return None
+
+
+def free_bytes() -> int | None:
+    """Memory that this process could still take; None where nobody can tell."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = 1024 * int(next(x for x in lines if x.startswith("MemAvailable:")).split()[1])
+    except (OSError, ValueError, StopIteration):
+        return None
+    for limit, used in _LIMITS:
+        try:
+            free = min(free, int(Path(limit).read_text()) - int(Path(used).read_text()))
+        except (OSError, ValueError):  # no such group, or one without a limit
+            continue
+    return max(0, free)
+
+
+def _status(key: str) -> int:
+    lines = (_PROCESS / "status").read_text().splitlines()
+    return 1024 * int(next(x for x in lines if x.startswith(key + ":")).split()[1])
