@@ -188,6 +188,224 @@ def test_runs_of_the_same_name_are_told_apart(made, tmp_path: Path):
     assert "runs/ours" in text and "older/ours" in text
 
 
+FACTS: dict[str, object] = {
+    "unknown": "materials", "bounces": 1, "prior": "extra-bounce", "representation": "neural",
+    "radiance": "neural", "estimator": "split-halves",
+}  # fmt: skip
+
+
+def _words(text: str) -> str:
+    """A page's text without its markup."""
+    return " ".join(re.sub(r"<[^>]*>", "", text).split())
+
+
+def test_each_run_tells_what_it_works_with(made, tmp_path: Path):
+    _edit(made[1][0], lambda m: m.update(FACTS, bounces=3, prior="one-bounce"))
+    other = {"representation": "bitmap", "radiance": None, "estimator": "two-pass"}
+    _edit(made[1][1], lambda m: m.update(FACTS, method="prb", **other))
+    text = _words(write_report(made[1], tmp_path / "report.html").read_text())
+    told = "φ network, Lθ network, 3 bounces, one bounce prior, split halves"
+    assert f"ours {told}" in text or f"ours{told}" in text
+    assert "prbφ bitmaps, no Lθ, two passes" in text
+    assert "Materials recovered in room" in text
+
+
+def _score(run: Path, values: dict[int, float]) -> None:
+    with (run / "log.jsonl").open("w") as log:
+        for step, value in values.items():
+            scores = {"views": 2, "albedo_psnr": value, "roughness_psnr": value / 2}
+            log.write(json.dumps({"step": step, "seconds": step / 4, "score": scores}) + "\n")
+
+
+def test_scores_become_curves_and_a_race(made, tmp_path: Path):
+    _score(made[1][0], {0: 10.0, 40: 30.0, 80: 31.0})
+    _score(made[1][1], {0: 10.0, 40: 20.0})
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert _Page(text).count("svg") == 4
+    assert "Held-out albedo PSNR" in text and "Validation during training" not in text
+    rows = re.findall(r"<tr>.*?</tr>", text.split('class="race"')[1].split("</table>")[0], re.S)
+    assert [re.findall(r'<td class="(.*?)">(.*?)</td>', row) for row in rows[1:]] == [
+        [("n", "31.00"), ("n best", "20.0"), ("n", "—")],
+        [("n", "20.00"), ("n best", "5.0"), ("n", "10.0")],
+    ]
+
+
+def test_one_run_is_no_race(made, tmp_path: Path):
+    _score(made[1][0], {0: 10.0, 40: 30.0})
+    assert "Time to quality" not in write_report(made[1], tmp_path / "report.html").read_text()
+
+
+def _environment() -> np.ndarray:
+    """A made-up environment map, far brighter than 1 in places."""
+    y, x = np.mgrid[0:128, 0:256] / 128
+    return np.stack([8 * np.exp(-9 * (x - y) ** 2), 4 * y, x], axis=-1)
+
+
+def _seek_light(run: Path, noise: float, unknown: str = "materials+lighting") -> None:
+    """Make a run one that sought the environment map, and say that it found it up to noise."""
+    map_ = _environment() + noise
+    _save(run / "evaluation" / "environment.exr", map_)
+    numbers = {"sh_error": noise, "sh_error_aligned": noise / 2}
+    numbers |= {"relight_psnr": 4 / noise, "relight_psnr_aligned": 5 / noise}
+    _edit(run, lambda m: m.update(FACTS, unknown=unknown, environment=numbers))
+    _edit(run, lambda m: m["definitions"].update(sh_error="|c - c*|", relight_psnr="balls"))
+
+
+def _seek_lamps(run: Path, lamps: dict[str, tuple[list[float], float | None]]) -> None:
+    """Make a run one that sought the strength of lights; by name, strength and error."""
+    rows = [
+        {"name": name, "strength": strength, "emission_error": error,
+         "truth": None if error is None else [17, 15.8, 13.8]}
+        for name, (strength, error) in lamps.items()
+    ]  # fmt: skip
+    _know_materials(run)
+    _edit(run, lambda m: m.update(unknown="emission", emission=rows))
+    _edit(run, lambda m: m["definitions"].update(emission_error="of a colour"))
+
+
+def _know_materials(run: Path) -> None:
+    """Make a run one whose materials are known: no numbers of them, no pictures."""
+    unsought = {"albedo_psnr": None, "roughness_psnr": None}
+    _seek_light(run, 0.1, "lighting")
+
+    def change(metrics: dict) -> None:
+        metrics.update(representation=None)
+        for row in (*metrics["per_view"], metrics["heldout"], metrics["train"]):
+            row.update(unsought)
+
+    _edit(run, change)
+    for kind in ("albedo", "roughness"):
+        for path in run.rglob(f"*_{kind}.exr"):
+            path.unlink()
+
+
+def test_a_run_with_known_materials_beside_one_that_seeks_them(made, tmp_path: Path):
+    _know_materials(made[1][1])
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    shown = [alt for alt in _Page(text).images() if "heldout_000" in alt and "Albedo" in alt]
+    assert len(shown) == 3 and not any("direct" in alt for alt in shown)
+    assert "known, not sought" in text and "lighting sought" in text
+    assert "Materials and lighting recovered" in text
+
+
+def test_runs_with_known_materials_show_renderings_alone(made, tmp_path: Path):
+    for run in made[1]:
+        _know_materials(run)
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    shown = [alt for alt in _Page(text).images() if "heldout_000" in alt]
+    assert len(shown) == 5 and all(alt.startswith("Rendering") for alt in shown)
+    assert "Lighting recovered in room" in text and "not sought" not in text
+
+
+def _section(text: str, name: str) -> str:
+    return text.split(f'<section id="{name}">')[1].split("</section>")[0]
+
+
+def _cells(table: str) -> list[list[tuple[str, str]]]:
+    """The class and the text of each cell, row by row."""
+    rows = re.findall(r"<tr>(.*?)</tr>", table.split("<tbody>")[1], re.S)
+    return [re.findall(r'<td class="(.*?)".*?>(.*?)</td>', row) for row in rows]
+
+
+def test_runs_that_know_the_light_have_no_section_on_it(made, tmp_path: Path):
+    _edit(made[1][0], lambda m: m["definitions"].update(albedo_psnr_aligned="x", sh_error="x"))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert 'href="#light"' not in text and "light recovered" not in _words(text)
+    assert "Aligned" not in text and "SH error" not in text
+
+
+def test_environment_maps_are_shown_beside_the_truth(made, tmp_path: Path):
+    _save(made[0] / "truth" / "environment.exr", _environment(), np.ones((128, 256)))
+    third = _make_run(tmp_path / "runs" / "prb", made[0], "prb", 0.05)
+    _seek_light(made[1][0], 0.04)
+    _seek_light(made[1][1], 0.2, "lighting")
+    text = write_report([*made[1], third], tmp_path / "report.html").read_text()
+    light = _section(text, "light")
+    assert 'href="#light"' in text and "at -2.0 stops" in light and "0.05</span>" in light
+    names = [alt.removeprefix("Environment map") for alt in _Page(light).images()]
+    assert names == [
+        ", ground truth", ", ours", " error, ours, SH error 4.00 %",
+        ", direct", " error, direct, SH error 20.00 %",
+    ]  # fmt: skip
+    best = [("n best first", "4.00"), ("n best", "2.00"), ("n best first", "100.00")]
+    assert _cells(light) == [
+        [*best, ("n best", "125.00")],
+        [("n first", "20.00"), ("n", "10.00"), ("n first", "20.00"), ("n", "25.00")],
+        [("n first soft", "known, not sought")],
+    ]
+    assert 'class="number best">SH error 4.00 %' in light and light.count("best") == 5
+    assert "|c - c*|" in light and "balls" in light
+    assert "|c - c*|" not in _section(text, "numbers")
+    assert "albedo, roughness and light recovered" in _words(text)
+
+
+def test_all_maps_have_the_exposure_that_suits_the_truth(made, tmp_path: Path):
+    _save(made[0] / "truth" / "environment.exr", _environment(), np.ones((128, 256)))
+    _seek_light(made[1][0], 50.0)
+    light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
+    assert "at -2.0 stops" in light
+    truth, ours = re.findall(r'data-kind="picture".*?src="(.*?)"', light, re.S)
+    assert truth == pictures.png_data_uri(pictures.tonemap(_environment(), -2.0))
+    assert ours == pictures.png_data_uri(pictures.tonemap(_environment() + 50, -2.0))
+
+
+def test_maps_without_truth_stand_alone(made, tmp_path: Path):
+    for run in made[1]:
+        _seek_light(run, 0.05)
+        _edit(run, lambda m: m.update(environment=None))
+    light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
+    assert len(_Page(light).images()) == 2 and "no ground truth" in light
+    assert "<table" not in light and "The error is" not in light and "SH error" not in light
+
+
+def test_lights_are_a_table_of_strengths(made, tmp_path: Path):
+    _seek_lamps(made[1][0], {"lamp": ([17.217773, 15.829334, 13.7], 0.0084), EVIL: ([0, 0, 0], 0)})
+    _seek_lamps(made[1][1], {"lamp": ([170.5, 2.25, 0.001], 9.5), "sun": ([1e5, 2, 3], None)})
+    third = _make_run(tmp_path / "runs" / "prb", made[0], "prb", 0.05)
+    text = write_report([*made[1], third], tmp_path / "report.html").read_text()
+    light = _section(text, "light").replace("\N{EN SPACE}", " ")
+    unsought, dash = ("n first soft", "known, not sought"), [("n first", "—"), ("n", "—")]
+    truth, ours = ("n first", "17.00 15.80 13.80"), ("n first", "17.22 15.83 13.70")
+    assert _cells(light) == [
+        [truth, ours, ("n best", "0.84"), ("n first", "170.5 2.2 0.0"), ("n", "950.00"), unsought],
+        [truth, ("n first", "0.00 0.00 0.00"), ("n", "0.00"), *dash, unsought],
+        [("n first", "—"), *dash, ("n first", "100000 2 3"), ("n", "—"), unsought],
+    ]
+    assert "of a colour" in light and _Page(text).images().count("Environment map") == 0
+    assert _Page(text).count("script") == 1
+
+
+def test_lights_alone_are_the_title_and_leave_out_columns_of_materials(made, tmp_path: Path):
+    for run in made[1]:
+        _seek_lamps(run, {"lamp": ([1, 2, 3], 0.1)})
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert "Lights recovered in room" in text and "light recovered" in _words(text)
+    numbers = _section(text, "numbers")
+    assert "Rendering" in numbers and "Albedo" not in numbers and "Roughness" not in numbers
+
+
+def test_an_aligned_albedo_has_its_column(made, tmp_path: Path):
+    aligned = {"albedo_psnr_aligned": 43.21}
+    _seek_light(made[1][0], 0.05)
+    _edit(made[1][0], lambda m: [m[split].update(aligned) for split in ("heldout", "train")])
+    _edit(made[1][0], lambda m: m["definitions"].update(albedo_psnr_aligned="after scaling"))
+    text = _section(write_report(made[1], tmp_path / "report.html").read_text(), "numbers")
+    assert text.count(">Aligned albedo</th>") == 2 and "after scaling" in text
+    ours, direct = _cells(text)
+    assert [cell for _, cell in ours[1:9]] == ["40.00", "40.00", "43.21", "40.00"] * 2
+    assert [cell for _, cell in direct[1:9]] == ["20.00", "20.00", "—", "20.00"] * 2
+    assert [kind for kind, _ in ours if kind.endswith("first")] == ["n best first"] * 2 + [
+        "n first"
+    ]
+
+
+def test_what_failed_is_told_and_cannot_inject_markup(made, tmp_path: Path):
+    page = tmp_path / "report.html"
+    text = write_report(made[1], page, {"ad-pt": f"out of memory {EVIL}"}).read_text()
+    assert "ad-pt came to nothing: out of memory" in _words(text)
+    assert _Page(text).count("script") == 1
+
+
 def _edit(run: Path, change: Callable[[dict], object]) -> None:
     path = run / "evaluation" / "metrics.json"
     metrics = json.loads(path.read_text())
@@ -239,6 +457,31 @@ def _remove(path: str) -> Callable[[Path, list[Path]], None]:
             "`frames`",
         ),
         (lambda data, runs: _edit(runs[0], lambda m: m["per_view"].append({})), "has no name"),
+        (
+            lambda data, runs: _edit(runs[0], lambda m: m.update(unknown="lighting")),
+            r"environment\.exr.*picture is gone.*unbake evaluate \S*ours",
+        ),
+        (
+            lambda data, runs: (
+                _seek_light(runs[0], 0.1),
+                _save(data / "truth" / "environment.exr", np.zeros((2, 4, 4))),
+            ),
+            r"truth/environment\.exr",
+        ),
+        (
+            lambda data, runs: (
+                _seek_light(runs[0], 0.1),
+                _save(data / "truth" / "environment.exr", _environment(), np.ones((128, 256))),
+                _save(runs[0] / "evaluation" / "environment.exr", np.zeros((2, 4, 3))),
+            ),
+            r"ours/evaluation/environment\.exr.*4 x 2 pixels",
+        ),
+        (lambda data, runs: _edit(runs[0], lambda m: m.update(environment=[])), "`environment` is"),
+        (lambda data, runs: _edit(runs[0], lambda m: m.update(emission=[{}])), "has no name"),
+        (
+            lambda data, runs: _edit(runs[0], lambda m: m.update(unknown="emission")),
+            "`emission` has no light",
+        ),
         (lambda data, runs: runs.append(runs[0]), "given twice"),
         (lambda data, runs: runs.clear(), "at least one run"),
     ],

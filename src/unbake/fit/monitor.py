@@ -97,13 +97,18 @@ class Monitor:
             self.say(f"{100 * done / self._total:3.0f} %  {line}{left}")
 
     def validation(self, entry: dict) -> None:
-        """Log and print how good the materials are by now."""
+        """Log and print how good the materials are by now, or how strong the lights."""
         self._write(entry)
         v = entry["validation"]
-        self.say(
-            f"step {entry['step']}, {entry['seconds']:.0f} s: {v['split']} view, "
-            f"albedo {v['albedo_psnr']:.1f} dB, roughness {v['roughness_psnr']:.1f} dB"
-        )
+        if "emission" in v:
+            strengths = ((name, *(f"{x:.4g}" for x in rgb)) for name, rgb in v["emission"].items())
+            text = ", ".join(" ".join(words) for words in strengths)
+        else:
+            text = (
+                f"{v['split']} view, albedo {v['albedo_psnr']:.1f} dB, "
+                f"roughness {v['roughness_psnr']:.1f} dB"
+            )
+        self.say(f"step {entry['step']}, {entry['seconds']:.0f} s: {text}")
 
     def _write(self, entry: dict) -> None:
         rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in entry.items()}

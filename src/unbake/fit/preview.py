@@ -1,65 +1,70 @@
-"""Pictures of the materials while they are learned, and how far they are from the truth."""
+"""What is learned so far: pictures, and how far materials are from the truth."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..data.batches import CameraRays
-from ..data.views import Dataset, View, read_image
-from ..imaging.metrics import psnr
+from ..data.lights import ROWS, true_environment
+from ..data.views import Dataset, View
 from ..imaging.pictures import montage, to_bytes, tonemap, write_png
-from ..transport.render import render_materials
 from .checkpoint import Progress
 from .problem import Problem
-
-SAMPLES = 4
+from .score import SAMPLES, Seen, Truth
 
 
 class Preview:
-    """Renders albedo and roughness of one view, a held-out one if there is any.
+    """Shows the unknowns: materials in one view, a held-out one if there is any; light as a whole.
 
     Raises:
-        UserError: a truth image of that view cannot be read.
+        UserError: a truth image of that view, or of the environment, cannot be read.
     """
 
     def __init__(self, problem: Problem, dataset: Dataset, folder: Path) -> None:
         self._problem = problem
         self._folder = folder
         self._view: View = (dataset.heldout or dataset.train)[0]
-        self._rays = CameraRays.of([self._view.camera])
-        self._truth: tuple[np.ndarray, np.ndarray] | None = None
-        if self._view.albedo is not None and self._view.roughness is not None:
-            self._truth = self._read(self._view.albedo), self._read(self._view.roughness)
+        self._truth = None if problem.materials is None else Truth.of(self._view)
+        known = None if problem.environment is None else true_environment(dataset.folder)
+        self._environment = [] if known is None else [[tonemap(known)]]
 
     def show(self, progress: Progress) -> list[dict]:
-        """Write `step-NNNNNN.png`; with truth at hand, give one line for the log."""
-        shape = (self._view.camera.height, self._view.camera.width)
-        albedo, roughness, coverage = render_materials(
-            self._problem.world, self._rays.through, self._rays.pixels, SAMPLES, seed=0
-        )
-        albedo, roughness = albedo.reshape(*shape, 3), roughness.reshape(shape)
-        tiles = [[tonemap(albedo), _grey(roughness)]]
-        lines = []
-        if self._truth is not None:
-            true_albedo, true_roughness = self._truth
-            mask = (true_albedo[..., 3] >= 1) & (coverage.reshape(shape) >= 1)
-            tiles.append([tonemap(true_albedo[..., :3]), _grey(true_roughness[..., 0])])
-            if mask.any():
-                validation = {
-                    "split": self._view.split,
-                    "albedo_psnr": psnr(albedo, true_albedo[..., :3], mask),
-                    "roughness_psnr": psnr(roughness, true_roughness[..., 0], mask),
-                }
-                lines = [{**asdict(progress), "validation": validation}]
-        write_png(self._folder / f"step-{progress.step:06d}.png", montage(tiles))
-        return lines
+        """Show what the fields say now.
 
-    def _read(self, image: Path) -> np.ndarray:
-        width, height = self._view.camera.width, self._view.camera.height
-        return read_image(image, width, height).reshape(height, width, 4)
+        Albedo and roughness, and the environment map, go to `step-NNNNNN.png`, above the truth
+        where that is known. Lights have no picture.
+
+        Returns:
+            Lines for the log: materials against the truth, and the strength of lights.
+        """
+        sheets, found = [], []
+        if self._problem.materials is not None:
+            tiles, values = self._materials()
+            sheets.append([montage(tiles)])
+            found += [values] if values else []
+        if self._problem.environment is not None:
+            map_ = tonemap(self._problem.environment.to_latlong(ROWS))
+            sheets.append([montage([[map_], *self._environment])])
+        if self._problem.emission is not None:
+            strengths = np.array(self._problem.emission.values).T.tolist()
+            found.append({"emission": dict(zip(self._problem.lights, strengths, strict=True))})
+        if sheets:
+            file = self._folder / f"step-{progress.step:06d}.png"
+            write_png(file, montage(sheets, gap=0))
+        return [{**asdict(progress), "validation": values} for values in found]
+
+    def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:
+        """Pictures of them and of the truth; PSNRs where there is truth."""
+        (seen,) = Seen.of(self._problem, [self._view], SAMPLES, seed=0)
+        tiles = [[tonemap(seen.albedo), _grey(seen.roughness)]]
+        if self._truth is None:
+            return tiles, {}
+        tiles.append([tonemap(self._truth.albedo), _grey(self._truth.roughness)])
+        values = seen.psnr(self._truth)
+        return tiles, {} if None in values.values() else {"split": self._view.split} | values
 
 
 def _grey(values: np.ndarray) -> np.ndarray:

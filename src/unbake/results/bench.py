@@ -10,7 +10,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -18,46 +17,53 @@ import mitsuba as mi
 from rich.console import Console
 from rich.table import Table
 
-from ..config import FitConfig, MethodName, preset
+from ..config import FitConfig
 from ..data.capture import CaptureSettings, capture
 from ..data.views import Dataset
 from ..fit.monitor import memory_mb
 from ..fit.problem import make_problem, training_pixels
+from ..fit.rates import learning_rates
 from ..fit.step import State, TrainingStep, initial_state
 
 #: Steps before anything is measured.
 WARM_UP = 20
 
 
+@contextmanager
+def small_data(data: Path | None) -> Iterator[Path]:
+    """A data set's folder: the one given, or a small capture of the demo scene, for a while."""
+    if data is not None:
+        yield data
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        small = CaptureSettings(views=4, held_out=0, resolution=64, spp=8)
+        capture("demo", Path(folder) / "demo", small, tell=lambda line: None)
+        yield Path(folder) / "demo"
+
+
 def bench_step(
-    data: Path | None, method: MethodName, steps: int, out: Path | None, console: Console
+    data: Path, config: FitConfig, steps: int, out: Path | None, console: Console
 ) -> dict:
-    """Measure the training step on a data set, by default a small capture of the demo scene.
+    """Measure the training step on a data set.
 
     Times are medians after warm-up. A camera sample is one path from the camera with its RHS, its
     LHS, both residuals and all gradients.
 
     Args:
         data: a data set's folder.
-        method: whose step.
+        config: settings of the step.
         steps: to take the median of.
         out: JSON file to write.
 
     Returns:
         All that is printed.
     """
-    if data is None:
-        with tempfile.TemporaryDirectory() as folder:
-            small = CaptureSettings(views=4, held_out=0, resolution=64, spp=8)
-            capture("demo", Path(folder) / "demo", small, tell=lambda line: None)
-            return bench_step(Path(folder) / "demo", method, steps, out, console)
-    config = replace(preset("cpu"), method=method)
     dataset = Dataset.load(data)
     pixels, mean = training_pixels(dataset, clip_negative=False)
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
 
-    result = {"machine": _machine(), "method": method, "settings": _settings(config)}
+    result = {"machine": machine(), "method": config.method, "settings": _settings(config)}
     result |= _replayed(step, state, config, steps)
     _print(result, console)
     if out is not None:
@@ -68,18 +74,19 @@ def bench_step(
 
 def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -> dict:
     """The frozen step: wall time, time inside kernels by kind, and the Python side."""
+    rates = learning_rates(config, config.warm_up, 0.0)
     for i in range(WARM_UP):
-        step(state, i, config.learning_rate, config.radiance_learning_rate)
+        step(state, i, rates)
     dr.sync_thread()
     wall, python = [], []
     for i in range(WARM_UP, WARM_UP + steps):
         start = time.perf_counter()
-        step(state, i, config.learning_rate, config.radiance_learning_rate)
+        step(state, i, rates)
         python.append(time.perf_counter() - start)
         dr.sync_thread()
         wall.append(time.perf_counter() - start)
     with _kernel_history() as kernels:
-        step(state, WARM_UP + steps, config.learning_rate, config.radiance_learning_rate)
+        step(state, WARM_UP + steps, rates)
     kinds: dict[str, list[float]] = {}
     for kernel in kernels:
         kinds.setdefault(_kind(kernel), []).append(kernel["execution_time"])
@@ -143,7 +150,8 @@ def _settings(config: FitConfig) -> dict:
     }
 
 
-def _machine() -> dict:
+def machine() -> dict:
+    """What numbers were measured on: processor, variant, versions."""
     model = platform.processor()
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

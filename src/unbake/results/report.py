@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -13,14 +12,49 @@ import numpy as np
 
 from unbake.errors import UserError
 from unbake.imaging import pictures
-from unbake.results import curves
+from unbake.results import curves, shown
+from unbake.results.light_section import light_section
 from unbake.results.runs import Run, View, data_folder, labels, read_json, read_run, read_views
+from unbake.results.speed import score_curve, time_to_quality
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
-LONGEST_SIDE = 640  # pixels of an embedded picture: keeps a page of 24 views near 50 MB
 SPLITS = ("heldout", "train")
 QUANTITIES = ("render", "albedo", "roughness")
-LOSSES = {"photometric": "Photometric loss", "prior": "Prior loss", "lhs": "LHS loss"}
+PSNRS = {
+    "render_psnr": "Rendering",
+    "albedo_psnr": "Albedo",
+    "albedo_psnr_aligned": "Aligned albedo",
+    "roughness_psnr": "Roughness",
+}
+#: What an evaluation defines, and the name on the page; by the part of the page.
+DEFINED = {
+    "psnr": "PSNR",
+    "albedo_psnr_aligned": "Aligned albedo",
+    "colour_space": "Colour space",
+    "mask": "Mask",
+}
+LIGHT_DEFINED = {
+    "environment": {
+        "sh_error": "SH error",
+        "relight_psnr": "Relighting PSNR",
+        "aligned": "Aligned",
+    },
+    "emission": {"emission_error": "Error"},
+}
+LOSSES = {
+    "photometric": "Photometric loss",
+    "prior": "Prior loss",
+    "prior_extra": "Prior loss, extra bounce",
+    "lhs": "LHS loss",
+}
+SCORES = {"albedo_psnr": "Held-out albedo PSNR", "roughness_psnr": "Held-out roughness PSNR"}
+SOUGHT = {
+    "materials": "Materials",
+    "lighting": "Lighting",
+    "materials+lighting": "Materials and lighting",
+    "emission": "Lights",
+}
+FORMS = {"neural": "network", "grid": "3D grid", "bitmap": "bitmaps"}
 VALIDATION = {"albedo_psnr": "Albedo PSNR", "roughness_psnr": "Roughness PSNR"}
 AXES = {"step": "step", "seconds": "training time, seconds"}  # key in the log: title of the axis
 
@@ -34,7 +68,7 @@ class Display:
     error: dict[str, float]  # the brightest colour, a quantity
 
 
-def write_report(runs: Sequence[Path], out: Path) -> Path:
+def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | None = None) -> Path:
     """Write one HTML page that compares evaluated runs with the ground truth and each other.
 
     The page holds its pictures, styles and script itself and loads nothing from anywhere.
@@ -45,6 +79,7 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
     Args:
         runs: run folders, all evaluated on the same data.
         out: the page's file; it appears complete or not at all.
+        failed: further runs that came to nothing, by name: why.
 
     Returns:
         `out`.
@@ -74,13 +109,20 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
             scene=data.name,
             transforms=transforms,
             runs=loaded,
+            psnrs=_psnrs(loaded).values(),
             rows=_table(loaded),
+            light=light_section(loaded, data),
+            sought=_sought(loaded),
+            materials=any(run.seeks("albedo") for run in loaded),
+            failed=failed or {},
             groups=groups,
             display=display,
-            longest=LONGEST_SIDE,
+            longest=shown.LONGEST_SIDE,
             magma=pictures.MAGMA,
             chart=curves,
             losses=_loss_charts(loaded),
+            scores=_score_charts(loaded),
+            race=_race(loaded),
             validation=_validation_charts(loaded),
             validated=sorted(
                 {r["split"] for log in _validations(loaded) for r in log if "split" in r}
@@ -97,164 +139,129 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
 # ----------------------------------------------------------------------------------------- pictures
 
 
-def _rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) linear RGB and (H, W) bool, True where alpha (if any) is at least one half."""
-    pixels = pictures.read_exr(path)
-    if pixels.shape[2] < 3:
-        pixels = pixels[..., :1].repeat(3, axis=2)
-    mask = pixels[..., 3] >= 0.5 if pixels.shape[2] > 3 else np.ones(pixels.shape[:2], bool)
-    return pixels[..., :3], mask
-
-
 def _recovered(run: Run, view: View, quantity: str) -> Path | None:
-    """Where a run's picture of a view lies; None where it was not evaluated on that view."""
-    if not run.view(view.name):
+    """Where a run's picture of a view lies; None where there is none to be expected."""
+    if not run.view(view.name) or not run.seeks(quantity):
         return None
-    path = run.path / "evaluation" / view.split / f"{view.name}_{quantity}.exr"
-    if not path.is_file():
-        raise UserError(
-            "an evaluated picture is gone", path, f"Run `unbake evaluate {run.path}` again"
-        )
-    return path
-
-
-def _error(image: np.ndarray, reference: np.ndarray, path: Path) -> np.ndarray:
-    if image.shape != reference.shape:
-        raise UserError(
-            f"the picture has {image.shape[1]} x {image.shape[0]} pixels, "
-            f"its ground truth {reference.shape[1]} x {reference.shape[0]}",
-            path,
-            "Evaluate the run again",
-        )
-    return pictures.absolute_error(image, reference)
+    return shown.evaluated(run, f"{view.split}/{view.name}_{quantity}.exr")
 
 
 def _display(runs: list[Run], views: list[View]) -> Display:
-    """Exposure and error scales that suit all pictures of the page at once.
-
-    The exposure brings the ground truth's 95th percentile to 0.8, in half stops. The scale of an
-    error is rounded up to 1, 2 or 5 times 10^n from the best run's 97th percentile, so that a bad
-    run does not turn all others black.
-    """
+    """Exposure and error scales that suit all pictures of the page at once."""
     light: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
     for view in views:
         for quantity, path in view.truth.items():
-            reference, mask = _rgb(path)
+            reference, mask = shown.rgb(path)
             if quantity == "render":
-                light.append(_sample(reference.mean(axis=2)[mask]))
+                light.append(shown.sample(reference.mean(axis=2)[mask]))
             for run, parts in zip(runs, errors[quantity], strict=True):
                 recovered = _recovered(run, view, quantity)
                 if recovered is not None:
-                    error = _error(_rgb(recovered)[0], reference, recovered)
-                    parts.append(_sample(error[mask]))
-    bright = _percentile(light, 95)
-    exposure = round(2 * math.log2(0.8 / bright)) / 2 if bright > 0 else 0.0
-    return Display(exposure, {quantity: _error_scale(errors[quantity]) for quantity in QUANTITIES})
-
-
-def _error_scale(errors: list[list[np.ndarray]]) -> float:
-    high = np.array([_percentile(parts, 97) for parts in errors])
-    high = high[high > 1e-6]  # a run that agrees up to rounding needs no scale
-    return _round_up(float(high.min())) if len(high) else 0.01
-
-
-def _sample(values: np.ndarray, limit: int = 4096) -> np.ndarray:
-    values = values[np.isfinite(values)]
-    return values[:: max(1, len(values) // limit)]
-
-
-def _percentile(parts: list[np.ndarray], percent: float) -> float:
-    values = np.concatenate([np.zeros(0), *parts])
-    return float(np.percentile(values, percent)) if len(values) else 0.0
-
-
-def _round_up(value: float) -> float:
-    decade = 10.0 ** math.floor(math.log10(value))
-    return next(m * decade for m in (1, 2, 5, 10) if m * decade >= value * (1 - 1e-9))
+                    error = shown.error(shown.rgb(recovered)[0], reference, recovered)
+                    parts.append(shown.sample(error[mask]))
+    scales = {quantity: shown.error_scale(errors[quantity]) for quantity in QUANTITIES}
+    return Display(shown.exposure(light), scales)
 
 
 def _view_block(view: View, runs: list[Run], display: Display) -> dict[str, Any]:
     """A view's pictures for the template: a column a quantity, in it truth and runs."""
-    height, width = _rgb(view.truth["render"])[0].shape[:2]
-    columns = [_column(view, runs, quantity, display) for quantity in QUANTITIES]
+    height, width = shown.rgb(view.truth["render"])[0].shape[:2]
+    quantities = [q for q in QUANTITIES if any(run.seeks(q) for run in runs)]
+    columns = [_column(view, runs, quantity, display) for quantity in quantities]
     return {"name": view.name, "width": width, "height": height, "columns": columns}
 
 
 def _column(view: View, runs: list[Run], quantity: str, display: Display) -> dict[str, Any]:
     def paint(linear: np.ndarray) -> str:
-        small = pictures.shrink(linear, LONGEST_SIDE)
         if quantity == "roughness":
+            small = pictures.shrink(linear, shown.LONGEST_SIDE)
             return pictures.png_data_uri(pictures.to_bytes(small))
-        exposure = display.exposure if quantity == "render" else 0.0
-        return pictures.png_data_uri(pictures.tonemap(small, exposure))
+        return shown.tonemapped(linear, display.exposure if quantity == "render" else 0.0)
 
-    values = [_number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
-    best = _best(values)
-    reference, mask = _rgb(view.truth[quantity]) if quantity in view.truth else (None, None)
+    values = [shown.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
+    scale = display.error[quantity]
+    reference, mask = shown.rgb(view.truth[quantity]) if quantity in view.truth else (None, None)
     cells = []
-    for run, value in zip(runs, values, strict=True):
+    for run, psnr in zip(runs, shown.marked(values, shown.decibels), strict=True):
         path = _recovered(run, view, quantity)
-        cell: dict[str, Any] = {"picture": None, "error": None}
+        empty = "not evaluated" if run.seeks(quantity) else "known, not sought"
+        cell: dict[str, Any] = {"picture": None, "error": None, "empty": empty}
         if path is not None:
-            image = _rgb(path)[0]
+            image = shown.rgb(path)[0]
             cell["picture"] = paint(image)
             if reference is not None and mask is not None:
-                error = pictures.shrink(_error(image, reference, path), LONGEST_SIDE)
-                inside = pictures.shrink(mask, LONGEST_SIDE) >= 0.5
-                cell["error"] = pictures.png_data_uri(
-                    pictures.false_colour(error, display.error[quantity], inside)
-                )
-        cells.append(cell | {"psnr": _decibels(value), "best": value is not None and value == best})
+                cell["error"] = shown.painted(shown.error(image, reference, path), scale, mask)
+        unit = "" if psnr["text"] == shown.DASH else " dB"
+        cells.append(cell | {"number": psnr["text"] + unit, "best": psnr["best"]})
     truth = None if reference is None else paint(reference)
-    return {"quantity": quantity, "truth": truth, "cells": cells}
+    return {"quantity": quantity, "truth": truth, "scale": scale, "cells": cells}
 
 
 # ------------------------------------------------------------------------------------------ numbers
 
 
-def _number(value: object) -> float | None:
-    """A number that can be shown, or None for null and not-a-number."""
-    good = isinstance(value, int | float) and not math.isnan(value)
-    return float(value) if good else None
-
-
-def _best(values: Iterable[float | None]) -> float | None:
-    """The highest value, or None where there is nothing to choose between."""
-    known = [value for value in values if value is not None]
-    return max(known) if len(known) > 1 else None
-
-
-def _decibels(value: float | None) -> str:
-    if value is None:
-        return "—"
-    text = "∞" if math.isinf(value) else f"{abs(value):.2f}"
-    return f"−{text}" if value < 0 else text
+def _psnrs(runs: list[Run]) -> dict[str, str]:
+    """The PSNRs of the table and their headings: of what was sought, aligned where some run is."""
+    aligned = any("albedo_psnr_aligned" in (run.metrics.get("heldout") or {}) for run in runs)
+    sought = {key for key in PSNRS if any(run.seeks(key.split("_")[0]) for run in runs)}
+    return {
+        key: name
+        for key, name in PSNRS.items()
+        if key in sought and (aligned or key != "albedo_psnr_aligned")
+    }
 
 
 def _table(runs: list[Run]) -> list[dict[str, Any]]:
     """One row a run: for each split and quantity its mean PSNR, the best of each column marked."""
-    keys = [(split, f"{quantity}_psnr") for split in SPLITS for quantity in QUANTITIES]
-    cells: list[list[dict[str, Any]]] = [[] for _ in runs]
-    for split, key in keys:
-        values = [_number((run.metrics.get(split) or {}).get(key)) for run in runs]
-        best = _best(values)
-        for row, value in zip(cells, values, strict=True):
-            row.append({"text": _decibels(value), "best": value is not None and value == best})
+    columns = []
+    for split, key in ((split, key) for split in SPLITS for key in _psnrs(runs)):
+        values = [shown.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+        columns.append(shown.marked(values, shown.decibels))
     return [
         {
             "run": run,
+            "details": _details(run.metrics),
             "steps": _count(run.metrics.get("steps")),
             "samples": _count(run.metrics.get("samples")),
             "seconds": _seconds(run.metrics.get("seconds")),
             "cells": row,
         }
-        for run, row in zip(runs, cells, strict=True)
+        for run, row in zip(runs, zip(*columns, strict=True), strict=True)
     ]
 
 
+def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What a method works with, as text, symbol and subscript; empty for old evaluations."""
+    if "estimator" not in metrics:
+        return []
+    said = {key: str(metrics.get(key)) for key in ("representation", "radiance", "estimator")}
+    details = [(form, "φ", "")] if (form := FORMS.get(said["representation"])) else []
+    details.append((FORMS.get(said["radiance"], "no"), "L", "θ"))
+    if _unknown(metrics) != "materials":
+        details.append((f"{SOUGHT.get(_unknown(metrics), 'something').lower()} sought", "", ""))
+    if metrics.get("bounces", 1) != 1:
+        details.append((f"{metrics['bounces']} bounces", "", ""))
+    if metrics.get("prior", "extra-bounce") != "extra-bounce":
+        details.append((f"{metrics['prior']} prior".replace("-", " "), "", ""))
+    passes = {"split-halves": "split halves", "two-pass": "two passes"}
+    return [*details, (passes.get(said["estimator"], said["estimator"]), "", "")]
+
+
+def _unknown(metrics: dict[str, Any]) -> str:
+    return str(metrics.get("unknown", "materials"))
+
+
+def _sought(runs: list[Run]) -> str:
+    """What the runs recovered, for the title."""
+    kinds = {_unknown(run.metrics) for run in runs}
+    if len(kinds) == 1:
+        return SOUGHT.get(kinds.pop(), "Scene")
+    return "Materials and lighting" if any("materials" in k for k in kinds) else "Lighting"
+
+
 def _count(value: object) -> str:
-    number = _number(value)
+    number = shown.number(value)
     if number is None:
         return "—"
     for unit, size in (("G", 1e9), ("M", 1e6)):
@@ -264,25 +271,44 @@ def _count(value: object) -> str:
 
 
 def _seconds(value: object) -> str:
-    number = _number(value)
+    number = shown.number(value)
     if number is None:
         return "—"
     return f"{number:.1f}" if number < 100 else _count(round(number))
 
 
-def _definitions(runs: list[Run]) -> list[dict[str, Any]]:
-    """What the numbers mean, as each evaluation says; one entry for runs that say the same."""
+def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
+    """What the numbers of the page's parts mean, as each evaluation says."""
+    psnrs = _psnrs(runs)
+    told = {k: v for k, v in DEFINED.items() if k in psnrs or k not in PSNRS}
+    numbers = [_told(run, told) | _rendering(run) for run in runs]
+    light = {
+        kind: [_told(run, words) if run.seeks(kind) else {} for run in runs]
+        for kind, words in LIGHT_DEFINED.items()
+    }
+    return {part: _grouped(runs, said) for part, said in ({"numbers": numbers} | light).items()}
+
+
+def _told(run: Run, names: dict[str, str]) -> dict[str, str]:
+    said = run.metrics.get("definitions") or {}
+    return {name: str(said[key]) for key, name in names.items() if said.get(key)}
+
+
+def _rendering(run: Run) -> dict[str, str]:
+    said = run.metrics.get("render") or {}
+    spp, depth = said.get("spp", shown.DASH), said.get("max_depth", shown.DASH)
+    return {"Rendered with": f"{spp} samples a pixel, path depth {depth}"} if said else {}
+
+
+def _grouped(runs: list[Run], said: list[dict[str, str]]) -> list[dict[str, Any]]:
+    """One entry for runs that say the same; none for those that say nothing."""
     entries: list[dict[str, Any]] = []
-    for run in runs:
-        said = {
-            "definitions": run.metrics.get("definitions") or {},
-            "render": run.metrics.get("render") or {},
-        }
-        same = next((e for e in entries if all(e[key] == said[key] for key in said)), None)
-        if same is None:
-            entries.append(said | {"labels": [run.label]})
-        else:
+    for run, words in zip(runs, said, strict=True):
+        same = next((entry for entry in entries if entry["words"] == words), None)
+        if same is not None:
             same["labels"].append(run.label)
+        elif words:
+            entries.append({"words": words, "labels": [run.label]})
     return entries
 
 
@@ -315,8 +341,44 @@ def _loss_charts(runs: list[Run]) -> list[dict[str, Any]]:
     ]
 
 
+def _score_charts(runs: list[Run]) -> list[dict[str, Any]]:
+    logs = [score_curve(run.log) for run in runs]
+    return [
+        {"title": title, "unit": "dB", "chart": drawn}
+        for x_key, x_title in reversed(AXES.items())
+        for key, title in SCORES.items()
+        if (drawn := curves.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), False))
+    ]
+
+
+def _race(runs: list[Run]) -> list[dict[str, Any]]:
+    """When each run reached each run's last score; empty where there is nothing to compare."""
+    targets = time_to_quality({run.label: score_curve(run.log) for run in runs})
+    if len(targets) < 2:
+        return []
+    index = {run.label: i for i, run in enumerate(runs)}
+    return [
+        {
+            "run": index[target.run],
+            "target": shown.decibels(target.albedo_psnr),
+            "times": [
+                {"text": _seconds(t), "best": t is not None and t == _first(target.seconds)}
+                for t in target.seconds.values()
+            ],
+        }
+        for target in targets
+    ]
+
+
+def _first(times: Mapping[str, float | None]) -> float | None:
+    return min((t for t in times.values() if t is not None), default=None)
+
+
 def _validation_charts(runs: list[Run]) -> list[dict[str, Any]]:
+    """Of one view; nothing where all views were scored, which tells more."""
     logs = _validations(runs)
+    if all(score_curve(run.log) for run, log in zip(runs, logs, strict=True) if log):
+        return []
     return [
         {"title": title, "unit": "dB", "chart": drawn}
         for x_key, x_title in AXES.items()

@@ -33,6 +33,19 @@ class Run:
     config: dict[str, Any]
     log: list[dict[str, Any]]
 
+    def seeks(self, quantity: str) -> bool:
+        """Whether the run has pictures or numbers of a quantity, rather than knew it."""
+        unknown = str(self.metrics.get("unknown", "materials"))
+        match quantity:
+            case "render":
+                return True
+            case "environment":
+                return "lighting" in unknown
+            case "emission":
+                return unknown == "emission"
+            case _:
+                return "materials" in unknown
+
     def view(self, name: str) -> dict[str, Any]:
         """The numbers of one view; empty where this run was not evaluated on it."""
         return next((row for row in self.metrics["per_view"] if row["name"] == name), {})
@@ -75,6 +88,14 @@ def read_run(path: Path, label: str) -> Run:
             raise UserError(f"`{key}` is missing or of the wrong type", metrics_file, evaluate)
     if not all(isinstance(row, dict) and "name" in row for row in metrics["per_view"]):
         raise UserError("a view of `per_view` has no name", metrics_file, evaluate)
+    for key, kind in {"environment": dict, "emission": list}.items():
+        if not isinstance(metrics.get(key), kind | None):
+            raise UserError(f"`{key}` is of the wrong type", metrics_file, evaluate)
+    lights = metrics.get("emission") or ()
+    if not all(isinstance(row, dict) and isinstance(row.get("name"), str) for row in lights):
+        raise UserError("a light of `emission` has no name", metrics_file, evaluate)
+    if metrics.get("unknown") == "emission" and not lights:
+        raise UserError("`emission` has no light", metrics_file, evaluate)
     config_file = path / "config.toml"
     try:
         config = tomllib.loads(config_file.read_text(encoding="utf-8"))
@@ -82,7 +103,7 @@ def read_run(path: Path, label: str) -> Run:
         raise UserError(
             f"the settings cannot be read ({error})", config_file, "Give the folder of a run"
         ) from error
-    return Run(path, label, metrics, dict(_flatten(config)), _read_log(path / "log.jsonl"))
+    return Run(path, label, metrics, dict(_flatten(config)), read_log(path / "log.jsonl"))
 
 
 def read_json(path: Path, remedy: str) -> dict[str, Any]:
@@ -98,8 +119,12 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     return content
 
 
-def _read_log(path: Path) -> list[dict[str, Any]]:
-    """The log's lines; a torn last line, as a killed run leaves it, is left out."""
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The log's lines; a torn last line, as a killed run leaves it, is left out.
+
+    Raises:
+        UserError: there is no log, or a line before the last is not JSON.
+    """
     if not path.is_file():
         raise UserError("the run has no log", path, "Give the folder of a run")
     texts = [text for text in path.read_text(encoding="utf-8").splitlines() if text.strip()]

@@ -1,0 +1,100 @@
+"""The step time of several methods, side by side in one run."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import drjit as dr
+from rich.console import Console
+from rich.table import Table
+
+from ..config import FitConfig
+from ..data.views import Dataset
+from ..fit.problem import make_problem, training_pixels
+from ..fit.rates import learning_rates
+from ..fit.step import TrainingStep, initial_state
+from ..imaging.pictures import write_atomically
+from .bench import machine
+from .contender import Contender
+from .evaluate import description
+
+#: Steps of each method before anything is measured.
+WARM_UP = 6
+
+
+def bench_methods(
+    data: Path,
+    contenders: Sequence[Contender],
+    shared: FitConfig,
+    rounds: int,
+    out: Path | None,
+    console: Console,
+) -> dict:
+    """Measure steps of several methods in turn, round by round, so that all meet the same machine.
+
+    Args:
+        data: a data set's folder.
+        contenders: what to measure; times are compared with the first one's.
+        shared: settings of all.
+        rounds: steps of each, to take the median of.
+        out: JSON file to write.
+
+    Returns:
+        All that is printed.
+
+    Paper: Sec. 6.2, Fig. 3.
+    """
+    dataset = Dataset.load(data)
+    steps = []
+    for contender in contenders:
+        config = contender.settings(shared)
+        pixels, mean = training_pixels(dataset, clip_negative=False)
+        problem = make_problem(dataset.scene, dataset.background, config, mean)
+        step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+        for i in range(WARM_UP):
+            step(state, i, learning_rates(config, i, 0.0))
+        dr.sync_thread()
+        steps.append((config, step, state))
+        console.print(f"{contender.name}: ready", highlight=False)
+    seconds: list[list[float]] = [[] for _ in steps]
+    for i in range(WARM_UP, WARM_UP + rounds):
+        for times, (config, step, state) in zip(seconds, steps, strict=True):
+            start = time.perf_counter()
+            step(state, i, learning_rates(config, i, 0.0))
+            dr.sync_thread()
+            times.append(time.perf_counter() - start)
+    medians = [statistics.median(times) for times in seconds]
+    rows = [
+        {
+            **description(config),
+            "pixels": config.pixels,
+            "spp": config.spp,
+            "milliseconds_per_step": 1e3 * median,
+            "samples_per_second": config.samples_per_step / median,
+            "times_the_first": median / medians[0],
+        }
+        for (config, _, _), median in zip(steps, medians, strict=True)
+    ]
+    result = {"machine": machine(), "rounds": rounds, "data": dataset.folder.name, "rows": rows}
+    table = Table("method", "materials", "radiance", "estimator")
+    for title in ("ms a step", "k samples/s", "times the first"):
+        table.add_column(title, justify="right")
+    for row in rows:
+        table.add_row(
+            row["method"],
+            row["representation"] or "known",
+            row["radiance"] or "none",
+            row["estimator"],
+            f"{row['milliseconds_per_step']:.1f}",
+            f"{row['samples_per_second'] / 1e3:.0f}",
+            f"{row['times_the_first']:.2f}",
+        )
+    console.print(table)
+    if out is not None:
+        text = json.dumps(result, indent=1) + "\n"
+        write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+    return result

@@ -1,0 +1,93 @@
+"""How fast runs are, and how soon they are good: read from their logs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+#: The first steps trace and compile; intervals of the log that begin before are no measurement.
+WARM_UP = 4
+SCORES = ("albedo_psnr", "roughness_psnr")
+
+Log = Sequence[Mapping[str, Any]]
+
+
+@final
+@dataclass(frozen=True)
+class Target:
+    """A quality, the run that ended with it, and when each run had it for good."""
+
+    run: str
+    albedo_psnr: float  # dB, the run's last score on all held-out views
+    seconds: dict[str, float | None]  # of training; None: never
+
+
+def milliseconds_per_step(log: Log) -> float | None:
+    """Median time of a step after warm-up, in ms; None where a log is too short to tell."""
+    at = {r["step"]: r["seconds"] for r in log if _timed(r)}
+    marks = sorted(at.items())
+    spent, steps = [], []
+    for (first, start), (last, end) in zip(marks, marks[1:], strict=False):
+        if first >= WARM_UP:
+            spent.append(1e3 * (end - start) / (last - first))
+            steps.append(last - first)
+    # Intervals of the log differ in length: the median is over steps.
+    return float(np.median(np.repeat(spent, steps))) if spent else None
+
+
+def score_curve(log: Log) -> list[dict[str, float | None]]:
+    """The scores of a log in order: `seconds`, `step`, `albedo_psnr` and `roughness_psnr` in dB."""
+    found = {r["step"]: r for r in log if _timed(r) and isinstance(r.get("score"), Mapping)}
+    return [
+        {"seconds": r["seconds"], "step": step} | {key: r["score"].get(key) for key in SCORES}
+        for step, r in sorted(found.items())
+    ]
+
+
+def seconds_to(curve: Sequence[Mapping[str, Any]], target: float) -> float | None:
+    """When a score curve reached a target for good: from then on it never falls below it.
+
+    Between two scores the curve is a straight line. A curve that crosses the target in its noise
+    counts from the last crossing.
+
+    Args:
+        curve: as `score_curve` gives it.
+        target: albedo PSNR in dB.
+
+    Returns:
+        Seconds of training, None if the curve ends below the target.
+    """
+    points = _points(curve)
+    below = [i for i, (_, value) in enumerate(points) if value < target]
+    if not points or below[-1:] == [len(points) - 1]:
+        return None
+    if not below:
+        return points[0][0]
+    (t0, v0), (t1, v1) = points[below[-1]], points[below[-1] + 1]
+    return t0 + (t1 - t0) * (target - v0) / (v1 - v0)
+
+
+def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Target]:
+    """For each run's last score, when each run reached it for good.
+
+    Args:
+        curves: score curve of each run, by name; a run without scores sets no target.
+    """
+    ends = {name: points[-1][1] for name, c in curves.items() if (points := _points(c))}
+    return [
+        Target(run, end, {name: seconds_to(curve, end) for name, curve in curves.items()})
+        for run, end in ends.items()
+    ]
+
+
+def _points(curve: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    scored = [(point["seconds"], point["albedo_psnr"]) for point in curve]
+    return [(t, v) for t, v in scored if isinstance(v, int | float) and math.isfinite(v)]
+
+
+def _timed(record: Mapping[str, Any]) -> bool:
+    return all(isinstance(record.get(key), int | float) for key in ("step", "seconds"))
