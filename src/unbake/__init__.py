@@ -1,4 +1,4 @@
-"""unbake: materials from photographs, with the global illumination taken out.
+"""unbake: materials or lighting from photographs, with the global illumination taken out.
 
 The public names below are loaded when they are first used, after a Mitsuba variant has been chosen
 with `activate`:

@@ -20,6 +20,7 @@ Scene = Annotated[str, arg(metavar="SCENE")]
 Data = Annotated[Path, arg(metavar="DATA")]
 Run = Annotated[Path, arg(metavar="RUN")]
 Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]
+Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 #: Where None stands for what preset or settings file say, "default: None" would tell nothing.
 Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
 Seconds = Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")]
@@ -28,8 +29,16 @@ Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
 Preset = Annotated[
     config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
 ]
-Method = Annotated[
-    config.MethodName | None, arg(metavar="{ours,one-bounce,direct}", help_behavior_hint="")
+Method = Annotated[config.MethodName | None, arg(metavar="METHOD", help_behavior_hint="")]
+Unknown = Annotated[config.Unknown | None, arg(metavar="WHAT", help_behavior_hint="")]
+Prior = Annotated[
+    config.PriorName | None, arg(metavar="{one-bounce,extra-bounce}", help_behavior_hint="")
+]
+Representation = Annotated[
+    config.Representation | None, arg(metavar="{neural,grid,bitmap}", help_behavior_hint="")
+]
+RadianceRepresentation = Annotated[
+    config.RadianceRepresentation | None, arg(metavar="{neural,grid}", help_behavior_hint="")
 ]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
 
@@ -41,6 +50,7 @@ def main() -> None:
         "fit": fit,
         "evaluate": evaluate,
         "report": report,
+        "compare": compare,
         "bench": bench,
         "doctor": doctor,
     }
@@ -48,8 +58,8 @@ def main() -> None:
         status = tyro.extras.subcommand_cli_from_dict(
             commands,
             prog="unbake",
-            description="Recovers the materials of a scene with known geometry from posed HDR "
-            "photographs, with the global illumination taken out of them.\n\n"
+            description="Recovers the materials or the lighting of a scene with known geometry "
+            "from posed HDR photographs, with the global illumination taken out.\n\n"
             "From nothing to a result: unbake capture demo --out DATA; unbake fit DATA --out RUN; "
             "unbake evaluate RUN; unbake report RUN --out report.html",
         )
@@ -79,7 +89,7 @@ def capture(
     """Render a data set from a Mitsuba scene: photographs, cameras, and the true materials.
 
     Args:
-        scene: A Mitsuba 3 XML file, or a built-in scene: demo, cornell, cube or furnace.
+        scene: A Mitsuba 3 XML file, or a built-in scene: demo, still, cornell, cube, furnace.
         out: Folder to write; it must not exist.
         views: Views to learn from. Cameras are placed automatically.
         held_out: Further views that are kept apart, to judge results by.
@@ -121,15 +131,28 @@ def fit(
     spp: Count = None,
     batch: Count = None,
     preset: Preset = None,
+    unknown: Unknown = None,
     method: Method = None,
+    bounces: Count = None,
+    prior: Prior = None,
+    max_depth: Count = None,
+    representation: Representation = None,
+    radiance: RadianceRepresentation = None,
     seed: Count = None,
     settings: File = None,
     resume: Flag = False,
     clip_negative: Flag = False,
 ) -> int:
-    """Recover albedo and roughness from the photographs of a data set.
+    """Recover materials or lighting from the photographs of a data set.
 
     Ctrl-C stops after the present step and keeps what was learned; --resume goes on from there.
+
+    Unknown: materials are albedo and roughness, lighting is the environment map, emission is colour
+    and strength of the lights.
+
+    Methods: ours; no-prior (radiance learned from images alone), direct (no indirect light), ad-pt
+    (path tracing, differentiated), prb (path replay). From direct to ours the ablation goes by
+    with-prior, with-stop-gradient and with-second-bounce.
 
     Args:
         data: Folder of the data set, with its transforms.json.
@@ -139,7 +162,13 @@ def fit(
         spp: Samples per pixel in a step, an even number (cpu: 8, paper and release: 16).
         batch: Pixels in a step (cpu: 1024, paper and release: 16384).
         preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
-        method: ours (default), one-bounce (prior at the first vertex), direct (no indirect light).
+        unknown: What to recover: materials (default), lighting, materials+lighting or emission.
+        method: ours (default), no-prior, direct, ad-pt, prb, or a step of the ablation.
+        bounces: Differentiable bounces of ours before the radiance field is asked (default: 1).
+        prior: Where ours takes the residual: one-bounce, or extra-bounce (default) at x2 as well.
+        max_depth: Longest path of ad-pt and prb (default: 15).
+        representation: Of materials: networks (default), 3D grids, or bitmaps in UV coordinates.
+        radiance: Representation of the radiance field: a network (default) or a 3D grid.
         seed: Seed of weights and samples (default: 0).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
@@ -147,7 +176,18 @@ def fit(
     """
     start: dict[str, object] = {"preset": preset, "settings": settings}
     length: dict[str, object] = {"steps": steps, "seconds": seconds}
-    other: dict[str, object] = {"spp": spp, "batch": batch, "method": method, "seed": seed}
+    other: dict[str, object] = {
+        "spp": spp,
+        "batch": batch,
+        "unknown": unknown,
+        "method": method,
+        "bounces": bounces,
+        "prior": prior,
+        "max-depth": max_depth,
+        "representation": representation,
+        "radiance": radiance,
+        "seed": seed,
+    }
     if resume:
         _exclude("resume", start | other)
         if not (out / "config.toml").is_file():
@@ -180,7 +220,7 @@ def evaluate(
     train_views: int = 4,
     clip_negative: Flag = False,
 ) -> None:
-    """Render views with the recovered materials and measure them against the truth.
+    """Render views with what was recovered and measure it against the truth.
 
     Writes pictures and metrics.json to RUN/evaluation.
 
@@ -224,28 +264,106 @@ def report(runs: Positional[Runs], /, out: Path) -> None:
     _say(f"wrote {write_report(runs, out)}")
 
 
+def compare(
+    data: Positional[Data],
+    /,
+    methods: Methods,
+    out: Path,
+    steps: Count = None,
+    seconds: Seconds = None,
+    spp: Count = None,
+    batch: Count = None,
+    preset: Preset = None,
+    unknown: Unknown = None,
+    seed: Count = None,
+    settings: File = None,
+    score_seconds: Annotated[float, arg(metavar="SECONDS")] = 5.0,
+    evaluate_spp: int = 32,
+    clip_negative: Flag = False,
+) -> int:
+    """Fit several methods with the same settings, evaluate them, and tell which is good how soon.
+
+    Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. The same command
+    again keeps finished runs and goes on with interrupted ones. A method that fails is recorded
+    with its error; the exit status is then 1.
+
+    Args:
+        data: Folder of the data set, with its transforms.json.
+        methods: Methods of `unbake fit`, such as: ours prb direct. METHOD:REPRESENTATION, such as
+            prb:bitmap, also says how materials are represented (neural, grid or bitmap).
+        out: Folder to write to.
+        steps: Length of each fit in training steps.
+        seconds: Length of each fit in seconds of training, instead of steps.
+        spp: Samples per pixel in a step, an even number.
+        batch: Pixels in a step.
+        preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
+        unknown: What to recover: materials (default), lighting, materials+lighting or emission.
+        seed: Seed of weights and samples (default: 0).
+        settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
+        score_seconds: Training time between scores on all held-out views (0: no scores).
+        evaluate_spp: Samples per pixel of the final renderings.
+        clip_negative: Take negative pixels as zero instead of refusing them.
+    """
+    _require("evaluate-spp", evaluate_spp, 1)
+    if settings is not None:
+        _exclude("settings", {"preset": preset})
+    chosen = config.read_toml(settings) if settings else config.preset(preset or "cpu")
+    given: dict[str, object] = {"steps": steps, "seconds": seconds, "spp": spp, "batch": batch}
+    chosen = _overridden(chosen, given | {"unknown": unknown, "seed": seed})
+    try:
+        chosen = dataclasses.replace(chosen, score_seconds=score_seconds)
+    except UserError as error:
+        raise UserError(error.what, "--score-seconds") from None
+    backend.activate()
+    from .results.compare import compare as run
+    from .results.contender import Contender
+    from .results.evaluate import EvaluationSettings
+
+    contenders = [Contender.of(method) for method in methods]
+    evaluation = EvaluationSettings(spp=evaluate_spp, clip_negative=clip_negative)
+    result = run(data, contenders, out, chosen, evaluation=evaluation, clip_negative=clip_negative)
+    _say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
+    return 1 if any("error" in row for row in result["methods"].values()) else 0
+
+
 def bench(
-    what: Positional[Literal["step"]] = "step",
+    what: Positional[Literal["step", "methods"]] = "step",
     /,
     data: Folder = None,
-    method: config.MethodName = "ours",
+    methods: Annotated[tuple[str, ...], arg(metavar="METHODS")] = ("ours",),
     steps: int = 100,
+    settings: File = None,
     out: File = None,
 ) -> None:
     """Measure the training step: samples a second, and where the time goes.
 
+    step takes one method apart; methods measures several side by side, their steps in turn.
+
     Args:
         what: What to measure.
         data: Folder of a data set; by default a small capture of the demo scene.
-        method: Method whose step is measured.
+        methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
+            prb:bitmap prb:bitmap:split-halves.
         steps: Steps to take the median of, after warm-up.
+        settings: TOML file with settings; by default those of the preset cpu.
         out: JSON file to write the numbers to.
     """
     _require("steps", steps, 10)
+    chosen = config.read_toml(settings) if settings else config.preset("cpu")
     backend.activate()
-    from .results.bench import bench_step
+    from .results.bench import bench_step, small_data
+    from .results.bench_methods import bench_methods
+    from .results.contender import Contender
 
-    bench_step(data, method, steps, out, Console(highlight=False))
+    contenders = [Contender.of(method) for method in methods]
+    if what == "step" and len(contenders) != 1:
+        raise UserError("step takes one method", "--methods", "Or: unbake bench methods")
+    console = Console(highlight=False)
+    with small_data(data) as folder:
+        if what == "step":
+            bench_step(folder, contenders[0].settings(chosen), steps, out, console)
+        else:
+            bench_methods(folder, contenders, chosen, steps, out, console)
 
 
 def doctor() -> int:
@@ -257,14 +375,21 @@ def doctor() -> int:
 
 def _overridden(settings: config.FitConfig, given: dict[str, object]) -> config.FitConfig:
     """Settings with the options that were given; errors name the option."""
+    keys = {"batch": "pixels", "radiance": "radiance_representation"}
     if given["steps"] is not None and given["seconds"] is not None:
         _exclude("seconds", {"steps": given["steps"]})
     if given["steps"] is not None:
         settings = dataclasses.replace(settings, seconds=0.0)
-    for option, value in given.items():
-        key = "pixels" if option == "batch" else option
+    # The method first: whether other options make sense depends on it.
+    for option, value in sorted(given.items(), key=lambda item: item[0] != "method"):
+        if value is None:
+            continue
         try:
-            settings = dataclasses.replace(settings, **{key: value} if value is not None else {})
+            if option == "max-depth":
+                path = dataclasses.replace(settings.path, max_depth=value)
+                settings = dataclasses.replace(settings, path=path)
+            else:
+                settings = dataclasses.replace(settings, **{keys.get(option, option): value})
         except UserError as error:
             raise UserError(error.what, f"--{option}", error.remedy) from None
     return settings

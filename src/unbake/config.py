@@ -199,7 +199,8 @@ class FitConfig:
     pixels: int = 1024  #: batch size in pixels (Table 1)
     spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
 
-    learning_rate: float = 0.015  #: Adam, materials (Sec. 5.4: 5e-4)
+    learning_rate: float = 0.015  #: Adam, albedo network (Sec. 5.4: 5e-4)
+    roughness_learning_rate: float = 0.004  #: Adam, roughness network (Sec. 5.4: 5e-4)
     radiance_learning_rate: float = 0.01  #: Adam, radiance network (Sec. 5.4: 5e-4)
     final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)
     warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
@@ -228,7 +229,8 @@ class FitConfig:
         _check(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
         for name in ("steps", "pixels"):
             _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
-        for name in ("learning_rate", "radiance_learning_rate", "final_learning_rate"):
+        rates = ("learning_rate", "roughness_learning_rate", "radiance_learning_rate")
+        for name in (*rates, "final_learning_rate"):
             _check(getattr(self, name) > 0, name, "positive", getattr(self, name))
         times = ("seconds", "checkpoint_seconds", "preview_seconds", "score_seconds")
         for name in (*times, "warm_up", "seed"):
@@ -291,6 +293,7 @@ def _paper() -> FitConfig:
         pixels=16_384,
         spp=16,
         learning_rate=5e-4,
+        roughness_learning_rate=5e-4,
         radiance_learning_rate=5e-4,
         final_learning_rate=1.0,
         warm_up=0,

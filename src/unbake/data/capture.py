@@ -18,6 +18,7 @@ from ..transport.vertex import World
 from . import scene as scenes
 from .batches import CameraRays
 from .camera import Camera, frame_name, read_cameras
+from .lights import write_lights
 from .placement import coverage, is_room, place_object, place_room
 from .procedural import SCENES, default_cameras, write_scene
 from .views import Dataset, View
@@ -98,6 +99,7 @@ def _capture(
     sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     albedo, roughness, mask = _truth(path, scene, rays)
+    write_lights(path, folder / "truth")
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
         shape = (camera.height, camera.width)
@@ -235,9 +237,7 @@ def _truth(
     scenes.show_roughness_as_albedo(parsed)
     for shown in (scene, parsed.instantiate()):
         world = World.of(shown, None, specular)
-        images.append(
-            render_materials(world, rays.through, rays.pixels, TRUTH_SAMPLES, seed=1)
-        )
+        images.append(render_materials(world, rays.through, rays.pixels, TRUTH_SAMPLES, seed=1))
     (albedo, _, coverage_), (roughness, _, _) = images
     return albedo, roughness[:, 0], coverage_
 

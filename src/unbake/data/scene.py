@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..fields.envmap import latlong
+from ..fields.texture import painted_meshes_without_uv
 
 
 @dataclass
@@ -127,15 +130,36 @@ def set_textures(scene: ParsedScene, albedo: object, roughness: object) -> None:
     Raises:
         UserError: there is no such BSDF, so nothing could be fitted.
     """
+    set_own_textures(scene, [(albedo, roughness)] * len(material_names(scene)))
+
+
+def set_own_textures(scene: ParsedScene, textures: list[tuple[object, object]]) -> None:
+    """Give each `principled` BSDF an albedo and a roughness texture of its own.
+
+    BSDFs with textures of their own are not merged, nor are their shapes.
+    """
+    for node, (albedo, roughness) in zip(scene.principled_nodes(), textures, strict=True):
+        node.props["base_color"] = albedo
+        node.props["roughness"] = roughness
+
+
+def material_names(scene: ParsedScene) -> list[str]:
+    """Names of the `principled` BSDFs, each another one, in the order of the nodes.
+
+    Raises:
+        UserError: there is no such BSDF, so nothing could be fitted.
+    """
     nodes = scene.principled_nodes()
     if not nodes:
         raise UserError(
             "no material to fit: no shape has a principled, diffuse or roughplastic BSDF",
             where=scene.path,
         )
-    for node in nodes:
-        node.props["base_color"] = albedo
-        node.props["roughness"] = roughness
+    names: list[str] = []
+    for number, node in enumerate(nodes):
+        name = node.props.id() or f"material-{number}"
+        names.append(name if name not in names else f"{name}-{number}")
+    return names
 
 
 def show_roughness_as_albedo(scene: ParsedScene) -> None:
@@ -163,6 +187,162 @@ def require_emitters(scene: mi.Scene, path: Path) -> None:
     """Raise a `UserError` if nothing in the scene emits light."""
     if not scene.emitters():
         raise UserError("the scene has no light source", path, "Add a light or environment map")
+
+
+#: Emitters that surround the scene.
+ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
+#: Emitters whose strength can be unknown, and the parameter that is their strength.
+STRENGTHS = {
+    "area": "radiance",
+    "directionalarea": "radiance",
+    "constant": "radiance",
+    "point": "intensity",
+    "spot": "intensity",
+    "directional": "irradiance",
+}
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light whose strength is sought."""
+
+    name: str  #: its id in the scene, or that of its shape, or a made up one
+    strength: tuple[float, float, float] | None  #: true linear RGB; None: a picture, or not RGB
+
+
+def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:
+    """Put this emitter in the place of the scene's environment, whatever that is.
+
+    Raises:
+        UserError: the scene has none.
+    """
+    root = scene.state.root.props
+    for key in root.keys():
+        node = _referenced(scene, root[key])
+        if node is not None and node.props.plugin_name() in ENVIRONMENTS:
+            # Under a new name: merging meshes reuses those that the parser made up.
+            del root[key]
+            root["unknown environment"] = emitter
+            return
+    raise UserError(
+        "the scene has no environment map to fit",
+        scene.path,
+        "Add one, or fit its lights with --unknown emission",
+    )
+
+
+def environment_latlong(scene: mi.Scene, height: int) -> np.ndarray:
+    """The radiance of a scene's own environment, averaged over the pixels of a picture.
+
+    Returns:
+        Linear RGB, float32, shape (height, 2 height, 3), in the layout of `latlong`.
+
+    Raises:
+        UserError: the scene has no environment.
+    """
+    environment = scene.environment()
+    if environment is None:
+        raise UserError("the scene has no environment map")
+
+    def radiance(d: mi.Vector3f) -> mi.Color3f:
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(d))
+        si.wi = -d
+        return environment.eval(si)
+
+    return latlong(radiance, height, max(1, min(16, 1024 // height)))
+
+
+def lights_of(scene: ParsedScene) -> list[Light]:
+    """The lights whose strength could be sought, as the scene describes them."""
+    nodes = _light_nodes(scene)
+    pairs = zip(_light_names(scene, nodes), nodes, strict=True)
+    return [Light(name, _colour(scene, scene.state.nodes[i].props)) for name, i in pairs]
+
+
+def set_emission(scene: ParsedScene, make: Callable[[int], Sequence[mi.Texture]]) -> list[Light]:
+    """Give every light a texture as its strength; a light with a picture loses that.
+
+    Args:
+        make: from the number of lights to as many textures, each of one colour.
+
+    Returns:
+        The lights as they were, in the order of their textures.
+
+    Raises:
+        UserError: the scene has no light whose strength could be fitted.
+    """
+    lights = lights_of(scene)
+    if not lights:
+        raise UserError(
+            "the scene has no light to fit: no area, point, spot or directional one",
+            scene.path,
+            "Add one, or fit its environment map with --unknown lighting",
+        )
+    for i, texture in zip(_light_nodes(scene), make(len(lights)), strict=True):
+        props = scene.state.nodes[i].props
+        props[STRENGTHS[props.plugin_name()]] = texture
+    return lights
+
+
+def _light_nodes(scene: ParsedScene) -> list[int]:
+    """Numbers of the nodes that are lights."""
+    return [i for i, n in enumerate(scene.state.nodes) if n.props.plugin_name() in STRENGTHS]
+
+
+def _light_names(scene: ParsedScene, lights: list[int]) -> list[str]:
+    """A name for each of these nodes, no two the same."""
+    nodes, shapes = scene.state.nodes, {}
+    for shape in (n for n in nodes if n.type == mi.ObjectType.Shape):
+        for key in shape.props.keys():
+            if _is_reference(shape.props[key]):
+                shapes[shape.props[key].index()] = shape.props.id()
+    names = [
+        nodes[i].props.id() or shapes.get(i) or f"{nodes[i].props.plugin_name()} light"
+        for i in lights
+    ]
+    return [
+        name if names.count(name) == 1 else f"{name} {names[: i + 1].count(name)}"
+        for i, name in enumerate(names)
+    ]
+
+
+def _colour(scene: ParsedScene, props: mi.Properties) -> tuple[float, float, float] | None:
+    """The strength that a light was given, linear RGB; None if that is not one colour."""
+    key = STRENGTHS[props.plugin_name()]
+    node = _referenced(scene, props[key]) if key in props else None
+    if node is not None:
+        texture = mi.PluginManager.instance().create_object(node.props)
+        texture = (texture.expand() or [texture])[0]
+    else:
+        texture = props.get_emissive_texture(key, 1.0)
+    if texture.is_spatially_varying():
+        return None
+    try:
+        colour = texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+    except RuntimeError:  # a spectrum that Mitsuba does not turn into RGB, such as a black body
+        return None
+    return tuple(np.ravel(colour).tolist())
+
+
+def _is_reference(value: object) -> bool:
+    return isinstance(value, mi.Properties.ResolvedReference)
+
+
+def _referenced(scene: ParsedScene, value: object) -> object | None:
+    """The node that a property refers to, if it does."""
+    return scene.state.nodes[value.index()] if _is_reference(value) else None
+
+
+def require_unwrapped(scene: mi.Scene, path: Path) -> None:
+    """Raise a `UserError` if a mesh with unknown materials has no texture coordinates."""
+    names = painted_meshes_without_uv(scene)
+    if names:
+        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        raise UserError(
+            f"meshes without texture coordinates cannot have bitmaps: {shown}",
+            path,
+            "Use --representation neural or grid, or unwrap the mesh",
+        )
 
 
 def _resolve_files(scene: ParsedScene) -> None:

@@ -17,7 +17,7 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     """
     decay = config.final_learning_rate ** min(done, 1.0)
     rise = min(1.0, (step + 1) / (config.warm_up + 1))
-    albedo, roughness = config.learning_rate, config.learning_rate
+    albedo, roughness = config.learning_rate, config.roughness_learning_rate
     match config.representation:
         case "grid":
             albedo, roughness = config.grid.learning_rate, config.grid.roughness_learning_rate

@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..config import FitConfig
+from ..fields.materials import registry_number
+from ..fields.texture import slots_of
 from ..transport.regularisation import (
     albedo_ties_roughness,
-    is_sought,
     mean_albedo_deviation,
     roughness_smoothness,
 )
@@ -29,9 +30,7 @@ def beliefs(
         return {}
     world, everywhere = problem.world.with_scene(scene), mi.Bool(True)
     vertex = find_vertex(world, ray, everywhere, sampler, see_lights=problem.see_lights)
-    # Each shape is asked once, while this is recorded.
-    sought = dr.dispatch(vertex.si.shape, lambda shape: mi.Bool(is_sought(shape)))
-    valid = vertex.valid & sought
+    valid = vertex.valid & _is_sought(scene, vertex.si.shape)
     here = materials.evaluate(vertex.si, valid)
     dr.eval(here.albedo, here.roughness)
     terms: dict[str, mi.Float] = {}
@@ -56,3 +55,10 @@ def is_anchored(problem: Problem, config: FitConfig) -> bool:
     both = problem.materials is not None and problem.environment is not None
     alone = len(problem.world.scene.emitters()) == 1
     return both and alone and not problem.see_lights and config.lighting.anchor > 0
+
+
+def _is_sought(scene: mi.Scene, shape: mi.ShapePtr) -> mi.Bool:
+    """Whether shapes are of an unknown material, not of a known one such as metal."""
+    # Each shape is asked once, while this is recorded.
+    sought = slots_of(scene).keys()
+    return dr.dispatch(shape, lambda s: mi.Bool(registry_number(s) in sought))

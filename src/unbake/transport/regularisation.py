@@ -45,12 +45,5 @@ def mean_albedo_deviation(here: Material, valid: mi.Bool, mean: float) -> mi.Flo
     return sum(dr.square(m - mean) for m in means)
 
 
-def is_sought(shape: mi.Shape) -> bool:
-    """Whether the material of a shape is unknown: no known one, such as metal, and no light."""
-    # The printed form names the BSDF inside wrappers, which Mitsuba gives no other access to.
-    principled = shape.bsdf() is not None and "Principled BSDF" in str(shape.bsdf())
-    return principled and shape.emitter() is None
-
-
 def _mean(values: mi.Float, counted: mi.Bool) -> mi.Float:
     return dr.sum(values) / dr.maximum(dr.sum(dr.select(counted, mi.Float(1), 0)), 1)

@@ -1,24 +1,24 @@
-"""The built-in scenes: a demo room, the Cornell box, the paper's cube and a furnace."""
+"""The built-in scenes: a demo room, a still life, the Cornell box, the paper's cube, a furnace."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from ...errors import UserError
-from . import closed, cornell, demo
+from . import closed, cornell, demo, still
 from .cameras import Camera
 
 __all__ = ["SCENES", "Camera", "default_cameras", "write_scene"]
 
-SCENES = ("demo", "cornell", "cube", "furnace")
+SCENES = ("demo", "still", "cornell", "cube", "furnace")
 
 
 def write_scene(name: str, folder: Path, *, albedo: float = 0.5) -> Path:
     """Write a built-in scene as a self-contained Mitsuba 3 scene and return the path of its XML.
 
     `folder` gets `scene.xml`, `meshes/*.ply` and `textures/*.exr` (linear, raw); lengths are
-    metres in `demo`, half widths of the box elsewhere; z is up. `albedo` in [0, 1) is that of the
-    walls of `cube` and `furnace`, the other scenes ignore it. Needs a Mitsuba variant to be set.
+    metres in `demo`, half widths of the box or slab elsewhere; z is up. `albedo` in [0, 1) is that
+    of the walls of `cube` and `furnace`, the other scenes ignore it. Needs a Mitsuba variant.
 
     Raises UserError for an unknown name or an albedo out of range.
     """
@@ -29,6 +29,8 @@ def write_scene(name: str, folder: Path, *, albedo: float = 0.5) -> Path:
     match name:
         case "demo":
             return demo.write(folder)
+        case "still":
+            return still.write(folder)
         case "cornell":
             return cornell.write(folder)
         case "cube":
@@ -51,6 +53,8 @@ def default_cameras(name: str, views: int, held_out: int) -> list[Camera]:
     match name:
         case "demo":
             return demo.cameras(views, held_out)
+        case "still":
+            return still.cameras(views, held_out)
         case "cornell":
             return cornell.cameras(views, held_out)
         case _:

@@ -83,6 +83,13 @@ class SceneWriter:
             emitter = self._add(shape, "emitter", type="area")
             self._add(emitter, "rgb", name="radiance", value=_numbers(emission))
 
+    def environment(self, name: str, radiance: np.ndarray) -> None:
+        """An environment map from latitude-longitude radiance, (h, 2 h, 3), z up."""
+        emitter = self._add(self._root, "emitter", type="envmap", id=name)
+        self._add(emitter, "string", name="filename", value=self._texture(name, radiance))
+        transform = self._add(emitter, "transform", name="to_world")
+        self._add(transform, "rotate", x="1", angle="90")
+
     def _principled(self, name: str) -> ElementTree.Element:
         bsdf = self._add(self._root, "bsdf", type="principled", id=name)
         # Varnished (F0 = 0.08): roughness shows little under light from everywhere.

@@ -1,0 +1,94 @@
+"""The unknown strength of lights (Sec. 5.1): one colour for each light."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+BOUND = 20.0  #: of the log of strength over scale, so that nothing overflows single precision
+
+
+class Emission:
+    """One linear RGB strength for each light, positive by construction: scale · exp(φ).
+
+    After `assign`, and after a frozen function that assigns, call `prepare`.
+
+    Args:
+        count: number of lights.
+        scale: strength at the start: radiance in W·sr⁻¹·m⁻² for area lights and constant
+            environments, intensity in W·sr⁻¹ for point and spot lights, irradiance in W·m⁻² for
+            directional ones.
+
+    Paper: Sec. 5.1.
+    """
+
+    def __init__(self, count: int, *, scale: float) -> None:
+        self.count = count
+        self.scale = scale
+        self._log = dr.zeros(mi.Float, 3 * count)
+        dr.make_opaque(self._log)
+        #: What `prepare` computes; textures hold it too.
+        self.tables: dict[str, mi.Color3f] = {}
+        self.prepare()
+
+    def parameters(self) -> dict[str, mi.Float]:
+        """The trainable array, RGB of one light after the other; `assign` takes it back."""
+        return {"log": self._log}
+
+    def assign(self, parameters: dict[str, mi.Float]) -> None:
+        """Use this array from the next `prepare` on; gradients arrive in the array given."""
+        self._log = parameters["log"]
+
+    def prepare(self) -> None:
+        """Compute `values`; to be called outside of virtual calls and loops."""
+        log = dr.unravel(mi.Color3f, self._log)
+        # Clipped entries keep a gradient, which brings them back.
+        log += dr.detach(dr.clip(log, -BOUND, BOUND) - log)
+        self.tables["values"] = self.scale * dr.exp(log)
+        dr.eval(self.tables)
+
+    @property
+    def values(self) -> mi.Color3f:
+        """Linear RGB, one lane a light; passes gradients to the parameters."""
+        return self.tables["values"]
+
+
+def emission_textures(emission: Emission) -> list[mi.Texture]:
+    """A texture for each light, of one colour, to stand where its strength is given.
+
+    Paper: Sec. 5.1.
+    """
+
+    # The class is made here because `mi.Texture` exists only once a variant has been chosen.
+    class Strength(mi.Texture):
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.number = props["number"]
+            # A frozen function calls all textures that there are, those of other scenes too. What
+            # they read it finds in their attributes alone.
+            self.tables = emission.tables
+
+        def eval(self, si, active=True):
+            return dr.gather(mi.Color3f, emission.values, mi.UInt32(self.number), active)
+
+        def eval_1(self, si, active=True):
+            return mi.luminance(self.eval(si, active))
+
+        def eval_3(self, si, active=True):
+            return self.eval(si, active)
+
+        def mean(self):
+            return self.eval_1(None)
+
+        def is_spatially_varying(self):
+            return False
+
+        def to_string(self):
+            return f"Strength[{self.number}]"
+
+    textures = []
+    for number in range(emission.count):
+        props = mi.Properties()
+        props["number"] = number
+        textures.append(Strength(props))
+    return textures
