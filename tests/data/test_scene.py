@@ -364,6 +364,13 @@ def test_no_two_lights_have_one_name(parse_lit):
     assert names == ["point light 1", "point light 2", "point light 3", "spot light"]
 
 
+def test_a_light_without_an_id_has_the_name_of_its_file(built_in, tmp_path):
+    parsed = scenes.parse(built_in("cornell"))
+    assert [light.name for light in scenes.lights_of(parsed)] == ["light_shape"]
+    copied = scenes.parse(scenes.write(parsed, tmp_path))
+    assert [light.name for light in scenes.lights_of(copied)] == ["light"]
+
+
 def test_every_light_gets_a_texture_of_its_own(parse_lit):
     parsed = parse_lit("".join(LIGHTS.values()))
     before = scenes.lights_of(parsed)

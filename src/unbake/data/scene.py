@@ -206,7 +206,7 @@ STRENGTHS = {
 class Light:
     """A light whose strength is sought."""
 
-    name: str  #: its id in the scene, or that of its shape, or a made up one
+    name: str  #: its id in the scene, or that of its shape or its file, or a made up one
     strength: tuple[float, float, float] | None  #: true linear RGB; None: a picture, or not RGB
 
 
@@ -295,7 +295,9 @@ def _light_names(scene: ParsedScene, lights: list[int]) -> list[str]:
     for shape in (n for n in nodes if n.type == mi.ObjectType.Shape):
         for key in shape.props.keys():
             if _is_reference(shape.props[key]):
-                shapes[shape.props[key].index()] = shape.props.id()
+                # Copied scenes have lost ids that nothing refers to.
+                file = str(_take(shape.props, "filename", ""))
+                shapes[shape.props[key].index()] = shape.props.id() or Path(file).stem
     names = [
         nodes[i].props.id() or shapes.get(i) or f"{nodes[i].props.plugin_name()} light"
         for i in lights
