@@ -140,9 +140,9 @@ class BitmapConfig:
 class LightingConfig:
     """The unknown environment map and the unknown strength of lights (Sec. 5.1, Fig. 8).
 
-    Where materials are unknown as well and the environment is never seen directly, albedo and light
-    are known up to one factor a channel. It is then chosen such that the mean albedo of what the
-    training views see is `mean_albedo`.
+    Where materials are unknown as well, the environment is never seen directly and no other light
+    is known, albedo and light are known up to one factor a channel. It is then chosen such that the
+    mean albedo of what the training views see is `mean_albedo`.
     """
 
     resolution: int = 64  #: texels along an edge of the square that the sphere is mapped to

@@ -90,6 +90,8 @@ class TrainingStep:
     """
 
     def __init__(self, problem: Problem, pixels: PixelSource, config: FitConfig) -> None:
+        # What is left of earlier problems would be found, half gone, by the recording of this one.
+        gc.collect()
         self._problem = problem
         self._pixels = pixels
         self._config = config

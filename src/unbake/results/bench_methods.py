@@ -22,25 +22,27 @@ from .bench import machine
 from .contender import Contender
 from .evaluate import description
 
-#: Steps of each method before anything is measured.
+#: Steps of a method before anything is measured.
 WARM_UP = 6
+#: A machine that gets slower meets all methods, not the last ones alone.
+TURNS = 2
 
 
 def bench_methods(
     data: Path,
     contenders: Sequence[Contender],
     shared: FitConfig,
-    rounds: int,
+    steps: int,
     out: Path | None,
     console: Console,
 ) -> dict:
-    """Measure steps of several methods in turn, round by round, so that all meet the same machine.
+    """Measure steps of several methods, in two turns, so that all meet the same machine.
 
     Args:
         data: a data set's folder.
         contenders: what to measure; times are compared with the first one's.
         shared: settings of all.
-        rounds: steps of each, to take the median of.
+        steps: steps of each, to take the median of.
         out: JSON file to write.
 
     Returns:
@@ -49,24 +51,13 @@ def bench_methods(
     Paper: Sec. 6.2, Fig. 3.
     """
     dataset = Dataset.load(data)
-    steps = []
-    for contender in contenders:
-        config = contender.settings(shared)
-        pixels, mean = training_pixels(dataset, clip_negative=False)
-        problem = make_problem(dataset.scene, dataset.background, config, mean)
-        step, state = TrainingStep(problem, pixels, config), initial_state(problem)
-        for i in range(WARM_UP):
-            step(state, i, learning_rates(config, i, 0.0))
-        dr.sync_thread()
-        steps.append((config, step, state))
-        console.print(f"{contender.name}: ready", highlight=False)
-    seconds: list[list[float]] = [[] for _ in steps]
-    for i in range(WARM_UP, WARM_UP + rounds):
-        for times, (config, step, state) in zip(seconds, steps, strict=True):
-            start = time.perf_counter()
-            step(state, i, learning_rates(config, i, 0.0))
-            dr.sync_thread()
-            times.append(time.perf_counter() - start)
+    configs = [contender.settings(shared) for contender in contenders]
+    seconds: list[list[float]] = [[] for _ in configs]
+    for turn in range(TURNS):
+        for contender, config, times in zip(contenders, configs, seconds, strict=True):
+            times += _timed(dataset, config, -(-steps // TURNS))
+            told = 1e3 * statistics.median(times)
+            console.print(f"turn {turn + 1}, {contender.name}: {told:.1f} ms", highlight=False)
     medians = [statistics.median(times) for times in seconds]
     rows = [
         {
@@ -77,9 +68,9 @@ def bench_methods(
             "samples_per_second": config.samples_per_step / median,
             "times_the_first": median / medians[0],
         }
-        for (config, _, _), median in zip(steps, medians, strict=True)
+        for config, median in zip(configs, medians, strict=True)
     ]
-    result = {"machine": machine(), "rounds": rounds, "data": dataset.folder.name, "rows": rows}
+    result = {"machine": machine(), "steps": steps, "data": dataset.folder.name, "rows": rows}
     table = Table("method", "materials", "radiance", "estimator")
     for title in ("ms a step", "k samples/s", "times the first"):
         table.add_column(title, justify="right")
@@ -98,3 +89,17 @@ def bench_methods(
         text = json.dumps(result, indent=1) + "\n"
         write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
     return result
+
+
+def _timed(dataset: Dataset, config: FitConfig, steps: int) -> list[float]:
+    """Seconds of steps after warm-up, of a fit that is then forgotten."""
+    pixels, mean = training_pixels(dataset, clip_negative=False)
+    problem = make_problem(dataset.scene, dataset.background, config, mean)
+    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    times = []
+    for i in range(WARM_UP + steps):
+        start = time.perf_counter()
+        step(state, i, learning_rates(config, i, 0.0))
+        dr.sync_thread()
+        times.append(time.perf_counter() - start)
+    return times[WARM_UP:]
