@@ -86,7 +86,7 @@ class ConstantMaterials:
         return self.evaluate(si, valid).albedo
 
     def evaluate(
-        self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: str = "tensor"
+        self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: str | None = None
     ) -> Material:
         lanes = dr.zeros(mi.Float, dr.width(si.p))
         return Material(self.albedo + lanes, self.roughness + lanes)
@@ -98,7 +98,7 @@ class ConstantRadiance:
     def __init__(self, value: float) -> None:
         self.value = mi.Color3f(value)
 
-    def evaluate(self, p, w, n, albedo, valid, engine="tensor") -> mi.Color3f:
+    def evaluate(self, p, w, n, albedo, valid, engine=None) -> mi.Color3f:
         return dr.select(valid, self.value, 0)
 
 
@@ -108,7 +108,7 @@ class PathTracedRadiance:
     def __init__(self, world, seed: int, max_depth: int) -> None:
         self.world, self.seed, self.max_depth = world, seed, max_depth
 
-    def evaluate(self, p, w, n, albedo, valid, engine="tensor") -> mi.Color3f:
+    def evaluate(self, p, w, n, albedo, valid, engine=None) -> mi.Color3f:
         # Look at the point from very near, and take away the light that it emits itself.
         with dr.suspend_grad():
             ray = mi.Ray3f(dr.select(valid, p + 1e-4 * w, 1e6), -w)

@@ -84,7 +84,7 @@ def room(bsdf):
 class VaryingRadiance:
     """Some smooth radiance field that does not depend on the materials."""
 
-    def evaluate(self, p, w, n, albedo, valid, engine="tensor"):
+    def evaluate(self, p, w, n, albedo, valid, engine=None):
         value = mi.Color3f(1 + dr.sin(3 * p.x), 1 + 0.5 * w.y, 0.5 + dr.square(p.z))
         return dr.select(valid, value, 0)
 

@@ -49,7 +49,7 @@ class Bitmaps:
         """Use this array from now on; gradients arrive in the very array given."""
         self.texels = parameters["texels"]
 
-    def __call__(self, point: SurfacePoint, engine: Engine = "tensor") -> list[mi.Float]:
+    def __call__(self, point: SurfacePoint, engine: Engine | None = None) -> list[mi.Float]:
         """Look the bitmaps up; the engine makes no difference.
 
         Returns:

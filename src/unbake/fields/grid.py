@@ -47,7 +47,7 @@ class DenseGrid:
         self.grid.data = parameters["corners"]
 
     def __call__(
-        self, position: mi.Point3f, extra: list[mi.Float], engine: Engine = "tensor"
+        self, position: mi.Point3f, extra: list[mi.Float], engine: Engine | None = None
     ) -> list[mi.Float]:
         """Evaluate the grid.
 

@@ -38,7 +38,7 @@ class Volume:
         """Use these arrays from now on."""
         self.function.assign(parameters)
 
-    def __call__(self, point: SurfacePoint, engine: Engine = "tensor") -> list[mi.Float]:
+    def __call__(self, point: SurfacePoint, engine: Engine | None = None) -> list[mi.Float]:
         """One array for each output, [0,1]."""
         return [sigmoid(x) for x in self.function(point.position, [], engine)]
 
@@ -92,7 +92,7 @@ class Materials:
         return mi.Color3f(self.fields["albedo"](self._locate(si, valid)))
 
     def evaluate(
-        self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine = "tensor"
+        self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine | None = None
     ) -> Material:
         """The materials at surface interactions; see `Network.__call__` for the engines."""
         point = self._locate(si, valid)

@@ -1,9 +1,9 @@
-"""A hash grid with a multilayer perceptron on top, evaluated by either of two engines.
+"""A hash grid with a multilayer perceptron on top, evaluated by one of three engines.
 
-The *tensor* engine multiplies matrices over all points at once. It is the fast one on LLVM,
-forward and backward, but needs evaluated arrays: it cannot run inside virtual calls or symbolic
-loops. The *cooperative vector* engine runs anywhere, also inside a BSDF, and is the fast one on
-CUDA.
+The *cooperative vector* engine runs anywhere, also inside a BSDF or a symbolic loop, and is the
+fast one on CUDA; on LLVM its gradients are slow. The other two need evaluated arrays. The *tensor*
+engine multiplies matrices over all points at once, a layer after the other: the fast one for wide
+layers on LLVM. The *fused* engine does narrow ones in one kernel, with gradients of its own.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ import numpy as np
 
 from ..config import NetworkConfig
 
-Engine = Literal["tensor", "coopvec"]
+Engine = Literal["fused", "tensor", "coopvec"]
+
+#: Neurons of a layer up to which the fused engine is the faster one.
+_NARROW = 48
 
 
 class Network:
@@ -76,20 +79,34 @@ class Network:
         self._packed = None
 
     def __call__(
-        self, position: mi.Point3f, extra: list[mi.Float], engine: Engine = "tensor"
+        self, position: mi.Point3f, extra: list[mi.Float], engine: Engine | None = None
     ) -> list[mi.Float]:
         """Evaluate the network.
 
         Args:
             position: points in [0,1]³; the caller masks points that lie outside or are not finite.
             extra: the further inputs, as many as the constructor was told.
-            engine: `tensor` outside of virtual calls and loops, `coopvec` anywhere.
+            engine: `coopvec` inside of virtual calls and loops; None: the fastest one elsewhere.
 
         Returns:
             One array for each output.
         """
         features = [*self.grid(list(position)), *extra]
-        return self._tensor(features) if engine == "tensor" else self._coopvec(features)
+        match engine or self._usual_engine():
+            case "fused":
+                if dr.grad_enabled(self.layers, features):
+                    return dr.custom(_Perceptron, features, self.layers)
+                outputs = self._coopvec(features)  # there is nothing to keep
+                dr.eval(outputs)
+                return outputs
+            case "tensor":
+                return self._tensor(features)
+            case "coopvec":
+                return self._coopvec(features)
+
+    def _usual_engine(self) -> Engine:
+        narrow = max(weights.shape[0] for weights, _ in self.layers) <= _NARROW
+        return "fused" if narrow and can_record_layout() else "tensor"
 
     def _tensor(self, features: list[mi.Float]) -> list[mi.Float]:
         x = mi.TensorXf(mi.ArrayXf(features))
@@ -116,12 +133,98 @@ class Network:
         Needed once after `assign`, and before any evaluation inside a virtual call or loop, where
         it can no longer be done.
         """
-        flat = [a if a.shape[1] > 1 else mi.TensorXf(a.array) for pair in self.layers for a in pair]
+        flat = [array for weights, bias in self.layers for array in (weights, _flat(bias))]
         if can_record_layout():
             views = [nn.view(a) for a in flat]
         else:
             views = nn.pack(*flat, layout="training")
         self._packed = list(zip(views[::2], views[1::2], strict=True))
+
+
+class _Perceptron(dr.CustomOp):
+    """A narrow perceptron in one kernel each way, rather than several for each layer.
+
+    Only the weights' gradients, sums over all lanes, are products of matrices. What they multiply
+    is kept in memory: inputs of layers as (lanes, inputs), gradients of outputs as (outputs,
+    lanes), so that neither needs to be transposed.
+    """
+
+    def eval(self, features, layers):
+        self.layers = [(nn.view(weights), nn.view(_flat(bias))) for weights, bias in layers]
+        x = nn.CoopVec(features)
+        self.inputs = [_to_rows(list(x))]
+        for weights, bias in self.layers[:-1]:
+            x = dr.maximum(nn.matvec(weights, x, bias), 0)
+            self.inputs.append(_to_rows(list(x)))
+        weights, bias = self.layers[-1]
+        outputs = list(nn.matvec(weights, x, bias))
+        dr.eval(self.inputs, outputs)
+        return outputs
+
+    def backward(self):
+        lanes = self.inputs[0].shape[0]
+        # An output that nobody used has a gradient of a single zero.
+        gradient = [g + dr.zeros(mi.Float, lanes) for g in self.grad_out()]
+        dr.eval(gradient)
+        kept: list[mi.TensorXf] = []
+        for number in reversed(range(len(self.layers))):
+            kept.insert(0, mi.TensorXf(mi.ArrayXf(gradient)))
+            weights, _ = self.layers[number]
+            gradient = list(nn.matvec(weights, nn.CoopVec(gradient), transpose=True))
+            if number > 0:
+                active = [x > 0 for x in _from_rows(self.inputs[number])]
+                gradient = [dr.select(on, g, 0) for on, g in zip(active, gradient, strict=True)]
+                # One kernel a layer: a longer one would run out of registers.
+                dr.eval(kept, gradient)
+        dr.eval(kept, gradient)
+        self.set_grad_in("features", gradient)
+        self.set_grad_in(
+            "layers",
+            [(g @ x, _lane_sums(g)) for g, x in zip(kept, self.inputs, strict=True)],
+        )
+
+    def name(self):
+        return "perceptron"
+
+
+def _flat(bias: mi.TensorXf) -> mi.TensorXf:
+    return mi.TensorXf(bias.array)
+
+
+def _lane_sums(rows: mi.TensorXf) -> mi.TensorXf:
+    outputs, lanes = rows.shape
+    return mi.TensorXf(dr.block_sum(rows.array, lanes), (outputs, 1))
+
+
+def _to_rows(values: list[mi.Float]) -> mi.TensorXf:
+    """Arrays as the columns of a matrix with a row for each lane."""
+    count, lanes = len(values), dr.width(values)
+    size = _packet_size(count)
+    rows = dr.empty(mi.Float, lanes * count)
+    first = dr.arange(mi.UInt32, lanes) * (count // size)
+    for i in range(count // size):
+        packet = mi.ArrayXf(values[i * size : (i + 1) * size]) if size > 1 else values[i]
+        dr.scatter(rows, packet, first + i, mode=dr.ReduceMode.Permute)
+    return mi.TensorXf(rows, (lanes, count))
+
+
+def _from_rows(rows: mi.TensorXf) -> list[mi.Float]:
+    """The arrays that `_to_rows` was given."""
+    lanes, count = rows.shape
+    size = _packet_size(count)
+    first = dr.arange(mi.UInt32, lanes) * (count // size)
+    if size == 1:
+        return [dr.gather(mi.Float, rows.array, first + i) for i in range(count)]
+    packets = [
+        dr.gather(mi.ArrayXf, rows.array, first + i, shape=(size, lanes))
+        for i in range(count // size)
+    ]
+    return [packet[j] for packet in packets for j in range(size)]
+
+
+def _packet_size(count: int) -> int:
+    """Neighbouring floats that are read and written at once: a power of two that divides all."""
+    return min(16, count & -count)
 
 
 def can_record_layout() -> bool:

@@ -48,7 +48,7 @@ class RadianceField:
         n: mi.Normal3f,
         albedo: mi.Color3f,
         valid: mi.Bool,
-        engine: Engine = "tensor",
+        engine: Engine | None = None,
     ) -> mi.Color3f:
         """L_θ at world positions `p` towards `w`.
 
