@@ -198,6 +198,7 @@ class FitConfig:
     seconds: float = 0.0  #: stop after this much training time instead (0: count steps)
     pixels: int = 1024  #: batch size in pixels (Table 1)
     spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
+    radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
 
     learning_rate: float = 0.015  #: Adam, albedo network (Sec. 5.4: 5e-4)
     roughness_learning_rate: float = 0.004  #: Adam, roughness network (Sec. 5.4: 5e-4)
@@ -227,6 +228,8 @@ class FitConfig:
             if isinstance(value, float):
                 _check(math.isfinite(value), name, "a finite number", value)
         _check(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
+        few = self.radiance_spp
+        _check(few >= 0 and few % 2 == 0, "radiance_spp", "an even number, 0 or more", few)
         for name in ("steps", "pixels"):
             _check(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
         rates = ("learning_rate", "roughness_learning_rate", "radiance_learning_rate")
@@ -274,6 +277,11 @@ class FitConfig:
         return self.unknown in ("lighting", "materials+lighting")
 
     @property
+    def radiance_samples(self) -> int:
+        """Camera samples a pixel that L_θ learns of."""
+        return min(self.radiance_spp or self.spp, self.spp)
+
+    @property
     def samples_per_step(self) -> int:
         """Camera samples of a training step."""
         return self.pixels * self.spp
@@ -292,6 +300,7 @@ def _paper() -> FitConfig:
         steps=18_000,
         pixels=16_384,
         spp=16,
+        radiance_spp=0,
         learning_rate=5e-4,
         roughness_learning_rate=5e-4,
         radiance_learning_rate=5e-4,

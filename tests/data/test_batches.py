@@ -52,6 +52,11 @@ def sampler(lanes, seed=0):
     return made
 
 
+def drawn(source, seed, pixels, spp):
+    """A batch."""
+    return source.draw(seed, pixels).batch(source.rays, sampler(spp * pixels, seed), spp)
+
+
 @pytest.fixture
 def source():
     """Pixels whose colour is their number, and which are foreground where that is odd."""
@@ -109,7 +114,7 @@ def pixel_of(ray_d, ray_o, views):
 @pytest.mark.parametrize("foreground_only", [False, True])
 def test_targets_are_the_pixels_that_the_rays_go_through(source, foreground_only):
     views, spp, pixels = cameras(), 3, 200
-    batch = source(foreground_only).draw(mi.UInt32(5), sampler(spp * pixels), pixels, spp)
+    batch = drawn(source(foreground_only), 5, pixels, spp)
     target = rows(batch.target)
     assert target.shape == (pixels, 3) and dr.width(batch.ray) == spp * pixels
     assert np.array_equal(target[:, 1:] - target[:, :1], np.tile([100, 200], (pixels, 1)))
@@ -122,7 +127,7 @@ def test_targets_are_the_pixels_that_the_rays_go_through(source, foreground_only
 
 def test_samples_fill_their_pixel_evenly(source):
     views, spp = cameras(), 4096
-    batch = source().draw(mi.UInt32(2), sampler(spp), 1, spp)
+    batch = drawn(source(), 2, 1, spp)
     number = int(rows(batch.target)[0, 0])
     view, x, y = numbered()[number]
     camera = views[view]
@@ -140,7 +145,7 @@ def test_all_pixels_are_drawn_equally_often(source, foreground_only):
     made, pixels = source(foreground_only), 1000
     counts = np.zeros(len(numbered()))
     for seed in range(20):
-        batch = made.draw(mi.UInt32(seed), sampler(pixels, seed), pixels, 1)
+        batch = drawn(made, seed, pixels, 1)
         numbers, times = np.unique(rows(batch.target)[:, 0].astype(int), return_counts=True)
         counts[numbers] += times
     chosen = np.arange(len(counts)) % 2 == 1 if foreground_only else np.ones(len(counts), bool)
@@ -154,7 +159,7 @@ def test_all_pixels_are_drawn_equally_often(source, foreground_only):
 
 def test_seeds_decide_the_pixels(source):
     made = source()
-    draws = [rows(made.draw(mi.UInt32(s), sampler(64), 64, 1).target) for s in (1, 1, 2)]
+    draws = [rows(drawn(made, s, 64, 1).target) for s in (1, 1, 2)]
     assert np.array_equal(draws[0], draws[1]) and not np.array_equal(draws[0], draws[2])
 
 
@@ -163,5 +168,5 @@ def test_one_view_of_one_pixel():
     made = PixelSource.of(
         [camera], np.full((1, 3), 0.5, np.float32), np.ones(1), foreground_only=True
     )
-    batch = made.draw(mi.UInt32(0), sampler(8), 2, 4)
+    batch = drawn(made, 0, 2, 4)
     assert (rows(batch.target) == 0.5).all() and (rows(batch.ray.d)[:, 2] < -0.9).all()

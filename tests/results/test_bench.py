@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from support import TINY
 
 
 def bench(unbake, what, data, tiny, out, *methods):
@@ -31,14 +32,55 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
         assert f"{row['milliseconds_per_step']:.1f}" in done.out
 
 
-def test_one_method_is_taken_apart(unbake, cornell, tiny, tmp_path):
+PARTS = {"batch", "ray tracing", "BSDFs and lights", "losses", "gradients", "optimiser"}
+
+
+@pytest.mark.parametrize(
+    ("method", "more"),
+    [
+        ("ours", {"material nets", "radiance net"}),
+        ("direct", {"material nets"}),
+        ("prb", {"paths"}),
+    ],
+)
+def test_one_method_is_taken_apart(unbake, cornell, tiny, tmp_path, method, more):
     out = tmp_path / "step.json"
-    done = bench(unbake, "step", cornell, tiny, out, "direct")
+    done = bench(unbake, "step", cornell, tiny, out, method)
     assert done.status == 0, done.err
     result = json.loads(out.read_text())
-    assert result["method"] == "direct" and result["compiled"] == 0
-    assert sum(row["launches"] for row in result["kernels"].values()) == result["launches"] > 0
+    assert result["method"] == method and result["compiled"] == 0 and result["launches"] > 0
+    parts = result["parts"]
+    wanted = PARTS | more if method != "prb" else more | {"batch", "gradients", "optimiser"}
+    assert wanted <= parts.keys()
+    assert all(row["launches"] > 0 and row["milliseconds"] > 0 for row in parts.values())
+    assert 0 < result["milliseconds_in_kernels"] < 1.5 * result["milliseconds_per_step"]
     assert f"{result['milliseconds_per_step']:.1f} ms a step" in done.out
+    assert result["memory_mb"]["peak"] >= result["memory_mb"]["now"] > 0
+    assert (result["floor"] is None) == (method == "prb")
+
+
+def test_the_floor_counts_what_a_step_must_do(unbake, cornell, tiny, tmp_path):
+    out = tmp_path / "step.json"
+    assert bench(unbake, "step", cornell, tiny, out, "ours").status == 0
+    result = json.loads(out.read_text())
+    work, rates, floor = (result["floor"][k] for k in ("work", "rates", "milliseconds"))
+    samples, learned = 64 * 4, 64 * 2
+    # From the camera and at x1 one to a light and one by the BSDF; at x2 where L learns of it.
+    assert work["rays"] == 3 * samples + 2 * learned
+    encoded = TINY.grid.levels * TINY.grid.features
+    sizes = {"albedo": (encoded, 3), "roughness": (encoded, 1), "radiance": (encoded + 12, 6)}
+    products = {k: TINY.width * (a + b) for k, (a, b) in sizes.items()}
+    materials = products["albedo"] + products["roughness"]
+    # With gradients, three times: materials at x1, and L at x1 and x2 where it learns.
+    image = 3 * materials + products["albedo"] + products["radiance"]
+    learning = materials + products["albedo"] + 7 * products["radiance"]
+    assert work["multiply_adds"] == image * samples + learning * learned
+    assert floor["all"] == pytest.approx(sum(v for k, v in floor.items() if k != "all"))
+    for key, rate in rates.items():
+        assert floor[key] == pytest.approx(1e3 * work[key] / rate)
+    # No machine that runs this is slower or faster than that.
+    assert 1e5 < rates["rays"] < 1e11 and 1e8 < rates["bytes"] < 1e14
+    assert 1e8 < rates["multiply_adds"] < 1e15
 
 
 @pytest.mark.parametrize(

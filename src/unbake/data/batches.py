@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ import numpy as np
 
 from ..fields.network import from_numpy
 from .camera import Camera
+from .photographs import Photographs
 
 
 @dataclass
@@ -69,6 +71,37 @@ class CameraRays:
 
 
 @dataclass
+class Drawn:
+    """Some pixels: which ones they are, and what the photographs show there; a PyTree."""
+
+    count: int
+    _packed: mi.UInt32  # numbers, then bits of colours: one array, so that a step copies one
+
+    @staticmethod
+    def of(numbers: np.ndarray, colours: np.ndarray) -> Drawn:
+        """Pixels by their numbers, shape (n,), and the rows of `Photographs.table`, (n, 6)."""
+        packed = np.empty((7, len(numbers)), np.uint32)
+        packed[0] = numbers
+        packed[1:] = np.ascontiguousarray(colours.T).view(np.uint32)
+        return Drawn(len(numbers), from_numpy(mi.UInt32, packed))
+
+    def batch(self, rays: CameraRays, sampler: mi.Sampler, spp: int) -> Batch:
+        """Jittered camera rays through the pixels (box filter), and their colours.
+
+        Args:
+            sampler: seeded for `spp` lanes a pixel.
+        """
+        number = self._row(0, dr.arange(mi.UInt32, self.count * spp) // spp)
+        ray = rays.through(number, sampler.next_2d())
+        pixel = dr.arange(mi.UInt32, self.count)
+        rgb = [dr.reinterpret_array(mi.Float, self._row(1 + i, pixel)) for i in range(6)]
+        return Batch(mi.Color3f(rgb[:3]), mi.Color3f(rgb[3:]), ray)
+
+    def _row(self, row: int, pixel: mi.UInt32) -> mi.UInt32:
+        return dr.gather(mi.UInt32, self._packed, pixel + row * self.count)
+
+
+@dataclass
 class Batch:
     """Pixels and the camera rays of their samples."""
 
@@ -77,75 +110,44 @@ class Batch:
     ray: mi.Ray3f  # `spp` consecutive lanes a pixel, world space
 
 
-@dataclass
+@final
+@dataclass(frozen=True, eq=False)
 class PixelSource:
-    """All training pixels in one flat array, to draw batches from; a PyTree.
+    """All training pixels, to draw batches from.
 
     Random pixels over all views rather than one crop of one view a step (Sec. 5.4): neighbouring
-    pixels tell much the same, so that scattered ones learn faster at equal cost.
+    pixels tell much the same, so that scattered ones learn faster at equal cost. They are drawn on
+    the host, where photographs that are larger than memory can stay on disk.
+
+    Args:
+        rays: through the pixels of all views.
+        photographs: of the same views.
     """
 
     rays: CameraRays
-    _rgb: mi.Float  # linear RGB of all pixels
-    _smoothed: mi.Float  # the same, blurred
-    _chosen: mi.UInt32  # numbers of the pixels that batches are drawn from
-    _count: mi.UInt32  # of the chosen pixels, one lane
+    photographs: Photographs
 
     @staticmethod
     def of(
         cameras: Sequence[Camera], rgb: np.ndarray, alpha: np.ndarray, *, foreground_only: bool
     ) -> PixelSource:
-        """The pixels of these views.
-
-        Where the background is hidden, background pixels say nothing about the scene and only
-        foreground pixels are drawn (the paper: at least half of them).
+        """The pixels of views in memory.
 
         Args:
             cameras: one a view.
             rgb: linear RGB of all views' pixels, row by row, view after view, shape (pixels, 3).
             alpha: coverage of the same pixels, shape (pixels,).
-            foreground_only: draw only pixels with alpha > 0.
+            foreground_only: see `Photographs.chosen`.
+        """
+        found = Photographs.of(cameras, rgb, alpha, foreground_only=foreground_only)
+        return PixelSource(CameraRays.of(cameras), found)
+
+    def draw(self, seed: int, count: int) -> Drawn:
+        """Draw random pixels, each as likely as any other.
 
         Paper: Sec. 5.4.
         """
-        chosen = np.flatnonzero(alpha > 0) if foreground_only else np.arange(len(alpha))
-        return PixelSource(
-            rays=CameraRays.of(cameras),
-            _rgb=from_numpy(mi.Float, rgb),
-            _smoothed=from_numpy(mi.Float, _blurred(cameras, rgb)),
-            _chosen=from_numpy(mi.UInt32, chosen),
-            _count=dr.opaque(mi.UInt32, len(chosen)),
-        )
-
-    def draw(self, seed: mi.UInt32, sampler: mi.Sampler, pixels: int, spp: int) -> Batch:
-        """Draw random pixels and jittered camera rays through them (box filter).
-
-        Args:
-            seed: decides which pixels, one lane.
-            sampler: seeded for `pixels * spp` lanes.
-        """
-        slot = dr.arange(mi.UInt32, pixels)
-        pixel = self._pixel(slot, seed)
-        every_sample = self._pixel(dr.arange(mi.UInt32, pixels * spp) // spp, seed)
-        ray = self.rays.through(every_sample, sampler.next_2d())
-        target = dr.gather(mi.Color3f, self._rgb, pixel)
-        return Batch(target, dr.gather(mi.Color3f, self._smoothed, pixel), ray)
-
-    def _pixel(self, slot: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-        # 32 random bits times the count, upper half: uniform even over hundreds of millions.
-        # Of neighbouring slots, the usual 4 rounds draw some pixels far more often than others.
-        bits, _ = mi.sample_tea_32(slot, seed, rounds=8)
-        return dr.gather(mi.UInt32, self._chosen, dr.mul_hi(bits, self._count))
-
-
-def _blurred(cameras: Sequence[Camera], rgb: np.ndarray, radius: int = 2) -> np.ndarray:
-    """Each view's image, every pixel the mean of the (2 radius + 1)² pixels around it."""
-    parts, first = [], 0
-    for camera in cameras:
-        count = camera.width * camera.height
-        image = rgb[first : first + count].reshape(camera.height, camera.width, 3)
-        first += count
-        padded = np.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * radius + 1,) * 2, (0, 1))
-        parts.append(windows.mean((-2, -1), dtype=np.float32).reshape(count, 3))
-    return np.concatenate(parts)
+        every = self.photographs
+        slots = np.random.default_rng(seed).integers(0, every.count, count)
+        numbers = slots if every.chosen is None else every.chosen[slots]
+        return Drawn.of(numbers, every.table[numbers])

@@ -7,7 +7,7 @@ import math
 import os
 import struct
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -149,34 +149,6 @@ class Dataset:
             except BaseException:
                 os.unlink(file.name)
                 raise
-
-
-def load_pixels(
-    views: Sequence[View], clip_negative: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels of all views, row by row and view after view; every image is read once.
-
-    Args:
-        views: whose images to read.
-        clip_negative: take negative pixels as zero instead of refusing them.
-
-    Returns:
-        (n, 3) float32 linear RGB radiance and (n,) float32 alpha, 1 where images have none; n is
-        the sum of width * height.
-
-    Raises:
-        UserError: an image is missing, unreadable, of another size, or has invalid pixels.
-    """
-    count = sum(view.camera.width * view.camera.height for view in views)
-    rgb, alpha = np.empty((count, 3), np.float32), np.ones(count, np.float32)
-    start = 0
-    for view in views:
-        pixels = read_image(view.image, view.camera.width, view.camera.height, clip_negative)
-        stop = start + len(pixels)
-        rgb[start:stop] = pixels[:, :3]
-        alpha[start:stop] = pixels[:, 3]
-        start = stop
-    return rgb, alpha
 
 
 def read_image(path: Path, width: int, height: int, clip_negative: bool = False) -> np.ndarray:

@@ -29,6 +29,9 @@ from .step import TrainingStep, initial_state
 
 #: Steps between readings of the loss; reading waits for the machine.
 READ_EVERY = 20
+#: Steps between looks at the clock, where time is the limit or decides when to score. Looking waits
+#: for the machine, too.
+TIME_EVERY = 4
 #: Consecutive steps without a finite loss after which a fit gives up.
 GIVE_UP_AFTER = 100
 
@@ -42,7 +45,7 @@ def fit(
     clip_negative: bool = False,
     console: Console | None = None,
 ) -> Progress:
-    """Recover the materials of a scene from its photographs.
+    """Recover materials or lighting of a scene from its photographs.
 
     Args:
         data: a data set's folder, with `transforms.json`.
@@ -64,7 +67,8 @@ def fit(
     config = _resumed_config(run, config) if resume else _refuse_second_run(run, config)
     dataset = Dataset.load(data)
     clip_negative = clip_negative or (resume and read_origin(run).clip_negative)
-    pixels, mean_radiance = training_pixels(dataset, clip_negative=clip_negative)
+    pixels = training_pixels(dataset, clip_negative=clip_negative)
+    mean_radiance = pixels.photographs.mean
     if resume:
         _require_same_photographs(run, data, mean_radiance)
     problem = make_problem(dataset.scene, dataset.background, config, mean_radiance)
@@ -105,7 +109,8 @@ def fit(
             last = _done(config, progress) >= total or bool(stop)
 
             full = len(recent) >= READ_EVERY
-            if full or last or config.seconds or score is not None:
+            timed = config.seconds or score is not None
+            if full or last or (timed and progress.step % TIME_EVERY == 0):
                 dr.sync_thread()
                 progress.seconds = time.perf_counter() - clock
                 last = last or _done(config, progress) >= total

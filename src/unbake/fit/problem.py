@@ -12,8 +12,9 @@ import numpy as np
 
 from ..config import FitConfig
 from ..data import scene as scenes
-from ..data.batches import PixelSource
-from ..data.views import Dataset, check_cameras, load_pixels
+from ..data.batches import CameraRays, PixelSource
+from ..data.photographs import Photographs
+from ..data.views import Dataset, check_cameras
 from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.emission import Emission, emission_textures
@@ -138,8 +139,8 @@ def _unknown_emission(parsed: scenes.ParsedScene, scale: float) -> tuple[Emissio
     return made[0], [light.name for light in lights]
 
 
-def training_pixels(dataset: Dataset, *, clip_negative: bool) -> tuple[PixelSource, float]:
-    """The pixels of the training views, and the mean of their radiance.
+def training_pixels(dataset: Dataset, *, clip_negative: bool) -> PixelSource:
+    """The pixels of the training views.
 
     Raises:
         UserError: there is no training view, an image is bad, or all pixels are black.
@@ -149,15 +150,12 @@ def training_pixels(dataset: Dataset, *, clip_negative: bool) -> tuple[PixelSour
         raise UserError(
             "no training view", dataset.folder, 'Give frames of transforms.json "split": "train"'
         )
-    rgb, alpha = load_pixels(views, clip_negative)
-    hidden = dataset.background == "hidden"
-    if hidden and not (alpha > 0).any():
+    photographs = Photographs.load(dataset, clip_negative)
+    if not photographs.count:
         raise UserError("no foreground pixel in any training view", dataset.folder)
-    mean = float(rgb[alpha > 0].mean() if hidden else rgb.mean())
-    if mean <= 0:
+    if photographs.mean <= 0:
         raise UserError("all training images are black", dataset.folder)
-    source = PixelSource.of([v.camera for v in views], rgb, alpha, foreground_only=hidden)
-    return source, mean
+    return PixelSource(CameraRays.of([view.camera for view in views]), photographs)
 
 
 def camera_warnings(dataset: Dataset, scene: mi.Scene) -> list[str]:

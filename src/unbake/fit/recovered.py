@@ -41,8 +41,9 @@ class Recovered:
 def load_run(run: Path) -> Recovered:
     """Read a run's newest checkpoint.
 
-    `problem.world.scene` is a Mitsuba scene whose albedo and roughness are the recovered fields.
-    After `problem.materials.stand_alone()` any integrator of Mitsuba renders it.
+    `problem.world.scene` is a Mitsuba scene with the recovered fields in the place of its albedo
+    and roughness, its environment or its lights' strengths. Where materials were recovered, any
+    integrator of Mitsuba renders it after `problem.materials.stand_alone()`, and else at once.
 
     Raises:
         UserError: the folder holds no run, no checkpoint, or its data set is gone.

@@ -17,11 +17,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..data.batches import Batch, PixelSource
+from ..data.batches import Batch, CameraRays, Drawn, PixelSource
 from ..errors import UserError
 from ..fields.network import can_record_layout
 from ..transport.baselines import materials_along_paths, path_radiance, path_replay
-from ..transport.image import PathSample, rhs, trace
+from ..transport.image import PathSample, Some, rhs, trace
 from ..transport.objective import (
     METHODS,
     PHOTOMETRIC,
@@ -83,6 +83,18 @@ def initial_state(problem: Problem) -> State:
     return State(phi, theta)
 
 
+@dataclass
+class Inputs:
+    """What a step works on; a PyTree, since a frozen function must be handed all that changes."""
+
+    scene: mi.Scene
+    rays: CameraRays
+    pixels: Drawn
+    sampler: mi.Sampler  # of all camera samples
+    second: mi.Sampler  # of those that L_θ learns of, if these are fewer
+    seed: mi.UInt32
+
+
 class TrainingStep:
     """The training step of a method on a problem.
 
@@ -98,28 +110,27 @@ class TrainingStep:
         transport = _Paths if config.method == "prb" else _Bounces
         self._transport = transport(problem, config)
         self._sampler = mi.load_dict({"type": "independent"})
+        self._second = mi.load_dict({"type": "independent"})
         self._frozen = dr.freeze(self._step) if _can_be_recorded(config) else None
         self._fits_memory = config.method != "ad-pt"
 
-    def __call__(self, state: State, step: int, rates: Mapping[str, float]) -> dict[str, mi.Float]:
+    def __call__(
+        self, state: State, number: int, rates: Mapping[str, float]
+    ) -> dict[str, mi.Float]:
         """Take a step; returns the loss terms and `skipped` (1 if a term was not finite).
 
         Args:
-            step: number of the step; with the seed of the settings it decides all random numbers.
+            number: of the step; with the seed of the settings it decides all random numbers.
             rates: Adam's learning rates; see `learning_rates`.
 
         Raises:
             UserError: `ad-pt` would need more memory than there is.
         """
         self.require_memory(state)
-        state.set_learning_rates(rates)
-        seed = np.random.SeedSequence([self._config.seed, step]).generate_state(1)[0]
-        number = dr.opaque(mi.UInt32, int(seed))
         step = self._step if self._frozen is None else self._frozen
         try:
             with _no_garbage_collection():
-                scene = self._problem.world.scene
-                return step(scene, self._sampler, self._pixels, state, number)
+                return step(self.prepare(state, number, rates), state)
         except RuntimeError as error:
             if not _lacks_memory(error):
                 raise
@@ -147,20 +158,28 @@ class TrainingStep:
         """How often the step was traced to be replayed; 0 if it is traced each time."""
         return 0 if self._frozen is None else self._frozen.n_recordings
 
-    def unfrozen(self, state: State, seed: mi.UInt32) -> dict[str, mi.Float]:
+    def unfrozen(self, state: State, number: int) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
-        scene = self._problem.world.scene
-        return self._step(scene, self._sampler, self._pixels, state, seed)
+        return self._step(self._inputs(number, self._config.pixels), state)
 
-    def _step(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        pixels: PixelSource,
-        state: State,
-        seed: mi.UInt32,
-    ) -> dict[str, mi.Float]:
-        terms = self._gradients(scene, sampler, pixels, state, seed, self._config.pixels)
+    def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:
+        """All that is done in Python for a step that is replayed."""
+        state.set_learning_rates(rates)
+        return self._inputs(number, self._config.pixels)
+
+    def _inputs(self, number: int, pixels: int) -> Inputs:
+        seeds = np.random.SeedSequence([self._config.seed, number]).generate_state(2)
+        return Inputs(
+            scene=self._problem.world.scene,
+            rays=self._pixels.rays,
+            pixels=self._pixels.draw(int(seeds[0]), pixels),
+            sampler=self._sampler,
+            second=self._second,
+            seed=dr.opaque(mi.UInt32, int(seeds[1])),
+        )
+
+    def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
+        terms = self._gradients(inputs, state)
         finite = dr.isfinite(sum(terms.values()))
         for _, optimizer in state.optimizers():
             _drop_broken_gradients(optimizer)
@@ -169,30 +188,24 @@ class TrainingStep:
         dr.eval(state, terms)
         return terms
 
-    def _gradients(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        pixels: PixelSource,
-        state: State,
-        seed: mi.UInt32,
-        count: int,
-    ) -> dict[str, mi.Float]:
-        """The loss terms on a batch of `count` pixels; their gradients are left in the state."""
+    def _gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
+        """The loss terms on the pixels drawn; their gradients are left in the state."""
         config, transport = self._config, self._transport
+        scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
         state.publish(self._problem)
-        sampler.seed(seed, count * config.spp)
-        batch = pixels.draw(seed, sampler, count, config.spp)
+        sampler.seed(inputs.seed, pixels.count * config.spp)
+        batch = pixels.batch(inputs.rays, sampler, config.spp)
         with transport.prepared():
             primal = None
             if not config.halves:
                 with dr.suspend_grad():
-                    again = pixels.draw(seed, sampler, count, config.spp)
+                    again = pixels.batch(inputs.rays, sampler, config.spp)
                     image = transport.image(scene, again.ray, sampler)
                     primal = pixel_means(image, config.spp)
             smoothed = config.loss_reference == "smoothed"
             loss = RelativeL2(config.loss_epsilon, batch.smoothed if smoothed else None)
-            terms = transport.terms(scene, batch, sampler, loss, primal)
+            some = _some(config, inputs)
+            terms = transport.terms(scene, batch, sampler, some, loss, primal)
             terms |= beliefs(self._problem, config, scene, batch.ray, sampler)
             dr.backward(sum(terms.values()))
         return terms
@@ -203,8 +216,7 @@ class TrainingStep:
         few = max(1, min(config.pixels // 4, _PROBED_PATHS // config.spp))
 
         def probe(count: int) -> None:
-            scene, seed = self._problem.world.scene, dr.opaque(mi.UInt32, 0)
-            terms = self._gradients(scene, self._sampler, self._pixels, state, seed, count)
+            terms = self._gradients(self._inputs(0, count), state)
             for _, optimizer in state.optimizers():
                 dr.eval(terms, [dr.grad(value) for value in optimizer.values()])
                 dr.clear_grad(dict(optimizer.items()))
@@ -214,6 +226,21 @@ class TrainingStep:
         if fewer is None or more is None:
             return None
         return more + max(0, more - fewer) * (config.pixels / few - 2)
+
+
+def _some(config: FitConfig, inputs: Inputs) -> Some | None:
+    """The first camera samples of each pixel, if L_θ learns of them alone."""
+    each = config.radiance_samples
+    if each == config.spp:
+        return None
+    lanes = inputs.pixels.count * each
+    inputs.second.seed(inputs.seed + 1, lanes)
+    lane = dr.arange(mi.UInt32, lanes)
+    chosen = lane // each * config.spp + lane % each
+    # As an array in memory: a replayed kernel takes its size from arrays that it reads, and would
+    # find none of this size.
+    dr.eval(chosen)
+    return Some(chosen, inputs.second)
 
 
 #: Paths of the smaller one of two batches that tell how much memory a batch takes.
@@ -267,18 +294,21 @@ class _Bounces:
         scene: mi.Scene,
         batch: Batch,
         sampler: mi.Sampler,
+        some: Some | None,
         loss: RelativeL2,
         primal: mi.Color3f | None,
     ) -> dict[str, mi.Float]:
         """The terms of the objective."""
-        sample = self._trace(scene, batch.ray, sampler)
+        sample = self._trace(scene, batch.ray, sampler, some)
         target, bounces = batch.target, self._bounces
         return objective(self._terms, sample, target, self._spp, loss, primal, bounces)
 
-    def _trace(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> PathSample:
+    def _trace(
+        self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler, some: Some | None = None
+    ) -> PathSample:
         p, wanted = self._problem, needs(self._terms, self._bounces)
         world = p.world.with_scene(scene)
-        return trace(world, p.radiance, ray, sampler, wanted, p.see_lights)
+        return trace(world, p.radiance, ray, sampler, wanted, p.see_lights, some)
 
 
 class _Paths:
@@ -306,6 +336,7 @@ class _Paths:
         scene: mi.Scene,
         batch: Batch,
         sampler: mi.Sampler,
+        some: Some | None,
         loss: RelativeL2,
         primal: mi.Color3f | None,
     ) -> dict[str, mi.Float]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import platform
+import resource
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -18,15 +20,21 @@ from rich.console import Console
 from rich.table import Table
 
 from ..config import FitConfig
+from ..data.batches import PixelSource
 from ..data.capture import CaptureSettings, capture
 from ..data.views import Dataset
 from ..fit.monitor import memory_mb
-from ..fit.problem import make_problem, training_pixels
+from ..fit.problem import Problem, make_problem, training_pixels
 from ..fit.rates import learning_rates
 from ..fit.step import State, TrainingStep, initial_state
+from ..imaging.pictures import write_atomically
+from .floor import floor
+from .parts import Parts
 
 #: Steps before anything is measured.
 WARM_UP = 20
+#: Steps that are taken apart, to take the median of.
+APART = 7
 
 
 @contextmanager
@@ -44,7 +52,7 @@ def small_data(data: Path | None) -> Iterator[Path]:
 def bench_step(
     data: Path, config: FitConfig, steps: int, out: Path | None, console: Console
 ) -> dict:
-    """Measure the training step on a data set.
+    """Measure the training step on a data set, and take it apart.
 
     Times are medians after warm-up. A camera sample is one path from the camera with its RHS, its
     LHS, both residuals and all gradients.
@@ -59,21 +67,26 @@ def bench_step(
         All that is printed.
     """
     dataset = Dataset.load(data)
-    pixels, mean = training_pixels(dataset, clip_negative=False)
+    pixels = training_pixels(dataset, clip_negative=False)
+    mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
 
-    result = {"machine": machine(), "method": config.method, "settings": _settings(config)}
+    result = {"machine": machine(), "data": dataset.folder.name}
+    result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(step, state, config, steps)
+    result["parts"] = _taken_apart(step, state)
+    result["memory_mb"] = _memory(problem, pixels, state)
+    result["floor"] = floor(problem, pixels, state, config)
     _print(result, console)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(result, indent=1) + "\n")
+        text = json.dumps(result, indent=1) + "\n"
+        write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
     return result
 
 
 def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -> dict:
-    """The frozen step: wall time, time inside kernels by kind, and the Python side."""
+    """The step as a fit takes it: wall time, time in kernels, and what is left for the host."""
     rates = learning_rates(config, config.warm_up, 0.0)
     for i in range(WARM_UP):
         step(state, i, rates)
@@ -82,51 +95,66 @@ def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -
     for i in range(WARM_UP, WARM_UP + steps):
         start = time.perf_counter()
         step(state, i, rates)
-        python.append(time.perf_counter() - start)
         dr.sync_thread()
         wall.append(time.perf_counter() - start)
-    with _kernel_history() as kernels:
-        step(state, WARM_UP + steps, rates)
-    kinds: dict[str, list[float]] = {}
-    for kernel in kernels:
-        kinds.setdefault(_kind(kernel), []).append(kernel["execution_time"])
+    for i in range(steps):
+        start = time.perf_counter()
+        step.prepare(state, i, rates)
+        python.append(time.perf_counter() - start)
+        dr.sync_thread()
+    in_kernels = []
+    for i in range(WARM_UP + steps, WARM_UP + steps + APART):
+        with _kernel_history() as kernels:
+            step(state, i, rates)
+        in_kernels.append(sum(k["execution_time"] for k in kernels))
     seconds = statistics.median(wall)
     return {
         "milliseconds_per_step": 1e3 * seconds,
-        "milliseconds_until_call_returns": 1e3 * statistics.median(python),
+        "milliseconds_in_python": 1e3 * statistics.median(python),
+        "milliseconds_in_kernels": statistics.median(in_kernels),
         "samples_per_second": config.samples_per_step / seconds,
         "launches": len(kernels),
         "compiled": sum(k["cache_hit"] is False for k in kernels if "cache_hit" in k),
         "recordings": step.recordings(),
-        "memory_mb": memory_mb(),
-        "kernels": {
-            kind: {"launches": len(times), "milliseconds": sum(times)}
-            for kind, times in sorted(kinds.items(), key=lambda item: -sum(item[1]))
-        },
     }
 
 
-def _kind(kernel: dict) -> str:
-    """What a kernel is for, as far as its launch tells."""
-    kind = str(kernel["type"]).split(".")[-1]
-    if kind != "JIT":
-        return {
-            "BatchedGemm": "matrix products of the networks",
-            "BlockReduce": "sums",
-            "Memset": "clearing memory",
-            "Aggregate": "call tables",
-        }.get(kind, kind)
-    if kernel.get("uses_optix"):
-        return "ray tracing"
-    return "traced code, " + _size_class(kernel.get("operation_count", 0))
+def _taken_apart(step: TrainingStep, state: State) -> dict:
+    """Milliseconds and launches of each part of a step, medians over steps traced anew."""
+    recorded = []
+    for i in range(APART + 1):
+        parts = Parts()
+        with parts.recorded():
+            step.unfrozen(state, i)
+        recorded.append(parts.kernels)
+    names = list(recorded[-1])
+    times = {
+        name: [sum(k["execution_time"] for k in kernels[name]) for kernels in recorded[1:]]
+        for name in names
+    }
+    rows = {
+        name: {
+            "milliseconds": statistics.median(times[name]),
+            "launches": len(recorded[-1][name]),
+            "products": sum(
+                k["execution_time"] for k in recorded[-1][name] if "Gemm" in str(k["type"])
+            ),
+        }
+        for name in names
+    }
+    return {name: row for name, row in rows.items() if row["launches"]}
 
 
-def _size_class(operations: int) -> str:
-    if operations >= 3000:
-        return "long (BSDFs, rays, emitters and their gradients)"
-    if operations >= 400:
-        return "middle (hash grids, rays)"
-    return "short (layers, losses, Adam)"
+def _memory(problem: Problem, pixels: PixelSource, state: State) -> dict:
+    """Megabytes of this process, and what of them is known by owner."""
+    owned = {
+        name: 3 * 4 * sum(dr.width(a) for a in adam.values()) for name, adam in state.optimizers()
+    }
+    owned["photographs"] = pixels.photographs.bytes
+    unit = 1 if sys.platform == "darwin" else 1024
+    now = memory_mb()
+    peak = max(now, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6)
+    return {"now": now, "peak": peak} | {name: size / 1e6 for name, size in owned.items()}
 
 
 @contextmanager
@@ -144,6 +172,7 @@ def _settings(config: FitConfig) -> dict:
         "preset": config.preset,
         "pixels": config.pixels,
         "spp": config.spp,
+        "radiance_spp": config.radiance_samples,
         "radiance": f"{config.radiance.width} x {config.radiance.hidden}",
         "albedo": f"{config.albedo.width} x {config.albedo.hidden}",
         "roughness": f"{config.roughness.width} x {config.roughness.hidden}",
@@ -168,21 +197,32 @@ def machine() -> dict:
 
 
 def _print(result: dict, console: Console) -> None:
-    s = result["settings"]
+    s, wall = result["settings"], result["milliseconds_per_step"]
     console.print(
         f"{result['method']}, {s['pixels']} pixels x {s['spp']} samples, radiance net "
-        f"{s['radiance']}, albedo net {s['albedo']}, roughness net {s['roughness']}"
+        f"{s['radiance']} of {s['radiance_spp']} samples, albedo net {s['albedo']}, "
+        f"roughness net {s['roughness']}"
     )
     console.print(
-        f"{result['milliseconds_per_step']:.1f} ms a step, "
-        f"[bold]{result['samples_per_second'] / 1e3:.0f} k samples/s[/]; the call returns after "
-        f"{result['milliseconds_until_call_returns']:.1f} ms"
+        f"{wall:.1f} ms a step, [bold]{result['samples_per_second'] / 1e3:.0f} k samples/s[/]; "
+        f"{result['milliseconds_in_kernels']:.1f} ms of it in {result['launches']} kernels, "
+        f"{result['compiled']} compiled, {result['milliseconds_in_python']:.1f} ms in Python "
+        f"({result['milliseconds_in_python'] / wall:.0%}); traced {result['recordings']} times"
     )
-    console.print(
-        f"{result['launches']} launches, {result['compiled']} kernels compiled, step traced "
-        f"{result['recordings']} times, {result['memory_mb']:.0f} MB"
-    )
-    table = Table("where the time goes", "launches", "ms")
-    for kind, row in result["kernels"].items():
-        table.add_row(kind, str(row["launches"]), f"{row['milliseconds']:.2f}")
+    table = Table("the step taken apart", "launches", "ms", "of it products", "share")
+    total = sum(row["milliseconds"] for row in result["parts"].values())
+    for name, row in sorted(result["parts"].items(), key=lambda item: -item[1]["milliseconds"]):
+        ms = row["milliseconds"]
+        cells = f"{ms:.2f}", f"{row['products']:.2f}", f"{ms / total:.0%}"
+        table.add_row(name, str(row["launches"]), *cells)
     console.print(table)
+    memory = result["memory_mb"]
+    console.print("memory, MB: " + ", ".join(f"{name} {mb:.0f}" for name, mb in memory.items()))
+    least = result["floor"]
+    if least is not None:
+        ms = least["milliseconds"]
+        console.print(
+            f"floor {ms['all']:.1f} ms (rays {ms['rays']:.1f}, products "
+            f"{ms['multiply_adds']:.1f}, bytes {ms['bytes']:.1f}); the step takes "
+            f"{wall / ms['all']:.1f} times as long"
+        )

@@ -93,7 +93,8 @@ def bench_methods(
 
 def _timed(dataset: Dataset, config: FitConfig, steps: int) -> list[float]:
     """Seconds of steps after warm-up, of a fit that is then forgotten."""
-    pixels, mean = training_pixels(dataset, clip_negative=False)
+    pixels = training_pixels(dataset, clip_negative=False)
+    mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
     times = []

@@ -10,7 +10,9 @@ each piece evaluated once. Which of the pieces pass gradients is decided elsewhe
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +20,8 @@ import mitsuba as mi
 from ..fields.radiance import RadianceField
 from .operator import Bounce, attach_albedo, attach_material, bounce, transported
 from .vertex import Vertex, World, find_vertex
+
+Piece = TypeVar("Piece")
 
 
 @dataclass
@@ -31,10 +35,18 @@ class PathSample:
     x1: Vertex
     bounces: list[Bounce]  # from x₁, x₂, …; the next vertex of each is where the next one starts
     radiance: list[mi.Color3f]  # L_θ at x₁, x₂, …; zero where nobody needs it
+    learned: PathSample | None = None  # the samples that L_θ learns of; None: all of these
 
     def vertex(self, number: int) -> Vertex:
         """x₁, x₂, …"""
         return self.x1 if number == 1 else self.bounces[number - 2].next
+
+    def place(self, number: int, vertex: Vertex) -> None:
+        """Replace x₁, x₂, … by the same with more known about it."""
+        if number == 1:
+            self.x1 = vertex
+        else:
+            self.bounces[number - 2].next = vertex
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,19 @@ class Needs:
         return self.lhs or self.residuals > 0
 
 
+@dataclass
+class Some:
+    """Some of the camera samples: L_θ learns of them, and the others only make the image.
+
+    Args:
+        lanes: their numbers.
+        sampler: for as many lanes.
+    """
+
+    lanes: mi.UInt32
+    sampler: mi.Sampler
+
+
 def trace(
     world: World,
     radiance: RadianceField | None,
@@ -58,50 +83,81 @@ def trace(
     sampler: mi.Sampler,
     needs: Needs,
     see_lights: bool,
+    some: Some | None = None,
 ) -> PathSample:
     """Trace one path sample for each camera ray.
 
     Materials are evaluated once a vertex, and L_θ once where the image and residuals both need it.
 
+    Args:
+        some: the samples that L_θ learns of; None: all.
+
     Paper: Sec. 4.2, 6.3, Fig. 2.
     """
-    ends = max(needs.bounces, needs.residuals)
-    x = find_vertex(world, ray, mi.Bool(True), sampler, see_lights=see_lights)
-    x1 = x = attach_material(world, x)
-    bounces: list[Bounce] = []
-    for number in range(1, ends + 1):
-        with dr.suspend_grad(when=number > needs.bounces):
-            step = bounce(world, x, sampler)
-        bounces.append(step)
-        if number < ends:
-            with dr.suspend_grad(when=number >= needs.bounces):
-                step.next = attach_material(world, step.next)
-        elif needs.radiance:
-            with dr.suspend_grad():
-                step.next = attach_albedo(world, step.next)
-        x = step.next
-    sample = PathSample(x1, bounces, [mi.Color3f(0)] * (ends + 1))
+    x1 = find_vertex(world, ray, mi.Bool(True), sampler, see_lights=see_lights)
+    sample = learned = PathSample(x1, [], [])
+    _prolong(world, sample, needs.bounces, sampler, needs)
+    if some is not None and needs.radiance:
+        _end(world, sample)
+        x1, bounces = _gather(sample.x1, some), [_gather(b, some) for b in sample.bounces]
+        sample.learned = learned = PathSample(x1, bounces, [])
+        sampler = some.sampler
+    _prolong(world, learned, needs.residuals, sampler, needs)
+    if needs.radiance and (learned is sample or needs.residuals > needs.bounces):
+        _end(world, learned)
+    for paths in (sample, learned):
+        paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
     if needs.radiance:
-        learned, constant = _where_radiance_is_needed(needs)
-        _look_up(radiance, sample, learned)
+        with_gradients, without = where_radiance_is_needed(needs)
+        _look_up(radiance, learned, with_gradients)
+        last = {needs.bounces + 1}  # where the image ends
         with dr.suspend_grad():
-            _look_up(radiance, sample, constant)
+            if learned is not sample:
+                _look_up(radiance, sample, last)
+                without = without - last if needs.bounces > needs.residuals else without
+            _look_up(radiance, learned, without)
     return sample
 
 
-def _where_radiance_is_needed(needs: Needs) -> tuple[list[int], list[int]]:
+def _prolong(
+    world: World, sample: PathSample, bounces: int, sampler: mi.Sampler, needs: Needs
+) -> None:
+    """Add bounces to a path until it has so many."""
+    for number in range(len(sample.bounces) + 1, bounces + 1):
+        with dr.suspend_grad(when=number > needs.bounces):
+            x = attach_material(world, sample.vertex(number))
+            sample.place(number, x)
+            sample.bounces.append(bounce(world, x, sampler))
+
+
+def _end(world: World, sample: PathSample) -> None:
+    """Let L_θ know the albedo where a path ends: no more light is scattered there."""
+    last = len(sample.bounces) + 1
+    with dr.suspend_grad():
+        sample.place(last, attach_albedo(world, sample.vertex(last)))
+
+
+def _gather(piece: Piece, some: Some) -> Piece:
+    """Some lanes of a vertex or a bounce, and of all that it consists of."""
+    if not dataclasses.is_dataclass(piece):
+        return dr.gather(type(piece), piece, some.lanes)
+    parts = {f.name: _gather(getattr(piece, f.name), some) for f in dataclasses.fields(piece)}
+    return dataclasses.replace(piece, **parts)
+
+
+def where_radiance_is_needed(needs: Needs) -> tuple[set[int], set[int]]:
     """Numbers of the vertices where L_θ is needed: with gradients to θ, and without.
 
     A residual at xᵢ compares L(xᵢ) with L(xᵢ₊₁); the image ends with L(x) after k bounces.
     """
     learned = set(range(1, needs.residuals + 1)) | ({1} if needs.lhs else set())
     read = {needs.bounces + 1} | {i + 1 for i in range(1, needs.residuals + 1)}
-    return sorted(learned), sorted(read - learned)
+    return learned, read - learned
 
 
-def _look_up(radiance: RadianceField, sample: PathSample, numbers: list[int]) -> None:
-    found = reflected_radiance(radiance, *(sample.vertex(i) for i in numbers))
-    for number, value in zip(numbers, found, strict=True):
+def _look_up(radiance: RadianceField, sample: PathSample, numbers: set[int]) -> None:
+    found = reflected_radiance(radiance, *(sample.vertex(i) for i in sorted(numbers)))
+    for number, value in zip(sorted(numbers), found, strict=True):
         sample.radiance[number - 1] = value
 
 

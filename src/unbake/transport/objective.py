@@ -109,9 +109,10 @@ def objective(
 
     Args:
         terms: a row of `METHODS`.
-        sample: path samples, `spp` consecutive lanes a pixel.
+        sample: path samples, as many consecutive lanes for each pixel; those that L_θ learns of,
+            too.
         target: the photographs' pixels, linear RGB.
-        spp: camera samples a pixel.
+        spp: camera samples a pixel, of which `sample.learned` may hold fewer.
         loss: what errors are relative to.
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
             None: the split-halves estimator.
@@ -122,9 +123,10 @@ def objective(
     values: dict[str, mi.Float] = {}
     weight = loss.weight(target)
     for term, live in terms.items():
-        scattered = sample if live.scene else dr.detach(sample)
-        seen = [L if live.lhs else dr.detach(L) for L in sample.radiance]
-        incoming = [L if live.rhs else dr.detach(L) for L in sample.radiance]
+        paths = sample if term == PHOTOMETRIC else (sample.learned or sample)
+        scattered = paths if live.scene else dr.detach(paths)
+        seen = [L if live.lhs else dr.detach(L) for L in paths.radiance]
+        incoming = [L if live.rhs else dr.detach(L) for L in paths.radiance]
         match term:
             case "photometric":
                 pixels = rhs(scattered, incoming[bounces], bounces)
@@ -137,7 +139,8 @@ def objective(
                 values[term] = residual_norm(second, seen[1], loss.epsilon)
             case "lhs":
                 pixels = lhs(scattered, seen[0])
-                values[term] = squared_error(pixels, target, spp, weight, None)
+                some = dr.width(scattered.x1.valid) // dr.width(target)
+                values[term] = squared_error(pixels, target, some, weight, None)
     return values
 
 
