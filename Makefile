@@ -30,8 +30,8 @@ test-slow: setup ## every test, minutes; those for a GPU run where there is one
 demo: setup ## capture, fit, evaluate and report a small room into demo/ (FRESH=1 starts over)
 	@FRESH="$(FRESH)" bash scripts/demo.sh
 
-bench: setup ## time a step of every method
-	@$(BIN)/unbake bench $(ARGS)
+bench: setup ## where the time of a step goes here, into benchmarks/results (STAIRCASE=data adds it)
+	@bash benchmarks/run.sh machine
 
 clean: ## remove the demo, builds and caches
 	rm -rf demo build dist src/*.egg-info .pytest_cache .ruff_cache .import_linter_cache

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Every comparison of docs/comparison.md, one after the other: bash benchmarks/run.sh [JOB ...]
-# Jobs: steps rivals long ablation lighting emission sparse (default: all; hours on two cores).
+# Jobs: machine steps rivals long ablation lighting emission sparse (default: all; hours).
 # STAIRCASE takes part where STAIRCASE names its data set (docs/staircase.md says how to make it).
 # Runs are kept in build/bench; what is finished is not done again. Results: benchmarks/results.
 set -euo pipefail
@@ -29,6 +29,20 @@ steps() {
     "$unbake" bench methods --data "$STAIRCASE" --methods $methods \
         --settings benchmarks/staircase.toml --out "$results/methods-staircase.json"
 }
+machine() { # where the time of a step goes on this machine
+    local method files=()
+    on_demo
+    for method in ours ours:bitmap no-prior direct prb; do
+        files+=("$work/step-${method/:/-}.json")
+        "$unbake" bench step --data "$work/demo" --methods $method --out "${files[-1]}"
+    done
+    if staircase; then
+        files+=("$work/step-staircase.json")
+        "$unbake" bench step --data "$STAIRCASE" --settings benchmarks/staircase.toml --steps 40 \
+            --out "${files[-1]}"
+    fi
+    "$python" benchmarks/machine.py "$results" "${files[@]}"
+}
 rivals() { # equal time, and equal samples
     local methods="ours prb prb:neural:split-halves prb:bitmap ad-pt:neural:split-halves direct
         no-prior"
@@ -38,18 +52,18 @@ rivals() { # equal time, and equal samples
     "$unbake" compare "$work/demo" --methods ours prb --steps 2400 --out "$work/equal-demo"
     summary "$results/equal-demo.json" "$work/equal-demo"
     staircase || return 0
-    "$unbake" compare "$STAIRCASE" --methods $methods --seconds 200 --out "$work/rivals-staircase" \
-        --settings benchmarks/staircase.toml
+    "$unbake" compare "$STAIRCASE" --methods ours prb ad-pt:neural:split-halves no-prior \
+        --seconds 180 --evaluate-spp 16 --settings benchmarks/staircase.toml \
+        --out "$work/rivals-staircase"
     summary "$results/rivals-staircase.json" "$work/rivals-staircase"
 }
 long() { # what PRB ends with after 20 minutes; the runs of `rivals` tell when ours has it
     on_demo
-    "$unbake" compare "$work/demo" --methods prb:neural:split-halves --seconds 1200 \
-        --out "$work/long-demo"
+    "$unbake" compare "$work/demo" --methods prb --seconds 1200 --out "$work/long-demo"
     summary "$results/long-demo.json" "$work/long-demo"
     staircase || return 0
-    "$unbake" compare "$STAIRCASE" --methods prb:neural:split-halves --seconds 1200 \
-        --out "$work/long-staircase" --settings benchmarks/staircase.toml
+    "$unbake" compare "$STAIRCASE" --methods prb --seconds 1200 --evaluate-spp 16 \
+        --settings benchmarks/staircase.toml --out "$work/long-staircase"
     summary "$results/long-staircase.json" "$work/long-staircase"
 }
 ablation() {
@@ -87,6 +101,6 @@ sparse() { # 6 views, with and without regularisation
     done
 }
 
-for job in ${@:-steps rivals long ablation lighting emission sparse}; do
+for job in ${@:-machine steps rivals long ablation lighting emission sparse}; do
     "$job"
 done

@@ -31,12 +31,13 @@ def test_every_file_and_name_in_the_table_exists(repository, rows):
 
 @pytest.mark.parametrize("equation", [1, 2, 3, 4, 5, 8, 10, 11, 12, 13, 14])
 def test_an_equation_is_cited_where_the_table_sends_its_reader(repository, rows, equation):
-    cells = [w for paper, _, w in rows if equation in map(int, re.findall(r"\d+", paper))
-             and paper.startswith("Eq")]
+    cells = [
+        w
+        for paper, _, w in rows
+        if equation in map(int, re.findall(r"\d+", paper)) and paper.startswith("Eq")
+    ]
     assert cells, f"Eq. {equation} is not in the table"
     files = {file for cell in cells for file, _ in places(cell)}
     sources = [(repository / "src" / "unbake" / f).read_text(encoding="utf-8") for f in files]
     cited = re.compile(rf"Eq\. (?:\d+, (?:Eq\. )?)*{equation}\b")
     assert any(cited.search(source) for source in sources), f"Eq. {equation}: nowhere in {files}"
-
-

@@ -1,0 +1,142 @@
+"""The tables of docs/comparison.md, from benchmarks/results: python tables.py"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def main() -> None:
+    """Print every table whose numbers are there."""
+    for title, names, table in TABLES:
+        found = [read(name) for name in names]
+        if all(found):
+            print(f"{title}\n\n{table(*found)}\n")
+
+
+def read(name: str) -> dict | None:
+    """The numbers of one file of results."""
+    file = RESULTS / f"{name}.json"
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+
+
+def steps(demo: dict, staircase: dict) -> str:
+    """Milliseconds of a step, and in the second column as multiples of ours."""
+    rows = []
+    for a, b in zip(demo["rows"], staircase["rows"], strict=True):
+        name = f"`{a['method']}` | {a['representation']} | {a['estimator'].replace('-', ' ')}"
+        cells = [
+            cell
+            for row, table in ((a, demo), (b, staircase))
+            for cell in (f"{row['milliseconds_per_step']:.0f} ms", f"{ratio(row, table):.2f}")
+        ]
+        rows.append([name, *cells])
+    return markdown("method | materials | estimator | demo | / ours | STAIRCASE | / ours", rows)
+
+
+def ratio(row: dict, table: dict) -> float:
+    """Time of a step as a multiple of that of ours with the same materials."""
+    same = (r for r in table["rows"] if r["representation"] == row["representation"])
+    ours = next(r for r in same if r["method"] == "ours")
+    return row["milliseconds_per_step"] / ours["milliseconds_per_step"]
+
+
+def quality(result: dict) -> str:
+    """What every method reaches on held-out views, and when."""
+    rows = []
+    for name, row in result["methods"].items():
+        if "error" in row:
+            rows.append([f"`{name}`", "", "", row["error"], "", ""])
+            continue
+        psnr = [f"{row[f'{k}_psnr']:.1f}" for k in ("albedo", "roughness", "render")]
+        told = f"`{name}`", str(row["steps"]), f"{row['milliseconds_per_step']:.0f}"
+        rows.append([*told, *psnr])
+    return markdown("run | steps | ms a step | albedo | roughness | rendering", rows)
+
+
+def time_to_quality(end: dict, runs: dict) -> str:
+    """When ours has the albedo that another method ends with."""
+    (name, row), ours = next(iter(end["methods"].items())), runs["methods"]["ours"]["score"]
+    last = row["score"][-1]
+    reached = next((s for s in ours if s["albedo_psnr"] >= last["albedo_psnr"]), None)
+    told = [f"`{name}`", f"{last['seconds']:.0f} s", f"{last['albedo_psnr']:.2f} dB"]
+    if reached is None:
+        told += ["not in this run", ""]
+    else:
+        seconds = reached["seconds"]
+        told += [f"{seconds:.0f} s", f"{last['seconds'] / seconds:.0f}"]
+    return markdown("method | ends after | with albedo | `ours` has it after | times", [told])
+
+
+def ladder(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
+    """Mean and spread over seeds; a column is its title, key, factor and digits."""
+
+    def table(result: dict) -> str:
+        rows = [
+            [f"`{name}`", *(spread(row, key, by, digits) for _, key, by, digits in columns)]
+            for name, row in result["methods"].items()
+        ]
+        return markdown(" | ".join(["run", *(title for title, *_ in columns)]), rows)
+
+    return table
+
+
+def spread(row: dict, key: str, factor: float, digits: int) -> str:
+    """A mean, and the standard deviation over seeds if there are several."""
+    if key not in row:
+        return ""
+    text = f"{factor * row[key]:.{digits}f}"
+    deviation = row.get(f"{key}_sd")
+    return text if deviation is None else f"{text} ± {factor * deviation:.{digits}f}"
+
+
+def markdown(head: str, rows: Iterable[list[str]]) -> str:
+    """A table of Markdown."""
+    rule = "|".join("---" for _ in head.split("|"))
+    return "\n".join([f"| {head} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+PSNR = (
+    ("albedo, dB", "albedo_psnr", 1, 1),
+    ("roughness, dB", "roughness_psnr", 1, 1),
+    ("rendering, dB", "render_psnr", 1, 1),
+)
+LIGHT = (
+    ("SH error, %", "sh_error", 100, 1),
+    ("relighting, dB", "relight_psnr", 1, 1),
+    ("rendering, dB", "render_psnr", 1, 1),
+)
+BOTH = (
+    ("albedo, dB", "albedo_psnr", 1, 1),
+    ("albedo, scale aligned", "albedo_psnr_aligned", 1, 1),
+    ("roughness, dB", "roughness_psnr", 1, 1),
+    ("SH error, %", "sh_error", 100, 1),
+    ("aligned", "sh_error_aligned", 100, 1),
+    ("relighting, dB", "relight_psnr", 1, 1),
+    ("relighting, aligned", "relight_psnr_aligned", 1, 1),
+)
+TABLES = (
+    ("Time of a step", ("methods-demo", "methods-staircase"), steps),
+    ("Equal time, demo", ("rivals-demo",), quality),
+    ("Equal time, STAIRCASE", ("rivals-staircase",), quality),
+    ("Equal samples, demo", ("equal-demo",), quality),
+    ("Time to quality, demo", ("long-demo", "rivals-demo"), time_to_quality),
+    ("Time to quality, STAIRCASE", ("long-staircase", "rivals-staircase"), time_to_quality),
+    ("Ablation, materials", ("ablation-materials",), ladder(*PSNR)),
+    ("Ablation, lighting", ("ablation-lighting",), ladder(*LIGHT)),
+    *(
+        (f"still, {unknown}", (f"still-{unknown}",), ladder(*BOTH))
+        for unknown in ("materials", "lighting", "materials+lighting")
+    ),
+    ("Emission", ("emission",), ladder(("error, %", "emission_error", 100, 2))),
+    *(
+        (f"Six views, {name}", (f"sparse-{name}",), ladder(*PSNR))
+        for name in ("none", "smooth", "tied", "both")
+    ),
+)
+
+if __name__ == "__main__":
+    main()

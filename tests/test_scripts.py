@@ -1,0 +1,50 @@
+"""The script for GPU machines runs through, at a scale where nothing takes long."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+
+def cuda(repository, out, *jobs):
+    """Run the script's jobs on this machine's variant."""
+    paths = os.pathsep.join(p for p in sys.path if p)
+    return subprocess.run(
+        ["bash", str(repository / "scripts" / "cuda.sh"), str(out), *jobs],
+        env={**os.environ, "SCALE": "smoke", "PYTHON": sys.executable, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def numbers(file):
+    result = json.loads(file.read_text())
+    assert result["milliseconds_per_step"] > 0 and result["parts"]
+    return result
+
+
+def test_the_script_for_gpu_machines_runs_through(repository, tmp_path):
+    done = cuda(repository, tmp_path, "doctor", "step", "cube", "staircase")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "can work on this machine" in (tmp_path / "doctor.txt").read_text()
+    for method in ("ours", "prb", "ad-pt"):
+        assert numbers(tmp_path / f"step-{method}.json")["method"] == method
+        assert numbers(tmp_path / f"cube-0.3-{method}.json")["method"] == method
+    assert not (tmp_path / "cube-failed.txt").exists()
+    assert (tmp_path / "staircase" / "evaluation" / "metrics.json").is_file()
+
+
+@pytest.mark.slow
+def test_a_long_fit_goes_on_where_the_last_call_ended(repository, tmp_path):
+    for _ in range(2):
+        done = cuda(repository, tmp_path, "staircase")
+        assert done.returncode == 0, done.stderr[-3000:]
+    assert "going on after step 20" in done.stdout
+
+
+def test_without_a_folder_the_script_tells_how_to_use_it(repository):
+    done = cuda(repository, "")
+    assert done.returncode == 2 and "OUT [JOB ...]" in done.stdout + done.stderr
