@@ -41,6 +41,7 @@ PriorName = Literal["one-bounce", "extra-bounce"]
 Unknown = Literal["materials", "lighting", "materials+lighting", "emission"]
 Representation = Literal["neural", "grid", "bitmap"]
 RadianceRepresentation = Literal["neural", "grid"]
+Precision = Literal["single", "half"]
 PresetName = Literal["cpu", "paper", "release"]
 
 _FINEST = "base_resolution * growth^(levels - 1) is 2^24 or less"
@@ -212,6 +213,7 @@ class FitConfig:
     albedo: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(7), hidden=1))
     roughness: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(4), 16, 1))
     radiance: NetworkConfig = field(default_factory=NetworkConfig)
+    precision: Precision = "single"  #: of the networks' products; all else is single (ours)
     grid: DenseGridConfig = field(default_factory=DenseGridConfig)
     bitmap: BitmapConfig = field(default_factory=BitmapConfig)
     lighting: LightingConfig = field(default_factory=LightingConfig)

@@ -71,6 +71,25 @@ def test_engines_agree_on_values_and_gradients(config, extra, outputs):
                 np.testing.assert_allclose(gradient, grad_b[name], atol=1e-4 * scale, err_msg=name)
 
 
+@pytest.mark.parametrize("engine", ["tensor", "coopvec"])
+def test_half_precision_is_near_single(engine):
+    found = []
+    for half in (False, True):
+        network = Network(WIDE, extra=0, outputs=3, seed=3, half=half)
+        parameters = randomised(network)
+        values = network(points(), [], engine)
+        assert all(type(v) is mi.Float for v in values)
+        dr.backward(sum((i + 1) * dr.mean(v * v) for i, v in enumerate(values)))
+        gradients = {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
+        found.append((np.array(values), gradients))
+    (exact, of_exact), (near, of_near) = found
+    assert np.abs(near - exact).max() < 2e-2 * np.abs(exact).max()
+    assert (near != exact).any(), "the products were not in half precision"
+    for name, gradient in of_exact.items():
+        difference = np.linalg.norm(of_near[name] - gradient)
+        assert difference < 3e-2 * np.linalg.norm(gradient), name
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_gradient_of_one_output_of_several(engine):
     """The other outputs, which nobody uses, have none."""

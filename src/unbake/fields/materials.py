@@ -148,8 +148,9 @@ def make_materials(config: FitConfig, names: list[str], *, seed: int) -> Materia
     """
     match config.representation:
         case "neural":
-            albedo = Network(config.albedo, extra=0, outputs=3, seed=seed)
-            roughness = Network(config.roughness, extra=0, outputs=1, seed=seed + 1)
+            half = config.precision == "half"
+            albedo = Network(config.albedo, extra=0, outputs=3, seed=seed, half=half)
+            roughness = Network(config.roughness, extra=0, outputs=1, seed=seed + 1, half=half)
             return Materials(Volume(albedo), Volume(roughness))
         case "grid":
             albedo = DenseGrid(config.grid.albedo, outputs=3)

@@ -32,13 +32,17 @@ class Network:
         extra: number of inputs besides the position's encoding.
         outputs: number of outputs.
         seed: seed of the initial weights.
+        half: multiply matrices in half precision. Weights, tables and results stay single.
 
     The last layer starts small, so that every output starts near zero.
 
     Paper: Sec. 5.3.
     """
 
-    def __init__(self, config: NetworkConfig, *, extra: int, outputs: int, seed: int) -> None:
+    def __init__(
+        self, config: NetworkConfig, *, extra: int, outputs: int, seed: int, half: bool = False
+    ) -> None:
+        self.half = half
         rng = np.random.default_rng(seed)
         g = config.grid
         self.grid = nn.HashGridEncoding(
@@ -106,14 +110,15 @@ class Network:
 
     def _usual_engine(self) -> Engine:
         narrow = max(weights.shape[0] for weights, _ in self.layers) <= _NARROW
-        return "fused" if narrow and can_record_layout() else "tensor"
+        return "fused" if narrow and can_record_layout() and not self.half else "tensor"
 
     def _tensor(self, features: list[mi.Float]) -> list[mi.Float]:
-        x = mi.TensorXf(mi.ArrayXf(features))
+        kind = mi.TensorXf16 if self.half else mi.TensorXf
+        x = kind(mi.TensorXf(mi.ArrayXf(features)))
         for weights, bias in self.layers[:-1]:
-            x = dr.maximum(weights @ x + bias, 0)
+            x = dr.maximum(kind(weights) @ x + kind(bias), 0)
         weights, bias = self.layers[-1]
-        x = weights @ x + bias
+        x = mi.TensorXf(kind(weights) @ x + kind(bias))
         width = x.shape[1]
         lane = dr.arange(mi.UInt32, width)
         return [dr.gather(mi.Float, x.array, lane + i * width) for i in range(self.outputs)]
@@ -121,11 +126,12 @@ class Network:
     def _coopvec(self, features: list[mi.Float]) -> list[mi.Float]:
         if self._packed is None:
             self.pack()
-        x = nn.CoopVec(features)
+        number = mi.Float16 if self.half else mi.Float
+        x = nn.CoopVec([number(f) for f in features])
         for weights, bias in self._packed[:-1]:
             x = dr.maximum(nn.matvec(weights, x, bias), 0)
         weights, bias = self._packed[-1]
-        return list(nn.matvec(weights, x, bias))
+        return [mi.Float(y) for y in nn.matvec(weights, x, bias)]
 
     def pack(self) -> None:
         """Lay the layers out for cooperative vectors.
@@ -133,7 +139,8 @@ class Network:
         Needed once after `assign`, and before any evaluation inside a virtual call or loop, where
         it can no longer be done.
         """
-        flat = [array for weights, bias in self.layers for array in (weights, _flat(bias))]
+        kind = mi.TensorXf16 if self.half else mi.TensorXf
+        flat = [kind(a) for weights, bias in self.layers for a in (weights, _flat(bias))]
         if can_record_layout():
             views = [nn.view(a) for a in flat]
         else:

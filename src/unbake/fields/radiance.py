@@ -77,7 +77,8 @@ def make_radiance(config: FitConfig, domain: Domain, *, scale: float, seed: int)
     """
     match config.radiance_representation:
         case "neural":
-            function = Network(config.radiance, extra=12, outputs=6, seed=seed)
+            half = config.precision == "half"
+            function = Network(config.radiance, extra=12, outputs=6, seed=seed, half=half)
         case "grid":
             function = DenseGrid(config.grid.radiance, outputs=6)
     return RadianceField(function, domain, scale=scale)

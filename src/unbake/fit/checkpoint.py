@@ -52,6 +52,8 @@ def save_checkpoint(folder: Path, state: State, progress: Progress) -> Path:
             arrays[f"{name}.{key}:m"] = first.numpy()
             arrays[f"{name}.{key}:v"] = second.numpy()
             arrays[f"{name}.{key}:t"] = np.asarray(count).astype(np.uint32).ravel()[:1]
+    if state.scale is not None:
+        arrays["scale"] = np.array(state.scale)
     metadata = {
         "format": FORMAT,
         "step": str(progress.step),
@@ -113,6 +115,8 @@ def _checksum(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> int:
 
 
 def _restore(state: State, arrays: dict[str, np.ndarray], path: Path) -> None:
+    if state.scale is not None and "scale" in arrays:
+        state.scale = dr.opaque(mi.Float, float(arrays["scale"][0]))
     for name, optimizer in state.optimizers():
         for key, (value, promoted, rate, _) in list(optimizer.state.items()):
             full = f"{name}.{key}"

@@ -38,10 +38,16 @@ from .regularise import beliefs
 
 @dataclass
 class State:
-    """All that a step changes: the optimisers, which own φ and θ."""
+    """All that a step changes: the optimisers, which own φ and θ, and the scale of the loss.
+
+    In half precision small gradients would vanish. So the loss is multiplied by a factor, which
+    steps divide by again: as large as no gradient overflows (Micikevicius et al. 2018). Dr.Jit's
+    `GradScaler` does so for one optimiser; here two share a loss.
+    """
 
     phi: mi.ad.Adam
     theta: mi.ad.Adam | None
+    scale: mi.Float | None = None  # None: single precision, not scaled
 
     def optimizers(self) -> list[tuple[str, mi.ad.Adam]]:
         """The optimisers with their names, `phi` and `theta`."""
@@ -69,8 +75,11 @@ class State:
             problem.radiance.assign(dict(self.theta.items()))
 
 
-def initial_state(problem: Problem) -> State:
+def initial_state(problem: Problem, *, half: bool = False) -> State:
     """Optimisers that own the problem's parameters.
+
+    Args:
+        half: networks multiply in half precision.
 
     Entries of the hash tables that a step does not touch keep their momentum (`mask_updates`).
 
@@ -80,7 +89,7 @@ def initial_state(problem: Problem) -> State:
     theta = None
     if problem.radiance is not None:
         theta = mi.ad.Adam(1e-3, problem.radiance.parameters(), mask_updates=True)
-    return State(phi, theta)
+    return State(phi, theta, dr.opaque(mi.Float, _FIRST_SCALE) if half else None)
 
 
 @dataclass
@@ -181,9 +190,14 @@ class TrainingStep:
     def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         terms = self._gradients(inputs, state)
         finite = dr.isfinite(sum(terms.values()))
+        if state.scale is not None:
+            finite &= _all_finite(state)
         for _, optimizer in state.optimizers():
             _drop_broken_gradients(optimizer)
-            optimizer.step(active=finite, eval=False)
+            factor = None if state.scale is None else dr.rcp(state.scale)
+            optimizer.step(active=finite, grad_scale=factor, eval=False)
+        if state.scale is not None:
+            state.scale = state.scale * dr.select(finite, _GROWTH, 0.5)
         terms["skipped"] = dr.select(finite, mi.Float(0), mi.Float(1))
         dr.eval(state, terms)
         return terms
@@ -207,7 +221,8 @@ class TrainingStep:
             some = _some(config, inputs)
             terms = transport.terms(scene, batch, sampler, some, loss, primal)
             terms |= beliefs(self._problem, config, scene, batch.ray, sampler)
-            dr.backward(sum(terms.values()))
+            total = sum(terms.values())
+            dr.backward(total if state.scale is None else total * state.scale)
         return terms
 
     def _bytes_needed(self, state: State) -> float | None:
@@ -360,6 +375,19 @@ def _no_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+#: Scale of the loss in half precision, at first and after each good step.
+_FIRST_SCALE, _GROWTH = 65536.0, 2 ** (1 / 2000)
+
+
+def _all_finite(state: State) -> mi.Bool:
+    """Whether no gradient has overflowed."""
+    good = mi.Bool(True)
+    for _, optimizer in state.optimizers():
+        for value in optimizer.values():
+            good &= dr.all(dr.isfinite(dr.grad(value).array))
+    return good
 
 
 def _drop_broken_gradients(optimizer: mi.ad.Adam) -> None:

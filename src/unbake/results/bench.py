@@ -70,7 +70,8 @@ def bench_step(
     pixels = training_pixels(dataset, clip_negative=False)
     mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
-    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    step = TrainingStep(problem, pixels, config)
+    state = initial_state(problem, half=config.precision == "half")
 
     result = {"machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}

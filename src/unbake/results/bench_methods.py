@@ -96,7 +96,8 @@ def _timed(dataset: Dataset, config: FitConfig, steps: int) -> list[float]:
     pixels = training_pixels(dataset, clip_negative=False)
     mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
-    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    step = TrainingStep(problem, pixels, config)
+    state = initial_state(problem, half=config.precision == "half")
     times = []
     for i in range(WARM_UP + steps):
         start = time.perf_counter()
