@@ -53,7 +53,7 @@ def test_one_method_is_taken_apart(unbake, cornell, tiny, tmp_path, method, more
     wanted = PARTS | more if method != "prb" else more | {"batch", "gradients", "optimiser"}
     assert wanted <= parts.keys()
     assert all(row["launches"] > 0 and row["milliseconds"] > 0 for row in parts.values())
-    assert 0 < result["milliseconds_in_kernels"] < 1.5 * result["milliseconds_per_step"]
+    assert result["milliseconds_in_kernels"] > 0 and result["milliseconds_in_python"] > 0
     assert f"{result['milliseconds_per_step']:.1f} ms a step" in done.out
     assert result["memory_mb"]["peak"] >= result["memory_mb"]["now"] > 0
     assert (result["floor"] is None) == (method == "prb")

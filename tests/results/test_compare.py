@@ -54,7 +54,7 @@ def test_two_methods_side_by_side(compare, tmp_path):
         assert row["radiance"] == {"ours": "neural", "direct": None}[name]
         metrics = json.loads((out / name / "evaluation" / "metrics.json").read_text())
         assert row["heldout"] == metrics["heldout"] and row["train"] == metrics["train"]
-        assert [point["step"] for point in row["score"]] == list(range(9))
+        assert [point["step"] for point in row["score"]] == [0, 4, 8]
         gap = row["score"][-1]["albedo_psnr"] - row["heldout"]["albedo_psnr"]
         assert abs(gap) < 0.5
     assert found["machine"]["cores"] >= 1 and found["evaluation"]["spp"] == 2
@@ -114,7 +114,7 @@ def test_an_interrupted_comparison_goes_on(compare, tmp_path, monkeypatch):
     outcome = compare("direct", "ours")
     assert outcome.status == 0 and "going on after step 5" in outcome.out
     assert [row["steps"] for row in result(tmp_path)["methods"].values()] == [8, 8]
-    assert [p["step"] for p in result(tmp_path)["methods"]["direct"]["score"]] == list(range(9))
+    assert [p["step"] for p in result(tmp_path)["methods"]["direct"]["score"]] == [0, 4, 5, 8]
 
 
 def test_a_method_that_fails_is_recorded_and_the_others_go_on(compare, tmp_path, monkeypatch):
