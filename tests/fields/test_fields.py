@@ -9,11 +9,12 @@ from support import TINY, seeded
 from unbake.config import GridConfig, NetworkConfig
 from unbake.fields.domain import Domain
 from unbake.fields.materials import ROUGHNESS_FLOOR, Materials, Volume
-from unbake.fields.network import Network
+from unbake.fields.network import Network, can_record_layout
 from unbake.fields.radiance import RadianceField
 
 LANES = 200
-ENGINES = ("fused", "tensor", "coopvec")
+#: The fused engine is for LLVM.
+ENGINES = ("tensor", "coopvec", *(["fused"] if can_record_layout() else []))
 WIDE = NetworkConfig(
     grid=GridConfig(levels=3, features=4, table_log2=6, base_resolution=3, growth=1.6),
     width=24,
