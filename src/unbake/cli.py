@@ -330,8 +330,10 @@ def bench(
     what: Positional[Literal["step", "methods"]] = "step",
     /,
     data: Folder = None,
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None,
     methods: Annotated[tuple[str, ...], arg(metavar="METHODS")] = ("ours",),
     steps: int = 100,
+    preset: Preset = None,
     settings: File = None,
     out: File = None,
 ) -> None:
@@ -341,15 +343,21 @@ def bench(
 
     Args:
         what: What to measure.
-        data: Folder of a data set; by default a small capture of the demo scene.
+        data: Folder of a data set.
+        scene: Without --data: a scene to render a small data set of (default: demo).
         methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
             prb:bitmap prb:bitmap:split-halves.
         steps: Steps to take the median of, after warm-up.
-        settings: TOML file with settings; by default those of the preset cpu.
+        preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code).
+        settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
     _require("steps", steps, 10)
-    chosen = config.read_toml(settings) if settings else config.preset("cpu")
+    if data is not None:
+        _exclude("data", {"scene": scene})
+    if settings is not None:
+        _exclude("settings", {"preset": preset})
+    chosen = config.read_toml(settings) if settings else config.preset(preset or "cpu")
     backend.activate()
     from .results.bench import bench_step, small_data
     from .results.bench_methods import bench_methods
@@ -359,7 +367,7 @@ def bench(
     if what == "step" and len(contenders) != 1:
         raise UserError("step takes one method", "--methods", "Or: unbake bench methods")
     console = Console(highlight=False)
-    with small_data(data) as folder:
+    with small_data(data, scene or "demo") as folder:
         if what == "step":
             bench_step(folder, contenders[0].settings(chosen), steps, out, console)
         else:

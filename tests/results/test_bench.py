@@ -83,6 +83,28 @@ def test_the_floor_counts_what_a_step_must_do(unbake, cornell, tiny, tmp_path):
     assert 1e8 < rates["multiply_adds"] < 1e15
 
 
+def test_a_scene_is_rendered_for_the_measurement(unbake, tiny, tmp_path):
+    out = tmp_path / "step.json"
+    words = ("--scene", "still", "--settings", tiny, "--steps", 10, "--out", out)
+    done = unbake("bench", "step", *words)
+    assert done.status == 0, done.err
+    assert json.loads(out.read_text())["data"] == "still"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--data", "d", "--scene", "still"), "--scene: cannot be given together with --data"),
+        (("--preset", "paper", "--settings", "f"), "--preset: cannot be given together"),
+        (("--scene", "nowhere"), "nowhere"),
+    ],
+)
+def test_options_that_make_no_sense_are_told_in_one_line(unbake, words, message):
+    done = unbake("bench", "step", *words)
+    assert done.status == 2 and message in done.err
+    assert done.err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("what", "methods", "message"),
     [

@@ -38,15 +38,20 @@ APART = 7
 
 
 @contextmanager
-def small_data(data: Path | None) -> Iterator[Path]:
-    """A data set's folder: the one given, or a small capture of the demo scene, for a while."""
+def small_data(data: Path | None, scene: str = "demo") -> Iterator[Path]:
+    """A data set's folder: the one given, or a small capture of a scene, for a while.
+
+    Args:
+        scene: a built-in scene's name, or a Mitsuba XML file.
+    """
     if data is not None:
         yield data
         return
     with tempfile.TemporaryDirectory() as folder:
         small = CaptureSettings(views=4, held_out=0, resolution=64, spp=8)
-        capture("demo", Path(folder) / "demo", small, tell=lambda line: None)
-        yield Path(folder) / "demo"
+        made = Path(folder) / Path(scene).stem
+        capture(scene, made, small, tell=lambda line: None)
+        yield made
 
 
 def bench_step(
