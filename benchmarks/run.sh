@@ -52,7 +52,7 @@ rivals() { # equal time, and equal samples
     "$unbake" compare "$work/demo" --methods ours prb --steps 2400 --out "$work/equal-demo"
     summary "$results/equal-demo.json" "$work/equal-demo"
     staircase || return 0
-    "$unbake" compare "$STAIRCASE" --methods ours prb ad-pt:neural:split-halves no-prior \
+    "$unbake" compare "$STAIRCASE" --methods ours prb ad-pt:neural:split-halves direct no-prior \
         --seconds 180 --evaluate-spp 16 --settings benchmarks/staircase.toml \
         --out "$work/rivals-staircase"
     summary "$results/rivals-staircase.json" "$work/rivals-staircase"
