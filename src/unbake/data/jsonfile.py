@@ -1,4 +1,4 @@
-"""Typed access to hand-written JSON: every mistake becomes a `UserError` that names its place."""
+"""Typed access to JSON files: every mistake becomes a `UserError` that names its place."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from unbake.errors import UserError
+from unbake.imaging.pictures import write_atomically
 
 
 def read_json(path: Path) -> Any:
@@ -24,6 +25,16 @@ def read_json(path: Path) -> Any:
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UserError(f"the file is not readable JSON ({reason})", path, "Repair it") from None
+
+
+def write_json(path: Path, content: Any, *, allow_nan: bool = True) -> None:
+    """Write a JSON file, complete or not at all.
+
+    Raises:
+        UserError: the folder cannot be made or written.
+    """
+    described = json.dumps(content, indent=1, allow_nan=allow_nan) + "\n"
+    write_atomically(path, lambda file: file.write_text(described, encoding="utf-8"))
 
 
 def number(keys: dict[str, Any], key: str, where: str) -> float:

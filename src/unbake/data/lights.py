@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import UserError
-from ..imaging.pictures import write_atomically, write_exr
+from ..imaging.pictures import write_exr
 from . import scene as scenes
-from .jsonfile import array, read_json, text
+from .jsonfile import array, read_json, text, write_json
 from .views import read_image
 
 #: Rows of the picture of a true environment.
@@ -29,8 +28,7 @@ def write_lights(scene: Path, folder: Path) -> None:
     parsed = scenes.parse(scene)
     lights = scenes.lights_of(parsed)
     if lights:
-        described = json.dumps([asdict(light) for light in lights], indent=1) + "\n"
-        write_atomically(folder / "emission.json", lambda file: file.write_text(described, "utf-8"))
+        write_json(folder / "emission.json", [asdict(light) for light in lights])
     loaded = parsed.instantiate()
     if loaded.environment() is not None:
         picture = scenes.environment_latlong(loaded, ROWS)

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..config import FitConfig, read_toml
+from ..data.jsonfile import write_json
 from ..data.views import Dataset
 from ..errors import UserError
-from ..imaging.pictures import write_atomically
 from .checkpoint import Progress, load_checkpoint
 from .problem import Problem, make_problem
 from .step import initial_state
@@ -68,8 +68,7 @@ def load_run(run: Path) -> Recovered:
 
 def write_origin(run: Path, origin: Origin) -> None:
     """Write `origin.json`, complete or not at all."""
-    text = json.dumps(asdict(origin), indent=1) + "\n"
-    write_atomically(run / ORIGIN, lambda path: path.write_text(text, encoding="utf-8"))
+    write_json(run / ORIGIN, asdict(origin))
 
 
 def read_origin(run: Path) -> Origin:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,12 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ..config import FitConfig, read_toml
+from ..data.jsonfile import write_json
 from ..data.views import Dataset
 from ..errors import UserError
 from ..fit.checkpoint import Progress
 from ..fit.loop import fit
 from ..fit.recovered import read_origin
-from ..imaging.pictures import write_atomically
 from .bench import machine
 from .contender import Contender
 from .evaluate import EvaluationSettings, description, evaluate
@@ -115,8 +114,7 @@ def compare(
         "time_to_quality": [asdict(target) for target in targets],
         "definitions": DEFINITIONS,
     }
-    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
-    write_atomically(out / "compare.json", lambda path: path.write_text(text, encoding="utf-8"))
+    write_json(out / "compare.json", result, allow_nan=False)
     good = [out / name for name, row in rows.items() if "error" not in row]
     failed = {name: row["error"] for name, row in rows.items() if "error" in row}
     write_report(good, out / "report.html", failed)

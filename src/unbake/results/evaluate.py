@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,12 +11,13 @@ import numpy as np
 
 from ..config import FitConfig
 from ..data.batches import CameraRays
+from ..data.jsonfile import write_json
 from ..data.lights import ROWS, true_environment
 from ..data.views import View
 from ..fit.recovered import Recovered, load_run
 from ..fit.score import Seen, Truth, finite, read_view
 from ..imaging.metrics import mean_psnr, psnr
-from ..imaging.pictures import montage, to_bytes, tonemap, write_atomically, write_exr, write_png
+from ..imaging.pictures import montage, to_bytes, tonemap, write_exr, write_png
 from ..transport.objective import METHODS, needs
 from ..transport.render import render_radiance
 from . import lighting
@@ -101,8 +101,7 @@ def evaluate(
         "data": str(dataset.folder),
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
     }
-    text = json.dumps(metrics, indent=1) + "\n"
-    write_atomically(run / "evaluation" / "metrics.json", lambda p: Path(p).write_text(text))
+    write_json(run / "evaluation" / "metrics.json", metrics)
     return metrics
 
 
