@@ -96,7 +96,10 @@ def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
     assert again.mean == first.mean
 
 
-@pytest.mark.parametrize("change", ["another image", "clipped", "interrupted", "damaged key"])
+@pytest.mark.parametrize(
+    "change",
+    ["another image", "clipped", "interrupted", "damaged key", "odd key", "cut table"],
+)
 def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch, change):
     made = dataset()
     Photographs.load(made, False)
@@ -109,6 +112,10 @@ def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch,
         (made.folder / module.CACHE / "key.json").unlink()
     elif change == "damaged key":
         (made.folder / module.CACHE / "key.json").write_text("{")
+    elif change == "odd key":
+        (made.folder / module.CACHE / "key.json").write_text("[]")
+    elif change == "cut table":
+        os.truncate(made.folder / module.CACHE / "photographs.npy", 40)
     read = []
     decode = module.read_image
     monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))

@@ -131,14 +131,7 @@ class PixelSource:
     def of(
         cameras: Sequence[Camera], rgb: np.ndarray, alpha: np.ndarray, *, foreground_only: bool
     ) -> PixelSource:
-        """The pixels of views in memory.
-
-        Args:
-            cameras: one a view.
-            rgb: linear RGB of all views' pixels, row by row, view after view, shape (pixels, 3).
-            alpha: coverage of the same pixels, shape (pixels,).
-            foreground_only: see `Photographs.chosen`.
-        """
+        """The pixels of views in memory; see `Photographs.of`."""
         found = Photographs.of(cameras, rgb, alpha, foreground_only=foreground_only)
         return PixelSource(CameraRays.of(cameras), found)
 

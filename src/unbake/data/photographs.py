@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from ..errors import UserError
 from .camera import Camera
+from .jsonfile import write_json
 from .views import Dataset, View, read_image
 
 #: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
@@ -64,6 +64,7 @@ class Photographs:
             cameras: one a view.
             rgb: linear RGB of all views' pixels, row by row, view after view, shape (pixels, 3).
             alpha: coverage of the same pixels, shape (pixels,).
+            foreground_only: train only on pixels with alpha > 0.
         """
         table = np.empty((len(rgb), _COLUMNS), np.float32)
         images = zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
@@ -137,41 +138,43 @@ def _cached(
         "clip_negative": clip_negative,
         "foreground_only": hidden,
     }
-    stored = _read_key(folder)
-    if stored is None or {**key, "mean": stored.get("mean")} != stored:
+    found = _open_cache(folder, key)
+    if found is None:
         try:
-            _write_cache(folder, views, count, key)
+            _write_cache(folder, views, key)
         except OSError as error:
             raise UserError(
                 f"the decoded photographs cannot be written ({error.strerror})",
                 folder,
                 f"They take {4 * _COLUMNS * count / 1e9:.1f} GB. Make room, or the folder writable",
             ) from None
-        stored = _read_key(folder)
-    table = np.load(folder / "photographs.npy", mmap_mode="r")
-    chosen = np.load(folder / "foreground.npy", mmap_mode="r") if hidden else None
+        found = _open_cache(folder, key)
+    return found
+
+
+def _open_cache(folder: Path, key: dict) -> Photographs | None:
+    """What is in the files, if they are whole and of these photographs."""
+    try:
+        stored = json.loads((folder / "key.json").read_text(encoding="utf-8"))
+        if stored != {"key": key, "mean": stored["mean"]}:
+            return None
+        table, chosen = np.load(folder / "photographs.npy", mmap_mode="r"), None
+        if key["foreground_only"]:
+            chosen = np.load(folder / "foreground.npy", mmap_mode="r")
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
     return Photographs(table, chosen, stored["mean"])
 
 
-def _write_cache(folder: Path, views: Sequence[View], count: int, key: dict) -> None:
+def _write_cache(folder: Path, views: Sequence[View], key: dict) -> None:
     folder.mkdir(exist_ok=True)
     # The key is written last: without it the rest is taken for unfinished.
     (folder / "key.json").unlink(missing_ok=True)
     table = np.lib.format.open_memmap(
-        folder / "photographs.npy", "w+", np.float32, (count, _COLUMNS)
+        folder / "photographs.npy", "w+", np.float32, (key["pixels"], _COLUMNS)
     )
-    images = _decoded(views, key["clip_negative"])
-    made = _fill(table, images, key["foreground_only"])
+    made = _fill(table, _decoded(views, key["clip_negative"]), key["foreground_only"])
     table.flush()
     if made.chosen is not None:
         np.save(folder / "foreground.npy", made.chosen)
-    unfinished = folder / "key.partial"
-    unfinished.write_text(json.dumps(key | {"mean": made.mean}), encoding="utf-8")
-    os.replace(unfinished, folder / "key.json")
-
-
-def _read_key(folder: Path) -> dict | None:
-    try:
-        return json.loads((folder / "key.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+    write_json(folder / "key.json", {"key": key, "mean": made.mean})
