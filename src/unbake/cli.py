@@ -194,9 +194,7 @@ def fit(
             raise UserError("there is no run to resume in this folder", out, "Leave out --resume")
         chosen = config.read_toml(out / "config.toml")
     else:
-        if settings is not None:
-            _exclude("settings", {"preset": preset})
-        chosen = config.read_toml(settings) if settings else config.preset(preset or "cpu")
+        chosen = _chosen(preset, settings)
     chosen = _overridden(chosen, length | other)
     backend.activate()
     from .fit.loop import fit as run
@@ -305,9 +303,7 @@ def compare(
         clip_negative: Take negative pixels as zero instead of refusing them.
     """
     _require("evaluate-spp", evaluate_spp, 1)
-    if settings is not None:
-        _exclude("settings", {"preset": preset})
-    chosen = config.read_toml(settings) if settings else config.preset(preset or "cpu")
+    chosen = _chosen(preset, settings)
     given: dict[str, object] = {"steps": steps, "seconds": seconds, "spp": spp, "batch": batch}
     chosen = _overridden(chosen, given | {"unknown": unknown, "seed": seed})
     try:
@@ -355,9 +351,7 @@ def bench(
     _require("steps", steps, 10)
     if data is not None:
         _exclude("data", {"scene": scene})
-    if settings is not None:
-        _exclude("settings", {"preset": preset})
-    chosen = config.read_toml(settings) if settings else config.preset(preset or "cpu")
+    chosen = _chosen(preset, settings)
     backend.activate()
     from .results.bench import bench_step, small_data
     from .results.bench_methods import bench_methods
@@ -379,6 +373,14 @@ def doctor() -> int:
     from . import doctor as module
 
     return module.main()
+
+
+def _chosen(preset: config.PresetName | None, settings: Path | None) -> config.FitConfig:
+    """The settings that --preset or --settings name, if either was given."""
+    if settings is None:
+        return config.preset(preset or "cpu")
+    _exclude("settings", {"preset": preset})
+    return config.read_toml(settings)
 
 
 def _overridden(settings: config.FitConfig, given: dict[str, object]) -> config.FitConfig:

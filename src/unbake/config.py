@@ -264,6 +264,11 @@ class FitConfig:
         return self.estimator == "split-halves"
 
     @property
+    def half_precision(self) -> bool:
+        """Whether networks multiply in half precision."""
+        return self.precision == "half"
+
+    @property
     def follows_paths(self) -> bool:
         """Whether the method follows paths to their end, and has no radiance field."""
         return self.method in typing.get_args(PathMethodName)

@@ -20,7 +20,7 @@ def start(built_in, precision, **settings):
     config = dataclasses.replace(TINY_FIT, precision=precision, **settings)
     problem = make_problem(built_in("cornell"), "visible", config, 0.2)
     pixels = grey_photographs(built_in_cameras("cornell", 8, views=2))
-    return TrainingStep(problem, pixels, config), initial_state(problem, half=precision == "half")
+    return TrainingStep(problem, pixels, config), initial_state(problem)
 
 
 def gradients(step, state, number):

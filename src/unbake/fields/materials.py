@@ -148,7 +148,7 @@ def make_materials(config: FitConfig, names: list[str], *, seed: int) -> Materia
     """
     match config.representation:
         case "neural":
-            half = config.precision == "half"
+            half = config.half_precision
             albedo = Network(config.albedo, extra=0, outputs=3, seed=seed, half=half)
             roughness = Network(config.roughness, extra=0, outputs=1, seed=seed + 1, half=half)
             return Materials(Volume(albedo), Volume(roughness))

@@ -77,7 +77,7 @@ def make_radiance(config: FitConfig, domain: Domain, *, scale: float, seed: int)
     """
     match config.radiance_representation:
         case "neural":
-            half = config.precision == "half"
+            half = config.half_precision
             function = Network(config.radiance, extra=12, outputs=6, seed=seed, half=half)
         case "grid":
             function = DenseGrid(config.grid.radiance, outputs=6)

@@ -75,7 +75,7 @@ def fit(
     for warning in camera_warnings(dataset, problem.world.scene):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
-    state = initial_state(problem, half=config.precision == "half")
+    state = initial_state(problem)
     progress = Progress()
     if resume:
         progress = load_checkpoint(run / "checkpoints", state) or progress

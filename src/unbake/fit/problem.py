@@ -42,6 +42,7 @@ class Problem:
     lights: list[str]  #: names of the lights whose strength is unknown
     radiance: RadianceField | None
     see_lights: bool
+    half_precision: bool  #: in products of its networks
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays φ by name; the first word tells of which unknown."""
@@ -114,7 +115,9 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
         radiance = make_radiance(config, domain, scale=scale, seed=int(seeds[1]))
     world = World.of(loaded, materials, config.transport.max_specular)
     visible = background == "visible"
-    return Problem(world, materials, environment, emission, lights, radiance, visible)
+    return Problem(
+        world, materials, environment, emission, lights, radiance, visible, config.half_precision
+    )
 
 
 def _unknown_materials(parsed: scenes.ParsedScene, config: FitConfig, seed: int) -> Materials:

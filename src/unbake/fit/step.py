@@ -75,11 +75,8 @@ class State:
             problem.radiance.assign(dict(self.theta.items()))
 
 
-def initial_state(problem: Problem, *, half: bool = False) -> State:
+def initial_state(problem: Problem) -> State:
     """Optimisers that own the problem's parameters.
-
-    Args:
-        half: networks multiply in half precision.
 
     Entries of the hash tables that a step does not touch keep their momentum (`mask_updates`).
 
@@ -89,7 +86,8 @@ def initial_state(problem: Problem, *, half: bool = False) -> State:
     theta = None
     if problem.radiance is not None:
         theta = mi.ad.Adam(1e-3, problem.radiance.parameters(), mask_updates=True)
-    return State(phi, theta, dr.opaque(mi.Float, _FIRST_SCALE) if half else None)
+    scale = dr.opaque(mi.Float, _FIRST_SCALE) if problem.half_precision else None
+    return State(phi, theta, scale)
 
 
 @dataclass
@@ -190,14 +188,14 @@ class TrainingStep:
     def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         terms = self._gradients(inputs, state)
         finite = dr.isfinite(sum(terms.values()))
+        factor = None
         if state.scale is not None:
             finite &= _all_finite(state)
+            factor = dr.rcp(state.scale)
+            state.scale = state.scale * dr.select(finite, _GROWTH, 0.5)
         for _, optimizer in state.optimizers():
             _drop_broken_gradients(optimizer)
-            factor = None if state.scale is None else dr.rcp(state.scale)
             optimizer.step(active=finite, grad_scale=factor, eval=False)
-        if state.scale is not None:
-            state.scale = state.scale * dr.select(finite, _GROWTH, 0.5)
         terms["skipped"] = dr.select(finite, mi.Float(0), mi.Float(1))
         dr.eval(state, terms)
         return terms

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import resource
@@ -12,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -22,14 +22,14 @@ from rich.table import Table
 from ..config import FitConfig
 from ..data.batches import PixelSource
 from ..data.capture import CaptureSettings, capture
+from ..data.jsonfile import write_json
 from ..data.views import Dataset
 from ..fit.monitor import memory_mb
 from ..fit.problem import Problem, make_problem, training_pixels
 from ..fit.rates import learning_rates
 from ..fit.step import State, TrainingStep, initial_state
-from ..imaging.pictures import write_atomically
 from .floor import floor
-from .parts import Parts
+from .parts import Parts, kernel_history, milliseconds
 
 #: Steps before anything is measured.
 WARM_UP = 20
@@ -37,8 +37,26 @@ WARM_UP = 20
 APART = 7
 
 
+@dataclass(frozen=True)
+class Begun:
+    """A fit before its first step."""
+
+    problem: Problem
+    pixels: PixelSource
+    step: TrainingStep
+    state: State
+
+
+def begin(dataset: Dataset, config: FitConfig) -> Begun:
+    """A fit of a data set that writes nothing."""
+    pixels = training_pixels(dataset, clip_negative=False)
+    mean = pixels.photographs.mean
+    problem = make_problem(dataset.scene, dataset.background, config, mean)
+    return Begun(problem, pixels, TrainingStep(problem, pixels, config), initial_state(problem))
+
+
 @contextmanager
-def small_data(data: Path | None, scene: str = "demo") -> Iterator[Path]:
+def small_data(data: Path | None, scene: str) -> Iterator[Path]:
     """A data set's folder: the one given, or a small capture of a scene, for a while.
 
     Args:
@@ -59,8 +77,8 @@ def bench_step(
 ) -> dict:
     """Measure the training step on a data set, and take it apart.
 
-    Times are medians after warm-up. A camera sample is one path from the camera with its RHS, its
-    LHS, both residuals and all gradients.
+    Times are medians after warm-up. A camera sample is one path from the camera with its RHS and
+    all gradients; those that L_θ learns of have their LHS and both residuals as well.
 
     Args:
         data: a data set's folder.
@@ -72,22 +90,16 @@ def bench_step(
         All that is printed.
     """
     dataset = Dataset.load(data)
-    pixels = training_pixels(dataset, clip_negative=False)
-    mean = pixels.photographs.mean
-    problem = make_problem(dataset.scene, dataset.background, config, mean)
-    step = TrainingStep(problem, pixels, config)
-    state = initial_state(problem, half=config.precision == "half")
-
+    fit = begin(dataset, config)
     result = {"machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
-    result |= _replayed(step, state, config, steps)
-    result["parts"] = _taken_apart(step, state)
-    result["memory_mb"] = _memory(problem, pixels, state)
-    result["floor"] = floor(problem, pixels, state, config)
+    result |= _replayed(fit.step, fit.state, config, steps)
+    result["parts"] = _taken_apart(fit.step, fit.state)
+    result["memory_mb"] = _memory(fit.pixels, fit.state)
+    result["floor"] = floor(fit.problem, fit.pixels, fit.state, config)
     _print(result, console)
     if out is not None:
-        text = json.dumps(result, indent=1) + "\n"
-        write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+        write_json(out, result)
     return result
 
 
@@ -110,9 +122,9 @@ def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -
         dr.sync_thread()
     in_kernels = []
     for i in range(WARM_UP + steps, WARM_UP + steps + APART):
-        with _kernel_history() as kernels:
+        with kernel_history() as kernels:
             step(state, i, rates)
-        in_kernels.append(sum(k["execution_time"] for k in kernels))
+        in_kernels.append(milliseconds(kernels))
     seconds = statistics.median(wall)
     return {
         "milliseconds_per_step": 1e3 * seconds,
@@ -133,25 +145,18 @@ def _taken_apart(step: TrainingStep, state: State) -> dict:
         with parts.recorded():
             step.unfrozen(state, i)
         recorded.append(parts.kernels)
-    names = list(recorded[-1])
-    times = {
-        name: [sum(k["execution_time"] for k in kernels[name]) for kernels in recorded[1:]]
-        for name in names
-    }
-    rows = {
+    return {
         name: {
-            "milliseconds": statistics.median(times[name]),
-            "launches": len(recorded[-1][name]),
-            "products": sum(
-                k["execution_time"] for k in recorded[-1][name] if "Gemm" in str(k["type"])
-            ),
+            "milliseconds": statistics.median(milliseconds(one[name]) for one in recorded[1:]),
+            "launches": len(kernels),
+            "products": milliseconds(k for k in kernels if "Gemm" in str(k["type"])),
         }
-        for name in names
+        for name, kernels in recorded[-1].items()
+        if kernels
     }
-    return {name: row for name, row in rows.items() if row["launches"]}
 
 
-def _memory(problem: Problem, pixels: PixelSource, state: State) -> dict:
+def _memory(pixels: PixelSource, state: State) -> dict:
     """Megabytes of this process, and what of them is known by owner."""
     owned = {
         name: 3 * 4 * sum(dr.width(a) for a in adam.values()) for name, adam in state.optimizers()
@@ -161,16 +166,6 @@ def _memory(problem: Problem, pixels: PixelSource, state: State) -> dict:
     now = memory_mb()
     peak = max(now, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6)
     return {"now": now, "peak": peak} | {name: size / 1e6 for name, size in owned.items()}
-
-
-@contextmanager
-def _kernel_history() -> Iterator[list]:
-    kernels: list = []
-    dr.kernel_history_clear()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        yield kernels
-        dr.sync_thread()
-        kernels.extend(dr.kernel_history())
 
 
 def _settings(config: FitConfig) -> dict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections.abc import Sequence
@@ -13,12 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from ..config import FitConfig
+from ..data.jsonfile import write_json
 from ..data.views import Dataset
-from ..fit.problem import make_problem, training_pixels
 from ..fit.rates import learning_rates
-from ..fit.step import TrainingStep, initial_state
-from ..imaging.pictures import write_atomically
-from .bench import machine
+from .bench import begin, machine
 from .contender import Contender
 from .evaluate import description
 
@@ -86,22 +83,16 @@ def bench_methods(
         )
     console.print(table)
     if out is not None:
-        text = json.dumps(result, indent=1) + "\n"
-        write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+        write_json(out, result)
     return result
 
 
 def _timed(dataset: Dataset, config: FitConfig, steps: int) -> list[float]:
     """Seconds of steps after warm-up, of a fit that is then forgotten."""
-    pixels = training_pixels(dataset, clip_negative=False)
-    mean = pixels.photographs.mean
-    problem = make_problem(dataset.scene, dataset.background, config, mean)
-    step = TrainingStep(problem, pixels, config)
-    state = initial_state(problem, half=config.precision == "half")
-    times = []
+    fit, times = begin(dataset, config), []
     for i in range(WARM_UP + steps):
         start = time.perf_counter()
-        step(state, i, learning_rates(config, i, 0.0))
+        fit.step(fit.state, i, learning_rates(config, i, 0.0))
         dr.sync_thread()
         times.append(time.perf_counter() - start)
     return times[WARM_UP:]

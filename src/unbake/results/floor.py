@@ -16,8 +16,9 @@ from ..fields.materials import Volume
 from ..fields.network import Network
 from ..fit.problem import Problem
 from ..fit.step import State
-from ..transport.image import Needs, where_radiance_is_needed
+from ..transport.image import Needs, where_radiance_is_learned
 from ..transport.objective import METHODS, needs
+from .parts import kernel_history, milliseconds
 
 #: A parameter, its gradient and both moments of Adam: read, and all but the gradient written.
 _ADAM_FLOATS = 7
@@ -115,13 +116,14 @@ def _of_learning(problem: Problem, wanted: Needs, *, all_samples: bool) -> Work:
     work = Work(2 * bounces, 0, 0)
     for _ in range(bounces):
         work += _materials(problem, gradient=False)
-    learned, constant = where_radiance_is_needed(wanted)
+    learned, constant = where_radiance_is_learned(wanted)
     for number in learned | constant:
         work += _radiance(problem, gradient=number in learned)
-    if all_samples:
-        # What the image asks at its end is asked once for both.
-        return work + _radiance(problem, gradient=False).times(-1)
-    return work + _albedo(problem)
+    if not all_samples:
+        return work + _albedo(problem) if bounces else work
+    # Where learning needs what the image asks at its end, it is asked once for both.
+    shared = wanted.bounces + 1 in learned | constant
+    return work + _radiance(problem, gradient=False).times(-1) if shared else work
 
 
 def _materials(problem: Problem, *, gradient: bool) -> Work:
@@ -208,10 +210,7 @@ def _seconds(work: Callable[[], None]) -> float:
     """Median time of the kernels that some work launches."""
     times = []
     for _ in range(_TIMES + 1):
-        dr.sync_thread()
-        dr.kernel_history_clear()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        with kernel_history() as kernels:
             work()
-            dr.sync_thread()
-            times.append(sum(k["execution_time"] for k in dr.kernel_history()) / 1e3)
+        times.append(milliseconds(kernels) / 1e3)
     return statistics.median(times[1:])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 import drjit as dr
@@ -13,24 +13,40 @@ from ..data.batches import Drawn
 from ..fit import step as steps
 from ..transport import image, operator
 
-RAYS, MATERIALS, BSDFS = "ray tracing", "material nets", "BSDFs and lights"
-RADIANCE, GRADIENTS, OPTIMISER = "radiance net", "gradients", "optimiser"
-BATCH, LOSSES = "batch", "losses"
-
+#: What is done outside of all calls below counts as this.
+OPTIMISER = "optimiser"
 #: What a step calls, and the part that the work of it belongs to. What is called inside of another
 #: one counts for itself alone.
 _CALLS = (
-    (Drawn, "batch", BATCH),
-    (image, "find_vertex", RAYS),
-    (operator, "find_vertex", RAYS),
-    (image, "attach_material", MATERIALS),
-    (image, "attach_albedo", MATERIALS),
-    (image, "bounce", BSDFS),
-    (image, "reflected_radiance", RADIANCE),
+    (Drawn, "batch", "batch"),
+    (image, "find_vertex", "ray tracing"),
+    (operator, "find_vertex", "ray tracing"),
+    (image, "attach_material", "material nets"),
+    (image, "attach_albedo", "material nets"),
+    (image, "bounce", "BSDFs and lights"),
+    (image, "reflected_radiance", "radiance net"),
     (steps, "path_radiance", "paths"),
-    (steps, "objective", LOSSES),
-    (dr, "backward", GRADIENTS),
+    (steps, "objective", "losses"),
+    (dr, "backward", "gradients"),
 )
+
+
+@contextmanager
+def kernel_history() -> Iterator[list[dict]]:
+    """A list that is filled at the end with the kernels launched meanwhile."""
+    kernels: list[dict] = []
+    dr.sync_thread()
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        yield kernels
+        dr.sync_thread()
+        kernels.extend(dr.kernel_history())
+    dr.kernel_history_clear()
+
+
+def milliseconds(kernels: Iterable[dict]) -> float:
+    """Time in kernels."""
+    return sum(k["execution_time"] for k in kernels)
 
 
 class Parts:

@@ -108,13 +108,14 @@ def trace(
     for paths in (sample, learned):
         paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
     if needs.radiance:
-        with_gradients, without = where_radiance_is_needed(needs)
+        with_gradients, without = where_radiance_is_learned(needs)
         _look_up(radiance, learned, with_gradients)
         last = {needs.bounces + 1}  # where the image ends
         with dr.suspend_grad():
-            if learned is not sample:
+            if learned is sample:
+                without |= last - with_gradients
+            else:
                 _look_up(radiance, sample, last)
-                without = without - last if needs.bounces > needs.residuals else without
             _look_up(radiance, learned, without)
     return sample
 
@@ -145,14 +146,13 @@ def _gather(piece: Piece, some: Some) -> Piece:
     return dataclasses.replace(piece, **parts)
 
 
-def where_radiance_is_needed(needs: Needs) -> tuple[set[int], set[int]]:
-    """Numbers of the vertices where L_θ is needed: with gradients to θ, and without.
+def where_radiance_is_learned(needs: Needs) -> tuple[set[int], set[int]]:
+    """Numbers of the vertices whose L_θ learning needs: with gradients to θ, and without.
 
-    A residual at xᵢ compares L(xᵢ) with L(xᵢ₊₁); the image ends with L(x) after k bounces.
+    A residual at xᵢ compares L(xᵢ) with L(xᵢ₊₁).
     """
     learned = set(range(1, needs.residuals + 1)) | ({1} if needs.lhs else set())
-    read = {needs.bounces + 1} | {i + 1 for i in range(1, needs.residuals + 1)}
-    return learned, read - learned
+    return learned, {i + 1 for i in range(1, needs.residuals + 1)} - learned
 
 
 def _look_up(radiance: RadianceField, sample: PathSample, numbers: set[int]) -> None:
