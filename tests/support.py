@@ -17,6 +17,7 @@ from unbake.data import procedural
 from unbake.data.batches import CameraRays, PixelSource
 from unbake.data.camera import Camera
 from unbake.fields.materials import Material
+from unbake.transport.operator import attach_material, bounce
 from unbake.transport.series import path_traced
 from unbake.transport.vertex import find_vertex
 
@@ -69,6 +70,70 @@ def grey_photographs(cameras: list[Camera], value: float = 0.3) -> PixelSource:
     count = sum(c.width * c.height for c in cameras)
     rgb = value * np.random.default_rng(7).uniform(0.5, 1.5, (count, 3))
     return PixelSource.of(cameras, rgb, np.ones(count), foreground_only=False)
+
+
+# ----------------------------------------------------------------------------- training steps
+
+
+def assert_only_replayed(step, state, rates, steps: int = 4) -> None:
+    """Take three steps of a fresh fit, then some more: they compile and trace nothing."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for i in range(3):
+            step(state, i, rates(i))
+        recorded = step.recordings()
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        for i in range(3, 3 + steps):
+            terms = step(state, i, rates(i))
+            assert float(terms["skipped"][0]) == 0
+        dr.sync_thread()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        dr.kernel_history_clear()
+    assert kernels, "the history was not recorded"
+    assert all(k["cache_hit"] and not k["cache_disk"] for k in kernels)
+    assert step.recordings() == recorded <= 3
+
+
+def losses_of_light(light, optimizer, world, rays, target: mi.Color3f, *, frozen: bool) -> list:
+    """Six steps that fit unknown light to one colour of all pixels, recorded or not.
+
+    Args:
+        light: an environment map or strengths of lights, whose parameters the optimizer owns.
+    """
+    sampler = mi.load_dict({"type": "independent"})
+
+    def step(scene, sampler, optimizer, rays, seed):
+        sampler.seed(seed, dr.width(rays))
+        light.assign(dict(optimizer.items()))
+        light.prepare()
+        here = world.with_scene(scene)
+        first = find_vertex(here, rays, mi.Bool(True), sampler)
+        taken = bounce(here, attach_material(here, first), sampler)
+        seen = taken.direct + taken.weight * taken.next.emitted
+        loss = dr.mean(dr.mean(dr.square(seen - target)))
+        dr.backward(loss)
+        optimizer.step(eval=False)
+        dr.eval(optimizer, loss)
+        return loss
+
+    run = dr.freeze(step) if frozen else step
+    losses = [
+        run(world.scene, sampler, optimizer, rays, dr.opaque(mi.UInt32, 7 + i))[0] for i in range(6)
+    ]
+    if frozen:
+        assert run.n_recordings <= 2
+    return losses
+
+
+def enable_gradients(problem):
+    """Make all parameters of both fields take gradients, from zero; φ and θ by name."""
+    φ, θ = problem.materials.parameters(), problem.radiance.parameters()
+    for parameters in (φ, θ):
+        dr.disable_grad(parameters)
+        dr.enable_grad(parameters)
+    problem.materials.assign(φ)
+    problem.radiance.assign(θ)
+    return φ, θ
 
 
 # ------------------------------------------------------------------------- stand-ins for fields

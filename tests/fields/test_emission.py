@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import pixel_rays, seeded
+from support import losses_of_light, pixel_rays, seeded
 
 from unbake.data.camera import Camera
 from unbake.fields.emission import BOUND, Emission, emission_textures
@@ -135,29 +135,7 @@ def test_gradients_through_a_bounce_of_our_own_and_a_frozen_step():
         emission, log = fitted(TRUTH)
         world = World.of(lit_scene(emission_textures(emission)), None, 4)
         optimizer = mi.ad.Adam(0.05, {"log": log})
-        sampler = mi.load_dict({"type": "independent"})
-
-        def step(scene, sampler, optimizer, rays, seed, world=world, emission=emission):
-            sampler.seed(seed, dr.width(rays))
-            emission.assign(dict(optimizer.items()))
-            emission.prepare()
-            here = world.with_scene(scene)
-            first = find_vertex(here, rays, mi.Bool(True), sampler)
-            taken = bounce(here, attach_material(here, first), sampler)
-            light = taken.direct + taken.weight * taken.next.emitted
-            loss = dr.mean(dr.mean(dr.square(light - target)))
-            dr.backward(loss)
-            optimizer.step(eval=False)
-            dr.eval(optimizer, loss)
-            return loss
-
-        run = dr.freeze(step) if frozen else step
-        losses = [
-            run(world.scene, sampler, optimizer, rays, dr.opaque(mi.UInt32, 7 + i))[0]
-            for i in range(6)
-        ]
-        if frozen:
-            assert run.n_recordings <= 2
+        losses = losses_of_light(emission, optimizer, world, rays, target, frozen=frozen)
         histories.append((losses, np.array(optimizer["log"])))
     gc.enable()
     (a, learnt_a), (b, learnt_b) = histories

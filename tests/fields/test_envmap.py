@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import assert_same_expectation, pixel_rays, seeded, stock_path
+from support import assert_same_expectation, losses_of_light, pixel_rays, seeded, stock_path
 
 from unbake.data.camera import Camera
 from unbake.fields.envmap import (
@@ -424,35 +424,13 @@ def no_collection():
 
 
 def test_a_frozen_step_is_the_same_as_one_that_is_not(no_collection):
-    rays = pixel_rays(CAMERA, 16, 3)
+    rays, target = pixel_rays(CAMERA, 16, 3), mi.Color3f(0.1, 0.2, 0.3)
     histories = []
     for frozen in (True, False):
         environment, values = filled(16)
         world = World.of(lit_scene(environment_emitter(environment)), None, 4)
         optimizer = mi.ad.Adam(0.05, values)
-        sampler = mi.load_dict({"type": "independent"})
-
-        def step(scene, sampler, optimizer, rays, seed, world=world, environment=environment):
-            sampler.seed(seed, dr.width(rays))
-            environment.assign(dict(optimizer.items()))
-            environment.prepare()
-            here = world.with_scene(scene)
-            first = find_vertex(here, rays, mi.Bool(True), sampler)
-            taken = bounce(here, attach_material(here, first), sampler)
-            light = taken.direct + taken.weight * taken.next.emitted
-            loss = dr.mean(dr.mean(dr.square(light - mi.Color3f(0.1, 0.2, 0.3))))
-            dr.backward(loss)
-            optimizer.step(eval=False)
-            dr.eval(optimizer, loss)
-            return loss
-
-        run = dr.freeze(step) if frozen else step
-        losses = [
-            run(world.scene, sampler, optimizer, rays, dr.opaque(mi.UInt32, 7 + i))[0]
-            for i in range(6)
-        ]
-        if frozen:
-            assert run.n_recordings <= 2
+        losses = losses_of_light(environment, optimizer, world, rays, target, frozen=frozen)
         learnt = np.concatenate([np.array(v) for v in optimizer.values()])
         histories.append((losses, learnt))
         # After the frozen calls the map holds old texels until it is told anew.

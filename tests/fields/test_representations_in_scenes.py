@@ -7,7 +7,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, grey_photographs, pixel_rays, seeded
+from support import (
+    TINY_FIT,
+    assert_only_replayed,
+    built_in_cameras,
+    grey_photographs,
+    pixel_rays,
+    seeded,
+)
 
 from unbake.config import BitmapConfig, DenseGridConfig
 from unbake.data import scene as scenes
@@ -267,20 +274,7 @@ def test_a_frozen_step_trains_every_representation(built_in, representation, rad
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
     optimizers = state.optimizers()
     before = {(n, k): np.array(v).copy() for n, o in optimizers for k, v in o.items()}
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for i in range(3):
-            step(state, i, rates(i))
-        recorded = step.recordings()
-        dr.sync_thread()
-        dr.kernel_history_clear()
-        for i in range(3, 7):
-            terms = step(state, i, rates(i))
-            assert float(terms["skipped"][0]) == 0
-        dr.sync_thread()
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        dr.kernel_history_clear()
-    assert kernels and all(k["cache_hit"] and not k["cache_disk"] for k in kernels)
-    assert step.recordings() == recorded <= 3
+    assert_only_replayed(step, state, rates)
     for (name, key), old in before.items():
         new = np.array(dict(optimizers)[name][key])
         assert np.isfinite(new).all() and (new != old).any(), f"{name}.{key} was not trained"

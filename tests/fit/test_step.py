@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, grey_photographs
+from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
 
 import unbake.fit.step as step_module
 from unbake.config import PathConfig
@@ -115,20 +115,7 @@ def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, settings, 
 )
 def test_nothing_is_compiled_or_traced_after_the_third_step(built_in, settings):
     step, state = start(built_in, dataclasses.replace(TINY_FIT, **settings))
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for i in range(3):
-            step(state, i, rates(i))
-        recorded = step.recordings()
-        dr.sync_thread()
-        dr.kernel_history_clear()
-        for i in range(3, 8):
-            step(state, i, rates(i))
-        dr.sync_thread()
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        dr.kernel_history_clear()
-    assert kernels, "the history was not recorded"
-    assert all(k["cache_hit"] and not k["cache_disk"] for k in kernels)
-    assert step.recordings() == recorded <= 3
+    assert_only_replayed(step, state, rates, steps=5)
 
 
 # ------------------------------------------------------------------------- paths to their end

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, pixel_rays, seeded
+from support import TINY_FIT, built_in_cameras, enable_gradients, pixel_rays, seeded
 
 from unbake.fit.problem import make_problem
 from unbake.transport.image import Needs, trace
@@ -82,17 +82,6 @@ def with_live_pieces(sample):
     arrays = {"bounce1": [step.direct, step.weight], "L1": [L1], "L2": [L2]}
     dr.enable_grad(arrays)
     return sample, arrays
-
-
-def enable_gradients(problem):
-    """Make all parameters of both fields take gradients, from zero; φ and θ by name."""
-    φ, θ = problem.materials.parameters(), problem.radiance.parameters()
-    for parameters in (φ, θ):
-        dr.disable_grad(parameters)
-        dr.enable_grad(parameters)
-    problem.materials.assign(φ)
-    problem.radiance.assign(θ)
-    return φ, θ
 
 
 def test_nothing_beyond_the_second_vertex_passes_gradients(problem, rays):

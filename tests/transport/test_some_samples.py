@@ -6,7 +6,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, assert_same_expectation, built_in_cameras, pixel_rays, seeded
+from support import (
+    TINY_FIT,
+    assert_same_expectation,
+    built_in_cameras,
+    enable_gradients,
+    pixel_rays,
+    seeded,
+)
 
 from unbake.fit.problem import make_problem
 from unbake.transport.image import Some, lhs, rhs, trace
@@ -95,12 +102,7 @@ def test_terms_train_the_same_parameters(problem, rays, method):
     target = mi.Color3f(0.1 + 0.3 * dr.arange(mi.Float, dr.width(rays) // SPP) / 36)
     trained = []
     for some in (False, True):
-        φ, θ = problem.materials.parameters(), problem.radiance.parameters()
-        for parameters in (φ, θ):
-            dr.disable_grad(parameters)
-            dr.enable_grad(parameters)
-        problem.materials.assign(φ)
-        problem.radiance.assign(θ)
+        φ, θ = enable_gradients(problem)
         sample = traced(problem, rays, needs(row), some=some)
         values = objective(row, sample, target, SPP, RelativeL2(0.01))
         assert list(values) == list(row)
