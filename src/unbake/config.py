@@ -212,7 +212,7 @@ class FitConfig:
 
     albedo: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(7), hidden=1))
     roughness: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(4), 16, 1))
-    radiance: NetworkConfig = field(default_factory=NetworkConfig)
+    radiance: NetworkConfig = field(default_factory=lambda: NetworkConfig(GridConfig(6)))
     precision: Precision = "single"  #: of the networks' products; all else is single (ours)
     grid: DenseGridConfig = field(default_factory=DenseGridConfig)
     bitmap: BitmapConfig = field(default_factory=BitmapConfig)

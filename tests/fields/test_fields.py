@@ -303,6 +303,30 @@ def test_material_engines_agree():
     )
 
 
+@pytest.mark.parametrize("used", ["both", "albedo", "roughness"])
+def test_gradients_computed_together_are_those_computed_one_by_one(used):
+    def gradients(evaluate):
+        fields = materials()
+        parameters = {}
+        for i, (name, field) in enumerate(fields.fields.items()):
+            for key, value in randomised(field, i).items():
+                parameters[f"{name}.{key}"] = value
+        fields.assign(parameters)
+        found = getattr(fields, evaluate)(surface(points()), mi.Bool(True))
+        loss = 0
+        if used != "roughness":
+            loss += dr.sum(dr.square(found.albedo).x * found.albedo.z)
+        if used != "albedo":
+            loss += dr.sum(found.roughness * dr.detach(found.albedo.y))
+        dr.backward(dr.sum(loss))
+        return {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
+
+    apart, together = gradients("evaluate"), gradients("evaluate_once")
+    assert max(abs(g).max() for g in apart.values()) > 1e-3
+    for name, gradient in apart.items():
+        np.testing.assert_allclose(together[name], gradient, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
 def test_parameters_go_out_and_come_back():
     one, other = materials(), materials(seed=9)
     other.assign(one.parameters())

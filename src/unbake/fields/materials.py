@@ -101,6 +101,17 @@ class Materials:
         roughness = dr.fma(roughness, 1 - ROUGHNESS_FLOOR, ROUGHNESS_FLOOR)
         return Material(mi.Color3f(albedo), roughness)
 
+    def evaluate_once(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> Material:
+        """The same, where BSDFs that read the result are evaluated outside of any loop.
+
+        The gradients of albedo and roughness are computed together: one after the other, each of
+        them would differentiate all BSDFs again.
+        """
+        material = self.evaluate(si, valid)
+        if not dr.grad_enabled(material):
+            return material
+        return Material(*dr.custom(_Together, [material.albedo, material.roughness]))
+
     def evaluate_near(
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, sample: mi.Point2f, radius: float
     ) -> Material:
@@ -127,6 +138,21 @@ class Materials:
         # Each shape is asked once, while this is recorded. (A table would be an array that comes
         # from outside of a frozen function.)
         return dr.dispatch(shape, lambda s: mi.UInt32(self.slots.get(registry_number(s), 0)))
+
+
+class _Together(dr.CustomOp):
+    """Passes values on, and evaluates their gradients in one kernel."""
+
+    def eval(self, values):
+        return values
+
+    def backward(self):
+        gradients = self.grad_out()
+        dr.eval(gradients)
+        self.set_grad_in("values", gradients)
+
+    def name(self):
+        return "together"
 
 
 def registry_number(shape: mi.Shape) -> int:

@@ -32,7 +32,7 @@ def attach_material(world: World, vertex: Vertex) -> Vertex:
     if world.materials is None:
         return attach_albedo(world, vertex)
     si = vertex.si
-    material = world.materials.evaluate(si, vertex.valid)
+    material = world.materials.evaluate_once(si, vertex.valid)
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
     return replace(vertex, si=si, albedo=dr.detach(material.albedo))
