@@ -101,17 +101,6 @@ class Materials:
         roughness = dr.fma(roughness, 1 - ROUGHNESS_FLOOR, ROUGHNESS_FLOOR)
         return Material(mi.Color3f(albedo), roughness)
 
-    def evaluate_once(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> Material:
-        """The same, where BSDFs that read the result are evaluated outside of any loop.
-
-        The gradients of albedo and roughness are computed together: one after the other, each of
-        them would differentiate all BSDFs again.
-        """
-        material = self.evaluate(si, valid)
-        if not dr.grad_enabled(material):
-            return material
-        return Material(*dr.custom(_Together, [material.albedo, material.roughness]))
-
     def evaluate_near(
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, sample: mi.Point2f, radius: float
     ) -> Material:
@@ -138,6 +127,17 @@ class Materials:
         # Each shape is asked once, while this is recorded. (A table would be an array that comes
         # from outside of a frozen function.)
         return dr.dispatch(shape, lambda s: mi.UInt32(self.slots.get(registry_number(s), 0)))
+
+
+def with_joint_gradients(material: Material) -> Material:
+    """The same material, whose gradients are computed together; not inside of loops.
+
+    One after the other, those of albedo and of roughness would each differentiate every BSDF that
+    reads the material.
+    """
+    if not dr.grad_enabled(material):
+        return material
+    return Material(*dr.custom(_Together, [material.albedo, material.roughness]))
 
 
 class _Together(dr.CustomOp):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..fields.materials import carry
+from ..fields.materials import carry, with_joint_gradients
 from .vertex import Scattering, Vertex, World, evaluate, find_vertex, mis_weight
 
 
@@ -32,7 +32,7 @@ def attach_material(world: World, vertex: Vertex) -> Vertex:
     if world.materials is None:
         return attach_albedo(world, vertex)
     si = vertex.si
-    material = world.materials.evaluate_once(si, vertex.valid)
+    material = with_joint_gradients(world.materials.evaluate(si, vertex.valid))
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
     return replace(vertex, si=si, albedo=dr.detach(material.albedo))
