@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,11 +171,22 @@ def _write_cache(folder: Path, views: Sequence[View], key: dict) -> None:
     folder.mkdir(exist_ok=True)
     # The key is written last: without it the rest is taken for unfinished.
     (folder / "key.json").unlink(missing_ok=True)
-    table = np.lib.format.open_memmap(
-        folder / "photographs.npy", "w+", np.float32, (key["pixels"], _COLUMNS)
-    )
+    path = folder / "photographs.npy"
+    table = np.lib.format.open_memmap(path, "w+", np.float32, (key["pixels"], _COLUMNS))
+    try:
+        _reserve(path)
+    except OSError:
+        path.unlink()
+        raise
     made = _fill(table, _decoded(views, key["clip_negative"]), key["foreground_only"])
     table.flush()
     if made.chosen is not None:
         np.save(folder / "foreground.npy", made.chosen)
     write_json(folder / "key.json", {"key": key, "mean": made.mean})
+
+
+def _reserve(path: Path) -> None:
+    """Take the room of a file at once: a mapped file that finds the disk full kills the process."""
+    if hasattr(os, "posix_fallocate"):  # not on macOS
+        with open(path, "r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
