@@ -6,7 +6,8 @@ It renders recovered materials with full global illumination. Mitsuba's `path` g
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -40,35 +41,97 @@ def path_traced(
 
     Paper: Sec. 3, Sec. 6.
     """
-    sampler = mi.load_dict({"type": "independent"})
-    lanes = dr.width(ray)
     with dr.suspend_grad():
-        _reseed(sampler, seed, 0, lanes)
-        v = find_vertex(world, ray, mi.Bool(True), sampler, see_lights=see_lights)
-        total = mi.Color3f(v.emitted)
-        lane = dr.arange(mi.UInt32, lanes)
-        β = mi.Color3f(v.throughput)
-
-        for depth in range(1, max_depth):
-            keep = v.valid & (dr.max(β) > 0)
-            if depth >= rr_depth:
-                survival = dr.minimum(dr.max(β), 0.95)
-                keep &= sampler.next_1d() < survival
-                β *= dr.select(keep, dr.rcp(survival), 0)
-            alive = dr.compress(keep)
-            if len(alive) == 0:
-                break
-            v = replace(v, valid=keep)
-            if 2 * len(alive) <= dr.width(lane):
-                v, β, lane = _compacted(alive, v, β, lane)
-            _reseed(sampler, seed, depth, dr.width(lane))
-
-            step = bounce(world, attach_material(world, v), sampler)
-            dr.scatter_add(total, β * (step.direct + step.weight * step.next.emitted), lane)
-            β *= step.weight * step.next.throughput
-            v = step.next
-            dr.eval(total, β, lane)
+        total = dr.zeros(mi.Color3f, dr.width(ray))
+        for step in _follow(world, ray, seed, max_depth, rr_depth, 0.95, see_lights=see_lights):
+            dr.scatter_add(total, step.light, step.lane)
+            dr.eval(total)
     return total
+
+
+def path_lengths(
+    world: World,
+    ray: mi.Ray3f,
+    seed: int,
+    *,
+    max_depth: int,
+    rr_depth: int,
+    most_likely: float = 1.0,
+) -> mi.Float:
+    """Surface interactions of the paths that `path_traced` follows along rays.
+
+    Args:
+        max_depth: paths end at that many interactions.
+        rr_depth: interactions after which Russian roulette may end a path.
+        most_likely: largest probability to survive it.
+
+    Returns:
+        One lane a ray; zero where nothing was hit.
+
+    Paper: Table 1, Table 2.
+    """
+    with dr.suspend_grad():
+        length = dr.zeros(mi.Float, dr.width(ray))
+        # One bounce more than there are interactions to count: its own start is the last of them.
+        depth = max_depth + 1
+        for step in _follow(world, ray, seed, depth, rr_depth, most_likely, see_lights=True):
+            dr.scatter_add(length, 1, step.lane, step.scattered)
+            dr.eval(length)
+    return length
+
+
+@dataclass
+class _Step:
+    """Paths that are followed by one bounce, or just begun."""
+
+    lane: mi.UInt32  # the rays that they belong to
+    scattered: mi.Bool  # whether they have bounced, rather than ended before or begun
+    light: mi.Color3f  # what arrives at the cameras of it
+
+
+def _follow(
+    world: World,
+    ray: mi.Ray3f,
+    seed: int,
+    max_depth: int,
+    rr_depth: int,
+    most_likely: float,
+    *,
+    see_lights: bool,
+) -> Iterator[_Step]:
+    """Follow paths to their end; all that is yielded is evaluated."""
+    sampler = mi.load_dict({"type": "independent"})
+    lane = dr.arange(mi.UInt32, dr.width(ray))
+    _reseed(sampler, seed, 0, dr.width(ray))
+    v = find_vertex(world, ray, mi.Bool(True), sampler, see_lights=see_lights)
+    β = mi.Color3f(v.throughput)
+    yield _evaluated(_Step(lane, dr.zeros(mi.Bool, dr.width(ray)), mi.Color3f(v.emitted)))
+
+    for depth in range(1, max_depth):
+        keep = v.valid & (dr.max(β) > 0)
+        if depth >= rr_depth:
+            survival = dr.minimum(dr.max(β), most_likely)
+            keep &= sampler.next_1d() < survival
+            β *= dr.select(keep, dr.rcp(survival), 0)
+        alive = dr.compress(keep)
+        if len(alive) == 0:
+            break
+        v = replace(v, valid=keep)
+        if 2 * len(alive) <= dr.width(lane):
+            v, β, lane = _compacted(alive, v, β, lane)
+        _reseed(sampler, seed, depth, dr.width(lane))
+
+        step = bounce(world, attach_material(world, v), sampler)
+        light = β * (step.direct + step.weight * step.next.emitted)
+        β *= step.weight * step.next.throughput
+        dr.eval(β)
+        yield _evaluated(_Step(lane, v.valid, light))
+        v = step.next
+
+
+def _evaluated(step: _Step) -> _Step:
+    dr.eval(step)
+    return step
 
 
 def _reseed(sampler: mi.Sampler, seed: int, depth: int, lanes: int) -> None:
