@@ -1,0 +1,154 @@
+"""Derivatives of pixels by one parameter of a material, as each method would estimate them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.operator import attach_material, bounce
+from ..transport.render import RayGenerator, parts_of
+from ..transport.vertex import Vertex, World, find_vertex
+
+#: Bounces before Russian roulette.
+RR_DEPTH = 3
+
+
+@final
+@dataclass(frozen=True)
+class Estimates:
+    """What pixels are, and their derivatives.
+
+    All are linear RGB, shape (pixels, 3).
+
+    Args:
+        image: with all light.
+        derivative: of it.
+        cut: by longest path (Mitsuba's meaning, 2 is direct light): image and derivative.
+        live: by the number k of differentiable bounces: the derivative with an exact L after them.
+    """
+
+    image: np.ndarray
+    derivative: np.ndarray
+    cut: dict[int, tuple[np.ndarray, np.ndarray]]
+    live: dict[int, np.ndarray]
+
+
+def estimate(
+    world: World,
+    assign: Callable[[mi.Float], None],
+    value: float,
+    through: RayGenerator,
+    pixels: int,
+    spp: int,
+    *,
+    seed: int,
+    max_depth: int,
+    cut: Sequence[int],
+    live: Sequence[int],
+) -> Estimates:
+    """Estimate pixels and derivatives along the same paths for all methods.
+
+    Each bounce is differentiated by itself, forwards; the product rule along a path then gives what
+    any method finds on it: those that end paths early, and those that let gradients through the
+    first k bounces only, after which the incident radiance is taken as it is.
+
+    Args:
+        assign: gives the scene the parameter's value.
+        value: of the parameter.
+        max_depth: longest path that counts as all light.
+        cut: longest paths of methods that end them earlier.
+        live: numbers k.
+
+    Paper: Fig. 4, Sec. 6.3.
+    """
+    names = ["image", "derivative"]
+    names += [f"{what} {depth}" for depth in cut for what in ("cut", "cut'")]
+    names += [f"live {k}" for k in live]
+    sums = {name: np.zeros((pixels, 3)) for name in names}
+    for part, ray, part_seed in parts_of(through, pixels, spp, seed):
+        found = _along(world, assign, value, ray, part_seed, max_depth, set(cut), tuple(live))
+        for name, samples in found.items():
+            means = [np.array(dr.block_sum(c, spp)) / spp for c in samples]
+            sums[name][part] = np.stack(means, -1)
+    return Estimates(
+        sums["image"],
+        sums["derivative"],
+        {depth: (sums[f"cut {depth}"], sums[f"cut' {depth}"]) for depth in cut},
+        {k: sums[f"live {k}"] for k in live},
+    )
+
+
+def _along(
+    world: World,
+    assign: Callable[[mi.Float], None],
+    value: float,
+    ray: mi.Ray3f,
+    seed: int,
+    max_depth: int,
+    cut: set[int],
+    live: tuple[int, ...],
+) -> dict[str, mi.Color3f]:
+    """The estimates of each sample."""
+    found: dict[str, mi.Color3f] = {}
+    lanes = dr.width(ray)
+    sampler = mi.load_dict({"type": "independent"})
+    _reseed(sampler, seed, 0, lanes)
+    with dr.suspend_grad():
+        x = find_vertex(world, ray, mi.Bool(True), sampler)
+    total, β = mi.Color3f(x.emitted), mi.Color3f(x.throughput)
+    # How throughput and sum change with the parameter: by all bounces, and by the first k alone.
+    ks = (max_depth, *live)
+    dβ = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
+    dtotal = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
+    lane = dr.arange(mi.UInt32, lanes)
+    for number in range(1, max_depth):
+        keep = x.valid & (dr.max(β) > 0)
+        if number >= RR_DEPTH:
+            survival = dr.minimum(dr.max(β), 0.95)
+            keep &= sampler.next_1d() < survival
+            β *= dr.rcp(survival)
+            dβ = {k: v * dr.rcp(survival) for k, v in dβ.items()}
+        alive = dr.compress(keep)
+        if len(alive) == 0:
+            break
+        gathered = {f.name: getattr(x, f.name) for f in fields(Vertex)}
+        x = Vertex(**{name: dr.gather(type(v), v, alive) for name, v in gathered.items()})
+        β, lane = dr.gather(mi.Color3f, β, alive), dr.gather(mi.UInt32, lane, alive)
+        dβ = {k: dr.gather(mi.Color3f, v, alive) for k, v in dβ.items()}
+        _reseed(sampler, seed, number, len(alive))
+
+        parameter = mi.Float(value)
+        dr.enable_grad(parameter)
+        assign(parameter)
+        step = bounce(world, attach_material(world, x), sampler)
+        dr.forward(parameter)
+        d, dd = dr.detach(step.direct), dr.grad(step.direct)
+        w, dw = dr.detach(step.weight), dr.grad(step.weight)
+        x, e, t = step.next, dr.detach(step.next.emitted), dr.detach(step.next.throughput)
+        light, dlight = d + w * e, dd + dw * e
+        for k in ks:
+            on = number <= k
+            dr.scatter_add(dtotal[k], dβ[k] * light + (β * dlight if on else 0), lane)
+            dβ[k] = (dβ[k] * w + (β * dw if on else 0)) * t
+        dr.scatter_add(total, β * light, lane)
+        β *= w * t
+        dr.eval(total, β, dβ, dtotal, lane)
+        if number + 1 in cut:
+            found[f"cut {number + 1}"] = mi.Color3f(total)
+            found[f"cut' {number + 1}"] = mi.Color3f(dtotal[max_depth])
+    assign(mi.Float(value))
+    found["image"], found["derivative"] = total, dtotal[max_depth]
+    for depth in cut:  # where all paths had ended before
+        found.setdefault(f"cut {depth}", total)
+        found.setdefault(f"cut' {depth}", dtotal[max_depth])
+    return found | {f"live {k}": dtotal[k] for k in live}
+
+
+def _reseed(sampler: mi.Sampler, seed: int, number: int, lanes: int) -> None:
+    (value,) = np.random.SeedSequence([seed, number]).generate_state(1)
+    sampler.seed(dr.opaque(mi.UInt32, int(value)), lanes)
