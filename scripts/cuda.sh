@@ -1,17 +1,22 @@
 #!/usr/bin/env bash
 # All there is to measure on a machine with an NVIDIA GPU, also one without a package registry:
-#   bash scripts/cuda.sh OUT [JOB ...]          jobs: doctor tests step methods cube staircase
+#   bash scripts/cuda.sh OUT [JOB ...]
 #
-#   SCALE       paper (default), or smoke: the same in a minute, on a CPU, to see that it runs
+#   jobs: doctor tests step methods staircase, and the paper's tables and figures: table1 table2 fig3
+#   fig4 fig5 fig6 fig7 fig8
+#
+#   SCALE       paper (default), or smoke: the same at a size for a CPU, to see that it runs
 #   PYTHON      the interpreter (default: python3)
 #   SITE        a folder with the dependencies, if they are not installed
-#   STAIRCASE   a data set, as docs/staircase.md makes it; without it STAIRCASE is left out
-#   MINUTES     how long `staircase` may take in one call (default: 8); the next call goes on
+#   STAIRCASE   a data set, as docs/staircase.md makes it; without it `staircase` is left out
+#   SCENES      folder of the published scenes; without it only table2 and fig5 are reproduced
+#   MINUTES     how long `staircase`, a table or a figure may take in one call (default: 8); the next
+#               call goes on: with the same fit, or with the same part of a table or figure
 #
 # Results go to OUT: text, and JSON as `unbake bench` and `unbake compare` write it.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-[ -n "${1:-}" ] || { sed -n '2,11p' "$0" | cut -c3-; exit 2; }
+[ -n "${1:-}" ] || { sed -n '2,16p' "$0" | cut -c3-; exit 2; }
 out=$1
 shift
 scale=${SCALE:-paper}
@@ -24,12 +29,12 @@ say() { printf '== %s\n' "$*"; }
 case $scale in
 paper)
   size=(--views 8 --held-out 1 --resolution 256 --spp 32)
-  steps=100 grid=256 pixels=65536 spp=16 albedos=(0.3 0.5 0.7 0.9 0.95 0.97)
+  steps=100
   printf 'preset = "paper"\n' >"$out/step.toml"
   ;;
 smoke)
   size=(--views 2 --held-out 1 --resolution 16 --spp 4)
-  steps=10 grid=8 pixels=64 spp=4 albedos=(0.3)
+  steps=10
   {
     printf 'pixels = 64\nspp = 4\nsteps = 20\n'
     for net in albedo roughness radiance; do
@@ -63,41 +68,17 @@ methods() { # step times side by side
   unbake bench methods --data "$out/data/demo" --methods ours direct no-prior prb ad-pt ours:bitmap \
     prb:bitmap --settings "$out/step.toml" --steps $steps --out "$out/methods.json"
 }
-cube() { # Fig. 5: dense grids, ever longer paths; the limits of Table 2
-  local limits=(0.3:5 0.5:7 0.7:13 0.9:42 0.95:84 0.97:140) albedo limit
-  for albedo in "${albedos[@]}"; do
-    for limit in "${limits[@]}"; do
-      if [ "${limit%:*}" = "$albedo" ]; then break; fi
-    done
-    "$python" - "$out/data/scene-$albedo" "$albedo" <<'PY'
-import sys
-from pathlib import Path
-
-from unbake import activate
-from unbake.data.procedural import write_scene
-
-activate()
-write_scene("cube", Path(sys.argv[1]), albedo=float(sys.argv[2]))
-PY
-    data "cube-$albedo" "$out/data/scene-$albedo/scene.xml"
-    cat >"$out/cube-$albedo.toml" <<TOML
-pixels = $pixels
-spp = $spp
-radiance_spp = 0
-radiance_representation = "grid"
-[grid]
-albedo = $grid
-roughness = $grid
-radiance = $grid
-[path]
-max_depth = ${limit#*:}
-TOML
-    for method in ours prb ad-pt; do # each by itself: one may run out of memory
-      unbake bench step --data "$out/data/cube-$albedo" --methods $method:grid --steps $steps \
-        --settings "$out/cube-$albedo.toml" --out "$out/cube-$albedo-$method.json" \
-        || echo "$albedo $method failed" | tee -a "$out/cube-failed.txt"
-    done
-  done
+# Tables and figures of the paper; each call goes on where the last one ended.
+reproduce() {
+  local status=0 scenes=(--scenes "${SCENES:-scenes}")
+  case $1 in
+  table2 | fig5) ;;
+  *) [ -d "${scenes[1]}" ] || { echo "SCENES is not set: $1 is left out"; return; } ;;
+  esac
+  timeout --signal=TERM "$((60 * ${MINUTES:-8}))" "$python" -m unbake reproduce "$1" \
+    --scale "$scale" --out "$out/reproduction" "${scenes[@]}" || status=$?
+  # Stopped by the time that it was given, or from outside: no failure.
+  [ $status -eq 0 ] || [ $status -eq 124 ] || [ $status -eq 130 ]
 }
 staircase() { # 4.7 G samples at the paper's sizes, in slices that continue one another
   local scene=${STAIRCASE:-} resume=()
@@ -116,7 +97,14 @@ staircase() { # 4.7 G samples at the paper's sizes, in slices that continue one 
   unbake evaluate "$out/staircase" --spp 64 --train-views 2
 }
 
-for job in ${@:-doctor tests step methods cube staircase}; do
+figures=(table1 table2 fig3 fig4 fig5 fig6 fig7 fig8)
+[ $# -gt 0 ] || set -- doctor tests step methods staircase "${figures[@]}"
+failed=
+for job in "$@"; do
   say "$job ($scale)"
-  "$job"
+  case " ${figures[*]} " in
+  *" $job "*) reproduce "$job" || failed+=" $job" ;; # the others are still worth their time
+  *) "$job" ;;
+  esac
 done
+[ -z "$failed" ] || { echo "failed:$failed" >&2; exit 1; }

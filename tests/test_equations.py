@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-ROW = re.compile(r"^\| ((?:Eq|Sec|Table)\.? ?[^|]+) \| ([^|]+) \| ([^|]+) \|$", re.M)
+ROW = re.compile(r"^\| ((?:Eq|Sec|Table|Fig)\.? ?[^|]+) \| ([^|]+) \| ([^|]+) \|$", re.M)
 
 
 @pytest.fixture(scope="module")

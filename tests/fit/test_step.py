@@ -152,7 +152,7 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
     message = str(error.value)
     print(message)
     needed = re.fullmatch(
-        r"ad-pt needs about (\S+) GB for a step of 8192 paths, 0\.0 GB are free\. "
+        r"ad-pt needs about (\S+) GB of memory for a step of 8192 paths, 0\.0 GB are free\. "
         r"Lower --batch or --spp or path\.max_depth, or use --method prb",
         message,
     )

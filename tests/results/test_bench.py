@@ -5,6 +5,9 @@ import json
 import pytest
 from support import TINY
 
+from unbake.errors import UserError
+from unbake.results import bench_methods
+
 
 def bench(unbake, what, data, tiny, out, *methods):
     words = ("--data", data, "--settings", tiny, "--steps", 10, "--out", out, "--methods", *methods)
@@ -33,6 +36,26 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
 
 
 PARTS = {"batch", "ray tracing", "BSDFs and lights", "losses", "gradients", "optimiser"}
+
+
+def test_a_method_that_fails_does_not_keep_others_from_being_measured(
+    unbake, cornell, tiny, tmp_path, monkeypatch
+):
+    measured = bench_methods._timed
+
+    def timed(dataset, config, steps):
+        if config.method == "prb":
+            raise UserError("no memory for a step")
+        return measured(dataset, config, steps)
+
+    monkeypatch.setattr(bench_methods, "_timed", timed)
+    out = tmp_path / "methods.json"
+    done = bench(unbake, "methods", cornell, tiny, out, "direct", "prb")
+    assert done.status == 0 and "failed" in done.out
+    direct, prb = json.loads(out.read_text())["rows"]
+    assert direct["milliseconds_per_step"] > 0 and prb["error"] == "no memory for a step"
+    done = bench(unbake, "methods", cornell, tiny, out, "prb")
+    assert done.status == 2 and "no memory for a step" in done.err
 
 
 @pytest.mark.parametrize(

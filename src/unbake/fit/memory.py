@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 
 _PROCESS = Path("/proc/self")
 #: Where control groups, as containers are, state their limit and what is used of it.
@@ -17,9 +18,14 @@ _LIMITS = (
 
 
 def peak_bytes(work: Callable[[], None]) -> int | None:
-    """By how much resident memory rises at most while `work` runs; None where nobody can tell."""
+    """By how much memory rises at most while `work` runs; None where nobody can tell.
+
+    On a CPU this is resident memory, on a GPU what Dr.Jit has allocated there.
+    """
     dr.sync_thread()
     dr.flush_malloc_cache()
+    if mi.variant().startswith("cuda"):
+        return _peak_on_device(work)
     try:
         # What was freed goes back to the system, or `work` would take it up unseen.
         ctypes.CDLL(None).malloc_trim(0)
@@ -31,6 +37,14 @@ def peak_bytes(work: Callable[[], None]) -> int | None:
         return max(0, _status("VmHWM") - before)
     except (OSError, AttributeError, ValueError, StopIteration):
         return None
+
+
+def _peak_on_device(work: Callable[[], None]) -> int:
+    dr.detail.malloc_clear_statistics()
+    before = dr.detail.malloc_watermark(dr.JitBackend.CUDA)
+    work()
+    dr.sync_thread()
+    return max(0, dr.detail.malloc_watermark(dr.JitBackend.CUDA) - before)
 
 
 def free_bytes() -> int | None:

@@ -139,7 +139,7 @@ class TrainingStep:
             with _no_garbage_collection():
                 return step(self.prepare(state, number, rates), state)
         except RuntimeError as error:
-            if not _lacks_memory(error):
+            if not lacks_memory(error):
                 raise
             lanes = self._config.samples_per_step
             raise UserError(f"no memory for a step of {lanes} paths", None, _SMALLER) from None
@@ -156,7 +156,7 @@ class TrainingStep:
             return
         need, free = self._bytes_needed(state), free_bytes()
         if need is not None and free is not None and need > free:
-            what = f"ad-pt needs about {need / 1e9:.1f} GB for a step of"
+            what = f"ad-pt needs about {need / 1e9:.1f} GB of memory for a step of"
             what += f" {self._config.samples_per_step} paths, {free / 1e9:.1f} GB are free"
             raise UserError(what, None, _SMALLER)
         self._fits_memory = True
@@ -262,7 +262,7 @@ _PROBED_PATHS = 4096
 _SMALLER = "Lower --batch or --spp or path.max_depth, or use --method prb"
 
 
-def _lacks_memory(error: BaseException | None) -> bool:
+def lacks_memory(error: BaseException | None) -> bool:
     """Whether an error comes from Dr.Jit running out of memory, also while it records."""
     while error is not None and "out of memory" not in str(error):
         error = error.__cause__ or error.__context__

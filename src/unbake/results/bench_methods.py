@@ -14,6 +14,7 @@ from rich.table import Table
 from ..config import FitConfig
 from ..data.jsonfile import write_json
 from ..data.views import Dataset
+from ..errors import UserError
 from ..fit.rates import learning_rates
 from .bench import begin, machine
 from .contender import Contender
@@ -43,43 +44,57 @@ def bench_methods(
         out: JSON file to write.
 
     Returns:
-        All that is printed.
+        All that is printed. The row of a method that failed has its `error` instead of times.
+
+    Raises:
+        UserError: the data set cannot be used, or every method failed.
 
     Paper: Sec. 6.2, Fig. 3.
     """
     dataset = Dataset.load(data)
     configs = [contender.settings(shared) for contender in contenders]
     seconds: list[list[float]] = [[] for _ in configs]
+    errors: dict[int, UserError] = {}
     for turn in range(TURNS):
-        for contender, config, times in zip(contenders, configs, seconds, strict=True):
-            times += _timed(dataset, config, -(-steps // TURNS))
-            told = 1e3 * statistics.median(times)
-            console.print(f"turn {turn + 1}, {contender.name}: {told:.1f} ms", highlight=False)
-    medians = [statistics.median(times) for times in seconds]
-    rows = [
-        {
-            **description(config),
-            "pixels": config.pixels,
-            "spp": config.spp,
-            "milliseconds_per_step": 1e3 * median,
-            "samples_per_second": config.samples_per_step / median,
-            "times_the_first": median / medians[0],
-        }
-        for config, median in zip(configs, medians, strict=True)
-    ]
+        for i, (contender, config) in enumerate(zip(contenders, configs, strict=True)):
+            if i in errors:
+                continue
+            try:
+                seconds[i] += _timed(dataset, config, -(-steps // TURNS))
+                told = f"{1e3 * statistics.median(seconds[i]):.1f} ms"
+            except UserError as error:
+                errors[i], told = error, f"error: {error}"
+            line = f"turn {turn + 1}, {contender.name}: {told}"
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if len(errors) == len(configs):
+        raise errors[0]
+    rows = []
+    for i, (config, times) in enumerate(zip(configs, seconds, strict=True)):
+        row: dict = {**description(config), "pixels": config.pixels, "spp": config.spp}
+        if i in errors:
+            rows.append(row | {"error": str(errors[i])})
+            continue
+        median = statistics.median(times)
+        row["milliseconds_per_step"] = 1e3 * median
+        row["samples_per_second"] = config.samples_per_step / median
+        row["times_the_first"] = None if 0 in errors else median / statistics.median(seconds[0])
+        rows.append(row)
     result = {"machine": machine(), "steps": steps, "data": dataset.folder.name, "rows": rows}
     table = Table("method", "materials", "radiance", "estimator")
     for title in ("ms a step", "k samples/s", "times the first"):
         table.add_column(title, justify="right")
     for row in rows:
+        known = (row["method"], row["representation"] or "known", row["radiance"] or "none")
+        if "error" in row:
+            table.add_row(*known, row["estimator"], "failed")
+            continue
+        ratio = row["times_the_first"]
         table.add_row(
-            row["method"],
-            row["representation"] or "known",
-            row["radiance"] or "none",
+            *known,
             row["estimator"],
             f"{row['milliseconds_per_step']:.1f}",
             f"{row['samples_per_second'] / 1e3:.0f}",
-            f"{row['times_the_first']:.2f}",
+            "—" if ratio is None else f"{ratio:.2f}",
         )
     console.print(table)
     if out is not None:

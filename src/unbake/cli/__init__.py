@@ -11,36 +11,34 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 from rich.text import Text
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from . import backend, config
-from .errors import UserError
-
-Scene = Annotated[str, arg(metavar="SCENE")]
-Data = Annotated[Path, arg(metavar="DATA")]
-Run = Annotated[Path, arg(metavar="RUN")]
-Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]
-Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
-#: Where None stands for what preset or settings file say, "default: None" would tell nothing.
-Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
-Seconds = Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")]
-File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
-Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
-Preset = Annotated[
-    config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
-]
-Method = Annotated[config.MethodName | None, arg(metavar="METHOD", help_behavior_hint="")]
-Unknown = Annotated[config.Unknown | None, arg(metavar="WHAT", help_behavior_hint="")]
-Prior = Annotated[
-    config.PriorName | None, arg(metavar="{one-bounce,extra-bounce}", help_behavior_hint="")
-]
-Representation = Annotated[
-    config.Representation | None, arg(metavar="{neural,grid,bitmap}", help_behavior_hint="")
-]
-RadianceRepresentation = Annotated[
-    config.RadianceRepresentation | None, arg(metavar="{neural,grid}", help_behavior_hint="")
-]
-Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
+from .. import backend, config, experiments
+from ..errors import UserError
+from .options import (
+    Count,
+    Data,
+    Experiment,
+    File,
+    Flag,
+    Folder,
+    Method,
+    Methods,
+    Preset,
+    Prior,
+    RadianceRepresentation,
+    Representation,
+    Run,
+    Runs,
+    Scale,
+    Scene,
+    Seconds,
+    Unknown,
+    chosen_settings,
+    exclude,
+    overridden,
+    require,
+)
 
 
 def main() -> None:
@@ -52,6 +50,7 @@ def main() -> None:
         "report": report,
         "compare": compare,
         "bench": bench,
+        "reproduce": reproduce,
         "doctor": doctor,
     }
     try:
@@ -99,15 +98,15 @@ def capture(
         max_depth: Longest light path; too short a limit looks like darker materials.
         seed: Seed of all random numbers.
     """
-    _require("views", views, 1)
-    _require("held-out", held_out, 0)
-    _require("resolution", resolution, 2)
-    _require("spp", spp, 1)
-    _require("max-depth", max_depth, 1)
-    _require("seed", seed, 0)
+    require("views", views, 1)
+    require("held-out", held_out, 0)
+    require("resolution", resolution, 2)
+    require("spp", spp, 1)
+    require("max-depth", max_depth, 1)
+    require("seed", seed, 0)
     backend.activate()
-    from .data.capture import CaptureSettings
-    from .data.capture import capture as run
+    from ..data.capture import CaptureSettings
+    from ..data.capture import capture as run
 
     settings = CaptureSettings(
         views=views,
@@ -189,15 +188,15 @@ def fit(
         "seed": seed,
     }
     if resume:
-        _exclude("resume", start | other)
+        exclude("resume", start | other)
         if not (out / "config.toml").is_file():
             raise UserError("there is no run to resume in this folder", out, "Leave out --resume")
         chosen = config.read_toml(out / "config.toml")
     else:
-        chosen = _chosen(preset, settings)
-    chosen = _overridden(chosen, length | other)
+        chosen = chosen_settings(preset, settings)
+    chosen = overridden(chosen, length | other)
     backend.activate()
-    from .fit.loop import fit as run
+    from ..fit.loop import fit as run
 
     console = Console(highlight=False)
     progress = run(data, out, chosen, resume=resume, clip_negative=clip_negative, console=console)
@@ -229,12 +228,12 @@ def evaluate(
         train_views: How many of the views learned from to render, beside all held-out ones.
         clip_negative: Take negative pixels of photographs as zero, as in a fit with this option.
     """
-    _require("spp", spp, 1)
-    _require("max-depth", max_depth, 1)
-    _require("train-views", train_views, 0)
+    require("spp", spp, 1)
+    require("max-depth", max_depth, 1)
+    require("train-views", train_views, 0)
     backend.activate()
-    from .results.evaluate import EvaluationSettings
-    from .results.evaluate import evaluate as go
+    from ..results.evaluate import EvaluationSettings
+    from ..results.evaluate import evaluate as go
 
     settings = EvaluationSettings(
         spp=spp, max_depth=max_depth, train_views=train_views, clip_negative=clip_negative
@@ -257,7 +256,7 @@ def report(runs: Positional[Runs], /, out: Path) -> None:
     if not runs:
         raise UserError("no run given", remedy="unbake report RUN [RUN ...] --out report.html")
     backend.activate()
-    from .results.report import write_report
+    from ..results.report import write_report
 
     _say(f"wrote {write_report(runs, out)}")
 
@@ -302,18 +301,18 @@ def compare(
         evaluate_spp: Samples per pixel of the final renderings.
         clip_negative: Take negative pixels as zero instead of refusing them.
     """
-    _require("evaluate-spp", evaluate_spp, 1)
-    chosen = _chosen(preset, settings)
+    require("evaluate-spp", evaluate_spp, 1)
+    chosen = chosen_settings(preset, settings)
     given: dict[str, object] = {"steps": steps, "seconds": seconds, "spp": spp, "batch": batch}
-    chosen = _overridden(chosen, given | {"unknown": unknown, "seed": seed})
+    chosen = overridden(chosen, given | {"unknown": unknown, "seed": seed})
     try:
         chosen = dataclasses.replace(chosen, score_seconds=score_seconds)
     except UserError as error:
         raise UserError(error.what, "--score-seconds") from None
     backend.activate()
-    from .results.compare import compare as run
-    from .results.contender import Contender
-    from .results.evaluate import EvaluationSettings
+    from ..results.compare import compare as run
+    from ..results.contender import Contender
+    from ..results.evaluate import EvaluationSettings
 
     contenders = [Contender.of(method) for method in methods]
     evaluation = EvaluationSettings(spp=evaluate_spp, clip_negative=clip_negative)
@@ -348,14 +347,14 @@ def bench(
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
-    _require("steps", steps, 10)
+    require("steps", steps, 10)
     if data is not None:
-        _exclude("data", {"scene": scene})
-    chosen = _chosen(preset, settings)
+        exclude("data", {"scene": scene})
+    chosen = chosen_settings(preset, settings)
     backend.activate()
-    from .results.bench import bench_step, small_data
-    from .results.bench_methods import bench_methods
-    from .results.contender import Contender
+    from ..results.bench import bench_step, small_data
+    from ..results.bench_methods import bench_methods
+    from ..results.contender import Contender
 
     contenders = [Contender.of(method) for method in methods]
     if what == "step" and len(contenders) != 1:
@@ -368,53 +367,43 @@ def bench(
             bench_methods(folder, contenders, chosen, steps, out, console)
 
 
+def reproduce(
+    what: Positional[Experiment],
+    /,
+    scale: Scale = "cpu",
+    out: Path = Path("reproduction"),
+    scenes: Path = Path("scenes"),
+    plan: Flag = False,
+) -> None:
+    """Make a table or a figure of the paper again: data, table and picture.
+
+    Writes OUT/WHAT/data.json, data.csv, table.md and pictures. What was stopped goes on with the
+    same command; data sets and fits are kept in OUT/work, and experiments share them.
+
+    table1: scenes, views, path lengths. table2: path lengths in a cube. fig3: time of a step, by
+    scene. fig4: gradients of a roughness. fig5: time and memory against albedo. fig6: materials of
+    eight scenes (and fig. 1). fig7, fig8: the ablation, for materials and for lighting.
+
+    Args:
+        what: Which one.
+        scale: smoke (takes seconds, and shows nothing but that it runs), cpu (sized for two cores)
+            or paper (for a GPU).
+        out: Folder to write to, shared by all experiments.
+        scenes: Folder of the published scenes, each in a folder or as .tar.xz.
+        plan: Only tell what is left to do, and how long it will take on this machine.
+    """
+    backend.activate()
+    from ..experiments.experiment import Setting
+    from ..experiments.experiment import reproduce as run
+
+    run(experiments.load(what), Setting(scale, out, scenes), plan=plan)
+
+
 def doctor() -> int:
     """Show what unbake runs on here, and what to install if it cannot."""
-    from . import doctor as module
+    from .. import doctor as module
 
     return module.main()
-
-
-def _chosen(preset: config.PresetName | None, settings: Path | None) -> config.FitConfig:
-    """The settings that --preset or --settings name, if either was given."""
-    if settings is None:
-        return config.preset(preset or "cpu")
-    _exclude("settings", {"preset": preset})
-    return config.read_toml(settings)
-
-
-def _overridden(settings: config.FitConfig, given: dict[str, object]) -> config.FitConfig:
-    """Settings with the options that were given; errors name the option."""
-    keys = {"batch": "pixels", "radiance": "radiance_representation"}
-    if given["steps"] is not None and given["seconds"] is not None:
-        _exclude("seconds", {"steps": given["steps"]})
-    if given["steps"] is not None:
-        settings = dataclasses.replace(settings, seconds=0.0)
-    # The method first: whether other options make sense depends on it.
-    for option, value in sorted(given.items(), key=lambda item: item[0] != "method"):
-        if value is None:
-            continue
-        try:
-            if option == "max-depth":
-                path = dataclasses.replace(settings.path, max_depth=value)
-                settings = dataclasses.replace(settings, path=path)
-            else:
-                settings = dataclasses.replace(settings, **{keys.get(option, option): value})
-        except UserError as error:
-            raise UserError(error.what, f"--{option}", error.remedy) from None
-    return settings
-
-
-def _exclude(option: str, others: dict[str, object]) -> None:
-    """Refuse options that make no sense beside another one."""
-    for name, value in others.items():
-        if value is not None:
-            raise UserError(f"cannot be given together with --{option}", where=f"--{name}")
-
-
-def _require(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise UserError(f"must be {least} or more, not {value}", where=f"--{name}")
 
 
 def _say(line: str) -> None:

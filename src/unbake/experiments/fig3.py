@@ -1,0 +1,127 @@
+"""Figure 3: the time of a step of every method, scene by scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..config import FitConfig
+from ..data.capture import CaptureSettings
+from ..results.bench_methods import bench_methods
+from ..results.contender import Contender
+from .experiment import Experiment, Found, Part, Setting, Shown, markdown, save_figure
+from .scenes import SCENES, PaperScene
+
+METHODS = {
+    "ours": "ours",
+    "no prior": "no-prior",
+    "direct": "direct",
+    "PRB": "prb",
+    "AD-PT": "ad-pt",
+}
+#: Seconds of a step, read off the authors' bars (RTX 3090).
+PUBLISHED: Mapping[str, Mapping[str, float]] = {
+    "STAIRCASE": {"ours": 0.86, "PRB": 3.2, "AD-PT": 2.55, "no prior": 0.78, "direct": 0.53},
+    "LIVING ROOM": {"ours": 0.78, "PRB": 1.7, "AD-PT": 1.55},
+    "KITCHEN": {"ours": 0.76, "PRB": 1.9, "AD-PT": 1.6},
+    "VEACH DOOR": {"ours": 0.69, "PRB": 0.9, "AD-PT": 1.0},
+    "LEGO": {"ours": 1.5, "PRB": 3.5, "AD-PT": 2.6},
+    "HOTDOG": {"ours": 0.68, "PRB": 0.85, "AD-PT": 0.75},
+    "FICUS": {"ours": 0.71, "PRB": 0.58, "AD-PT": 0.45},
+}
+
+
+def _parts(setting: Setting) -> list[Part]:
+    steps = setting.pick(4, 40, 60)
+    scenes = SCENES[-1:] if setting.scale == "smoke" else SCENES
+    parts = []
+    for scene in scenes:
+        scene.require(setting)
+        # What a step takes has nothing to do with how good photographs are.
+        shots = dataclasses.replace(
+            scene.capture_settings(setting), resolution=setting.pick(16, 64, 128), spp=1
+        )
+        config = scene.settings(setting)
+        parts.append(
+            Part(
+                scene.folder,
+                {"steps": steps, "methods": list(METHODS), "fit": dataclasses.asdict(config)}
+                | scene.described(setting, shots),
+                functools.partial(_measure, setting, scene, shots, config, steps),
+                setting.pick(15.0, 90.0, None),
+            )
+        )
+    return parts
+
+
+def _measure(
+    setting: Setting, scene: PaperScene, shots: CaptureSettings, config: FitConfig, steps: int
+) -> Found:
+    data = scene.captured(setting, shots)
+    contenders = [Contender.of(name) for name in METHODS.values()]
+    result = bench_methods(data, contenders, config, steps, None, setting.console)
+    kept = ("milliseconds_per_step", "error")
+    found = zip(METHODS, result["rows"], strict=True)
+    return {name: {k: row[k] for k in kept if k in row} for name, row in found}
+
+
+def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+    rows, lines = [], []
+    for scene in SCENES:
+        if scene.folder not in found:
+            continue
+        measured, theirs = found[scene.folder], PUBLISHED.get(scene.name, {})
+        times = {name: measured[name].get("milliseconds_per_step") for name in METHODS}
+        ours, cells = times["ours"], []
+        for name in METHODS:
+            row = {"scene": scene.label, "method": name, "milliseconds": times[name]}
+            if times[name] and ours:
+                row["times_ours"] = times[name] / ours
+            if name in theirs:
+                row["published_times_ours"] = theirs[name] / theirs["ours"]
+            rows.append(row | {"error": measured[name].get("error")})
+            if name != "ours":
+                cells.append(_ratio(row))
+        lines.append([scene.label, "failed" if ours is None else f"{ours:.0f} ms", *cells])
+    others = [f"{name} / ours" for name in METHODS if name != "ours"]
+    caption = "In brackets: the authors' bars, on their scenes and an RTX 3090.\n\n"
+    return Shown(
+        rows, caption + markdown(["scene", "ours", *others], lines), lambda path: _draw(path, rows)
+    )
+
+
+def _ratio(row: Mapping[str, Any]) -> str:
+    told = f"{row['times_ours']:.2f}" if "times_ours" in row else "failed"
+    return f"{told} ({row['published_times_ours']:.2f})" if "published_times_ours" in row else told
+
+
+def _draw(path: Path, rows: list[dict]) -> None:
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure = Figure(figsize=(1.2 + 1.1 * len(scenes), 3), layout="constrained")
+    panel = figure.subplots()
+    for number, method in enumerate(METHODS):
+        at = {
+            scenes.index(row["scene"]) + 0.16 * (number - 2): row
+            for row in rows
+            if row["method"] == method
+        }
+        mine = {x: row["times_ours"] for x, row in at.items() if "times_ours" in row}
+        panel.bar(list(mine), list(mine.values()), 0.15, label=method, color=f"C{number}")
+        theirs = {
+            x: row["published_times_ours"] for x, row in at.items() if "published_times_ours" in row
+        }
+        panel.plot(list(theirs), list(theirs.values()), "k_", markersize=7)
+    panel.set_xticks(range(len(scenes)), scenes, fontsize=7)
+    panel.set_ylabel("time of a step / ours\n(–: the authors')")
+    panel.legend(fontsize=7)
+    save_figure(figure, path)
+
+
+EXPERIMENT = Experiment(
+    "fig3", "Time of a step, scene by scene (Fig. 3)", _parts, _show, plots=True
+)

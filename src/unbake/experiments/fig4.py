@@ -1,0 +1,319 @@
+"""Figure 4: the gradients of a roughness in STAIRCASE, and which of them each method misses."""
+
+from __future__ import annotations
+
+import csv
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import mitsuba as mi
+import numpy as np
+
+from ..data.batches import CameraRays
+from ..data.camera import Camera
+from ..data.scene import ParsedScene, parse
+from ..errors import UserError
+from ..imaging.pictures import false_colour, montage, shrink, tonemap, write_atomically, write_png
+from ..transport.render import render_radiance
+from ..transport.vertex import World
+from .derivatives import Estimates, estimate
+from .experiment import (
+    Experiment,
+    Found,
+    Part,
+    Setting,
+    Shown,
+    copy_file,
+    markdown,
+    save_figure,
+)
+from .scenes import STAIRCASE
+
+#: Roughness of the wood of stairs and picture frames: where it is, and where it should be.
+VALUES = tuple(round(0.2 + 0.05 * i, 2) for i in range(15))
+#: Longest paths of PRB, and differentiable bounces of ours.
+CUTS, LIVE = (2, 4, 10, 15, 30), (1, 2, 4)
+#: The wood's texture: its materials have no names.
+WOOD = "WoodPanel"
+#: All light, in practice: Russian roulette ends paths before.
+MAX_DEPTH = 40
+#: ε of the relative L2 loss.
+EPSILON = 0.01
+#: As columns of the figure.
+METHODS = (
+    "reference",
+    "direct",
+    *(f"PRB {depth}" for depth in CUTS),
+    *(f"ours, k = {k}" for k in LIVE),
+)
+#: The authors' values: method, current and target roughness, gradient.
+_PUBLISHED = Path(__file__).parent / "published" / "fig4.csv"
+
+
+@final
+@dataclass(frozen=True)
+class _Wood:
+    """STAIRCASE, seen as its authors did, and the roughness of its wood."""
+
+    world: World
+    rays: CameraRays
+    camera: Camera
+    assign: Callable[[mi.Float], None]
+
+    @staticmethod
+    def of(setting: Setting, shrunk: int) -> _Wood:
+        parsed = parse(STAIRCASE.unpacked(setting))
+        texture, found = mi.load_dict({"type": "uniform", "value": 0.5}), False
+        for node in parsed.principled_nodes():
+            if WOOD in _picture(parsed, node):
+                node.props["roughness"] = texture
+                found = True
+        if not found:
+            raise UserError(f"no material has a texture {WOOD!r}", parsed.path)
+        scene = parsed.instantiate()
+        parameters = mi.traverse(texture)
+
+        def assign(value: mi.Float) -> None:
+            parameters["value"] = value
+            parameters.update()
+
+        camera = Camera.from_mitsuba(scene.sensors()[0])
+        camera = camera.rescaled(camera.width // shrunk, camera.height // shrunk)
+        world = World.of(scene, None, 8)
+        return _Wood(world, CameraRays.of([camera]), camera, assign)
+
+    def estimate(self, value: float, spp: int, seed: int) -> Estimates:
+        return estimate(
+            self.world,
+            self.assign,
+            value,
+            self.rays.through,
+            self.rays.pixels,
+            spp,
+            seed=seed,
+            max_depth=MAX_DEPTH,
+            cut=CUTS,
+            live=LIVE,
+        )
+
+
+def _picture(parsed: ParsedScene, node: object) -> str:
+    """The file of a material's albedo, empty if it is no picture."""
+    colour = node.props["base_color"]
+    if not isinstance(colour, mi.Properties.ResolvedReference):
+        return ""
+    texture = parsed.state.nodes[colour.index()].props
+    return str(texture["filename"]) if "filename" in texture else ""
+
+
+# ------------------------------------------------------------------------------------------- parts
+
+
+def _parts(setting: Setting) -> list[Part]:
+    STAIRCASE.require(setting)
+    known = {"max_depth": MAX_DEPTH, "albedo_power": STAIRCASE.albedo_power}
+    table = {"shrunk": setting.pick(80, 16, 8), "spp": setting.pick(4, 256, 1024)}
+    picture = {"shrunk": setting.pick(80, 6, 2), "spp": setting.pick(4, 64, 1024)}
+    parts = [
+        Part(
+            _arrays(setting, value).stem,
+            table | known | {"value": value},
+            functools.partial(_at, setting, value, **table),
+            setting.pick(15.0, 32.0, None),
+            files=[_arrays(setting, value)],
+        )
+        for value in _values(setting)
+    ]
+    work = functools.partial(_pictures, setting, **picture)
+    seconds = setting.pick(15.0, 60.0, None)
+    return [
+        *parts,
+        Part("pictures", picture | known, work, seconds, files=[_picture_file(setting)]),
+    ]
+
+
+def _values(setting: Setting) -> tuple[float, ...]:
+    return VALUES[::7] if setting.scale == "smoke" else VALUES
+
+
+def _arrays(setting: Setting, value: float) -> Path:
+    return setting.work / "fig4" / f"value-{value:.2f}.npz"
+
+
+def _picture_file(setting: Setting) -> Path:
+    return setting.work / "fig4" / "pictures.png"
+
+
+def _at(setting: Setting, value: float, shrunk: int, spp: int) -> Found:
+    """Images and derivatives of all methods at one roughness, kept as an array beside the part.
+
+    Two independent passes: an error from one and a derivative from the other make an unbiased
+    gradient. The target, from a third one, has no noise in common with either.
+    """
+    wood = _Wood.of(setting, shrunk)
+    a, b = (wood.estimate(value, spp, seed) for seed in (1, 2))
+    wood.assign(mi.Float(value))
+    target = render_radiance(
+        wood.world,
+        wood.rays.through,
+        wood.rays.pixels,
+        4 * spp,
+        seed=3,
+        max_depth=MAX_DEPTH,
+        rr_depth=5,
+        see_lights=True,
+    )
+    arrays = {"target": target}
+    for name, e in (("a", a), ("b", b)):
+        for method, (image, derivative) in _methods(e).items():
+            arrays[f"{name} {method} image"] = image.astype(np.float32)
+            arrays[f"{name} {method} derivative"] = derivative.astype(np.float32)
+    file = _arrays(setting, value)
+    write_atomically(file, lambda path: _save(path, arrays))
+    return {"file": file.name}
+
+
+def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with open(path, "wb") as file:  # numpy would add its own ending to a name
+        np.savez(file, **arrays)
+
+
+def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What each method takes for the image, and for its derivative."""
+    found = {"reference": (e.image, e.derivative), "direct": e.cut[2]}
+    found |= {f"PRB {depth}": e.cut[depth] for depth in CUTS}
+    return found | {f"ours, k = {k}": (e.image, e.live[k]) for k in LIVE}
+
+
+def _pictures(setting: Setting, shrunk: int, spp: int) -> Found:
+    """The first row of the figure: derivatives at a roughness of 0.5."""
+    wood = _Wood.of(setting, shrunk)
+    e = wood.estimate(0.5, spp, 1)
+    shape = (wood.camera.height, wood.camera.width, 3)
+    found = {m: np.abs(d).mean(-1).reshape(shape[:2]) for m, (_, d) in _methods(e).items()}
+    # A few paths of much light would hide all the others: means of small blocks, where there is
+    # room for it, and a scale that most pixels of the reference stay below.
+    longest = max(shape[:2]) // 2 if setting.scale != "smoke" else max(shape[:2])
+    found = {method: shrink(picture, longest) for method, picture in found.items()}
+    scale = max(float(np.percentile(found["reference"], 95)), 1e-6)
+    cells = [shrink(tonemap(e.image.reshape(shape)).astype(float), longest).astype(np.uint8)]
+    cells += [false_colour(picture, scale) for picture in found.values()]
+    half = -(-len(cells) // 2)
+    write_png(_picture_file(setting), montage([cells[:half], cells[half:]]))
+    return {"shown": ["image", *found], "scale": scale}
+
+
+# ------------------------------------------------------------------------------------------- table
+
+
+def gradient_table(
+    arrays: Mapping[float, Mapping[str, np.ndarray]], method: str
+) -> tuple[list[float], np.ndarray]:
+    """Gradients of the relative L2 loss by the parameter, (current, target), of a method.
+
+    Paper: Eq. 6, Sec. 5.2, 5.4.
+    """
+    values = sorted(arrays)
+    table = np.zeros((len(values), len(values)))
+    for i, current in enumerate(values):
+        found = arrays[current]
+        for j, wanted in enumerate(values):
+            target = arrays[wanted]["target"]
+            weight = 2 / (target.astype(np.float64) ** 2 + EPSILON)
+            for one, other in ("ab", "ba"):
+                error = found[f"{one} {method} image"] - target
+                table[i, j] += 0.5 * (weight * error * found[f"{other} {method} derivative"]).mean()
+    return values, table
+
+
+def agreement(values: list[float], table: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """How a table of gradients agrees with the reference.
+
+    Returns:
+        relative_rmse: √(mean squared difference / mean squared reference). correlation. slope: of
+        the line through zero that fits the table best. sign_agreement: share of entries off the
+        diagonal whose signs are the same. diagonal: mean magnitude where current and target are
+        equal and there should be no gradient, relative to the root mean square of the reference.
+    """
+    size = np.sqrt((reference**2).mean())
+    off = ~np.eye(len(values), dtype=bool)
+    return {
+        "relative_rmse": float(np.sqrt(((table - reference) ** 2).mean()) / size),
+        "correlation": float(np.corrcoef(table.ravel(), reference.ravel())[0, 1]),
+        "slope": float((table * reference).sum() / (reference**2).sum()),
+        "sign_agreement": float((np.sign(table) == np.sign(reference))[off].mean()),
+        "diagonal": float(np.abs(np.diag(table)).mean() / size),
+    }
+
+
+def published_tables() -> dict[str, tuple[list[float], np.ndarray]]:
+    """The tables that the authors published, as `gradient_table` returns them."""
+    cells: dict[str, dict[tuple[float, float], float]] = {method: {} for method in METHODS}
+    with open(_PUBLISHED, encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines):
+            place = float(row["current"]), float(row["target"])
+            cells[row["method"]][place] = float(row["gradient"])
+    tables = {}
+    for method, known in cells.items():
+        values = sorted({current for current, _ in known})
+        tables[method] = values, np.array([[known[c, t] for t in values] for c in values])
+    return tables
+
+
+def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+    copy_file(_picture_file(setting), setting.out / "fig4")
+    arrays = {}
+    for value in _values(setting):
+        with np.load(_arrays(setting, value)) as file:
+            arrays[value] = dict(file)
+    tables = {method: gradient_table(arrays, method) for method in METHODS}
+    theirs = published_tables()
+    rows, lines = [], []
+    for method, (values, table) in tables.items():
+        mine = agreement(values, table, tables["reference"][1])
+        their = agreement(*theirs[method], theirs["reference"][1])
+        rows.append({"method": method} | mine | {f"published_{k}": v for k, v in their.items()})
+        digits = {k: 3 if k == "diagonal" else 2 for k in mine}
+        told = (f"{mine[k]:.{digits[k]}f} ({their[k]:.{digits[k]}f})" for k in mine)
+        lines.append([method, *told])
+    titles = ["method", "relative RMSE", "correlation", "slope", "sign agreement", "diagonal"]
+    caption = "In brackets: the same of the authors' published table.\n\n"
+    everything = [
+        {"method": m, "current": c, "target": t, "gradient": float(table[i, j])}
+        for m, (values, table) in tables.items()
+        for i, c in enumerate(values)
+        for j, t in enumerate(values)
+    ]
+    return Shown(
+        [*rows, *everything],
+        caption + markdown(titles, lines),
+        lambda path: _draw(path, tables, theirs),
+    )
+
+
+def _draw(path: Path, tables: Mapping, theirs: Mapping) -> None:
+    from matplotlib.figure import Figure
+
+    rows = [("here", tables), ("published", theirs)]
+    figure = Figure(figsize=(1.5 * len(METHODS), 1.7 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), len(METHODS), squeeze=False)
+    for line, (title, shown) in zip(panels, rows, strict=True):
+        most = np.abs(shown["reference"][1]).max()
+        for panel, method in zip(line, METHODS, strict=True):
+            values, table = shown[method]
+            edges = (values[0], values[-1], values[0], values[-1])
+            panel.imshow(table, cmap="RdBu", vmin=-most, vmax=most, origin="lower", extent=edges)
+            panel.set_title(method, fontsize=8)
+            panel.tick_params(labelsize=6)
+        line[0].set_ylabel(f"{title}\ncurrent", fontsize=7)
+    for panel in panels[-1]:
+        panel.set_xlabel("target", fontsize=7)
+    save_figure(figure, path)
+
+
+EXPERIMENT = Experiment(
+    "fig4", "Gradients of a roughness in STAIRCASE (Fig. 4)", _parts, _show, plots=True
+)

@@ -1,0 +1,239 @@
+"""Figure 5: time and memory of a step in the cube, as paths get longer."""
+
+from __future__ import annotations
+
+import gc
+import math
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import final
+
+import drjit as dr
+
+from ..config import DenseGridConfig, FitConfig, PathConfig, PriorName
+from ..data.capture import CaptureSettings, capture
+from ..data.procedural import write_scene
+from ..data.scene import parse, to_principled, write
+from ..data.views import Dataset
+from ..errors import UserError
+from ..fit.memory import peak_bytes
+from ..fit.step import lacks_memory
+from ..results.bench import Begun, begin
+from ..results.contender import Contender
+from .experiment import Experiment, Found, Part, Setting, Shown, digest, markdown, save_figure
+from .table2 import PUBLISHED as PATHS
+
+
+@final
+@dataclass(frozen=True)
+class _Curve:
+    """A method of the figure."""
+
+    name: str
+    contender: str
+    prior: PriorName = "extra-bounce"
+    #: Whether the path's loop is one kernel (a mega kernel) or one for each bounce. Ours and AD-PT
+    #: have no loop.
+    symbolic: bool = True
+    #: Milliseconds of a step that the authors' figure shows, at first and at last; RTX 3090, 256²
+    #: pixels x 16 samples, grids of 256³.
+    published: str = ""
+
+
+CURVES = (
+    _Curve("ours", "ours:grid", published="110, mega kernels 98"),
+    _Curve("one bounce", "ours:grid", "one-bounce", published="75, mega kernels 64"),
+    _Curve("PRB, one kernel", "prb:grid", published="up to 531"),
+    _Curve("PRB, a kernel a bounce", "prb:grid", symbolic=False, published="up to 4272"),
+    _Curve("AD-PT", "ad-pt:grid", published="1742 at 0.95, then out of memory"),
+)
+#: How often methods take turns.
+TURNS = 2
+
+
+def _parts(setting: Setting) -> list[Part]:
+    albedos = setting.pick([0.3, 0.7], list(PATHS), list(PATHS))
+    cost = {0.3: 40, 0.5: 45, 0.7: 60, 0.9: 130, 0.95: 220, 0.97: 330}
+    settings = {
+        "grid": setting.pick(8, 64, 256),
+        "pixels": setting.pick(64, 1024, 65536),
+        "spp": setting.pick(4, 16, 16),
+        "steps": setting.pick(2, 6, 10),
+    }
+    return [
+        Part(
+            f"albedo-{albedo}",
+            settings | {"albedo": albedo, "max_depth": PATHS[albedo][0]},
+            lambda albedo=albedo: _measure(setting, albedo, **settings),
+            setting.pick(8.0, cost[albedo], None),
+        )
+        for albedo in albedos
+    ]
+
+
+def _measure(
+    setting: Setting, albedo: float, *, grid: int, pixels: int, spp: int, steps: int
+) -> Found:
+    dataset = _cube(setting, albedo)
+    shared = FitConfig(
+        pixels=pixels,
+        spp=spp,
+        radiance_spp=0,
+        radiance_representation="grid",
+        grid=DenseGridConfig(albedo=grid, roughness=grid, radiance=grid),
+        path=PathConfig(max_depth=PATHS[albedo][0], rr_depth=1),
+    )
+    found: Found = {curve.name: {"seconds": []} for curve in CURVES}
+    for turn in range(TURNS):
+        for curve in CURVES:
+            row = found[curve.name]
+            if "error" in row:
+                continue
+            config = Contender.of(curve.contender).settings(shared)
+            if config.method == "ours":
+                config = replace(config, prior=curve.prior)
+            try:
+                with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, curve.symbolic):
+                    times, memory = _steps(dataset, config, albedo, steps, frozen=curve.symbolic)
+            except (UserError, RuntimeError) as error:
+                if isinstance(error, RuntimeError) and not lacks_memory(error):
+                    raise
+                row["error"] = str(error)
+                setting.tell(f"albedo {albedo}, {curve.name}: {error}")
+                continue
+            row["seconds"] += times
+            row["memory"] = memory
+            told = f"{1e3 * statistics.median(times):.0f} ms"
+            setting.tell(f"turn {turn + 1}, albedo {albedo}, {curve.name}: {told}")
+    return found
+
+
+def _cube(setting: Setting, albedo: float) -> Dataset:
+    """A small data set of the cube, whose walls scatter as diffuse ones do.
+
+    What is unknown is the albedo of `principled` BSDFs. Without their specular lobe, and with the
+    roughness of a half that fields start with, they are nearly Lambertian: paths are as long as in
+    Table 2, which they would not be otherwise.
+    """
+    small = CaptureSettings(views=8, held_out=0, resolution=32, spp=4, max_depth=16)
+    folder = setting.work / "data" / f"cube-{albedo}-{digest(asdict(small))}"
+    if not folder.exists():
+        scenes = setting.work / "scenes"
+        scene = parse(write_scene("cube", scenes / f"cube-{albedo}", albedo=albedo))
+        to_principled(scene)
+        for node in scene.principled_nodes():
+            node.props["roughness"] = 0.5
+            node.props["specular"] = 0.0
+            node.props["main_specular_sampling_rate"] = 0.0
+        matte = scenes / f"cube-{albedo}-matte"
+        matte.mkdir(parents=True, exist_ok=True)
+        path = write(scene, matte)
+        capture(str(path), folder, small, tell=lambda line: None)
+    return Dataset.load(folder)
+
+
+def _steps(
+    dataset: Dataset, config: FitConfig, albedo: float, steps: int, *, frozen: bool
+) -> tuple[list[float], int | None]:
+    """Seconds of steps after warm-up, and the bytes that one needs beyond what a fit always holds.
+
+    Loops that are evaluated cannot be recorded, so that such steps are traced each time.
+    """
+    gc.collect()
+    dr.flush_malloc_cache()
+    fit = begin(dataset, config)
+    _paint(fit, albedo)
+    still = dict.fromkeys(("albedo", "roughness", "radiance"), 0.0)
+
+    def step(number: int) -> None:
+        if frozen:
+            fit.step(fit.state, number, still)
+        else:
+            fit.state.set_learning_rates(still)
+            fit.step.unfrozen(fit.state, number)
+        dr.sync_thread()
+
+    for number in range(4):
+        step(number)
+    memory = peak_bytes(lambda: step(4))
+    times = []
+    for number in range(5, 5 + steps):
+        start = time.perf_counter()
+        step(number)
+        times.append(time.perf_counter() - start)
+    return times, memory
+
+
+def _paint(fit: Begun, albedo: float) -> None:
+    """Let the albedo's grid say what the walls are: it decides how long paths are."""
+    raw = math.log(albedo / (1 - albedo))
+    for name, value in list(fit.state.phi.items()):
+        if name.startswith("albedo"):
+            fit.state.phi[name] = dr.full(type(value), raw, value.shape)
+
+
+def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+    rows = []
+    for part, methods in found.items():
+        good = {name: m for name, m in methods.items() if "error" not in m}
+        seconds = {name: statistics.median(m["seconds"]) for name, m in good.items()}
+        for name, measured in methods.items():
+            row = {"albedo": float(part.removeprefix("albedo-")), "method": name}
+            if name in good:
+                memory = measured["memory"]
+                row["milliseconds"] = 1e3 * seconds[name]
+                row["times_ours"] = seconds[name] / seconds["ours"] if "ours" in good else None
+                row["memory_mb"] = None if memory is None else memory / 1e6
+            rows.append(row | {"error": measured.get("error")})
+    albedos = sorted({row["albedo"] for row in rows})
+    tables = []
+    for title, key, digits in (
+        ("Milliseconds of a step", "milliseconds", 0),
+        ("As multiples of ours", "times_ours", 2),
+        ("Memory that a step takes, MB", "memory_mb", 0),
+    ):
+        lines = []
+        for curve in CURVES:
+            mine = {row["albedo"]: row for row in rows if row["method"] == curve.name}
+            line = [curve.name, *(_cell(mine[albedo], key, digits) for albedo in albedos)]
+            lines.append([*line, curve.published] if key == "milliseconds" else line)
+        titles = ["method", *(f"{albedo:g}" for albedo in albedos)]
+        titles += ["the authors'"] if key == "milliseconds" else []
+        tables.append(f"{title}, at an albedo of:\n\n{markdown(titles, lines)}")
+    return Shown(rows, "\n\n".join(tables), lambda path: _draw(path, rows))
+
+
+def _cell(row: Mapping[str, object], key: str, digits: int) -> str | None:
+    if row["error"]:
+        return "out of memory" if "memory" in str(row["error"]) else "failed"
+    value = row.get(key)
+    return None if value is None else f"{value:.{digits}f}"
+
+
+def _draw(path: Path, rows: list[dict]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    panels = figure.subplots(1, 2)
+    for number, curve in enumerate(CURVES):
+        mine = [row for row in rows if row["method"] == curve.name]
+        for panel, key in zip(panels, ("milliseconds", "memory_mb"), strict=True):
+            known = [row for row in mine if row.get(key) is not None]
+            x, y = [row["albedo"] for row in known], [row[key] for row in known]
+            panel.plot(x, y, color=f"C{number}", marker=".", label=curve.name)
+            lost = [row["albedo"] for row in mine if row["error"]]
+            if lost and y:
+                panel.plot(lost, [max(y)] * len(lost), "x", color=f"C{number}")
+    for panel, title in zip(panels, ("ms a step", "MB that a step takes"), strict=True):
+        panel.set(xlabel="albedo of the walls", ylabel=title, yscale="log")
+        panel.grid(alpha=0.3)
+    panels[1].legend(fontsize=7)
+    save_figure(figure, path)
+
+
+EXPERIMENT = Experiment(
+    "fig5", "A step in the cube as paths get longer (Fig. 5)", _parts, _show, plots=True
+)

@@ -1,0 +1,84 @@
+"""Figures 1 and 6: what every method makes of the eight scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ..imaging.pictures import write_png
+from .experiment import Experiment, Found, Part, Setting, Shown, markdown
+from .ladder import MATERIALS, QUALITIES, Ladder, at_equal_samples, decibels, lasting
+from .scenes import SCENES, PaperScene
+
+#: Columns of the figure.
+METHODS = {"direct": "direct", "PRB": "prb", "ours": "ours", "no prior": "no-prior"}
+#: Held-out views that are shown of each scene.
+VIEWS = (0, 1)
+
+
+def ladder_of(setting: Setting, scene: PaperScene, methods: Sequence[str]) -> Ladder:
+    """Fits of a scene by methods, as long as cpu scale has time for, or as the paper's."""
+    config = lasting(
+        scene.settings(setting),
+        setting.pick(0.0, 120.0 if scene.room else 60.0, 0.0),
+        steps=setting.pick(6, 1, scene.steps),
+        score_seconds=setting.pick(0.2, 10.0, 60.0),
+    )
+    return Ladder(scene, list(methods), config, spp=setting.pick(2, 32, 128))
+
+
+def _ladders(setting: Setting) -> list[Ladder]:
+    scenes = SCENES[-1:] if setting.scale == "smoke" else SCENES
+    return [ladder_of(setting, scene, list(METHODS.values())) for scene in scenes]
+
+
+def _parts(setting: Setting) -> list[Part]:
+    parts = []
+    for ladder in _ladders(setting):
+        parts += [
+            ladder.scene.capture(setting),
+            ladder.part(setting, setting.pick(2.0, 30.0, None)),
+        ]
+    return parts
+
+
+def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+    rows = []
+    for ladder in _ladders(setting):
+        scene = ladder.scene
+        methods = found[scene.folder]
+        equal = at_equal_samples(methods)
+        write_png(setting.out / "fig6" / f"{scene.folder}.png", ladder.picture(setting, VIEWS))
+        for title, method in METHODS.items():
+            row = methods[method]
+            head = {"scene": scene.label, "method": title}
+            length = {k: row[k] for k in ("steps", "samples", "seconds")}
+            same = {f"{k}_at_equal_samples": v for k, v in equal[method].items()}
+            *views, mean = ladder.qualities(setting, method, row)
+            rows.append(head | mean | length | same)
+            rows += [head | views[number] for number in VIEWS]
+    return Shown(rows, _tables(rows))
+
+
+def _tables(rows: list[dict]) -> str:
+    means = {(r["scene"], r["method"]): r for r in rows if "steps" in r}
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    samples = [f"{quality}_at_equal_samples" for quality in MATERIALS]
+    tables = []
+    for title, keys in (
+        ("Equal time: albedo / roughness / rendering", QUALITIES),
+        ("Equal samples: albedo / roughness", samples),
+    ):
+        lines = [
+            [scene, *(" / ".join(decibels(means[scene, m].get(k)) for k in keys) for m in METHODS)]
+            for scene in scenes
+        ]
+        table = markdown(["scene", *METHODS], lines)
+        tables.append(f"{title}; PSNR in dB, mean over held-out views\n\n{table}")
+    lines = [
+        [scene, *(f"{means[scene, m]['samples'] / 1e6:.0f} M" for m in METHODS)] for scene in scenes
+    ]
+    tables.append(f"Samples in equal time\n\n{markdown(['scene', *METHODS], lines)}")
+    return "\n\n".join(tables)
+
+
+EXPERIMENT = Experiment("fig6", "Materials of the eight scenes (Fig. 1, 6)", _parts, _show)

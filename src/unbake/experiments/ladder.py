@@ -1,0 +1,191 @@
+"""Methods against each other on the paper's scenes: what Figures 6, 7 and 8 have in common."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from ..config import FitConfig
+from ..data.jsonfile import read_json
+from ..data.views import Dataset, View
+from ..errors import UserError
+from ..imaging.metrics import mean_psnr, psnr
+from ..imaging.pictures import montage, read_exr, to_bytes, tonemap
+from ..results.compare import compare
+from ..results.contender import Contender
+from ..results.evaluate import EvaluationSettings
+from .experiment import Found, Part, Setting, digest
+from .scenes import PaperScene
+
+#: What is shown of a view, from top to bottom.
+SHOWN = ("render", "albedo", "roughness")
+MATERIALS = ("albedo_psnr", "roughness_psnr")
+QUALITIES = (*MATERIALS, "render_psnr")
+
+
+@final
+@dataclass(frozen=True)
+class Ladder:
+    """Methods that are fitted to a scene, and evaluated.
+
+    Args:
+        scene: what they see.
+        methods: of `unbake fit`, in the order of the picture's columns.
+        config: settings of all, with their length.
+        spp: samples a pixel of the final renderings.
+    """
+
+    scene: PaperScene
+    methods: Sequence[str]
+    config: FitConfig
+    spp: int
+
+    def settings(self, setting: Setting) -> dict[str, Any]:
+        """All that decides what is found."""
+        fits = {"methods": list(self.methods), "fit": asdict(self.config), "spp": self.spp}
+        return fits | self.scene.described(setting)
+
+    def runs(self, setting: Setting) -> Path:
+        """The folder of the runs: other settings have another one, experiments share it."""
+        described = self.scene.described(setting) | {"fit": asdict(self.config), "spp": self.spp}
+        return setting.work / "runs" / f"{self.scene.folder}-{digest(described)}"
+
+    def part(self, setting: Setting, seconds: float | None) -> Part:
+        """The part of an experiment that fits and evaluates them.
+
+        Args:
+            seconds: that compiling and evaluation take, a method.
+        """
+        work = functools.partial(self.fitted, setting)
+        many = len(self.methods)
+        known = None if seconds is None else many * seconds
+        waits = many * self.config.seconds
+        return Part(self.scene.folder, self.settings(setting), work, known, waits)
+
+    def fitted(self, setting: Setting) -> Found:
+        """Fit and evaluate, as `unbake compare` does; what was found of each method.
+
+        Raises:
+            UserError: a method failed. The same call goes on with it.
+        """
+        out = self.runs(setting)
+        result = compare(
+            self.scene.captured(setting),
+            [Contender.of(method) for method in self.methods],
+            out,
+            self.config,
+            evaluation=EvaluationSettings(spp=self.spp, train_views=0),
+            console=setting.console,
+        )
+        kept = ("steps", "samples", "seconds", "milliseconds_per_step", "heldout", "score")
+        found = {}
+        for method, row in result["methods"].items():
+            if "error" in row:
+                raise UserError(f"{method} failed: {row['error']}")
+            metrics = read_json(out / method / "evaluation" / "metrics.json")
+            found[method] = {k: row[k] for k in (*kept, "environment") if k in row}
+            found[method]["per_view"] = metrics["per_view"]
+        return found
+
+    def evaluation(self, setting: Setting, method: str) -> Path:
+        """The folder of a method's final renderings."""
+        return self.runs(setting) / method / "evaluation"
+
+    def heldout(self, setting: Setting, number: int) -> View:
+        """A held-out view."""
+        return self._dataset(setting).heldout[number]
+
+    def _dataset(self, setting: Setting) -> Dataset:
+        return Dataset.load(self.scene.data(setting))
+
+    def qualities(self, setting: Setting, method: str, row: Found) -> list[dict[str, Any]]:
+        """PSNRs of a method in each held-out view, and last their means over the views.
+
+        Renderings are multiplied by the photograph's `exposure` and clipped to [0,1]: other than
+        for `unbake evaluate`, a scene may be brighter than 1 all over.
+        """
+        rows = []
+        for view, known in zip(self._dataset(setting).heldout, row["per_view"], strict=True):
+            file = self.evaluation(setting, method) / view.split / f"{view.name}_render.exr"
+            photograph, found = read_exr(view.image), read_exr(file)[..., :3]
+            scale = exposure(photograph)
+            images = [np.clip(image[..., :3] * scale, 0, 1) for image in (found, photograph)]
+            rows.append(
+                {"views": view.name}
+                | {key: known[key] for key in MATERIALS}
+                | {"render_psnr": psnr(*images, _foreground(photograph))}
+            )
+        mean = {key: mean_psnr(r[key] for r in rows) for key in QUALITIES}
+        return [*rows, {"views": "mean of held-out"} | mean]
+
+    def picture(self, setting: Setting, views: Sequence[int]) -> np.ndarray:
+        """Held-out views as each method sees them, the truth on the right.
+
+        Args:
+            views: numbers of held-out views, each with rows for what is `SHOWN`.
+        """
+        sheet = []
+        for view in (self.heldout(setting, number) for number in views):
+            truth = {"render": view.image, "albedo": view.albedo, "roughness": view.roughness}
+            for what in SHOWN:
+                file = f"{view.split}/{view.name}_{what}.exr"
+                found = [self.evaluation(setting, method) / file for method in self.methods]
+                sheet.append([_cell(path, what, view) for path in (*found, truth[what])])
+        return montage(sheet)
+
+
+def lasting(config: FitConfig, seconds: float, *, steps: int, score_seconds: float) -> FitConfig:
+    """Settings of a fit of so many seconds, or of so many steps where that is zero."""
+    return dataclasses.replace(
+        config, seconds=seconds, steps=steps, score_seconds=score_seconds, checkpoint_seconds=120.0
+    )
+
+
+def at_equal_samples(found: Mapping[str, Found]) -> dict[str, dict[str, float | None]]:
+    """Scores of all methods when each had as many samples as the one that took the fewest.
+
+    Between two scores, PSNR is a straight line over samples.
+    """
+    fewest = min(row["samples"] for row in found.values())
+    at: dict[str, dict[str, float | None]] = {}
+    for method, row in found.items():
+        each = row["samples"] / row["steps"]
+        at[method] = {"samples": fewest}
+        for key in MATERIALS:
+            known = [(p["step"] * each, p[key]) for p in row["score"] if p.get(key) is not None]
+            x, y = zip(*known, strict=True) if known else ((), ())
+            at[method][key] = float(np.interp(fewest, x, y)) if known else None
+    return at
+
+
+def _cell(file: Path | None, what: str, view: View) -> np.ndarray:
+    """A picture in sRGB, renderings exposed as the photograph is; grey where there is none."""
+    if file is None or not file.is_file():
+        return np.full((view.camera.height, view.camera.width, 3), 128, np.uint8)
+    pixels = read_exr(file)
+    if what == "roughness":
+        return to_bytes(np.repeat(pixels[..., :1], 3, -1))
+    scale = exposure(read_exr(view.image)) if what == "render" else 1.0
+    return tonemap(scale * pixels[..., :3])
+
+
+def exposure(photograph: np.ndarray) -> float:
+    """What to multiply a picture with so that 95 % of the photograph's pixels are at most 1."""
+    seen = photograph[_foreground(photograph)][:, :3].max(-1)
+    return 1 / max(float(np.percentile(seen, 95)), 1e-6) if len(seen) else 1.0
+
+
+def _foreground(photograph: np.ndarray) -> np.ndarray:
+    shape = photograph.shape[:2]
+    return photograph[..., 3] >= 1 if photograph.shape[-1] == 4 else np.ones(shape, bool)
+
+
+def decibels(value: float | None) -> str:
+    """A PSNR as it stands in tables."""
+    return "—" if value is None else f"{value:.1f}"

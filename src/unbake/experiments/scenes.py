@@ -1,0 +1,344 @@
+"""The paper's scenes, or what stands in for them, and their data sets."""
+
+from __future__ import annotations
+
+import hashlib
+import lzma
+import shutil
+import tarfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, final
+
+import mitsuba as mi
+import numpy as np
+
+from ..config import FitConfig, from_toml
+from ..data.capture import CaptureSettings, capture
+from ..data.scene import ParsedScene, parse, to_principled, write
+from ..data.views import Dataset
+from ..errors import UserError
+from ..imaging.pictures import read_exr, tonemap, write_exr, write_png
+from .experiment import Found, Part, Setting, digest
+
+_CAMERAS = Path(__file__).parent / "cameras"
+
+#: Settings at cpu scale: rooms have finer grids and larger batches than single objects.
+_ROOM = """
+pixels = 2048
+learning_rate = 0.008
+radiance_learning_rate = 0.008
+loss_epsilon = 0.01
+preview_seconds = 600.0
+[albedo.grid]
+levels = 9
+table_log2 = 16
+[roughness.grid]
+levels = 6
+[radiance.grid]
+levels = 7
+table_log2 = 16
+"""
+_OBJECT = """
+pixels = 1024
+loss_epsilon = 0.01
+preview_seconds = 600.0
+[albedo.grid]
+levels = 8
+[roughness.grid]
+levels = 5
+"""
+_SMOKE = """
+pixels = 64
+spp = 4
+preview_seconds = 600.0
+[albedo]
+width = 8
+hidden = 1
+[albedo.grid]
+levels = 2
+table_log2 = 8
+[roughness]
+width = 8
+hidden = 1
+[roughness.grid]
+levels = 2
+table_log2 = 8
+[radiance]
+width = 8
+hidden = 1
+[radiance.grid]
+levels = 2
+table_log2 = 8
+"""
+
+
+@final
+@dataclass(frozen=True)
+class PaperScene:
+    """A scene of the paper.
+
+    Args:
+        name: in the paper.
+        folder: of the published scene, or its archive FOLDER.tar.xz; its camera file has the same
+            name.
+        file: of the scene in the folder.
+        room: whether cameras stand inside of it.
+        views: that are learned from; six more are held out.
+        steps: of the paper's fits.
+        spp: samples a pixel of photographs at cpu scale, more where light is hard to find: what is
+            too dark by chance weighs more in the relative loss than what is too bright.
+        stands_in: what is shown where the paper's scene is not published; empty: it is that scene.
+        albedo_power: every albedo is replaced by this power of it, below 1 to raise it, as the
+            authors did in STAIRCASE.
+        environment: an environment map to use instead of the scene's own, of `envmaps_blender`.
+    """
+
+    name: str
+    folder: str
+    file: str
+    room: bool
+    views: int
+    steps: int
+    spp: int = 64
+    stands_in: str = ""
+    albedo_power: float = 1.0
+    environment: str | None = None
+
+    @property
+    def label(self) -> str:
+        """The name in tables."""
+        return f"{self.name} ({self.stands_in})" if self.stands_in else self.name
+
+    @property
+    def cameras(self) -> Path:
+        """The camera file, with all training and held-out views."""
+        return _CAMERAS / f"{self.folder}.json"
+
+    @property
+    def lit_by(self) -> str | None:
+        """What stands in the place of the scene's own light, as it is known."""
+        return None if self.room else self.environment or "its own map, clamped at zero"
+
+    def require(self, setting: Setting) -> None:
+        """Find out whether the scene is there, before anything takes hours.
+
+        Raises:
+            UserError: it is not.
+        """
+        for name in (self.folder, "envmaps_blender") if self.environment else (self.folder,):
+            _found(setting, name)
+
+    def unpacked(self, setting: Setting) -> Path:
+        """The scene's XML file, of the published scene or of what was changed in it.
+
+        Raises:
+            UserError: the scene is not among the published ones at hand, or damaged.
+        """
+        source = _unpacked(setting, self.folder) / self.file
+        if not source.is_file():
+            raise UserError("the published scene lacks this file", source)
+        if self.room and self.albedo_power == 1.0:
+            return source
+        changes = {"power": self.albedo_power, "lit_by": self.lit_by}
+        changed = setting.work / "scenes" / f"{self.folder}-{digest(changes)}"
+        if not (changed / "scene.xml").is_file():
+            changed.mkdir(parents=True, exist_ok=True)
+            parsed = parse(source)
+            to_principled(parsed)
+            if self.albedo_power != 1.0:
+                _raise_albedo(parsed, self.albedo_power, changed)
+            if not self.room:
+                map_ = self.environment
+                map_ = map_ and _unpacked(setting, "envmaps_blender") / map_
+                _set_environment(parsed, map_, changed)
+            write(parsed, changed)
+        return changed / "scene.xml"
+
+    def settings(self, setting: Setting) -> FitConfig:
+        """The settings of fits, apart from method and length."""
+        match setting.scale:
+            case "smoke":
+                return from_toml(_SMOKE)
+            case "cpu":
+                return from_toml(_ROOM if self.room else _OBJECT)
+        pixels, spp = (16384, 16) if self.folder == "staircase" else (4096, 64)
+        return from_toml(f'preset = "paper"\npixels = {pixels}\nspp = {spp}\n')
+
+    def capture_settings(self, setting: Setting) -> CaptureSettings:
+        """How photographs are rendered."""
+        size = setting.pick(16, 256 if self.folder == "staircase" else 128, 512)
+        spp = setting.pick(4, self.spp, 8 * self.spp)
+        return CaptureSettings(resolution=size, spp=spp, max_depth=64)
+
+    def described(self, setting: Setting, shots: CaptureSettings | None = None) -> dict[str, Any]:
+        """All that decides what the data set is."""
+        return {
+            "photographs": asdict(shots or self.capture_settings(setting)),
+            "albedo_power": self.albedo_power,
+            "lit_by": self.lit_by,
+            "cameras": hashlib.sha256(self.cameras.read_bytes()).hexdigest(),
+        }
+
+    def data(self, setting: Setting, shots: CaptureSettings | None = None) -> Path:
+        """The folder of the scene's data set: other settings have another one."""
+        name = f"{self.folder}-{digest(self.described(setting, shots))}"
+        return setting.work / "data" / name
+
+    def captured(self, setting: Setting, shots: CaptureSettings | None = None) -> Path:
+        """The data set's folder, after it was rendered if it is not there."""
+        folder = self.data(setting, shots)
+        if not folder.exists():
+            capture(
+                str(self.unpacked(setting)),
+                folder,
+                shots or self.capture_settings(setting),
+                cameras=self.cameras,
+                tell=setting.tell,
+            )
+        return folder
+
+    def capture(self, setting: Setting) -> Part:
+        """The part of an experiment that renders the data set, if no other one has done it.
+
+        Raises:
+            UserError: the published scene is not at hand.
+        """
+        self.require(setting)
+        shots, folder = self.capture_settings(setting), self.data(setting)
+
+        def work() -> Found:
+            dataset = Dataset.load(self.captured(setting))
+            return {"train": len(dataset.train), "heldout": len(dataset.heldout)}
+
+        samples = (self.views + 6) * shots.resolution**2 * shots.spp
+        seconds = 1.0 if folder.exists() else 5 + samples / 600_000
+        return Part(
+            f"{self.folder}-data",
+            self.described(setting),
+            work,
+            setting.pick(seconds, seconds, None),
+            files=[folder / "transforms.json"],
+        )
+
+
+STAIRCASE = PaperScene(
+    "STAIRCASE",
+    "staircase",
+    "scene_principled.xml",
+    room=True,
+    views=26,
+    steps=18_000,
+    albedo_power=0.5,
+)
+SCENES = (
+    STAIRCASE,
+    PaperScene(
+        "KITCHEN", "kitchen", "scene_principled.xml", room=True, views=62, steps=32_000, spp=256
+    ),
+    PaperScene(
+        "LIVING ROOM",
+        "living-room-2",
+        "scene_principled.xml",
+        room=True,
+        views=64,
+        steps=32_000,
+        spp=192,
+    ),
+    PaperScene(
+        "VEACH DOOR",
+        "veach-ajar",
+        "scene_principled.xml",
+        room=True,
+        views=19,
+        steps=32_000,
+        spp=1024,
+    ),
+    PaperScene(
+        "LEGO",
+        "lego",
+        "scene_principled.xml",
+        room=False,
+        views=25,
+        steps=10_000,
+        environment="studio.exr",
+    ),
+    PaperScene(
+        "HOTDOG",
+        "vegboard",
+        "scene_mi3.xml",
+        room=False,
+        views=25,
+        steps=10_000,
+        stands_in="vegboard",
+    ),
+    PaperScene(
+        "FICUS", "plant", "scene_mi3.xml", room=False, views=25, steps=10_000, stands_in="plant"
+    ),
+    PaperScene("DRAGON", "dragon", "scene_mi3.xml", room=False, views=25, steps=10_000),
+)
+
+
+def _found(setting: Setting, name: str) -> Path:
+    """The folder of a published scene, or the archive where there is only that."""
+    folder, archive = setting.scenes / name, setting.scenes / f"{name}.tar.xz"
+    for place in (folder, setting.out / "work" / "published" / name):
+        if place.is_dir():
+            return place
+    if not archive.is_file():
+        remedy = "--scenes names a folder with the scenes, unpacked or as .tar.xz"
+        raise UserError(f"there is no published scene {name!r} here", setting.scenes, remedy)
+    return archive
+
+
+def _unpacked(setting: Setting, name: str) -> Path:
+    """The folder of a published scene; unpacks its archive where there is only that."""
+    found = _found(setting, name)
+    if found.is_dir():
+        return found
+    own = setting.out / "work" / "published" / name
+    partial = own.with_name(f"{name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        with tarfile.open(found) as file:
+            file.extractall(partial, filter="data")
+        (partial / name).rename(own)
+    except (tarfile.TarError, lzma.LZMAError, EOFError, OSError) as error:
+        what = f"the archive cannot be unpacked to a folder {name!r} ({error})"
+        raise UserError(what, found, "Get it again, or unpack it by hand") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return own
+
+
+def _raise_albedo(scene: ParsedScene, power: float, folder: Path) -> None:
+    """Replace every albedo, of colours and of bitmaps, by a power of it (linear)."""
+    for node in scene.principled_nodes():
+        colour = node.props["base_color"]
+        if not isinstance(colour, mi.Properties.ResolvedReference):
+            node.props["base_color"] = mi.ScalarColor3d([c**power for c in colour])
+            continue
+        texture = scene.state.nodes[colour.index()].props
+        if "filename" not in texture:
+            raise UserError("an albedo is a texture that is no bitmap", scene.path)
+        source = Path(texture["filename"])
+        raised = folder / "raised" / f"{colour.index()}-{source.stem}.png"
+        if source != raised:  # several materials may share a texture
+            rgb = (mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+            linear = np.array(mi.Bitmap(str(source)).convert(*rgb))
+            write_png(raised, tonemap(linear**power))
+        texture["filename"] = str(raised)
+
+
+def _set_environment(scene: ParsedScene, map_: Path | None, folder: Path) -> None:
+    """Let an environment map light the scene, or its own one, without negative texels."""
+    for node in scene.state.nodes:
+        if node.props.plugin_name() == "envmap":
+            file = map_ or Path(node.props["filename"])
+            texels = read_exr(file)[..., :3]
+            own = folder / "light" / file.name
+            write_exr(own, np.maximum(texels, 0))
+            node.props["filename"] = str(own)
+            return
+    raise UserError("the scene has no environment map to replace", scene.path)

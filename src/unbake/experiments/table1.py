@@ -1,0 +1,139 @@
+"""Table 1: the scenes, their views and how long their paths are."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..data.batches import CameraRays
+from ..data.camera import read_cameras
+from ..data.placement import coverage
+from ..data.scene import parse, to_principled
+from ..imaging.pictures import montage, tonemap, write_png
+from ..transport.render import parts_of, render_radiance
+from ..transport.series import path_lengths
+from ..transport.vertex import World
+from .experiment import Experiment, Found, Part, Setting, Shown, copy_file, markdown
+from .scenes import SCENES, PaperScene
+
+#: Scene: mean path length, views, samples a pixel, log2 of pixels a step (paper).
+PUBLISHED = {
+    "STAIRCASE": (4.74, 26, 16, 14),
+    "KITCHEN": (3.67, 62, 64, 12),
+    "LIVING ROOM": (4.10, 64, 64, 12),
+    "VEACH DOOR": (3.33, 19, 64, 12),
+    "LEGO": (2.32, 25, 64, 12),
+    "HOTDOG": (1.46, 25, 64, 12),
+    "FICUS": (1.43, 25, 64, 12),
+    "DRAGON": (1.26, 25, 64, 12),
+}
+#: The paper's paths: limited to 15, with a chance of 0.95 at most to survive Russian roulette.
+MAX_DEPTH, SURVIVAL = 15, 0.95
+
+
+def _parts(setting: Setting) -> list[Part]:
+    pixels, spp = setting.pick((8, 4), (64, 16), (128, 64))
+    scenes = SCENES[:1] if setting.scale == "smoke" else SCENES
+    parts = []
+    for scene in scenes:
+        scene.require(setting)
+        parts.append(
+            Part(
+                scene.folder,
+                {"pixels": pixels, "spp": spp} | scene.described(setting),
+                functools.partial(_measure, setting, scene, pixels, spp),
+                setting.pick(25.0, 30.0, None),
+                files=[_views(setting, scene)],
+            )
+        )
+    return parts
+
+
+def _views(setting: Setting, scene: PaperScene) -> Path:
+    return setting.work / "table1" / f"{scene.folder}.png"
+
+
+def _measure(setting: Setting, scene: PaperScene, pixels: int, spp: int) -> Found:
+    parsed = parse(scene.unpacked(setting))
+    to_principled(parsed)
+    loaded = parsed.instantiate()
+    world = World.of(loaded, None, 8)
+    posed = read_cameras(scene.cameras, pixels, pixels)
+    cameras = [camera for _, camera in posed]
+    rays = CameraRays.of(cameras)
+    lengths = [
+        np.array(
+            path_lengths(world, ray, seed, max_depth=MAX_DEPTH, rr_depth=2, most_likely=SURVIVAL)
+        )
+        for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
+    ]
+    image = render_radiance(
+        world, rays.through, rays.pixels, spp, seed=1, max_depth=16, rr_depth=5, see_lights=True
+    )
+    views = image.reshape(-1, pixels, pixels, 3)
+    across = 16
+    rows = [[tonemap(v) for v in views[i : i + across]] for i in range(0, len(views), across)]
+    write_png(_views(setting, scene), montage(rows))
+    lengths = np.concatenate(lengths)
+    trained = [camera for split, camera in posed if split == "train"]
+    return {
+        # Paths that see nothing at all are no paths.
+        "path_length": float(lengths[lengths > 0].mean(dtype=np.float64)),
+        "train": len(trained),
+        "heldout": len(posed) - len(trained),
+        "seen": coverage(loaded, trained),
+    }
+
+
+def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+    rows = []
+    for scene in SCENES:
+        if scene.folder not in found:
+            continue
+        copy_file(_views(setting, scene), setting.out / "table1")
+        config, shots = scene.settings(setting), scene.capture_settings(setting)
+        length, views, spp, batch = PUBLISHED[scene.name]
+        rows.append(
+            {"scene": scene.name, "label": scene.label}
+            | found[scene.folder]
+            | {"pixels": shots.resolution, "photograph_spp": shots.spp}
+            | {"spp": config.spp, "batch": config.pixels, "published_path_length": length}
+            | {"published_views": views, "published_spp": spp, "published_batch": 2**batch}
+            | {"published_steps": scene.steps}
+        )
+    table = markdown(
+        ["scene", "path length", "the paper", "views", "the paper", "held out", "surface seen"]
+        + [
+            "pixels a view",
+            "spp a step",
+            "the paper",
+            "pixels a step",
+            "the paper",
+            "the paper's steps",
+        ],
+        [
+            [
+                r["label"],
+                f"{r['path_length']:.2f}",
+                f"{r['published_path_length']:.2f}",
+                r["train"],
+                r["published_views"],
+                r["heldout"],
+                f"{100 * r['seen']:.0f} %",
+                f"{r['pixels']}²",
+                r["spp"],
+                r["published_spp"],
+                r["batch"],
+                r["published_batch"],
+                r["published_steps"],
+            ]
+            for r in rows
+        ],
+    )
+    return Shown(rows, table)
+
+
+EXPERIMENT = Experiment("table1", "Scenes, views and path lengths (Table 1)", _parts, _show)

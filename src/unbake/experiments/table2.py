@@ -1,0 +1,88 @@
+"""Table 2: how long the paths in a closed cube are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..data.batches import CameraRays
+from ..data.camera import Camera
+from ..data.procedural import default_cameras, write_scene
+from ..data.scene import parse
+from ..transport.render import parts_of
+from ..transport.series import path_lengths
+from ..transport.vertex import World
+from .experiment import Experiment, Found, Part, Setting, Shown, markdown
+
+#: Albedo: the longest path, and the mean, that the paper tells.
+PUBLISHED = {
+    0.3: (5, 1.43),
+    0.5: (7, 1.98),
+    0.7: (13, 3.30),
+    0.9: (42, 9.89),
+    0.95: (84, 19.76),
+    0.97: (140, 32.89),
+}
+#: So long that no path ends there.
+ENDLESS = 4096
+
+
+def _parts(setting: Setting) -> list[Part]:
+    pixels, spp = setting.pick((8, 32), (32, 64), (128, 64))
+    return [
+        Part(
+            f"albedo-{albedo}",
+            {"albedo": albedo, "pixels": pixels, "spp": spp},
+            lambda albedo=albedo: _measure(setting.work / "scenes", albedo, pixels, spp),
+            setting.pick(0.5, 1.5, None),
+        )
+        for albedo in PUBLISHED
+    ]
+
+
+def _measure(folder: Path, albedo: float, pixels: int, spp: int) -> Found:
+    """Lengths of the paths of a path tracer whose Russian roulette absorbs as the walls do."""
+    scene = parse(write_scene("cube", folder / f"cube-{albedo}", albedo=albedo)).instantiate()
+    world = World.of(scene, None, 0)
+    cameras = [
+        Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], pixels, pixels)
+        for c in default_cameras("cube", 8, 0)
+    ]
+    rays = CameraRays.of(cameras)
+    limit, _ = PUBLISHED[albedo]
+    found: Found = {"limit": limit}
+    for name, most in (("limited", limit), ("endless", ENDLESS)):
+        lengths = [
+            np.array(path_lengths(world, ray, seed, max_depth=most, rr_depth=2))
+            for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
+        ]
+        found[name] = float(np.concatenate(lengths).mean(dtype=np.float64))
+    return found
+
+
+def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+    rows = []
+    for albedo, (limit, mean) in PUBLISHED.items():
+        measured = found[f"albedo-{albedo}"]
+        rows.append(
+            {
+                "albedo": albedo,
+                "limit": limit,
+                "published": mean,
+                "mean": measured["limited"],
+                "expected": (1 - albedo**limit) / (1 - albedo),
+                "mean_without_limit": measured["endless"],
+                "expected_without_limit": 1 / (1 - albedo),
+            }
+        )
+    titles = ["albedo", "limit", "the paper", "mean", "(1 − ρⁿ) / (1 − ρ)"]
+    table = markdown(
+        [*titles, "mean, no limit", "1 / (1 − ρ)"],
+        [[r["albedo"], r["limit"], *(f"{x:.2f}" for x in list(r.values())[2:])] for r in rows],
+    )
+    return Shown(rows, table)
+
+
+EXPERIMENT = Experiment("table2", "Lengths of paths in the cube (Table 2)", _parts, _show)

@@ -1,0 +1,206 @@
+"""What experiments have in common: their parts are done once, and their findings are written."""
+
+import dataclasses
+import json
+import tarfile
+from functools import partial
+from typing import get_args
+
+import pytest
+from rich.console import Console
+
+from unbake.errors import UserError
+from unbake.experiments import Name, experiment, load
+from unbake.experiments.experiment import (
+    Experiment,
+    Part,
+    Setting,
+    Shown,
+    duration,
+    markdown,
+    reproduce,
+)
+from unbake.experiments.fig4 import agreement, published_tables
+from unbake.experiments.ladder import at_equal_samples
+from unbake.experiments.scenes import SCENES, STAIRCASE
+
+
+@pytest.fixture(autouse=True)
+def machine_of_reference(monkeypatch):
+    """Nothing is rendered to tell how fast this machine is."""
+    monkeypatch.setattr(experiment, "_slowness", lambda: 1.0)
+
+
+def setting(folder, **others) -> Setting:
+    return Setting("smoke", folder, folder, Console(quiet=True), **others)
+
+
+def squares(done: list, numbers=(2, 3), offset=0, files=(), plots=False) -> Experiment:
+    """An experiment that notes what it does."""
+
+    def work(number):
+        done.append(number)
+        for file in files:
+            file.touch()
+        return {"square": number**2 + offset}
+
+    def parts(_):
+        settings = {"offset": offset}
+        return [Part(f"of-{n}", settings, partial(work, n), 1.0, files=files) for n in numbers]
+
+    def show(_, found):
+        rows = [{"part": name} | f for name, f in found.items()]
+        return Shown(rows, markdown(["a", "b"], [[1, None]]))
+
+    return Experiment("squares", "Squares", parts, show, plots)
+
+
+def test_parts_that_are_done_are_not_done_again(tmp_path):
+    done = []
+    reproduce(squares(done), setting(tmp_path))
+    assert done == [2, 3]
+    reproduce(squares(done, (2, 3, 4)), setting(tmp_path))
+    assert done == [2, 3, 4]
+    data = json.loads((tmp_path / "squares" / "data.json").read_text())
+    assert [row["square"] for row in data["rows"]] == [4, 9, 16] and len(data["machines"]) == 1
+    assert (tmp_path / "squares" / "data.csv").read_text().splitlines()[1] == "of-2,4"
+    assert (tmp_path / "squares" / "table.md").read_text().endswith("| 1 | — |\n")
+
+
+def test_parts_with_other_settings_or_damaged_are_done_again(tmp_path):
+    done = []
+    reproduce(squares(done), setting(tmp_path))
+    reproduce(squares(done, offset=1), setting(tmp_path))
+    assert done == [2, 3, 2, 3]
+    (tmp_path / "work" / "smoke" / "squares" / "of-3.json").write_text("{")
+    reproduce(squares(done, offset=1), setting(tmp_path))
+    assert done == [2, 3, 2, 3, 3]
+
+
+def test_parts_whose_files_are_gone_are_done_again(tmp_path):
+    done, file = [], tmp_path / "picture.png"
+    reproduce(squares(done, files=[file]), setting(tmp_path))
+    reproduce(squares(done, files=[file]), setting(tmp_path))
+    assert done == [2, 3]
+    file.unlink()
+    reproduce(squares(done, files=[file]), setting(tmp_path))
+    assert done == [2, 3, 2, 3]
+
+
+def test_what_was_done_before_it_was_stopped_is_kept(tmp_path):
+    done = []
+
+    def stop():
+        raise KeyboardInterrupt
+
+    parts = [*squares(done).parts(None), Part("last", {}, stop, 1.0)]
+    stopped = Experiment("squares", "", lambda s: parts, squares(done).show)
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(stopped, setting(tmp_path))
+    assert not (tmp_path / "squares").exists()
+    reproduce(squares(done), setting(tmp_path))
+    assert done == [2, 3]
+
+
+def test_a_part_that_fails_does_not_keep_others_from_being_done(tmp_path):
+    done = []
+
+    def fail():
+        raise UserError("no luck", remedy="Try again")
+
+    parts = [Part("first", {}, fail, 1.0), *squares(done).parts(None)]
+    failing = Experiment("squares", "", lambda s: parts, squares(done).show)
+    with pytest.raises(UserError, match="squares, first: no luck. Try again"):
+        reproduce(failing, setting(tmp_path))
+    assert done == [2, 3] and not (tmp_path / "squares").exists()
+
+
+def test_figures_that_cannot_be_drawn_are_not_begun(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(experiment, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="matplotlib"):
+        reproduce(squares(done, plots=True), setting(tmp_path))
+    assert not done
+
+
+def test_a_plan_does_nothing(tmp_path):
+    done = []
+    reproduce(squares(done), setting(tmp_path), plan=True)
+    assert not done and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"), [(0.2, "1 s"), (75, "75 s"), (600, "10 min"), (9000, "2.5 h")]
+)
+def test_lengths_of_time_are_told_in_words(seconds, told):
+    assert duration(seconds) == told
+
+
+def test_scenes_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(UserError, match="'staircase'.*--scenes"):
+        STAIRCASE.capture(setting(tmp_path))
+    lego = next(scene for scene in SCENES if scene.name == "LEGO")
+    (tmp_path / "lego").mkdir()
+    with pytest.raises(UserError, match="'envmaps_blender'"):
+        lego.capture(setting(tmp_path))
+
+
+@pytest.mark.parametrize("damage", ["no archive", "cut off", "other folder"])
+def test_archives_that_are_damaged_are_named(tmp_path, damage):
+    archive = tmp_path / "staircase.tar.xz"
+    (tmp_path / "other").mkdir()
+    with tarfile.open(archive, "w:xz") as file:
+        file.add(tmp_path / "other", "other")
+    if damage != "other folder":
+        content = archive.read_bytes()
+        archive.write_bytes(b"nothing" if damage == "no archive" else content[: len(content) // 2])
+    with pytest.raises(UserError, match="staircase.tar.xz.*cannot be unpacked"):
+        STAIRCASE.unpacked(setting(tmp_path))
+    assert not list((tmp_path / "work" / "published").iterdir())
+
+
+def test_data_sets_of_other_settings_have_other_folders(tmp_path):
+    small = setting(tmp_path)
+    other = dataclasses.replace(STAIRCASE, albedo_power=0.8)
+    shots = dataclasses.replace(STAIRCASE.capture_settings(small), spp=7)
+    folders = {STAIRCASE.data(small), other.data(small), STAIRCASE.data(small, shots)}
+    assert len(folders) == 3 and STAIRCASE.data(small) == STAIRCASE.data(setting(tmp_path))
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.folder)
+def test_camera_files_hold_the_views_that_are_stated(scene):
+    cameras = json.loads(scene.cameras.read_text())["cameras"]
+    splits = [camera["split"] for camera in cameras]
+    assert splits.count("train") == scene.views and splits.count("heldout") == 6
+
+
+def test_scores_are_compared_at_the_samples_of_the_slowest():
+    def row(each, *scores):
+        curve = [
+            {"step": step, "albedo_psnr": psnr, "roughness_psnr": None} for step, psnr in scores
+        ]
+        return {"steps": scores[-1][0], "samples": each * scores[-1][0], "score": curve}
+
+    found = {
+        "fast": row(10, (0, 0.0), (100, 10.0), (200, 30.0)),
+        "slow": row(10, (0, 0.0), (150, 12.0)),
+    }
+    equal = at_equal_samples(found)
+    assert equal["fast"] == {"samples": 1500, "albedo_psnr": 20.0, "roughness_psnr": None}
+    assert equal["slow"]["albedo_psnr"] == 12.0
+
+
+def test_published_gradients_are_those_of_the_paper():
+    """Their table, as others have summarised it."""
+    tables = published_tables()
+    reference = tables["reference"][1]
+    told = {m: agreement(v, t, reference) for m, (v, t) in tables.items()}
+    direct = [round(v, 2) for v in list(told["direct"].values())[:4]]
+    assert direct == [0.87, 0.72, 0.74, 0.78]
+    errors = [told[f"ours, k = {k}"]["relative_rmse"] for k in (1, 2, 4)]
+    assert errors == sorted(errors, reverse=True)
+    assert told["reference"]["relative_rmse"] == 0
+
+
+def test_every_experiment_goes_by_its_name():
+    assert [load(name).name for name in get_args(Name)] == list(get_args(Name))

@@ -1,0 +1,115 @@
+"""Every experiment runs through at its smallest scale, and its files hold what they should."""
+
+import csv
+import json
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unbake.experiments.fig6 as fig6
+import unbake.experiments.fig7 as fig7
+import unbake.experiments.fig8 as fig8
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    """Experiments share their data sets."""
+    return tmp_path_factory.mktemp("reproduction")
+
+
+@pytest.fixture
+def rows(unbake, out):
+    """Reproduce: `rows(name, *options)` are the data that was written."""
+
+    def run(name, *options, figure=True) -> list[dict]:
+        done = unbake("reproduce", name, "--scale", "smoke", "--out", out, *options)
+        assert done.status == 0, done.err
+        assert "on this machine" in done.out or "parts are done" in done.out
+        folder = out / name
+        found = json.loads((folder / "data.json").read_text())["rows"]
+        table = (folder / "table.md").read_text()
+        assert table.count("| ---") >= 1 and table in done.out
+        with open(folder / "data.csv", encoding="utf-8", newline="") as file:
+            assert len(list(csv.DictReader(file))) == len(found)
+        if figure:
+            assert picture(folder / "figure.png").std() > 0
+        numbers = [v for row in found for v in row.values() if isinstance(v, float)]
+        assert numbers and all(map(math.isfinite, numbers))
+        return found
+
+    return run
+
+
+def picture(path) -> np.ndarray:
+    return np.array(mi.Bitmap(str(path)))
+
+
+def column(rows, key):
+    return [row[key] for row in rows]
+
+
+def test_table2_knows_how_long_paths_are(rows):
+    found = rows("table2", figure=False)
+    assert column(found, "albedo") == [0.3, 0.5, 0.7, 0.9, 0.95, 0.97]
+    for row in found:
+        assert row["mean"] == pytest.approx(row["expected"], rel=0.03)
+        assert row["mean_without_limit"] == pytest.approx(1 / (1 - row["albedo"]), rel=0.03)
+
+
+def test_fig5_ours_does_not_grow_and_differentiated_paths_do(rows):
+    found = rows("fig5")
+    kept = {(row["method"], row["albedo"]): row for row in found}
+    assert {albedo for _, albedo in kept} == {0.3, 0.7} and len(kept) == 10
+    assert not any(column(found, "error"))
+    ours, path = ([kept[m, a]["memory_mb"] for a in (0.3, 0.7)] for m in ("ours", "AD-PT"))
+    if None in ours + path:
+        pytest.skip("the memory that a step takes is not known here")
+    assert path[1] > 1.5 * path[0] and ours[1] - ours[0] < path[1] - path[0]
+
+
+def test_what_was_done_is_not_done_again(rows, unbake, out):
+    rows("table2", figure=False)
+    again = unbake("reproduce", "table2", "--scale", "smoke", "--out", out)
+    assert again.status == 0 and "all 6 parts are done" in again.out
+
+
+def test_table1_knows_the_scenes(rows, out, scenes_dir):
+    (row,) = rows("table1", "--scenes", scenes_dir, figure=False)
+    assert row["scene"] == "STAIRCASE" and (row["train"], row["heldout"]) == (26, 6)
+    assert 1 < row["path_length"] < 15 and row["seen"] > 0.9
+    assert picture(out / "table1" / "staircase.png").std() > 0
+
+
+def test_fig3_measures_every_method(rows, scenes_dir):
+    found = rows("fig3", "--scenes", scenes_dir)
+    assert column(found, "method") == ["ours", "no prior", "direct", "PRB", "AD-PT"]
+    assert min(column(found, "milliseconds")) > 0 and not any(column(found, "error"))
+
+
+def test_fig4_longer_paths_miss_less(rows, out, scenes_dir):
+    found = rows("fig4", "--scenes", scenes_dir)
+    told = {row["method"]: row for row in found if "relative_rmse" in row}
+    missed = [told[f"PRB {n}"]["relative_rmse"] for n in (4, 10, 15, 30)]
+    assert missed == sorted(missed, reverse=True) and missed[-1] < 0.05 < missed[0]
+    assert told["direct"]["relative_rmse"] > missed[2]
+    assert told["reference"]["sign_agreement"] == 1
+    assert len(found) == 10 + 10 * 3 * 3
+    assert picture(out / "fig4" / "pictures.png").std() > 0
+
+
+@pytest.mark.parametrize("figure", [fig6, fig7, fig8], ids=lambda f: f.EXPERIMENT.name)
+def test_ladders_fit_and_show_every_method(rows, out, scenes_dir, figure):
+    name = figure.EXPERIMENT.name
+    found = rows(name, "--scenes", scenes_dir, figure=figure is not fig6)
+    assert {row["method"] for row in found} >= set(
+        figure.METHODS if figure is fig6 else figure.METHODS.values()
+    )
+    means = [row for row in found if "steps" in row]
+    assert column(means, "steps") == [6] * len(figure.METHODS)
+    assert min(column(means, "render_psnr")) > 3
+    if figure is fig6:
+        assert len(found) == 3 * len(figure.METHODS)
+        shown = picture(out / name / "dragon.png")
+        assert shown.shape[1] > shown.shape[0] * 0.7 and shown.std() > 0
