@@ -35,7 +35,7 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
 
 
 def _parts(setting: Setting) -> list[Part]:
-    steps = setting.pick(4, 40, 60)
+    steps = setting.pick(4, 24, 60)
     scenes = SCENES[-1:] if setting.scale == "smoke" else SCENES
     parts = []
     for scene in scenes:

@@ -27,6 +27,8 @@ from .scenes import PaperScene
 SHOWN = ("render", "albedo", "roughness")
 MATERIALS = ("albedo_psnr", "roughness_psnr")
 QUALITIES = (*MATERIALS, "render_psnr")
+#: Width and height of a block of pixels that renderings are compared by.
+BLOCK = 4
 
 
 @final
@@ -107,19 +109,21 @@ class Ladder:
     def qualities(self, setting: Setting, method: str, row: Found) -> list[dict[str, Any]]:
         """PSNRs of a method in each held-out view, and last their means over the views.
 
-        Renderings are multiplied by the photograph's `exposure` and clipped to [0,1]: other than
-        for `unbake evaluate`, a scene may be brighter than 1 all over.
+        Renderings are means of blocks of pixels, multiplied by the photograph's `exposure` and
+        clipped to [0,1]. By itself, each pixel is mostly noise where light is hard to find, and
+        other than for `unbake evaluate`, a scene may be brighter than 1 all over.
         """
         rows = []
         for view, known in zip(self._dataset(setting).heldout, row["per_view"], strict=True):
             file = self.evaluation(setting, method) / view.split / f"{view.name}_render.exr"
             photograph, found = read_exr(view.image), read_exr(file)[..., :3]
             scale = exposure(photograph)
-            images = [np.clip(image[..., :3] * scale, 0, 1) for image in (found, photograph)]
+            images = [np.clip(_blocks(p[..., :3]) * scale, 0, 1) for p in (found, photograph)]
+            whole = _blocks(_foreground(photograph)[..., None].astype(float))[..., 0] >= 1
             rows.append(
                 {"views": view.name}
                 | {key: known[key] for key in MATERIALS}
-                | {"render_psnr": psnr(*images, _foreground(photograph))}
+                | {"render_psnr": psnr(*images, whole) if whole.any() else None}
             )
         mean = {key: mean_psnr(r[key] for r in rows) for key in QUALITIES}
         return [*rows, {"views": "mean of held-out"} | mean]
@@ -184,6 +188,13 @@ def exposure(photograph: np.ndarray) -> float:
 def _foreground(photograph: np.ndarray) -> np.ndarray:
     shape = photograph.shape[:2]
     return photograph[..., 3] >= 1 if photograph.shape[-1] == 4 else np.ones(shape, bool)
+
+
+def _blocks(pixels: np.ndarray) -> np.ndarray:
+    """Means of blocks; rows and columns that fill no block are left out."""
+    height, width = (size // BLOCK for size in pixels.shape[:2])
+    whole = pixels[: height * BLOCK, : width * BLOCK]
+    return whole.reshape(height, BLOCK, width, BLOCK, -1).mean((1, 3))
 
 
 def decibels(value: float | None) -> str:
