@@ -6,6 +6,7 @@ import tarfile
 from functools import partial
 from typing import get_args
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -20,7 +21,7 @@ from unbake.experiments.experiment import (
     markdown,
     reproduce,
 )
-from unbake.experiments.fig4 import agreement, published_tables
+from unbake.experiments.fig4 import agreement, published_tables, smoothed
 from unbake.experiments.ladder import at_equal_samples
 from unbake.experiments.scenes import SCENES, STAIRCASE
 
@@ -188,6 +189,24 @@ def test_scores_are_compared_at_the_samples_of_the_slowest():
     equal = at_equal_samples(found)
     assert equal["fast"] == {"samples": 1500, "albedo_psnr": 20.0, "roughness_psnr": None}
     assert equal["slow"]["albedo_psnr"] == 12.0
+
+
+def test_smoothing_keeps_cubics_and_takes_noise_away():
+    values = np.linspace(0.2, 0.9, 15)
+    rng = np.random.default_rng(3)
+    ramp = np.repeat(np.arange(4.0), 6)[:, None] * np.ones(3)  # 4 x 6 pixels
+    clean = {v: {"image": ramp + v**3 - v} for v in values}
+    noisy = {v: {"image": clean[v]["image"] + rng.normal(size=ramp.shape)} for v in values}
+    for value, found in smoothed(clean, 4, 6, 2).items():
+        rows = np.repeat([0.5, 2.5], 3) + value**3 - value
+        assert found["image"] == pytest.approx(np.repeat(rows[:, None], 3, 1))
+    off = [
+        found["image"] - clean["image"]
+        for found, clean in zip(
+            smoothed(noisy, 4, 6, 2).values(), smoothed(clean, 4, 6, 2).values(), strict=True
+        )
+    ]
+    assert np.std(off) == pytest.approx(0.5 * np.sqrt(4 / 15), rel=0.2)
 
 
 def test_published_gradients_are_those_of_the_paper():

@@ -40,6 +40,11 @@ CUTS, LIVE = (2, 4, 10, 15, 30), (1, 2, 4)
 WOOD = "WoodPanel"
 #: All light, in practice: Russian roulette ends paths before.
 MAX_DEPTH = 40
+#: By how much the scene's own film is divided for the table's loss, which compares images with the
+#: product of an error and a derivative: noise in both fades as pixels get larger.
+COARSE = 80
+#: Degree of the polynomials over the roughness that stand for the values of a pixel.
+DEGREE = 3
 #: ε of the relative L2 loss.
 EPSILON = 0.01
 #: As columns of the figure.
@@ -115,8 +120,9 @@ def _picture(parsed: ParsedScene, node: object) -> str:
 def _parts(setting: Setting) -> list[Part]:
     STAIRCASE.require(setting)
     known = {"max_depth": MAX_DEPTH, "albedo_power": STAIRCASE.albedo_power}
-    table = {"shrunk": setting.pick(80, 16, 8), "spp": setting.pick(4, 256, 1024)}
+    table = {"shrunk": _shrunk(setting), "spp": setting.pick(4, 256, 1024)}
     picture = {"shrunk": setting.pick(80, 6, 2), "spp": setting.pick(4, 64, 1024)}
+    picture["zoom"] = setting.pick(1, 3, 1)
     parts = [
         Part(
             _arrays(setting, value).stem,
@@ -133,6 +139,11 @@ def _parts(setting: Setting) -> list[Part]:
         *parts,
         Part("pictures", picture | known, work, seconds, files=[_picture_file(setting)]),
     ]
+
+
+def _shrunk(setting: Setting) -> int:
+    """By how much the scene's own film is divided in what is rendered for the table."""
+    return setting.pick(80, 16, 8)
 
 
 def _values(setting: Setting) -> tuple[float, ...]:
@@ -173,7 +184,7 @@ def _at(setting: Setting, value: float, shrunk: int, spp: int) -> Found:
             arrays[f"{name} {method} derivative"] = derivative.astype(np.float32)
     file = _arrays(setting, value)
     write_atomically(file, lambda path: _save(path, arrays))
-    return {"file": file.name}
+    return {"height": wood.camera.height, "width": wood.camera.width}
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -188,7 +199,7 @@ def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found | {f"ours, k = {k}": (e.image, e.live[k]) for k in LIVE}
 
 
-def _pictures(setting: Setting, shrunk: int, spp: int) -> Found:
+def _pictures(setting: Setting, shrunk: int, spp: int, zoom: int) -> Found:
     """The first row of the figure: derivatives at a roughness of 0.5."""
     wood = _Wood.of(setting, shrunk)
     e = wood.estimate(0.5, spp, 1)
@@ -201,6 +212,7 @@ def _pictures(setting: Setting, shrunk: int, spp: int) -> Found:
     scale = max(float(np.percentile(found["reference"], 95)), 1e-6)
     cells = [shrink(tonemap(e.image.reshape(shape)).astype(float), longest).astype(np.uint8)]
     cells += [false_colour(picture, scale) for picture in found.values()]
+    cells = [cell.repeat(zoom, 0).repeat(zoom, 1) for cell in cells]
     half = -(-len(cells) // 2)
     write_png(_picture_file(setting), montage([cells[:half], cells[half:]]))
     return {"shown": ["image", *found], "scale": scale}
@@ -209,10 +221,40 @@ def _pictures(setting: Setting, shrunk: int, spp: int) -> Found:
 # ------------------------------------------------------------------------------------------- table
 
 
+def smoothed(
+    arrays: Mapping[float, Mapping[str, np.ndarray]], height: int, width: int, block: int
+) -> dict[float, dict[str, np.ndarray]]:
+    """Means of blocks of pixels, and polynomials of them over the parameter, evaluated at it.
+
+    Args:
+        arrays: by value of the parameter, and by name: shape (height * width, 3).
+        block: rows and columns of a block.
+
+    Returns:
+        The same, of shape (blocks, 3).
+    """
+    values = sorted(arrays)
+    powers = np.vander(np.array(values) - np.mean(values), min(DEGREE + 1, len(values)))
+    onto = powers @ np.linalg.pinv(powers)
+    found: dict[float, dict[str, np.ndarray]] = {value: {} for value in values}
+    rows, columns = height // block, width // block
+    for key in arrays[values[0]]:
+        pixels = np.stack([arrays[value][key] for value in values]).astype(np.float64)
+        film = pixels.reshape(len(values), height, width, 3)[:, : rows * block, : columns * block]
+        means = film.reshape(len(values), rows, block, columns, block, 3).mean((2, 4))
+        for value, fit in zip(values, np.tensordot(onto, means, 1), strict=True):
+            found[value][key] = fit.reshape(-1, 3)
+    return found
+
+
 def gradient_table(
     arrays: Mapping[float, Mapping[str, np.ndarray]], method: str
 ) -> tuple[list[float], np.ndarray]:
     """Gradients of the relative L2 loss by the parameter, (current, target), of a method.
+
+    Args:
+        arrays: by value of the parameter, then by name: `target`, and `a` and `b`, the two passes,
+            followed by the method and `image` or `derivative`.
 
     Paper: Eq. 6, Sec. 5.2, 5.4.
     """
@@ -222,7 +264,7 @@ def gradient_table(
         found = arrays[current]
         for j, wanted in enumerate(values):
             target = arrays[wanted]["target"]
-            weight = 2 / (target.astype(np.float64) ** 2 + EPSILON)
+            weight = 2 / (target**2 + EPSILON)
             for one, other in ("ab", "ba"):
                 error = found[f"{one} {method} image"] - target
                 table[i, j] += 0.5 * (weight * error * found[f"{other} {method} derivative"]).mean()
@@ -269,6 +311,8 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
     for value in _values(setting):
         with np.load(_arrays(setting, value)) as file:
             arrays[value] = dict(file)
+    film = found[_arrays(setting, _values(setting)[0]).stem]
+    arrays = smoothed(arrays, film["height"], film["width"], COARSE // _shrunk(setting))
     tables = {method: gradient_table(arrays, method) for method in METHODS}
     theirs = published_tables()
     rows, lines = [], []
