@@ -27,8 +27,6 @@ from .scenes import PaperScene
 SHOWN = ("render", "albedo", "roughness")
 MATERIALS = ("albedo_psnr", "roughness_psnr")
 QUALITIES = (*MATERIALS, "render_psnr")
-#: Width and height of a block of pixels that renderings are compared by.
-BLOCK = 4
 
 
 @final
@@ -113,13 +111,14 @@ class Ladder:
         clipped to [0,1]. By itself, each pixel is mostly noise where light is hard to find, and
         other than for `unbake evaluate`, a scene may be brighter than 1 all over.
         """
-        rows = []
+        rows, size = [], setting.pick(1, 4, 4)
         for view, known in zip(self._dataset(setting).heldout, row["per_view"], strict=True):
             file = self.evaluation(setting, method) / view.split / f"{view.name}_render.exr"
             photograph, found = read_exr(view.image), read_exr(file)[..., :3]
             scale = exposure(photograph)
-            images = [np.clip(_blocks(p[..., :3]) * scale, 0, 1) for p in (found, photograph)]
-            whole = _blocks(_foreground(photograph)[..., None].astype(float))[..., 0] >= 1
+            images = [_blocks(p[..., :3], size) * scale for p in (found, photograph)]
+            images = [np.clip(image, 0, 1) for image in images]
+            whole = _blocks(_foreground(photograph)[..., None].astype(float), size)[..., 0] >= 1
             rows.append(
                 {"views": view.name}
                 | {key: known[key] for key in MATERIALS}
@@ -190,11 +189,11 @@ def _foreground(photograph: np.ndarray) -> np.ndarray:
     return photograph[..., 3] >= 1 if photograph.shape[-1] == 4 else np.ones(shape, bool)
 
 
-def _blocks(pixels: np.ndarray) -> np.ndarray:
-    """Means of blocks; rows and columns that fill no block are left out."""
-    height, width = (size // BLOCK for size in pixels.shape[:2])
-    whole = pixels[: height * BLOCK, : width * BLOCK]
-    return whole.reshape(height, BLOCK, width, BLOCK, -1).mean((1, 3))
+def _blocks(pixels: np.ndarray, size: int) -> np.ndarray:
+    """Means of square blocks; rows and columns that fill no block are left out."""
+    height, width = (length // size for length in pixels.shape[:2])
+    whole = pixels[: height * size, : width * size]
+    return whole.reshape(height, size, width, size, -1).mean((1, 3))
 
 
 def decibels(value: float | None) -> str:
