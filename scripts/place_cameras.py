@@ -21,13 +21,12 @@ def main() -> None:
     args = parser.parse_args()
     activate()
     from unbake.data.camera import write_camera_file
-    from unbake.data.placement import coverage, is_room, place_object, place_room
+    from unbake.data.placement import coverage, place
     from unbake.data.scene import parse, to_principled
 
     parsed = parse(args.scene)
     to_principled(parsed)
     scene = parsed.instantiate()
-    place = place_room if is_room(scene) else place_object
     placed = place(scene, args.views, args.held_out, seed=args.seed)
     train = [look.camera(64, 64) for split, look in placed if split == "train"]
     write_camera_file(args.out, placed)

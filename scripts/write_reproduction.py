@@ -15,24 +15,17 @@ from typing import Any
 
 import jinja2
 
+from unbake import activate
+
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE, KEPT = DOCS / "reproduction.md", DOCS / "reproduction"
-#: Folder of a scene: its name on the page.
-SCENES = {
-    "staircase": "STAIRCASE",
-    "kitchen": "KITCHEN",
-    "living-room-2": "LIVING ROOM",
-    "veach-ajar": "VEACH DOOR",
-    "lego": "LEGO",
-    "vegboard": "vegboard, for HOTDOG",
-    "plant": "plant, for FICUS",
-    "dragon": "DRAGON",
-}
 
 
 def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
     """Copy tables and data, pictures as JPEG, and licences, a folder an experiment."""
     import mitsuba as mi
+
+    from unbake.experiments.scenes import SCENES
 
     for data in sorted(results.glob("*/data.json")):
         about = json.loads(data.read_text(encoding="utf-8"))
@@ -52,11 +45,12 @@ def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
     for scene in SCENES:
         licences = kept / "licences"
         licences.mkdir(parents=True, exist_ok=True)
-        shutil.copy(scenes / scene / "LICENSE.txt", licences / f"{scene}.txt")
+        shutil.copy(scenes / scene.folder / "LICENSE.txt", licences / f"{scene.folder}.txt")
 
 
 def page(kept: Path = KEPT) -> str:
     """The page, of what is kept."""
+    from unbake.experiments.scenes import SCENES
 
     def about(name: str) -> dict[str, Any]:
         return json.loads((kept / name / "about.json").read_text(encoding="utf-8"))
@@ -84,7 +78,11 @@ def page(kept: Path = KEPT) -> str:
         raise SystemExit("the page is of one machine, results are of several")
     template = environment.from_string((DOCS / "reproduction.md.jinja").read_text("utf-8"))
     return template.render(
-        machine=machines[0], scenes=SCENES, table=table, cost=cost, picture=picture
+        machine=machines[0],
+        scenes={scene.folder: scene.label for scene in SCENES},
+        table=table,
+        cost=cost,
+        picture=picture,
     )
 
 
@@ -93,10 +91,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="folder that `unbake reproduce` wrote")
     parser.add_argument("--scenes", type=Path, default=Path("scenes"), help="unpacked scenes")
     args = parser.parse_args()
+    activate()
     if args.results is not None:
-        from unbake import activate
-
-        activate()
         take_over(args.results, args.scenes)
     PAGE.write_text(page(), encoding="utf-8")
     print(f"wrote {PAGE}")

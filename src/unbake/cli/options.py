@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
@@ -16,7 +16,7 @@ Data = Annotated[Path, arg(metavar="DATA")]
 Run = Annotated[Path, arg(metavar="RUN")]
 Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]
 Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint="(required)")]
-Scale = Annotated[Literal["smoke", "cpu", "paper"], arg(metavar="SCALE")]
+Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 #: Where None stands for what preset or settings file say, "default: None" would tell nothing.
 Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]

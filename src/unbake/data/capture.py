@@ -19,7 +19,7 @@ from . import scene as scenes
 from .batches import CameraRays
 from .camera import Camera, frame_name, read_cameras
 from .lights import write_lights
-from .placement import coverage, is_room, place_object, place_room
+from .placement import coverage, is_room, place
 from .procedural import SCENES, default_cameras, write_scene
 from .views import Dataset, View
 
@@ -181,7 +181,6 @@ def _cameras(
             for c in default_cameras(name, settings.views, settings.held_out)
         ]
     else:
-        place = place_room if is_room(scene) else place_object
         placed = place(scene, settings.views, settings.held_out, seed=settings.seed)
         posed = [(split, look.camera(size, size)) for split, look in placed]
     if not any(split == "train" for split, _ in posed):

@@ -67,6 +67,12 @@ def is_room(scene: mi.Scene) -> bool:
     return bool(freespace.enclosure(scene, probes).mean() >= freespace.ROOM_ENCLOSURE)
 
 
+def place(scene: mi.Scene, views: int, held_out: int, *, seed: int = 0) -> list[tuple[str, LookAt]]:
+    """Cameras as `place_room` or `place_object` finds them, whichever the scene is."""
+    placed = place_room if is_room(scene) else place_object
+    return placed(scene, views, held_out, seed=seed)
+
+
 def place_room(
     scene: mi.Scene, views: int, held_out: int, *, fov: float = 75.0, seed: int = 0
 ) -> list[tuple[str, LookAt]]:

@@ -218,7 +218,7 @@ def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:
     """
     root = scene.state.root.props
     for key in root.keys():
-        node = _referenced(scene, root[key])
+        node = referenced(scene, root[key])
         if node is not None and node.props.plugin_name() in ENVIRONMENTS:
             # Under a new name: merging meshes reuses those that the parser made up.
             del root[key]
@@ -311,7 +311,7 @@ def _light_names(scene: ParsedScene, lights: list[int]) -> list[str]:
 def _colour(scene: ParsedScene, props: mi.Properties) -> tuple[float, float, float] | None:
     """The strength that a light was given, linear RGB; None if that is not one colour."""
     key = STRENGTHS[props.plugin_name()]
-    node = _referenced(scene, props[key]) if key in props else None
+    node = referenced(scene, props[key]) if key in props else None
     if node is not None:
         texture = mi.PluginManager.instance().create_object(node.props)
         texture = (texture.expand() or [texture])[0]
@@ -330,7 +330,7 @@ def _is_reference(value: object) -> bool:
     return isinstance(value, mi.Properties.ResolvedReference)
 
 
-def _referenced(scene: ParsedScene, value: object) -> object | None:
+def referenced(scene: ParsedScene, value: object) -> object | None:
     """The node that a property refers to, if it does."""
     return scene.state.nodes[value.index()] if _is_reference(value) else None
 

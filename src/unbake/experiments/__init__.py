@@ -9,6 +9,8 @@ if TYPE_CHECKING:
 
 Name = Literal["table1", "table2", "fig3", "fig4", "fig5", "fig6", "fig7", "fig8"]
 
+Scale = Literal["smoke", "cpu", "paper"]
+
 
 def load(name: Name) -> Experiment:
     """The experiment of this name; a backend must be active."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import final
 
 import drjit as dr
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..transport.operator import attach_material, bounce
 from ..transport.render import RayGenerator, parts_of
-from ..transport.vertex import Vertex, World, find_vertex
+from ..transport.vertex import World, find_vertex
 
 #: Bounces before Russian roulette.
 RR_DEPTH = 3
@@ -116,8 +116,7 @@ def _along(
         alive = dr.compress(keep)
         if len(alive) == 0:
             break
-        gathered = {f.name: getattr(x, f.name) for f in fields(Vertex)}
-        x = Vertex(**{name: dr.gather(type(v), v, alive) for name, v in gathered.items()})
+        x = x.gathered(alive)
         β, lane = dr.gather(mi.Color3f, β, alive), dr.gather(mi.UInt32, lane, alive)
         dβ = {k: dr.gather(mi.Color3f, v, alive) for k, v in dβ.items()}
         _reseed(sampler, seed, number, len(alive))

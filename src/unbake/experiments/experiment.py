@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, final
 
 import drjit as dr
 import mitsuba as mi
@@ -29,11 +29,11 @@ from ..data.jsonfile import write_json
 from ..errors import UserError
 from ..imaging.pictures import write_atomically
 from ..results.bench import machine
+from . import Scale
 
 if typing.TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Scale = Literal["smoke", "cpu", "paper"]
 Found = dict[str, Any]
 Choice = typing.TypeVar("Choice")
 

@@ -13,7 +13,7 @@ from ..data.capture import CaptureSettings
 from ..results.bench_methods import bench_methods
 from ..results.contender import Contender
 from .experiment import Experiment, Found, Part, Setting, Shown, markdown, save_figure
-from .scenes import SCENES, PaperScene
+from .scenes import PaperScene, scenes_at
 
 METHODS = {
     "ours": "ours",
@@ -36,9 +36,8 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
 
 def _parts(setting: Setting) -> list[Part]:
     steps = setting.pick(4, 24, 60)
-    scenes = SCENES[-1:] if setting.scale == "smoke" else SCENES
     parts = []
-    for scene in scenes:
+    for scene in scenes_at(setting):
         scene.require(setting)
         # What a step takes has nothing to do with how good photographs are.
         shots = dataclasses.replace(
@@ -70,9 +69,7 @@ def _measure(
 
 def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
     rows, lines = [], []
-    for scene in SCENES:
-        if scene.folder not in found:
-            continue
+    for scene in scenes_at(setting):
         measured, theirs = found[scene.folder], PUBLISHED.get(scene.name, {})
         times = {name: measured[name].get("milliseconds_per_step") for name in METHODS}
         ours, cells = times["ours"], []

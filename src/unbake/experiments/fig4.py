@@ -14,9 +14,17 @@ import numpy as np
 
 from ..data.batches import CameraRays
 from ..data.camera import Camera
-from ..data.scene import ParsedScene, parse
+from ..data.scene import ParsedScene, parse, referenced
 from ..errors import UserError
-from ..imaging.pictures import false_colour, montage, shrink, tonemap, write_atomically, write_png
+from ..imaging.pictures import (
+    block_means,
+    false_colour,
+    montage,
+    shrink,
+    tonemap,
+    write_atomically,
+    write_png,
+)
 from ..transport.render import render_radiance
 from ..transport.vertex import World
 from .derivatives import Estimates, estimate
@@ -107,11 +115,8 @@ class _Wood:
 
 def _picture(parsed: ParsedScene, node: object) -> str:
     """The file of a material's albedo, empty if it is no picture."""
-    colour = node.props["base_color"]
-    if not isinstance(colour, mi.Properties.ResolvedReference):
-        return ""
-    texture = parsed.state.nodes[colour.index()].props
-    return str(texture["filename"]) if "filename" in texture else ""
+    texture = referenced(parsed, node.props["base_color"])
+    return "" if texture is None else str(texture.props.get("filename", ""))
 
 
 # ------------------------------------------------------------------------------------------- parts
@@ -237,11 +242,9 @@ def smoothed(
     powers = np.vander(np.array(values) - np.mean(values), min(DEGREE + 1, len(values)))
     onto = powers @ np.linalg.pinv(powers)
     found: dict[float, dict[str, np.ndarray]] = {value: {} for value in values}
-    rows, columns = height // block, width // block
     for key in arrays[values[0]]:
-        pixels = np.stack([arrays[value][key] for value in values]).astype(np.float64)
-        film = pixels.reshape(len(values), height, width, 3)[:, : rows * block, : columns * block]
-        means = film.reshape(len(values), rows, block, columns, block, 3).mean((2, 4))
+        films = (arrays[v][key].astype(np.float64).reshape(height, width, 3) for v in values)
+        means = np.stack([block_means(film, block) for film in films])
         for value, fit in zip(values, np.tensordot(onto, means, 1), strict=True):
             found[value][key] = fit.reshape(-1, 3)
     return found

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from ..imaging.pictures import write_png
 from .experiment import Experiment, Found, Part, Setting, Shown, markdown
-from .ladder import MATERIALS, QUALITIES, Ladder, at_equal_samples, decibels, lasting
-from .scenes import SCENES, PaperScene
+from .ladder import MATERIALS, QUALITIES, Ladder, at_equal_samples, decibels
+from .scenes import scenes_at
 
 #: Columns of the figure.
 METHODS = {"direct": "direct", "PRB": "prb", "ours": "ours", "no prior": "no-prior"}
@@ -15,30 +15,12 @@ METHODS = {"direct": "direct", "PRB": "prb", "ours": "ours", "no prior": "no-pri
 VIEWS = (0, 1)
 
 
-def ladder_of(setting: Setting, scene: PaperScene, methods: Sequence[str]) -> Ladder:
-    """Fits of a scene by methods, as long as cpu scale has time for, or as the paper's."""
-    config = lasting(
-        scene.settings(setting),
-        setting.pick(0.0, 120.0 if scene.room else 60.0, 0.0),
-        steps=setting.pick(6, 1, scene.steps),
-        score_seconds=setting.pick(0.2, 10.0, 60.0),
-    )
-    return Ladder(scene, list(methods), config, spp=setting.pick(2, 32, 128))
-
-
 def _ladders(setting: Setting) -> list[Ladder]:
-    scenes = SCENES[-1:] if setting.scale == "smoke" else SCENES
-    return [ladder_of(setting, scene, list(METHODS.values())) for scene in scenes]
+    return [Ladder.of(setting, scene, METHODS.values()) for scene in scenes_at(setting)]
 
 
 def _parts(setting: Setting) -> list[Part]:
-    parts = []
-    for ladder in _ladders(setting):
-        parts += [
-            ladder.scene.capture(setting),
-            ladder.part(setting, setting.pick(2.0, 30.0, None)),
-        ]
-    return parts
+    return [part for ladder in _ladders(setting) for part in ladder.parts(setting)]
 
 
 def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:

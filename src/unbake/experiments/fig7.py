@@ -6,43 +6,31 @@ from collections.abc import Mapping
 
 from ..imaging.pictures import write_png
 from .experiment import Experiment, Found, Part, Setting, Shown, markdown
-from .fig6 import ladder_of
-from .ladder import QUALITIES, Ladder, decibels
-from .scenes import SCENES, STAIRCASE
+from .ladder import ABLATION, QUALITIES, Ladder, decibels
+from .scenes import scenes_at
 
 #: Columns of the figure.
-METHODS = {
-    "direct": "direct",
-    "+ prior": "with-prior",
-    "+ stop gradient": "with-stop-gradient",
-    "+ second bounce": "with-second-bounce",
-    "+ LHS (ours)": "ours",
-    "ours without prior": "no-prior",
-}
+METHODS = ABLATION | {"ours without prior": "no-prior"}
 #: The held-out view that is shown.
 VIEW = 0
 
 
 def _ladder(setting: Setting) -> Ladder:
     # As in Figure 6, so that what both show is fitted once.
-    scene = SCENES[-1] if setting.scale == "smoke" else STAIRCASE
-    return ladder_of(setting, scene, list(METHODS.values()))
+    return Ladder.of(setting, scenes_at(setting)[0], METHODS.values())
 
 
 def _parts(setting: Setting) -> list[Part]:
-    ladder = _ladder(setting)
-    return [ladder.scene.capture(setting), ladder.part(setting, setting.pick(2.0, 30.0, None))]
+    return _ladder(setting).parts(setting)
 
 
 def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
     ladder = _ladder(setting)
-    rows = []
-    for title, method in METHODS.items():
-        row = found[ladder.scene.folder][method]
-        length = {k: row[k] for k in ("steps", "samples", "seconds")}
-        head = {"step": title, "method": method, "scene": ladder.scene.label}
-        *_, mean = ladder.qualities(setting, method, row)
-        rows.append(head | length | mean)
+    fits = found[ladder.scene.folder]
+    rows = [
+        {"step": title} | ladder.row(setting, method, fits[method])
+        for title, method in METHODS.items()
+    ]
     table = markdown(
         ["step", "steps", "albedo", "roughness", "rendering"],
         [[r["step"], r["steps"], *(decibels(r[k]) for k in QUALITIES)] for r in rows],

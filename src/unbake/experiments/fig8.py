@@ -10,50 +10,33 @@ import numpy as np
 from ..data.lights import true_environment
 from ..imaging.pictures import montage, read_exr, tonemap, write_png
 from .experiment import Experiment, Found, Part, Setting, Shown, markdown
-from .ladder import Ladder, decibels, exposure, lasting
-from .scenes import SCENES
+from .ladder import ABLATION, Ladder, decibels, exposure
+from .scenes import scenes_at
 
-#: Columns of the figure.
-METHODS = {
-    "direct": "direct",
-    "+ prior": "with-prior",
-    "+ stop gradient": "with-stop-gradient",
-    "+ second bounce": "with-second-bounce",
-    "+ LHS (ours)": "ours",
-}
 #: The held-out view that is shown below the maps.
 VIEW = 0
 
 
 def _ladder(setting: Setting) -> Ladder:
-    name = "DRAGON" if setting.scale == "smoke" else "LEGO"
-    scene = next(scene for scene in SCENES if scene.name == name)
-    config = lasting(
-        dataclasses.replace(scene.settings(setting), unknown="lighting"),
-        setting.pick(0.0, 60.0, 0.0),
-        steps=setting.pick(6, 1, scene.steps),
-        score_seconds=0.0,
-    )
-    return Ladder(scene, list(METHODS.values()), config, spp=setting.pick(2, 32, 128))
+    scene = next(scene for scene in scenes_at(setting) if not scene.room)
+    ladder = Ladder.of(setting, scene, ABLATION.values())
+    config = dataclasses.replace(ladder.config, unknown="lighting", score_seconds=0.0)
+    return dataclasses.replace(ladder, config=config)
 
 
 def _parts(setting: Setting) -> list[Part]:
-    ladder = _ladder(setting)
-    return [ladder.scene.capture(setting), ladder.part(setting, setting.pick(2.0, 25.0, None))]
+    return _ladder(setting).parts(setting)
 
 
 def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
     ladder = _ladder(setting)
     rows, lines = [], []
-    for title, method in METHODS.items():
-        row = found[ladder.scene.folder][method]
-        length = {k: row[k] for k in ("steps", "samples", "seconds")}
-        head = {"step": title, "method": method, "scene": ladder.scene.label}
-        *_, mean = ladder.qualities(setting, method, row)
-        light = row["environment"] | {"render_psnr": mean["render_psnr"]}
-        rows.append(head | length | light)
-        off, relit = f"{100 * light['sh_error']:.1f} %", decibels(light["relight_psnr"])
-        lines.append([title, row["steps"], off, relit, decibels(light["render_psnr"])])
+    for title, method in ABLATION.items():
+        fit = found[ladder.scene.folder][method]
+        row = {"step": title} | ladder.row(setting, method, fit) | fit["environment"]
+        rows.append({key: value for key, value in row.items() if value is not None})
+        off, relit = f"{100 * row['sh_error']:.1f} %", decibels(row["relight_psnr"])
+        lines.append([title, row["steps"], off, relit, decibels(row["render_psnr"])])
     titles = ["step", "steps", "low frequencies off", "relighting", "rendering"]
     caption = f"{ladder.scene.label}, materials known; PSNR in dB, "
     caption += "renderings: mean over held-out views\n\n"
@@ -63,8 +46,8 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
 
 def _picture(setting: Setting, ladder: Ladder) -> np.ndarray:
     """The maps that were found, and a view lit by them; the truth on the right."""
-    view = ladder.heldout(setting, VIEW)
-    folders = [ladder.evaluation(setting, method) for method in METHODS.values()]
+    view = ladder.heldout(setting)[VIEW]
+    folders = [ladder.evaluation(setting, method) for method in ABLATION.values()]
     maps = [read_exr(folder / "environment.exr") for folder in folders]
     renderings = [folder / view.split / f"{view.name}_render.exr" for folder in folders]
     truth = true_environment(ladder.scene.data(setting))

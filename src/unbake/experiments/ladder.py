@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
@@ -16,13 +16,22 @@ from ..data.jsonfile import read_json
 from ..data.views import Dataset, View
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr, psnr
-from ..imaging.pictures import montage, read_exr, to_bytes, tonemap
+from ..imaging.pictures import block_means, montage, read_exr, to_bytes, tonemap
 from ..results.compare import compare
 from ..results.contender import Contender
 from ..results.evaluate import EvaluationSettings
+from ..results.shown import rgb
 from .experiment import Found, Part, Setting, digest
 from .scenes import PaperScene
 
+#: The ablation, from direct illumination to ours; Figures 7 and 8.
+ABLATION = {
+    "direct": "direct",
+    "+ prior": "with-prior",
+    "+ stop gradient": "with-stop-gradient",
+    "+ second bounce": "with-second-bounce",
+    "+ LHS (ours)": "ours",
+}
 #: What is shown of a view, from top to bottom.
 SHOWN = ("render", "albedo", "roughness")
 MATERIALS = ("albedo_psnr", "roughness_psnr")
@@ -46,6 +55,18 @@ class Ladder:
     config: FitConfig
     spp: int
 
+    @staticmethod
+    def of(setting: Setting, scene: PaperScene, methods: Iterable[str]) -> Ladder:
+        """Fits that last as long as cpu scale has time for, or take the paper's steps."""
+        config = dataclasses.replace(
+            scene.settings(setting),
+            seconds=setting.pick(0.0, 120.0 if scene.room else 60.0, 0.0),
+            steps=setting.pick(6, 1, scene.steps),
+            score_seconds=setting.pick(0.2, 10.0, 60.0),
+            checkpoint_seconds=120.0,
+        )
+        return Ladder(scene, list(methods), config, spp=setting.pick(2, 32, 128))
+
     def settings(self, setting: Setting) -> dict[str, Any]:
         """All that decides what is found."""
         fits = {"methods": list(self.methods), "fit": asdict(self.config), "spp": self.spp}
@@ -56,17 +77,15 @@ class Ladder:
         described = self.scene.described(setting) | {"fit": asdict(self.config), "spp": self.spp}
         return setting.work / "runs" / f"{self.scene.folder}-{digest(described)}"
 
-    def part(self, setting: Setting, seconds: float | None) -> Part:
-        """The part of an experiment that fits and evaluates them.
-
-        Args:
-            seconds: that compiling and evaluation take, a method.
-        """
+    def parts(self, setting: Setting) -> list[Part]:
+        """The parts of an experiment that render the data set, fit and evaluate."""
         work = functools.partial(self.fitted, setting)
         many = len(self.methods)
-        known = None if seconds is None else many * seconds
+        # Compiling and evaluation, a method.
+        seconds = setting.pick(2.0 * many, 30.0 * many, None)
         waits = many * self.config.seconds
-        return Part(self.scene.folder, self.settings(setting), work, known, waits)
+        fits = Part(self.scene.folder, self.settings(setting), work, seconds, waits)
+        return [self.scene.capture(setting), fits]
 
     def fitted(self, setting: Setting) -> Found:
         """Fit and evaluate, as `unbake compare` does; what was found of each method.
@@ -97,12 +116,15 @@ class Ladder:
         """The folder of a method's final renderings."""
         return self.runs(setting) / method / "evaluation"
 
-    def heldout(self, setting: Setting, number: int) -> View:
-        """A held-out view."""
-        return self._dataset(setting).heldout[number]
+    def heldout(self, setting: Setting) -> Sequence[View]:
+        """The held-out views."""
+        return Dataset.load(self.scene.data(setting)).heldout
 
-    def _dataset(self, setting: Setting) -> Dataset:
-        return Dataset.load(self.scene.data(setting))
+    def row(self, setting: Setting, method: str, found: Found) -> dict[str, Any]:
+        """What tables say of a method: its length, and means over the held-out views."""
+        length = {key: found[key] for key in ("steps", "samples", "seconds")}
+        *_, mean = self.qualities(setting, method, found)
+        return {"method": method, "scene": self.scene.label} | length | mean
 
     def qualities(self, setting: Setting, method: str, row: Found) -> list[dict[str, Any]]:
         """PSNRs of a method in each held-out view, and last their means over the views.
@@ -112,13 +134,13 @@ class Ladder:
         other than for `unbake evaluate`, a scene may be brighter than 1 all over.
         """
         rows, size = [], setting.pick(1, 4, 4)
-        for view, known in zip(self._dataset(setting).heldout, row["per_view"], strict=True):
+        for view, known in zip(self.heldout(setting), row["per_view"], strict=True):
             file = self.evaluation(setting, method) / view.split / f"{view.name}_render.exr"
             photograph, found = read_exr(view.image), read_exr(file)[..., :3]
             scale = exposure(photograph)
-            images = [_blocks(p[..., :3], size) * scale for p in (found, photograph)]
+            images = [block_means(p[..., :3], size) * scale for p in (found, photograph)]
             images = [np.clip(image, 0, 1) for image in images]
-            whole = _blocks(_foreground(photograph)[..., None].astype(float), size)[..., 0] >= 1
+            whole = block_means(_foreground(photograph).astype(float), size) >= 1
             rows.append(
                 {"views": view.name}
                 | {key: known[key] for key in MATERIALS}
@@ -134,20 +156,15 @@ class Ladder:
             views: numbers of held-out views, each with rows for what is `SHOWN`.
         """
         sheet = []
-        for view in (self.heldout(setting, number) for number in views):
+        for view in (self.heldout(setting)[number] for number in views):
+            scale = exposure(read_exr(view.image))
             truth = {"render": view.image, "albedo": view.albedo, "roughness": view.roughness}
             for what in SHOWN:
                 file = f"{view.split}/{view.name}_{what}.exr"
                 found = [self.evaluation(setting, method) / file for method in self.methods]
-                sheet.append([_cell(path, what, view) for path in (*found, truth[what])])
+                factor = scale if what == "render" else 1.0
+                sheet.append([_cell(path, what, factor, view) for path in (*found, truth[what])])
         return montage(sheet)
-
-
-def lasting(config: FitConfig, seconds: float, *, steps: int, score_seconds: float) -> FitConfig:
-    """Settings of a fit of so many seconds, or of so many steps where that is zero."""
-    return dataclasses.replace(
-        config, seconds=seconds, steps=steps, score_seconds=score_seconds, checkpoint_seconds=120.0
-    )
 
 
 def at_equal_samples(found: Mapping[str, Found]) -> dict[str, dict[str, float | None]]:
@@ -167,15 +184,12 @@ def at_equal_samples(found: Mapping[str, Found]) -> dict[str, dict[str, float | 
     return at
 
 
-def _cell(file: Path | None, what: str, view: View) -> np.ndarray:
-    """A picture in sRGB, renderings exposed as the photograph is; grey where there is none."""
+def _cell(file: Path | None, what: str, factor: float, view: View) -> np.ndarray:
+    """A picture times a factor, in sRGB but for roughness; grey where there is none."""
     if file is None or not file.is_file():
         return np.full((view.camera.height, view.camera.width, 3), 128, np.uint8)
-    pixels = read_exr(file)
-    if what == "roughness":
-        return to_bytes(np.repeat(pixels[..., :1], 3, -1))
-    scale = exposure(read_exr(view.image)) if what == "render" else 1.0
-    return tonemap(scale * pixels[..., :3])
+    pixels, _ = rgb(file)
+    return to_bytes(pixels) if what == "roughness" else tonemap(factor * pixels)
 
 
 def exposure(photograph: np.ndarray) -> float:
@@ -187,13 +201,6 @@ def exposure(photograph: np.ndarray) -> float:
 def _foreground(photograph: np.ndarray) -> np.ndarray:
     shape = photograph.shape[:2]
     return photograph[..., 3] >= 1 if photograph.shape[-1] == 4 else np.ones(shape, bool)
-
-
-def _blocks(pixels: np.ndarray, size: int) -> np.ndarray:
-    """Means of square blocks; rows and columns that fill no block are left out."""
-    height, width = (length // size for length in pixels.shape[:2])
-    whole = pixels[: height * size, : width * size]
-    return whole.reshape(height, size, width, size, -1).mean((1, 3))
 
 
 def decibels(value: float | None) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..config import FitConfig, from_toml
 from ..data.capture import CaptureSettings, capture
-from ..data.scene import ParsedScene, parse, to_principled, write
+from ..data.scene import ParsedScene, parse, referenced, to_principled, write
 from ..data.views import Dataset
 from ..errors import UserError
 from ..imaging.pictures import read_exr, tonemap, write_exr, write_png
@@ -279,6 +279,11 @@ SCENES = (
 )
 
 
+def scenes_at(setting: Setting) -> tuple[PaperScene, ...]:
+    """The scenes of an experiment: all of them, or the quickest one to see that it runs."""
+    return SCENES[-1:] if setting.scale == "smoke" else SCENES
+
+
 def _found(setting: Setting, name: str) -> Path:
     """The folder of a published scene, or the archive where there is only that."""
     folder, archive = setting.scenes / name, setting.scenes / f"{name}.tar.xz"
@@ -316,10 +321,11 @@ def _raise_albedo(scene: ParsedScene, power: float, folder: Path) -> None:
     """Replace every albedo, of colours and of bitmaps, by a power of it (linear)."""
     for node in scene.principled_nodes():
         colour = node.props["base_color"]
-        if not isinstance(colour, mi.Properties.ResolvedReference):
+        found = referenced(scene, colour)
+        if found is None:
             node.props["base_color"] = mi.ScalarColor3d([c**power for c in colour])
             continue
-        texture = scene.state.nodes[colour.index()].props
+        texture = found.props
         if "filename" not in texture:
             raise UserError("an albedo is a texture that is no bitmap", scene.path)
         source = Path(texture["filename"])

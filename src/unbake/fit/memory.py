@@ -9,6 +9,8 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
+from ..backend import CUDA_VARIANT
+
 _PROCESS = Path("/proc/self")
 #: Where control groups, as containers are, state their limit and what is used of it.
 _LIMITS = (
@@ -24,7 +26,7 @@ def peak_bytes(work: Callable[[], None]) -> int | None:
     """
     dr.sync_thread()
     dr.flush_malloc_cache()
-    if mi.variant().startswith("cuda"):
+    if mi.variant() == CUDA_VARIANT:
         return _peak_on_device(work)
     try:
         # What was freed goes back to the system, or `work` would take it up unseen.

@@ -183,9 +183,12 @@ def shrink(picture: np.ndarray, longest: int) -> np.ndarray:
     """
     height, width = picture.shape[:2]
     block = -(-max(height, width) // longest)
-    if block == 1:
-        return picture
-    rows, columns = height // block, width // block
+    return picture if block == 1 else block_means(picture, block)
+
+
+def block_means(picture: np.ndarray, block: int) -> np.ndarray:
+    """Average (H, W) or (H, W, C) over squares of `block` pixels; a remainder is cut as above."""
+    rows, columns = (side // block for side in picture.shape[:2])
     cut = picture[: rows * block, : columns * block]
     return cut.reshape(rows, block, columns, block, *picture.shape[2:]).mean(axis=(1, 3))
 

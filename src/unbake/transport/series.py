@@ -7,7 +7,7 @@ It renders recovered materials with full global illumination. Mitsuba's `path` g
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -58,11 +58,11 @@ def path_lengths(
     rr_depth: int,
     most_likely: float = 1.0,
 ) -> mi.Float:
-    """Surface interactions of the paths that `path_traced` follows along rays.
+    """Surface interactions of paths along rays, followed as `path_traced` does.
 
     Args:
         max_depth: paths end at that many interactions.
-        rr_depth: interactions after which Russian roulette may end a path.
+        rr_depth: the first interaction that Russian roulette may take away.
         most_likely: largest probability to survive it.
 
     Returns:
@@ -150,7 +150,6 @@ def _compacted(
         size = (size + 1) // 2
     slot = dr.arange(mi.UInt32, size)
     chosen = dr.gather(mi.UInt32, alive, dr.minimum(slot, dr.opaque(mi.UInt32, count - 1)))
-    values = {f.name: getattr(v, f.name) for f in fields(Vertex)}
-    v = Vertex(**{name: dr.gather(type(x), x, chosen) for name, x in values.items()})
+    v = v.gathered(chosen)
     v.valid &= slot < dr.opaque(mi.UInt32, count)
     return v, dr.gather(mi.Color3f, β, chosen), dr.gather(mi.UInt32, lane, chosen)

@@ -6,7 +6,7 @@ sample, β throughput. Directions point away from the surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -71,6 +71,11 @@ class Vertex:
         """Shading normal on the side of `w`, world space."""
         n = self.si.sh_frame.n
         return mi.Normal3f(dr.select(self.si.wi.z < 0, -n, n))
+
+    def gathered(self, lanes: mi.UInt32) -> Vertex:
+        """The vertices of some lanes."""
+        values = {f.name: getattr(self, f.name) for f in fields(Vertex)}
+        return Vertex(**{name: dr.gather(type(v), v, lanes) for name, v in values.items()})
 
 
 @dataclass
