@@ -92,7 +92,7 @@ emission() {
         --unknown emission --out "$work/emission"
     summary "$results/emission.json" "$work/emission"
 }
-sparse() { # 6 views, with and without regularisation
+sparse() { # 6 views, with and without regularization
     [ -d "$work/few" ] || "$unbake" capture demo --views 6 --out "$work/few"
     for name in none smooth tied both; do
         "$unbake" compare "$work/few" --methods ours --steps 2400 --score-seconds 0 \

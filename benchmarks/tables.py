@@ -71,7 +71,7 @@ def time_to_quality(end: dict, runs: dict) -> str:
     return markdown("method | ends after | with albedo | `ours` has it after | times", [told])
 
 
-def ladder(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
+def scene_fits(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
     """Mean and spread over seeds; a column is its title, key, factor and digits."""
 
     def table(result: dict) -> str:
@@ -125,15 +125,15 @@ TABLES = (
     ("Equal samples, demo", ("equal-demo",), quality),
     ("Time to quality, demo", ("long-demo", "rivals-demo"), time_to_quality),
     ("Time to quality, STAIRCASE", ("long-staircase", "rivals-staircase"), time_to_quality),
-    ("Ablation, materials", ("ablation-materials",), ladder(*PSNR)),
-    ("Ablation, lighting", ("ablation-lighting",), ladder(*LIGHT)),
+    ("Ablation, materials", ("ablation-materials",), scene_fits(*PSNR)),
+    ("Ablation, lighting", ("ablation-lighting",), scene_fits(*LIGHT)),
     *(
-        (f"still, {unknown}", (f"still-{unknown}",), ladder(*BOTH))
+        (f"still, {unknown}", (f"still-{unknown}",), scene_fits(*BOTH))
         for unknown in ("materials", "lighting", "materials+lighting")
     ),
-    ("Emission", ("emission",), ladder(("error, %", "emission_error", 100, 2))),
+    ("Emission", ("emission",), scene_fits(("error, %", "emission_error", 100, 2))),
     *(
-        (f"Six views, {name}", (f"sparse-{name}",), ladder(*PSNR))
+        (f"Six views, {name}", (f"sparse-{name}",), scene_fits(*PSNR))
         for name in ("none", "smooth", "tied", "both")
     ),
 )

@@ -20,9 +20,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     activate()
-    from unbake.data.camera import write_camera_file
-    from unbake.data.placement import coverage, place
-    from unbake.data.scene import parse, to_principled
+    from unbake.acquisition.placement import coverage, place
+    from unbake.dataset.camera import write_camera_file
+    from unbake.scene.parse import parse, to_principled
 
     parsed = parse(args.scene)
     to_principled(parsed)

@@ -91,7 +91,7 @@ def unbake(monkeypatch, capfd):
 @pytest.fixture(scope="session")
 def cornell(tmp_path_factory) -> Path:
     """A captured data set, to be read alone: two views and a held-out one, 16 x 16 pixels."""
-    from unbake.data.capture import CaptureSettings, capture
+    from unbake.acquisition.capture import CaptureSettings, capture
 
     folder = tmp_path_factory.mktemp("captured") / "cornell"
     small = CaptureSettings(views=2, held_out=1, resolution=16, spp=8, max_depth=6)
@@ -115,12 +115,12 @@ def tiny(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def built_in(tmp_path_factory):
     """Write a built-in scene, once for each albedo: `built_in(name, albedo)` is its path."""
-    from unbake.data import procedural
+    from unbake.acquisition import built_in
 
     folder = tmp_path_factory.mktemp("built-in")
 
     @cache
     def write(name: str, albedo: float = 0.5) -> Path:
-        return procedural.write_scene(name, folder / f"{name}-{albedo}", albedo=albedo)
+        return built_in.write_scene(name, folder / f"{name}-{albedo}", albedo=albedo)
 
     return write

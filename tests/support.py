@@ -12,13 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unbake.acquisition import built_in
 from unbake.config import FitConfig, GridConfig, NetworkConfig
-from unbake.data import procedural
-from unbake.data.batches import CameraRays, PixelSource
-from unbake.data.camera import Camera
+from unbake.dataset.camera import Camera
+from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
 from unbake.transport.operator import attach_material, bounce
-from unbake.transport.series import path_traced
+from unbake.transport.path_tracer import path_traced
 from unbake.transport.vertex import find_vertex
 
 #: The smallest network that still has a hash table and a hidden layer.
@@ -45,7 +45,7 @@ def built_in_cameras(name: str, size: int, views: int = 1) -> list[Camera]:
     """Training cameras of a built-in scene, `size` pixels square."""
     return [
         Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], size, size)
-        for c in procedural.default_cameras(name, views, 0)
+        for c in built_in.default_cameras(name, views, 0)
     ]
 
 
@@ -94,7 +94,9 @@ def assert_only_replayed(step, state, rates, steps: int = 4) -> None:
     assert step.recordings() == recorded <= 3
 
 
-def losses_of_light(light, optimizer, world, rays, target: mi.Color3f, *, frozen: bool) -> list:
+def losses_of_light(
+    light, optimizer, scene_view, rays, target: mi.Color3f, *, frozen: bool
+) -> list:
     """Six steps that fit unknown light to one colour of all pixels, recorded or not.
 
     Args:
@@ -106,7 +108,7 @@ def losses_of_light(light, optimizer, world, rays, target: mi.Color3f, *, frozen
         sampler.seed(seed, dr.width(rays))
         light.assign(dict(optimizer.items()))
         light.prepare()
-        here = world.with_scene(scene)
+        here = scene_view.with_scene(scene)
         first = find_vertex(here, rays, mi.Bool(True), sampler)
         taken = bounce(here, attach_material(here, first), sampler)
         seen = taken.direct + taken.weight * taken.next.emitted
@@ -118,7 +120,8 @@ def losses_of_light(light, optimizer, world, rays, target: mi.Color3f, *, frozen
 
     run = dr.freeze(step) if frozen else step
     losses = [
-        run(world.scene, sampler, optimizer, rays, dr.opaque(mi.UInt32, 7 + i))[0] for i in range(6)
+        run(scene_view.scene, sampler, optimizer, rays, dr.opaque(mi.UInt32, 7 + i))[0]
+        for i in range(6)
     ]
     if frozen:
         assert run.n_recordings <= 2
@@ -170,8 +173,8 @@ class ConstantRadiance:
 class PathTracedRadiance:
     """The exact radiance field, one path a lookup: a stand-in for `RadianceField`."""
 
-    def __init__(self, world, seed: int, max_depth: int) -> None:
-        self.world, self.seed, self.max_depth = world, seed, max_depth
+    def __init__(self, scene_view, seed: int, max_depth: int) -> None:
+        self.scene_view, self.seed, self.max_depth = scene_view, seed, max_depth
 
     def evaluate(self, p, w, n, albedo, valid, engine=None) -> mi.Color3f:
         # Look at the point from very near, and take away the light that it emits itself.
@@ -179,14 +182,14 @@ class PathTracedRadiance:
             ray = mi.Ray3f(dr.select(valid, p + 1e-4 * w, 1e6), -w)
             dr.eval(ray)
             self.seed += 1
-            sees = find_vertex(self.world, ray, valid, seeded(0, dr.width(p)))
+            sees = find_vertex(self.scene_view, ray, valid, seeded(0, dr.width(p)))
             total = path_traced(
-                self.world,
+                self.scene_view,
                 ray,
                 self.seed,
                 max_depth=self.max_depth,
                 rr_depth=5,
-                see_lights=True,
+                hide_emitters=False,
             )
             return dr.select(valid, total - sees.emitted, 0)
 

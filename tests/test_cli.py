@@ -231,7 +231,7 @@ def test_a_disk_error_is_one_line(unbake, tmp_path, monkeypatch):
     def full(*words, **named):
         raise OSError(28, "No space left on device", "data/images/train_000.exr")
 
-    monkeypatch.setattr("unbake.data.capture.capture", full)
+    monkeypatch.setattr("unbake.acquisition.capture.capture", full)
     outcome = unbake("capture", "demo", "--out", tmp_path / "data")
     assert outcome.status == 2
     assert outcome.err == "error: data/images/train_000.exr: No space left on device\n"
@@ -241,7 +241,7 @@ def test_ctrl_c_while_nothing_is_written_yet(unbake, tmp_path, monkeypatch):
     def interrupted(*words, **named):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("unbake.data.capture.capture", interrupted)
+    monkeypatch.setattr("unbake.acquisition.capture.capture", interrupted)
     outcome = unbake("capture", "demo", "--out", tmp_path / "data")
     assert (outcome.status, outcome.err) == (130, "interrupted\n")
 

@@ -24,14 +24,14 @@ _HOME = {
     "read_toml": "config",
     "to_toml": "config",
     "UserError": "errors",
-    "CaptureSettings": "data.capture",
-    "capture": "data.capture",
-    "Dataset": "data.views",
-    "fit": "fit.loop",
-    "load_run": "fit.recovered",
-    "EvaluationSettings": "results.evaluate",
-    "evaluate": "results.evaluate",
-    "write_report": "results.report",
+    "CaptureSettings": "acquisition.capture",
+    "capture": "acquisition.capture",
+    "Dataset": "dataset.views",
+    "fit": "training.loop",
+    "load_run": "training.recovered",
+    "EvaluationSettings": "evaluation.evaluate",
+    "evaluate": "evaluation.evaluate",
+    "write_report": "report.page",
 }
 
 __all__ = sorted(_HOME)

@@ -161,7 +161,7 @@ class LightingConfig:
 
 
 @dataclass(frozen=True)
-class RegularisationConfig:
+class RegularizationConfig:
     """What is believed of materials where photographs say little; all off by default (ours)."""
 
     roughness_smoothness: float = 0.0  #: weight of differences between near points
@@ -217,7 +217,7 @@ class FitConfig:
     grid: DenseGridConfig = field(default_factory=DenseGridConfig)
     bitmap: BitmapConfig = field(default_factory=BitmapConfig)
     lighting: LightingConfig = field(default_factory=LightingConfig)
-    regularisation: RegularisationConfig = field(default_factory=RegularisationConfig)
+    regularization: RegularizationConfig = field(default_factory=RegularizationConfig)
     transport: TransportConfig = field(default_factory=TransportConfig)
     path: PathConfig = field(default_factory=PathConfig)
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
 
-from unbake.data import scene as scenes
 from unbake.fields.texture import material_textures
-from unbake.transport.baselines import materials_along_paths, path_radiance, path_replay
-from unbake.transport.image import Needs, rhs, trace
-from unbake.transport.vertex import World
+from unbake.scene import parse as scenes
+from unbake.transport.path_sample import Requirements, rhs, trace
+from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
+from unbake.transport.vertex import SceneView
 
 ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
 SPP, DEPTH = 16, 4
@@ -78,8 +78,11 @@ def with_bsdf(path, plugin, **properties):
 def path_traced(method, scene, materials, sampler, ray, rr_depth=DEPTH, depth=DEPTH):
     """Radiance by a method, differentiable in the materials (None: the scene's own)."""
     if method == "ad-pt":
-        world, needs = World.of(scene, materials, 8), Needs(depth - 1, 0, False)
-        sample = trace(world, None, ray, sampler, needs, see_lights=True)
+        scene_view, requirements = (
+            SceneView.of(scene, materials, 8),
+            Requirements(depth - 1, 0, False),
+        )
+        sample = trace(scene_view, None, ray, sampler, requirements, hide_emitters=False)
         return rhs(sample, mi.Color3f(0), depth - 1)
     integrator = path_replay(depth, rr_depth, False)
     arrays = {}

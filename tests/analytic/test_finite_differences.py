@@ -12,8 +12,8 @@ import pytest
 from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
 
 from unbake.fields.texture import material_textures
-from unbake.transport.image import Needs, rhs, trace
-from unbake.transport.vertex import World
+from unbake.transport.path_sample import Requirements, rhs, trace
+from unbake.transport.vertex import SceneView
 
 ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
 SPP = 64
@@ -89,12 +89,19 @@ class VaryingRadiance:
         return dr.select(valid, value, 0)
 
 
-def objective(world):
+def objective(scene_view):
     """A weighted sum of the pixels of the right-hand side, always with the same random numbers."""
     cameras = built_in_cameras("cornell", 12)
     ray = pixel_rays(cameras, SPP, seed=1)
     field = VaryingRadiance()
-    sample = trace(world, field, ray, seeded(2, dr.width(ray)), Needs(1, 1, lhs=True), True)
+    sample = trace(
+        scene_view,
+        field,
+        ray,
+        seeded(2, dr.width(ray)),
+        Requirements(1, 1, lhs=True),
+        hide_emitters=False,
+    )
     weights = np.random.default_rng(3).uniform(0.5, 1.5, (3, dr.width(ray) // SPP))
     weights = mi.Color3f(np.repeat(weights, SPP, axis=1).astype(np.float32))
     return weights * rhs(sample, sample.radiance[1])
@@ -117,7 +124,7 @@ def cut_out(bsdf):
 def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, parameter):
     materials = ConstantMaterials(mi.Color3f(*ALBEDO), ROUGHNESS)
     albedo, roughness = material_textures(materials)
-    live = World.of(room(wrap(principled(albedo, roughness))), materials, 8)
+    live = SceneView.of(room(wrap(principled(albedo, roughness))), materials, 8)
     dr.enable_grad(materials.albedo, materials.roughness)
     image = objective(live)
     dr.backward(dr.mean(dr.mean(image)))
@@ -133,7 +140,7 @@ def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, paramete
             "sampled": principled(ALBEDO, ROUGHNESS),
             "evaluated": principled(values[:3], values[3]),
         }
-        return total(objective(World.of(room(wrap(bsdf)), None, 8)))
+        return total(objective(SceneView.of(room(wrap(bsdf)), None, 8)))
 
     # Fourth-order differences: the step may be large enough for single precision.
     h = 0.02

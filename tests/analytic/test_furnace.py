@@ -18,35 +18,35 @@ from support import (
 )
 
 from unbake.config import GridConfig, NetworkConfig
-from unbake.data import scene as scenes
-from unbake.data.batches import CameraRays
+from unbake.dataset.pixels import CameraRays
 from unbake.fields.domain import Domain
 from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField
 from unbake.fields.texture import material_textures
-from unbake.transport.image import Needs, lhs, rhs, trace
+from unbake.scene import parse as scenes
 from unbake.transport.objective import (
     EXTRA,
     METHODS,
     PHOTOMETRIC,
     PRIOR,
-    Live,
+    Attached,
     RelativeL2,
-    needs,
     objective,
+    requirements,
 )
+from unbake.transport.path_sample import Requirements, lhs, rhs, trace
 from unbake.transport.prior import residual
-from unbake.transport.vertex import World
+from unbake.transport.vertex import SceneView
 
 SMALL = NetworkConfig(
     grid=GridConfig(levels=2, features=2, table_log2=10, base_resolution=2), width=16, hidden=1
 )
-ONE_BOUNCE = {PRIOR: Live(lhs=True)}
-EXTRA_BOUNCE = {PRIOR: Live(lhs=True), EXTRA: Live(lhs=True)}
+ONE_BOUNCE = {PRIOR: Attached(lhs=True)}
+EXTRA_BOUNCE = {PRIOR: Attached(lhs=True), EXTRA: Attached(lhs=True)}
 LANES = 2048
 
 
-def train(world, field, terms, steps, rate, final_rate):
+def train(scene_view, field, terms, steps, rate, final_rate):
     """Minimise the residual, and nothing else, over what the training cameras see."""
     rays = CameraRays.of(built_in_cameras("furnace", 16, views=8))
     adam = mi.ad.Adam(rate, field.parameters(), mask_updates=True)
@@ -57,7 +57,14 @@ def train(world, field, terms, steps, rate, final_rate):
         sampler.seed(seed, LANES)
         pixel = mi.UInt32(sampler.next_1d() * 0.99999 * rays.pixels)
         ray = rays.through(pixel, sampler.next_2d())
-        sample = trace(world.with_scene(scene), field, ray, sampler, Needs(1, 2, lhs=True), True)
+        sample = trace(
+            scene_view.with_scene(scene),
+            field,
+            ray,
+            sampler,
+            Requirements(1, 2, lhs=True),
+            hide_emitters=False,
+        )
         value = sum(objective(terms, sample, black, 2, loss).values())
         dr.backward(value)
         adam.step(eval=False)
@@ -70,15 +77,22 @@ def train(world, field, terms, steps, rate, final_rate):
     for i in range(steps):
         now = rate * (final_rate / rate) ** (i / steps)
         adam.set_learning_rate({k: dr.opaque(mi.Float, now) for k in adam})
-        frozen(world.scene, sampler, rays, adam, black, dr.opaque(mi.UInt32, 7919 * i))
+        frozen(scene_view.scene, sampler, rays, adam, black, dr.opaque(mi.UInt32, 7919 * i))
     field.assign(dict(adam.items()))
 
 
-def pictures(world, field, spp):
+def pictures(scene_view, field, spp):
     """LHS and RHS of views between the training views, (pixels, 3) each."""
     cameras = built_in_cameras("furnace", 8, views=12)[8:]
     ray = pixel_rays(cameras, spp, seed=99)
-    sample = trace(world, field, ray, seeded(5, dr.width(ray)), Needs(1, 1, lhs=True), True)
+    sample = trace(
+        scene_view,
+        field,
+        ray,
+        seeded(5, dr.width(ray)),
+        Requirements(1, 1, lhs=True),
+        hide_emitters=False,
+    )
     both = lhs(sample, sample.radiance[0]), rhs(sample, sample.radiance[1])
     return [np.array(x).reshape(3, -1, spp).mean(-1).T for x in both]
 
@@ -104,16 +118,16 @@ def test_the_residual_alone_finds_the_radiance(
     built_in, albedo, terms, scale, steps, rate, final_rate
 ):
     scene = mi.load_file(str(built_in("furnace", albedo)))
-    world = World.of(scene, None, 8)
+    scene_view = SceneView.of(scene, None, 8)
     network = Network(SMALL, extra=12, outputs=6, seed=1)
     field = RadianceField(network, Domain.of(scene.bbox()), scale=scale)
     truth = 1 / (1 - albedo)
 
-    untrained, _ = pictures(world, field, 4)
+    untrained, _ = pictures(scene_view, field, 4)
     assert np.abs(untrained / truth - 1).min() > 0.2, "it must not know the answer beforehand"
-    train(world, field, terms, steps, rate, final_rate)
+    train(scene_view, field, terms, steps, rate, final_rate)
 
-    seen, computed = pictures(world, field, 256)
+    seen, computed = pictures(scene_view, field, 256)
     for name, image in (("LHS", seen), ("RHS", computed)):
         error = image / truth - 1
         print(f"{albedo} {name}: mean {error.mean():+.4f}, rms {rms(error):.4f}")
@@ -123,10 +137,17 @@ def test_the_residual_alone_finds_the_radiance(
 
 def exact_sample(scene, albedo, factor=1.0, lanes_spp=64):
     """Path samples with the true reflected radiance ρ/(1 − ρ), times `factor`, everywhere."""
-    world = World.of(scene, None, 8)
+    scene_view = SceneView.of(scene, None, 8)
     field = ConstantRadiance(factor * albedo / (1 - albedo))
     ray = pixel_rays(built_in_cameras("furnace", 16, views=8), lanes_spp, seed=3)
-    return trace(world, field, ray, seeded(4, dr.width(ray)), Needs(1, 2, lhs=True), True)
+    return trace(
+        scene_view,
+        field,
+        ray,
+        seeded(4, dr.width(ray)),
+        Requirements(1, 2, lhs=True),
+        hide_emitters=False,
+    )
 
 
 @pytest.mark.parametrize("albedo", [0.3, 0.8])
@@ -158,7 +179,7 @@ def learnable(built_in):
     for node in parsed.state.nodes:
         if node.props.plugin_name() == "diffuse":
             node.props["reflectance"] = albedo
-    return World.of(parsed.instantiate(), materials, 8)
+    return SceneView.of(parsed.instantiate(), materials, 8)
 
 
 @pytest.mark.parametrize("bounces", [1, 2, 4, 8])
@@ -169,8 +190,8 @@ def test_the_gradient_with_k_live_bounces_is_the_closed_form(learnable, albedo, 
     materials.albedo = mi.Color3f(albedo)
     dr.enable_grad(materials.albedo)
     ray = pixel_rays(built_in_cameras("furnace", 16, views=8), 64, seed=5)
-    cache, wanted = ConstantRadiance(albedo / (1 - albedo)), Needs(bounces, 1, lhs=True)
-    sample = trace(learnable, cache, ray, seeded(6, dr.width(ray)), wanted, True)
+    cache, wanted = ConstantRadiance(albedo / (1 - albedo)), Requirements(bounces, 1, lhs=True)
+    sample = trace(learnable, cache, ray, seeded(6, dr.width(ray)), wanted, hide_emitters=False)
     image = rhs(sample, sample.radiance[bounces], bounces)
     value = np.array(dr.mean(dr.detach(image), axis=1)).ravel()
     dr.backward(dr.sum(dr.mean(image, axis=1)))
@@ -195,7 +216,9 @@ def test_more_live_bounces_come_nearer_to_the_true_gradient(learnable):
         row = METHODS["ours"]
         field = ConstantRadiance(albedo / (1 - albedo))
         sampler = seeded(6, dr.width(ray))
-        sample = trace(learnable, field, ray, sampler, needs(row, bounces), True)
+        sample = trace(
+            learnable, field, ray, sampler, requirements(row, bounces), hide_emitters=False
+        )
         target = dr.full(mi.Color3f, 4.0, dr.width(ray) // 16)
         loss = RelativeL2(0.01)
         terms = objective(row, sample, target, 16, loss, bounces=bounces)

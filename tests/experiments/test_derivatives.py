@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from support import built_in_cameras
 
-from unbake.data.batches import CameraRays
-from unbake.data.scene import parse
+from unbake.dataset.pixels import CameraRays
 from unbake.experiments.derivatives import estimate
-from unbake.transport.series import path_lengths
-from unbake.transport.vertex import World
+from unbake.scene.parse import parse
+from unbake.transport.path_tracer import path_lengths
+from unbake.transport.vertex import SceneView
 
 ALBEDO = 0.4
 CUT, LIVE = (2, 3, 6), (1, 2, 4)
@@ -27,16 +27,16 @@ def furnace(built_in):
             parameters[key] = mi.Color3f(value)
         parameters.update()
 
-    return World.of(scene, None, 0), assign
+    return SceneView.of(scene, None, 0), assign
 
 
 @pytest.fixture(scope="module")
 def estimates(furnace):
-    world, assign = furnace
+    scene_view, assign = furnace
     rays = CameraRays.of(built_in_cameras("furnace", 8))
     return estimate(
-        world, assign, ALBEDO, rays.through, rays.pixels, 64,
-        seed=1, max_depth=40, cut=CUT, live=LIVE,
+        scene_view, assign, ALBEDO, rays.through, rays.pixels, 64,
+        seed=1, max_depth=40, cut=CUT, attached=LIVE,
     )  # fmt: skip
 
 
@@ -60,18 +60,18 @@ def test_short_paths_know_the_first_terms(estimates, depth):
 @pytest.mark.parametrize("k", LIVE)
 def test_differentiable_bounces_know_the_first_terms_and_all_light_after_them(estimates, k):
     first = sum(i * ALBEDO ** (i - 1) for i in range(1, k))
-    same(estimates.live[k], first + k * ALBEDO ** (k - 1) / (1 - ALBEDO))
+    same(estimates.attached[k], first + k * ALBEDO ** (k - 1) / (1 - ALBEDO))
 
 
 @pytest.mark.parametrize("limit", [3, 500])
 def test_paths_are_as_long_as_walls_let_them_be(furnace, limit):
-    world, _ = furnace
+    scene_view, _ = furnace
     rays = CameraRays.of(built_in_cameras("furnace", 8))
     sampler = mi.load_dict({"type": "independent"})
     lanes = rays.pixels * 256
     sampler.seed(0, lanes)
     pixel = mi.UInt32(sampler.next_1d() * 0.99999 * rays.pixels)
     ray = rays.through(pixel, sampler.next_2d())
-    lengths = np.array(path_lengths(world, ray, 3, max_depth=limit, rr_depth=1))
+    lengths = np.array(path_lengths(scene_view, ray, 3, max_depth=limit, rr_depth=1))
     assert lengths.min() == 1 and lengths.max() <= limit
     assert lengths.mean() == pytest.approx((1 - ALBEDO**limit) / (1 - ALBEDO), rel=0.01)

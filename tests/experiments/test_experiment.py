@@ -14,15 +14,15 @@ from unbake.errors import UserError
 from unbake.experiments import Name, experiment, load
 from unbake.experiments.experiment import (
     Experiment,
-    Part,
-    Setting,
-    Shown,
+    ExperimentContext,
+    ExperimentResult,
+    Job,
     duration,
     markdown,
     reproduce,
 )
 from unbake.experiments.fig4 import agreement, published_tables, smoothed
-from unbake.experiments.ladder import at_equal_samples
+from unbake.experiments.scene_fits import at_equal_samples
 from unbake.experiments.scenes import SCENES, STAIRCASE
 
 
@@ -32,8 +32,8 @@ def machine_of_reference(monkeypatch):
     monkeypatch.setattr(experiment, "_slowness", lambda: 1.0)
 
 
-def setting(folder, **others) -> Setting:
-    return Setting("smoke", folder, folder, Console(quiet=True), **others)
+def context(folder, **others) -> ExperimentContext:
+    return ExperimentContext("smoke", folder, folder, Console(quiet=True), **others)
 
 
 def squares(done: list, numbers=(2, 3), offset=0, files=(), plots=False) -> Experiment:
@@ -47,20 +47,20 @@ def squares(done: list, numbers=(2, 3), offset=0, files=(), plots=False) -> Expe
 
     def parts(_):
         settings = {"offset": offset}
-        return [Part(f"of-{n}", settings, partial(work, n), 1.0, files=files) for n in numbers]
+        return [Job(f"of-{n}", settings, partial(work, n), 1.0, files=files) for n in numbers]
 
     def show(_, found):
         rows = [{"part": name} | f for name, f in found.items()]
-        return Shown(rows, markdown(["a", "b"], [[1, None]]))
+        return ExperimentResult(rows, markdown(["a", "b"], [[1, None]]))
 
     return Experiment("squares", "Squares", parts, show, plots)
 
 
 def test_parts_that_are_done_are_not_done_again(tmp_path):
     done = []
-    reproduce(squares(done), setting(tmp_path))
+    reproduce(squares(done), context(tmp_path))
     assert done == [2, 3]
-    reproduce(squares(done, (2, 3, 4)), setting(tmp_path))
+    reproduce(squares(done, (2, 3, 4)), context(tmp_path))
     assert done == [2, 3, 4]
     data = json.loads((tmp_path / "squares" / "data.json").read_text())
     assert [row["square"] for row in data["rows"]] == [4, 9, 16] and len(data["machines"]) == 1
@@ -70,21 +70,21 @@ def test_parts_that_are_done_are_not_done_again(tmp_path):
 
 def test_parts_with_other_settings_or_damaged_are_done_again(tmp_path):
     done = []
-    reproduce(squares(done), setting(tmp_path))
-    reproduce(squares(done, offset=1), setting(tmp_path))
+    reproduce(squares(done), context(tmp_path))
+    reproduce(squares(done, offset=1), context(tmp_path))
     assert done == [2, 3, 2, 3]
     (tmp_path / "work" / "smoke" / "squares" / "of-3.json").write_text("{")
-    reproduce(squares(done, offset=1), setting(tmp_path))
+    reproduce(squares(done, offset=1), context(tmp_path))
     assert done == [2, 3, 2, 3, 3]
 
 
 def test_parts_whose_files_are_gone_are_done_again(tmp_path):
     done, file = [], tmp_path / "picture.png"
-    reproduce(squares(done, files=[file]), setting(tmp_path))
-    reproduce(squares(done, files=[file]), setting(tmp_path))
+    reproduce(squares(done, files=[file]), context(tmp_path))
+    reproduce(squares(done, files=[file]), context(tmp_path))
     assert done == [2, 3]
     file.unlink()
-    reproduce(squares(done, files=[file]), setting(tmp_path))
+    reproduce(squares(done, files=[file]), context(tmp_path))
     assert done == [2, 3, 2, 3]
 
 
@@ -94,12 +94,12 @@ def test_what_was_done_before_it_was_stopped_is_kept(tmp_path):
     def stop():
         raise KeyboardInterrupt
 
-    parts = [*squares(done).parts(None), Part("last", {}, stop, 1.0)]
+    parts = [*squares(done).parts(None), Job("last", {}, stop, 1.0)]
     stopped = Experiment("squares", "", lambda s: parts, squares(done).show)
     with pytest.raises(KeyboardInterrupt):
-        reproduce(stopped, setting(tmp_path))
+        reproduce(stopped, context(tmp_path))
     assert not (tmp_path / "squares").exists()
-    reproduce(squares(done), setting(tmp_path))
+    reproduce(squares(done), context(tmp_path))
     assert done == [2, 3]
 
 
@@ -109,10 +109,10 @@ def test_a_part_that_fails_does_not_keep_others_from_being_done(tmp_path):
     def fail():
         raise UserError("no luck", remedy="Try again")
 
-    parts = [Part("first", {}, fail, 1.0), *squares(done).parts(None)]
+    parts = [Job("first", {}, fail, 1.0), *squares(done).parts(None)]
     failing = Experiment("squares", "", lambda s: parts, squares(done).show)
     with pytest.raises(UserError, match="squares, first: no luck. Try again"):
-        reproduce(failing, setting(tmp_path))
+        reproduce(failing, context(tmp_path))
     assert done == [2, 3] and not (tmp_path / "squares").exists()
 
 
@@ -120,13 +120,13 @@ def test_figures_that_cannot_be_drawn_are_not_begun(tmp_path, monkeypatch):
     done = []
     monkeypatch.setattr(experiment, "find_spec", lambda name: None)
     with pytest.raises(UserError, match="matplotlib"):
-        reproduce(squares(done, plots=True), setting(tmp_path))
+        reproduce(squares(done, plots=True), context(tmp_path))
     assert not done
 
 
 def test_a_plan_does_nothing(tmp_path):
     done = []
-    reproduce(squares(done), setting(tmp_path), plan=True)
+    reproduce(squares(done), context(tmp_path), plan=True)
     assert not done and not list(tmp_path.iterdir())
 
 
@@ -139,11 +139,11 @@ def test_lengths_of_time_are_told_in_words(seconds, told):
 
 def test_scenes_that_are_not_there_are_named(tmp_path):
     with pytest.raises(UserError, match="'staircase'.*--scenes"):
-        STAIRCASE.capture(setting(tmp_path))
+        STAIRCASE.capture(context(tmp_path))
     lego = next(scene for scene in SCENES if scene.name == "LEGO")
     (tmp_path / "lego").mkdir()
     with pytest.raises(UserError, match="'envmaps_blender'"):
-        lego.capture(setting(tmp_path))
+        lego.capture(context(tmp_path))
 
 
 @pytest.mark.parametrize("damage", ["no archive", "cut off", "other folder"])
@@ -156,16 +156,16 @@ def test_archives_that_are_damaged_are_named(tmp_path, damage):
         content = archive.read_bytes()
         archive.write_bytes(b"nothing" if damage == "no archive" else content[: len(content) // 2])
     with pytest.raises(UserError, match="staircase.tar.xz.*cannot be unpacked"):
-        STAIRCASE.unpacked(setting(tmp_path))
+        STAIRCASE.unpacked(context(tmp_path))
     assert not list((tmp_path / "work" / "published").iterdir())
 
 
 def test_data_sets_of_other_settings_have_other_folders(tmp_path):
-    small = setting(tmp_path)
+    small = context(tmp_path)
     other = dataclasses.replace(STAIRCASE, albedo_power=0.8)
     shots = dataclasses.replace(STAIRCASE.capture_settings(small), spp=7)
     folders = {STAIRCASE.data(small), other.data(small), STAIRCASE.data(small, shots)}
-    assert len(folders) == 3 and STAIRCASE.data(small) == STAIRCASE.data(setting(tmp_path))
+    assert len(folders) == 3 and STAIRCASE.data(small) == STAIRCASE.data(context(tmp_path))
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.folder)

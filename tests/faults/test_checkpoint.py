@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from unbake.errors import UserError
-from unbake.fit.checkpoint import KEEP, Progress, load_checkpoint, save_checkpoint
-from unbake.fit.step import State
+from unbake.training.checkpoint import KEEP, Progress, load_checkpoint, save_checkpoint
+from unbake.training.step import State
 
 
 def make_state(seed=0, width=3):

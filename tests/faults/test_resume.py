@@ -18,9 +18,9 @@ from safetensors.numpy import load_file
 
 from unbake import cli
 from unbake.config import read_toml
-from unbake.fit.monitor import forget_after
-from unbake.fit.step import TrainingStep
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.training.monitor import forget_after
+from unbake.training.step import TrainingStep
 
 
 @pytest.fixture

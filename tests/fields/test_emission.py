@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from support import losses_of_light, pixel_rays, seeded
 
-from unbake.data.camera import Camera
+from unbake.dataset.camera import Camera
 from unbake.fields.emission import BOUND, Emission, emission_textures
 from unbake.transport.operator import attach_material, bounce
-from unbake.transport.vertex import World, find_vertex
+from unbake.transport.vertex import SceneView, find_vertex
 
 #: Strengths in the order of `lit_scene`; each light alone makes a picture that is not black.
 TRUTH = [[1.0, 2.0, 3.0], [8.0, 4.0, 2.0], [10.0, 12.0, 14.0], [2.0, 3.0, 1.0], [0.2, 0.1, 0.3]]
@@ -133,9 +133,9 @@ def test_gradients_through_a_bounce_of_our_own_and_a_frozen_step():
     gc.disable()
     for frozen in (True, False):
         emission, log = fitted(TRUTH)
-        world = World.of(lit_scene(emission_textures(emission)), None, 4)
+        scene_view = SceneView.of(lit_scene(emission_textures(emission)), None, 4)
         optimizer = mi.ad.Adam(0.05, {"log": log})
-        losses = losses_of_light(emission, optimizer, world, rays, target, frozen=frozen)
+        losses = losses_of_light(emission, optimizer, scene_view, rays, target, frozen=frozen)
         histories.append((losses, np.array(optimizer["log"])))
     gc.enable()
     (a, learnt_a), (b, learnt_b) = histories
@@ -147,11 +147,11 @@ def test_gradients_through_a_bounce_of_our_own_and_a_frozen_step():
 def test_direct_light_is_linear_in_strengths():
     """Gradients of logs sum to the light itself, through the samples of `bounce`."""
     emission, log = fitted(TRUTH)
-    world = World.of(lit_scene(emission_textures(emission)), None, 4)
+    scene_view = SceneView.of(lit_scene(emission_textures(emission)), None, 4)
     rays = pixel_rays(CAMERA, 16, 3)
     sampler = seeded(5, dr.width(rays))
-    first = find_vertex(world, rays, mi.Bool(True), sampler)
-    step = bounce(world, attach_material(world, first), sampler)
+    first = find_vertex(scene_view, rays, mi.Bool(True), sampler)
+    step = bounce(scene_view, attach_material(scene_view, first), sampler)
     total = dr.sum(dr.sum(step.direct + step.weight * step.next.emitted + first.emitted))
     dr.backward(total)
     assert np.array(dr.grad(log)).min() > 0

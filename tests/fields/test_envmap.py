@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 from support import assert_same_expectation, losses_of_light, pixel_rays, seeded, stock_path
 
-from unbake.data.camera import Camera
-from unbake.fields.envmap import (
-    BOUND,
-    EnvironmentMap,
-    environment_emitter,
-    from_square,
-    to_square,
-)
+from unbake.dataset.camera import Camera
+from unbake.fields.envmap import BOUND, EnvironmentMap, environment_emitter, from_square, to_square
 from unbake.transport.operator import attach_material, bounce
-from unbake.transport.vertex import World, find_vertex
+from unbake.transport.vertex import SceneView, find_vertex
 
 CAMERA = [Camera.look_at([0, 1, 4], [0, 0, 0], [0, 1, 0], 45, 12, 12)]
 CAMERA_PLUGIN = {
@@ -379,11 +373,11 @@ def test_gradients_through_stock_integrators(integrator, name):
     assert ours == pytest.approx(expected, rel=0.05, abs=0.02 * picture())
 
 
-def directly_lit(world, rays, seed):
+def directly_lit(scene_view, rays, seed):
     """Direct light at the vertices that a camera sees: by emitter and by BSDF sampling."""
     sampler = seeded(seed, dr.width(rays))
-    first = find_vertex(world, rays, mi.Bool(True), sampler)
-    step = bounce(world, attach_material(world, first), sampler)
+    first = find_vertex(scene_view, rays, mi.Bool(True), sampler)
+    step = bounce(scene_view, attach_material(scene_view, first), sampler)
     light = dr.select(first.valid, step.direct + step.weight * step.next.emitted, 0)
     return light + first.emitted
 
@@ -391,13 +385,13 @@ def directly_lit(world, rays, seed):
 def test_gradients_through_a_bounce_of_our_own():
     environment, values = filled(8)
     scene = lit_scene(environment_emitter(environment))
-    world = World.of(scene, None, 4)
+    scene_view = SceneView.of(scene, None, 4)
     rays = pixel_rays(CAMERA, 256, 3)
 
     def mean(light):
         return dr.mean(dr.mean(light))
 
-    dr.backward(mean(directly_lit(world, rays, 5)))
+    dr.backward(mean(directly_lit(scene_view, rays, 5)))
     rng = np.random.default_rng(2)
     for name in values:
         direction = mi.Float(rng.normal(0, 1, dr.width(values[name])).astype(np.float32))
@@ -405,7 +399,7 @@ def test_gradients_through_a_bounce_of_our_own():
 
         def picture():
             with dr.suspend_grad():
-                return float(np.array(mean(directly_lit(world, rays, 6)))[0])
+                return float(np.array(mean(directly_lit(scene_view, rays, 6)))[0])
 
         expected = difference(environment, values, name, direction, 0.1, picture)
         assert ours == pytest.approx(expected, rel=0.05, abs=0.02 * picture())
@@ -428,9 +422,9 @@ def test_a_frozen_step_is_the_same_as_one_that_is_not(no_collection):
     histories = []
     for frozen in (True, False):
         environment, values = filled(16)
-        world = World.of(lit_scene(environment_emitter(environment)), None, 4)
+        scene_view = SceneView.of(lit_scene(environment_emitter(environment)), None, 4)
         optimizer = mi.ad.Adam(0.05, values)
-        losses = losses_of_light(environment, optimizer, world, rays, target, frozen=frozen)
+        losses = losses_of_light(environment, optimizer, scene_view, rays, target, frozen=frozen)
         learnt = np.concatenate([np.array(v) for v in optimizer.values()])
         histories.append((losses, learnt))
         # After the frozen calls the map holds old texels until it is told anew.

@@ -17,14 +17,14 @@ from support import (
 )
 
 from unbake.config import BitmapConfig, DenseGridConfig
-from unbake.data import scene as scenes
 from unbake.errors import UserError
 from unbake.fields.materials import make_materials
 from unbake.fields.texture import material_textures, slots_of
-from unbake.fit.problem import make_problem
-from unbake.fit.step import TrainingStep, initial_state
+from unbake.scene import parse as scenes
+from unbake.training.problem import make_problem
+from unbake.training.step import TrainingStep, initial_state
 from unbake.transport.operator import attach_albedo, attach_material
-from unbake.transport.vertex import World, find_vertex
+from unbake.transport.vertex import SceneView, find_vertex
 
 REPRESENTATIONS = ["neural", "grid", "bitmap"]
 
@@ -105,7 +105,7 @@ def with_slots(tmp_path):
         fields.fields["albedo"],
         np.repeat(list(colours.values()), 3).reshape(-1, 1, 1, 3),
     )
-    return World.of(scene, fields, 4), colours
+    return SceneView.of(scene, fields, 4), colours
 
 
 def rays_from_above():
@@ -116,20 +116,20 @@ def rays_from_above():
 
 
 def test_every_shape_has_the_bitmap_of_its_material(with_slots):
-    world, colours = with_slots
+    scene_view, colours = with_slots
     assert set(colours) == {"wall", "red", "copper", "masked"}
     expected = [colours.get(name) for name in STANDING]
-    sought = np.array([e is not None for e in expected])
-    v = find_vertex(world, rays_from_above(), mi.Bool(True), seeded(0, len(STANDING)))
+    optimized = np.array([e is not None for e in expected])
+    v = find_vertex(scene_view, rays_from_above(), mi.Bool(True), seeded(0, len(STANDING)))
     for attach in (attach_material, attach_albedo):
-        found = np.array(attach(world, v).albedo)[:, sought]
+        found = np.array(attach(scene_view, v).albedo)[:, optimized]
         np.testing.assert_allclose(found, [[e for e in expected if e]] * 3, atol=1e-5)
 
 
 def test_textures_find_their_bitmap_inside_virtual_calls(with_slots):
-    world, colours = with_slots
-    world.materials.stand_alone()
-    si = world.scene.ray_intersect(rays_from_above())
+    scene_view, colours = with_slots
+    scene_view.materials.stand_alone()
+    si = scene_view.scene.ray_intersect(rays_from_above())
     found = np.array(si.bsdf().eval_diffuse_reflectance(si))
     for i, name in enumerate(STANDING):
         if name is not None:
@@ -137,8 +137,10 @@ def test_textures_find_their_bitmap_inside_virtual_calls(with_slots):
 
 
 def test_meshes_are_merged_within_a_material_alone(with_slots):
-    world, _ = with_slots
-    assert sum(shape.is_mesh() for shape in world.scene.shapes()) == 3  # wall, red twice, masked
+    scene_view, _ = with_slots
+    assert (
+        sum(shape.is_mesh() for shape in scene_view.scene.shapes()) == 3
+    )  # wall, red twice, masked
 
 
 def test_materials_without_a_name_get_one_of_their_own(tmp_path):
@@ -217,7 +219,7 @@ def test_bitmaps_render_as_mitsubas_own(built_in):
     assert len(names) >= 3
 
     ray = pixel_rays(built_in_cameras("cornell", 16), 4, seed=1)
-    a, b = (s.ray_intersect(ray) for s in (problem.world.scene, scene))
+    a, b = (s.ray_intersect(ray) for s in (problem.scene_view.scene, scene))
     ours, theirs = (np.array(si.bsdf().eval_diffuse_reflectance(si)) for si in (a, b))
     assert np.ptp(theirs) > 0.5
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
@@ -231,7 +233,7 @@ def test_bitmaps_render_as_mitsubas_own(built_in):
     )
     pictures = [
         np.array(mi.render(s, integrator=path, sensor=sensor, spp=32, seed=3))
-        for s in (problem.world.scene, scene)
+        for s in (problem.scene_view.scene, scene)
     ]
     assert pictures[0].std() > 0.01
     np.testing.assert_allclose(pictures[0], pictures[1], rtol=1e-2, atol=1e-3)
@@ -247,8 +249,8 @@ def test_fields_pass_gradients_inside_virtual_calls(built_in, representation):
         parameters = randomised(problem.materials)
         if not carried:
             problem.materials.stand_alone()
-        v = find_vertex(problem.world, ray, mi.Bool(True), seeded(0, dr.width(ray)))
-        v = attach_material(problem.world, v) if carried else v
+        v = find_vertex(problem.scene_view, ray, mi.Bool(True), seeded(0, dr.width(ray)))
+        v = attach_material(problem.scene_view, v) if carried else v
         wo = mi.Vector3f(0.2, 0.3, 0.9)
         value = v.bsdf.eval(mi.BSDFContext(), v.si, dr.normalize(wo), v.valid)
         dr.backward(dr.sum(dr.sum(value)))
@@ -281,5 +283,5 @@ def test_a_frozen_step_trains_every_representation(built_in, representation, rad
     # What was trained is what is seen.
     state.publish(problem)
     ray = pixel_rays(built_in_cameras("cornell", 8), 1, seed=1)
-    v = find_vertex(problem.world, ray, mi.Bool(True), seeded(0, dr.width(ray)))
-    assert np.ptp(np.array(attach_albedo(problem.world, v).albedo)) > 1e-3
+    v = find_vertex(problem.scene_view, ray, mi.Bool(True), seeded(0, dr.width(ray)))
+    assert np.ptp(np.array(attach_albedo(problem.scene_view, v).albedo)) > 1e-3

@@ -12,6 +12,7 @@ import pytest
 
 from unbake.errors import UserError
 from unbake.imaging import metrics, pictures
+from unbake.io import write_atomically
 
 
 def _picture(height: int = 9, width: int = 13, channels: int = 3) -> np.ndarray:
@@ -104,7 +105,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path):
         raise OSError("disk full")
 
     with pytest.raises(UserError, match="disk full"):
-        pictures.write_atomically(path, fail)
+        write_atomically(path, fail)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

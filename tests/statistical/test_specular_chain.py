@@ -11,10 +11,10 @@ from support import (
     stock_path,
 )
 
-from unbake.data.camera import Camera
-from unbake.transport.image import Needs, lhs, rhs, trace
-from unbake.transport.series import path_traced
-from unbake.transport.vertex import World, find_vertex
+from unbake.dataset.camera import Camera
+from unbake.transport.path_sample import Requirements, lhs, rhs, trace
+from unbake.transport.path_tracer import path_traced
+from unbake.transport.vertex import SceneView, find_vertex
 
 SPP = 1024
 CAMERA = Camera.look_at((0, -2.6, 0.2), (0, 0, -0.1), (0, 0, 1), 50.0, 12, 12)
@@ -92,13 +92,13 @@ THINGS = {
 @pytest.mark.parametrize("name", THINGS)
 def test_series_is_the_image_of_path(name):
     scene = box(THINGS[name])
-    world = World.of(scene, None, 40)
-    assert world.has_chains
+    scene_view = SceneView.of(scene, None, 40)
+    assert scene_view.has_chains
     # Caustics have heavy tails: with few samples a pixel's own variance is no measure of them.
     spp = 4 * SPP if name == "glass ball" else SPP
     ray = pixel_rays([CAMERA], spp, seed=1)
     truth = stock_path(scene, ray, 2, max_depth=64)
-    series = path_traced(world, ray, 3, max_depth=16, rr_depth=5, see_lights=True)
+    series = path_traced(scene_view, ray, 3, max_depth=16, rr_depth=5, hide_emitters=False)
     assert_same_expectation(series, truth, spp)
 
 
@@ -106,11 +106,16 @@ def test_series_is_the_image_of_path(name):
 def test_both_sides_with_an_exact_cache_are_the_image_of_path(name):
     """The cache is asked at the first surface that scatters, seen along the chain's last ray."""
     scene = box(THINGS[name])
-    world = World.of(scene, None, 40)
+    scene_view = SceneView.of(scene, None, 40)
     ray = pixel_rays([CAMERA], SPP, seed=4)
     truth = stock_path(scene, ray, 5, max_depth=64)
-    cache, needs = PathTracedRadiance(world, 6, 16), Needs(bounces=1, residuals=1, lhs=True)
-    sample = trace(world, cache, ray, seeded(7, dr.width(ray)), needs, True)
+    cache, requirements = (
+        PathTracedRadiance(scene_view, 6, 16),
+        Requirements(bounces=1, residuals=1, lhs=True),
+    )
+    sample = trace(
+        scene_view, cache, ray, seeded(7, dr.width(ray)), requirements, hide_emitters=False
+    )
     flags = sample.x1.bsdf.flags()
     assert dr.all(mi.has_flag(flags, mi.BSDFFlags.Smooth) | ~sample.x1.valid)
     assert_same_expectation(rhs(sample, sample.radiance[1]), truth, SPP)
@@ -122,8 +127,8 @@ def test_both_sides_with_an_exact_cache_are_the_image_of_path(name):
 
 def along(scene: mi.Scene, max_specular: int, ray: mi.Ray3f):
     """The first vertex along a single ray."""
-    world = World.of(scene, None, max_specular)
-    return find_vertex(world, ray, mi.Bool(True), seeded(0, 1))
+    scene_view = SceneView.of(scene, None, max_specular)
+    return find_vertex(scene_view, ray, mi.Bool(True), seeded(0, 1))
 
 
 def corridor(panes: int, bsdf: dict) -> mi.Scene:
@@ -177,8 +182,10 @@ def test_a_lane_in_black_stays_black_in_both_images():
     """Between mirrors that nothing lights, neither side of the equation holds any light."""
     scene = mirrors()
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, 8), 0, 0), dr.normalize(mi.Vector3f(1, 0, 1)))
-    world = World.of(scene, None, 4)
-    cache = PathTracedRadiance(world, 1, 4)
-    sample = trace(world, cache, ray, seeded(2, 8), Needs(1, 2, lhs=True), True)
+    scene_view = SceneView.of(scene, None, 4)
+    cache = PathTracedRadiance(scene_view, 1, 4)
+    sample = trace(
+        scene_view, cache, ray, seeded(2, 8), Requirements(1, 2, lhs=True), hide_emitters=False
+    )
     assert dr.all(lhs(sample, sample.radiance[0]) == 0, axis=None)
     assert dr.all(rhs(sample, sample.radiance[1]) == 0, axis=None)

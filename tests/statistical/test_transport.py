@@ -14,37 +14,38 @@ from support import (
     stock_path,
 )
 
-from unbake.data import scene as scenes
-from unbake.data.camera import Camera
+from unbake.dataset.camera import Camera
 from unbake.fields.texture import material_textures
-from unbake.transport.image import Needs, lhs, rhs, trace
+from unbake.scene import parse as scenes
+from unbake.transport.path_sample import Requirements, lhs, rhs, trace
+from unbake.transport.path_tracer import path_traced
 from unbake.transport.prior import residual
-from unbake.transport.series import path_traced
-from unbake.transport.vertex import World
+from unbake.transport.vertex import SceneView
 
 # Deep enough that what is cut off is far below the noise; mirrors count for `path`, not for us.
 DEPTH, STOCK_DEPTH, SPP = 24, 64, 1024
 
 
 def compare(
-    ours: World,
+    ours: SceneView,
     stock: mi.Scene,
     cameras: list[Camera],
     *,
-    see_lights: bool = True,
+    hide_emitters: bool = False,
     spp: int = SPP,
 ) -> None:
     """All three ways to an image: E + T(L) and E + L with an exact L, and the series."""
     ray = pixel_rays(cameras, spp, seed=1)
-    hide = not see_lights
-    truth = stock_path(stock, ray, 3, max_depth=STOCK_DEPTH, hide_emitters=hide)
+    truth = stock_path(stock, ray, 3, max_depth=STOCK_DEPTH, hide_emitters=hide_emitters)
     # The series brings its own random numbers, from another seed.
     cache = PathTracedRadiance(ours, 4, DEPTH)
-    needs = Needs(bounces=1, residuals=1, lhs=True)
-    sample = trace(ours, cache, ray, seeded(5, dr.width(ray)), needs, see_lights)
+    requirements = Requirements(bounces=1, residuals=1, lhs=True)
+    sample = trace(
+        ours, cache, ray, seeded(5, dr.width(ray)), requirements, hide_emitters=hide_emitters
+    )
     assert_same_expectation(rhs(sample, sample.radiance[1]), truth, spp)
     assert_same_expectation(lhs(sample, sample.radiance[0]), truth, spp)
-    series = path_traced(ours, ray, 6, max_depth=DEPTH, rr_depth=5, see_lights=see_lights)
+    series = path_traced(ours, ray, 6, max_depth=DEPTH, rr_depth=5, hide_emitters=hide_emitters)
     assert_same_expectation(series, truth, spp)
 
 
@@ -54,18 +55,18 @@ def load(path) -> mi.Scene:
 
 def test_cornell_in_principled_paint(built_in):
     scene = load(built_in("cornell"))
-    compare(World.of(scene, None, 8), scene, built_in_cameras("cornell", 12))
+    compare(SceneView.of(scene, None, 8), scene, built_in_cameras("cornell", 12))
 
 
 def test_cube_with_a_light_that_reflects(built_in):
     scene = load(built_in("cube"))
-    compare(World.of(scene, None, 8), scene, built_in_cameras("cube", 12))
+    compare(SceneView.of(scene, None, 8), scene, built_in_cameras("cube", 12))
 
 
 @pytest.mark.slow
 def test_demo_with_textures_a_mirror_and_hidden_lamps(built_in):
     scene = load(built_in("demo"))
-    compare(World.of(scene, None, 8), scene, built_in_cameras("demo", 16), spp=2048)
+    compare(SceneView.of(scene, None, 8), scene, built_in_cameras("demo", 16), spp=2048)
 
 
 def test_fields_in_the_place_of_materials(built_in):
@@ -76,16 +77,23 @@ def test_fields_in_the_place_of_materials(built_in):
     scenes.set_textures(ours, *material_textures(materials))
     paint = mi.load_dict({"type": "rgb", "value": list(colour)})
     scenes.set_textures(stock, paint, roughness)
-    world = World.of(ours.instantiate(), materials, 8)
-    compare(world, stock.instantiate(), built_in_cameras("cornell", 12))
+    scene_view = SceneView.of(ours.instantiate(), materials, 8)
+    compare(scene_view, stock.instantiate(), built_in_cameras("cornell", 12))
 
 
 def test_the_residuals_of_the_exact_radiance_vanish(built_in):
     """Both of them, at the vertices that cameras see and one bounce further."""
-    world = World.of(load(built_in("cornell")), None, 8)
+    scene_view = SceneView.of(load(built_in("cornell")), None, 8)
     ray = pixel_rays(built_in_cameras("cornell", 8), 4 * SPP, seed=7)
-    cache = PathTracedRadiance(world, 8, DEPTH)
-    sample = trace(world, cache, ray, seeded(9, dr.width(ray)), Needs(1, 2, lhs=True), True)
+    cache = PathTracedRadiance(scene_view, 8, DEPTH)
+    sample = trace(
+        scene_view,
+        cache,
+        ray,
+        seeded(9, dr.width(ray)),
+        Requirements(1, 2, lhs=True),
+        hide_emitters=False,
+    )
     first = residual(sample, 1, sample.radiance[0], sample.radiance[1])
     assert_same_expectation(sample.radiance[0], sample.radiance[0] - first, 4 * SPP)
     second = residual(sample, 2, sample.radiance[1], sample.radiance[2])
@@ -143,22 +151,22 @@ def lamp_in_view():
 
 
 @pytest.mark.parametrize(
-    ("lights", "see_lights"),
+    ("lights", "hide_emitters"),
     [
-        ({"sky": sky}, True),
         ({"sky": sky}, False),
-        ({"even": lambda: {"type": "constant", "radiance": 0.7}}, True),
+        ({"sky": sky}, True),
         ({"even": lambda: {"type": "constant", "radiance": 0.7}}, False),
-        ({"point": lambda: {"type": "point", "position": [1, -1, 2.5], "intensity": 8.0}}, True),
+        ({"even": lambda: {"type": "constant", "radiance": 0.7}}, True),
+        ({"point": lambda: {"type": "point", "position": [1, -1, 2.5], "intensity": 8.0}}, False),
         (
             {
                 "point": lambda: {"type": "point", "position": [1, -1, 2.5], "intensity": 8.0},
                 "sky": sky,
             },
-            True,
+            False,
         ),
-        ({"lamp": lamp_in_view, "sky": sky}, True),
         ({"lamp": lamp_in_view, "sky": sky}, False),
+        ({"lamp": lamp_in_view, "sky": sky}, True),
     ],
     ids=[
         "sky",
@@ -171,7 +179,7 @@ def lamp_in_view():
         "hidden lamp",
     ],
 )
-def test_lights_far_away_and_without_extent(lights, see_lights):
+def test_lights_far_away_and_without_extent(lights, hide_emitters):
     scene = still_life(**{name: make() for name, make in lights.items()})
     camera = Camera.look_at(*CAMERA, 12, 12)
-    compare(World.of(scene, None, 8), scene, [camera], see_lights=see_lights)
+    compare(SceneView.of(scene, None, 8), scene, [camera], hide_emitters=hide_emitters)

@@ -17,21 +17,21 @@ from support import (
     seeded,
 )
 
-from unbake.data import scene as scenes
-from unbake.data.batches import CameraRays, PixelSource
+from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.texture import material_textures
-from unbake.fit.problem import make_problem
-from unbake.fit.step import State, TrainingStep
-from unbake.transport.image import Needs, rhs, trace
+from unbake.scene import parse as scenes
+from unbake.training.problem import make_problem
+from unbake.training.step import State, TrainingStep
 from unbake.transport.objective import (
     PHOTOMETRIC,
-    Live,
+    Attached,
     RelativeL2,
     objective,
     pixel_means,
     squared_error,
 )
-from unbake.transport.vertex import World
+from unbake.transport.path_sample import Requirements, rhs, trace
+from unbake.transport.vertex import SceneView
 
 
 def z_of(values, expected, error=0.0):
@@ -113,7 +113,7 @@ def room(built_in):
     materials = ConstantMaterials(0.5, 0.4)
     parsed = scenes.parse(built_in("cornell"))
     scenes.set_textures(parsed, *material_textures(materials))
-    return World.of(parsed.instantiate(), materials, 8)
+    return SceneView.of(parsed.instantiate(), materials, 8)
 
 
 def one_pixel(room, lanes, seed):
@@ -123,7 +123,9 @@ def one_pixel(room, lanes, seed):
     ray = rays.through(dr.full(mi.UInt32, 9, lanes), sampler.next_2d())
     albedo = room.materials.albedo = dr.full(mi.Color3f, 0.5, lanes)
     dr.enable_grad(albedo)
-    return albedo, trace(room, ConstantRadiance(0.3), ray, sampler, Needs(1, 1, lhs=True), True)
+    return albedo, trace(
+        room, ConstantRadiance(0.3), ray, sampler, Requirements(1, 1, lhs=True), hide_emitters=False
+    )
 
 
 def reference_gradient(room, target, weight, batches=12, lanes=1 << 17):
@@ -160,7 +162,7 @@ def test_the_gradient_of_a_real_pixel_is_unbiased(room):
         photographs = dr.repeat(mi.Color3f(target.tolist()), repeats)
         loss = RelativeL2(epsilon)
         if estimator is None:
-            row = {PHOTOMETRIC: Live(scene=True)}
+            row = {PHOTOMETRIC: Attached(scene=True)}
             value = objective(row, sample, photographs, spp, loss, primal)[PHOTOMETRIC]
         else:
             weight = loss.weight(photographs)

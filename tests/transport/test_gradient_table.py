@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from support import TINY_FIT, built_in_cameras, enable_gradients, pixel_rays, seeded
 
-from unbake.fit.problem import make_problem
-from unbake.transport.image import Needs, trace
+from unbake.training.problem import make_problem
 from unbake.transport.objective import (
     EXTRA,
     LHS,
     METHODS,
     PHOTOMETRIC,
     PRIOR,
-    Live,
+    Attached,
     RelativeL2,
-    needs,
     objective,
+    requirements,
 )
+from unbake.transport.path_sample import Requirements, trace
 
 SPP = 4
-#: Term → flag of `Live` → the piece of a path sample that it makes live.
+#: Term → flag of `Attached` → the piece of a path sample that it makes live.
 EDGES = {
     PHOTOMETRIC: {"scene": "bounce1", "rhs": "L2"},
     PRIOR: {"scene": "bounce1", "lhs": "L1", "rhs": "L2"},
@@ -34,7 +34,7 @@ EDGES = {
 PIECES = ("bounce1", "L1", "L2")
 FLAGS = ("scene", "lhs", "rhs")
 SYNTHETIC = [
-    pytest.param(term, Live(**dict(zip(EDGES[term], on, strict=True))), id=f"{term}-{on}")
+    pytest.param(term, Attached(**dict(zip(EDGES[term], on, strict=True))), id=f"{term}-{on}")
     for term in EDGES
     for on in itertools.product([False, True], repeat=len(EDGES[term]))
 ]
@@ -52,10 +52,12 @@ def rays():
 
 
 def traced(problem, rays, wanted=None):
-    wanted = wanted or Needs(bounces=1, residuals=2, lhs=True)
+    wanted = wanted or Requirements(bounces=1, residuals=2, lhs=True)
     sampler = seeded(2, dr.width(rays))
     radiance = problem.radiance if wanted.radiance else None
-    return trace(problem.world, radiance, rays, sampler, wanted, problem.see_lights)
+    return trace(
+        problem.scene_view, radiance, rays, sampler, wanted, hide_emitters=problem.hide_emitters
+    )
 
 
 def photographs(rays):
@@ -88,21 +90,21 @@ def test_nothing_beyond_the_second_vertex_passes_gradients(problem, rays):
     enable_gradients(problem)
     sample = traced(problem, rays)
     first, second = sample.bounces
-    for live in (first.direct, first.weight, *sample.radiance[:2]):
-        assert dr.grad_enabled(live)
+    for attached in (first.direct, first.weight, *sample.radiance[:2]):
+        assert dr.grad_enabled(attached)
     for fixed in (second.direct, second.weight, sample.radiance[2], sample.x1.albedo):
         assert not dr.grad_enabled(fixed)
 
 
 @pytest.mark.parametrize("reference", LOSSES)
 @pytest.mark.parametrize(("term", "live"), SYNTHETIC)
-def test_a_row_makes_those_pieces_live_that_it_says(problem, rays, term, live, reference):
+def test_a_row_makes_those_pieces_live_that_it_says(problem, rays, term, attached, reference):
     sample, arrays = with_live_pieces(traced(problem, rays))
-    values = objective({term: live}, sample, photographs(rays), SPP, LOSSES[reference])
+    values = objective({term: attached}, sample, photographs(rays), SPP, LOSSES[reference])
     assert list(values) == [term]
     if dr.grad_enabled(values[term]):
         dr.backward(values[term])
-    wanted = {piece for flag, piece in EDGES[term].items() if getattr(live, flag)}
+    wanted = {piece for flag, piece in EDGES[term].items() if getattr(attached, flag)}
     for piece in PIECES:
         assert non_zero(arrays[piece]) == [piece in wanted] * len(arrays[piece]), piece
 
@@ -110,15 +112,17 @@ def test_a_row_makes_those_pieces_live_that_it_says(problem, rays, term, live, r
 def test_live_edges_add_up(problem, rays):
     """A term's gradient is the sum of those through each of its live edges."""
 
-    def gradients(live):
+    def gradients(attached):
         sample, arrays = with_live_pieces(traced(problem, rays))
         dr.backward(
-            objective({PRIOR: live}, sample, photographs(rays), SPP, LOSSES["photograph"])[PRIOR]
+            objective({PRIOR: attached}, sample, photographs(rays), SPP, LOSSES["photograph"])[
+                PRIOR
+            ]
         )
         return np.concatenate([np.ravel(dr.grad(a)) for p in PIECES for a in arrays[p]])
 
-    parts = [gradients(Live(**{flag: True})) for flag in FLAGS]
-    np.testing.assert_array_equal(sum(parts), gradients(Live(True, True, True)))
+    parts = [gradients(Attached(**{flag: True})) for flag in FLAGS]
+    np.testing.assert_array_equal(sum(parts), gradients(Attached(True, True, True)))
 
 
 # ------------------------------------------------------ parameters of the fields, for each method
@@ -133,13 +137,13 @@ def test_a_term_of_a_method_trains_what_the_table_says(
     row = METHODS[method]
     φ, θ = enable_gradients(problem)
     target = photographs(rays)
-    sample = traced(problem, rays, needs(row))
+    sample = traced(problem, rays, requirements(row))
     primal = target + 0.1 if two_pass else None
     value = objective(row, sample, target, SPP, LOSSES[reference], primal)[term]
     dr.backward(value)
 
-    live = [flag for flag in EDGES[term] if getattr(row[term], flag)]
-    trains_φ, trains_θ = "scene" in live, bool({"lhs", "rhs"} & set(live))
+    attached = [flag for flag in EDGES[term] if getattr(row[term], flag)]
+    trains_φ, trains_θ = "scene" in attached, bool({"lhs", "rhs"} & set(attached))
     assert trains_φ or trains_θ, "a term that trains nothing has no place in the table"
     assert non_zero(φ.values()) == [trains_φ] * len(φ)
     assert non_zero(θ.values()) == [trains_θ] * len(θ)
@@ -148,22 +152,22 @@ def test_a_term_of_a_method_trains_what_the_table_says(
 @pytest.mark.parametrize("method", METHODS)
 def test_flags_without_an_edge_are_not_set(method):
     """A row must not promise what the objective does not do."""
-    for term, live in METHODS[method].items():
+    for term, attached in METHODS[method].items():
         for flag in set(FLAGS) - set(EDGES[term]):
-            assert not getattr(live, flag), f"{method}, {term}: {flag} has no effect"
+            assert not getattr(attached, flag), f"{method}, {term}: {flag} has no effect"
 
 
 @pytest.mark.parametrize("method", ["ours", "ours, one-bounce"])
 def test_the_paper_trains_materials_by_photographs_and_radiance_by_all_else(method):
     """Sec. 4.1: the photometric loss trains φ alone, prior and LHS loss θ alone."""
     row = METHODS[method]
-    assert row[PHOTOMETRIC] == Live(scene=True)
+    assert row[PHOTOMETRIC] == Attached(scene=True)
     others = set(row) - {PHOTOMETRIC}
     assert {PRIOR, LHS} <= others
-    assert all(row[term] == Live(lhs=True) for term in others)
+    assert all(row[term] == Attached(lhs=True) for term in others)
 
 
-@pytest.mark.parametrize("row", [{PRIOR: Live(lhs=True)}, {EXTRA: Live(lhs=True)}])
+@pytest.mark.parametrize("row", [{PRIOR: Attached(lhs=True)}, {EXTRA: Attached(lhs=True)}])
 def test_a_row_of_a_single_residual_asks_for_the_radiance_field(row):
-    assert needs(row).radiance
-    assert needs(row).residuals == (2 if EXTRA in row else 1)
+    assert requirements(row).radiance
+    assert requirements(row).residuals == (2 if EXTRA in row else 1)

@@ -105,8 +105,8 @@ def capture(
     require("max-depth", max_depth, 1)
     require("seed", seed, 0)
     backend.activate()
-    from ..data.capture import CaptureSettings
-    from ..data.capture import capture as run
+    from ..acquisition.capture import CaptureSettings
+    from ..acquisition.capture import capture as run
 
     settings = CaptureSettings(
         views=views,
@@ -196,7 +196,7 @@ def fit(
         chosen = chosen_settings(preset, settings)
     chosen = overridden(chosen, length | other)
     backend.activate()
-    from ..fit.loop import fit as run
+    from ..training.loop import fit as run
 
     console = Console(highlight=False)
     progress = run(data, out, chosen, resume=resume, clip_negative=clip_negative, console=console)
@@ -232,8 +232,8 @@ def evaluate(
     require("max-depth", max_depth, 1)
     require("train-views", train_views, 0)
     backend.activate()
-    from ..results.evaluate import EvaluationSettings
-    from ..results.evaluate import evaluate as go
+    from ..evaluation.evaluate import EvaluationSettings
+    from ..evaluation.evaluate import evaluate as go
 
     settings = EvaluationSettings(
         spp=spp, max_depth=max_depth, train_views=train_views, clip_negative=clip_negative
@@ -256,7 +256,7 @@ def report(runs: Positional[Runs], /, out: Path) -> None:
     if not runs:
         raise UserError("no run given", remedy="unbake report RUN [RUN ...] --out report.html")
     backend.activate()
-    from ..results.report import write_report
+    from ..report.page import write_report
 
     _say(f"wrote {write_report(runs, out)}")
 
@@ -310,13 +310,13 @@ def compare(
     except UserError as error:
         raise UserError(error.what, "--score-seconds") from None
     backend.activate()
-    from ..results.compare import compare as run
-    from ..results.contender import Contender
-    from ..results.evaluate import EvaluationSettings
+    from ..comparison.compare import compare as run
+    from ..comparison.method_variant import MethodVariant
+    from ..evaluation.evaluate import EvaluationSettings
 
-    contenders = [Contender.of(method) for method in methods]
+    variants = [MethodVariant.of(method) for method in methods]
     evaluation = EvaluationSettings(spp=evaluate_spp, clip_negative=clip_negative)
-    result = run(data, contenders, out, chosen, evaluation=evaluation, clip_negative=clip_negative)
+    result = run(data, variants, out, chosen, evaluation=evaluation, clip_negative=clip_negative)
     _say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
     return 1 if any("error" in row for row in result["methods"].values()) else 0
 
@@ -352,19 +352,19 @@ def bench(
         exclude("data", {"scene": scene})
     chosen = chosen_settings(preset, settings)
     backend.activate()
-    from ..results.bench import bench_step, small_data
-    from ..results.bench_methods import bench_methods
-    from ..results.contender import Contender
+    from ..comparison.bench_methods import bench_methods
+    from ..comparison.method_variant import MethodVariant
+    from ..profiling.bench_step import bench_step, small_data
 
-    contenders = [Contender.of(method) for method in methods]
-    if what == "step" and len(contenders) != 1:
+    variants = [MethodVariant.of(method) for method in methods]
+    if what == "step" and len(variants) != 1:
         raise UserError("step takes one method", "--methods", "Or: unbake bench methods")
     console = Console(highlight=False)
     with small_data(data, scene or "demo") as folder:
         if what == "step":
-            bench_step(folder, contenders[0].settings(chosen), steps, out, console)
+            bench_step(folder, variants[0].settings(chosen), steps, out, console)
         else:
-            bench_methods(folder, contenders, chosen, steps, out, console)
+            bench_methods(folder, variants, chosen, steps, out, console)
 
 
 def reproduce(

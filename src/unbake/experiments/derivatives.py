@@ -12,7 +12,7 @@ import numpy as np
 
 from ..transport.operator import attach_material, bounce
 from ..transport.render import RayGenerator, parts_of
-from ..transport.vertex import World, find_vertex
+from ..transport.vertex import SceneView, find_vertex
 
 #: Bounces before Russian roulette.
 RR_DEPTH = 3
@@ -35,11 +35,11 @@ class Estimates:
     image: np.ndarray
     derivative: np.ndarray
     cut: dict[int, tuple[np.ndarray, np.ndarray]]
-    live: dict[int, np.ndarray]
+    attached: dict[int, np.ndarray]
 
 
 def estimate(
-    world: World,
+    scene_view: SceneView,
     assign: Callable[[mi.Float], None],
     value: float,
     through: RayGenerator,
@@ -49,7 +49,7 @@ def estimate(
     seed: int,
     max_depth: int,
     cut: Sequence[int],
-    live: Sequence[int],
+    attached: Sequence[int],
 ) -> Estimates:
     """Estimate pixels and derivatives along the same paths for all methods.
 
@@ -68,10 +68,12 @@ def estimate(
     """
     names = ["image", "derivative"]
     names += [f"{what} {depth}" for depth in cut for what in ("cut", "cut'")]
-    names += [f"live {k}" for k in live]
+    names += [f"live {k}" for k in attached]
     sums = {name: np.zeros((pixels, 3)) for name in names}
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
-        found = _along(world, assign, value, ray, part_seed, max_depth, set(cut), tuple(live))
+        found = _along(
+            scene_view, assign, value, ray, part_seed, max_depth, set(cut), tuple(attached)
+        )
         for name, samples in found.items():
             means = [np.array(dr.block_sum(c, spp)) / spp for c in samples]
             sums[name][part] = np.stack(means, -1)
@@ -79,19 +81,19 @@ def estimate(
         sums["image"],
         sums["derivative"],
         {depth: (sums[f"cut {depth}"], sums[f"cut' {depth}"]) for depth in cut},
-        {k: sums[f"live {k}"] for k in live},
+        {k: sums[f"live {k}"] for k in attached},
     )
 
 
 def _along(
-    world: World,
+    scene_view: SceneView,
     assign: Callable[[mi.Float], None],
     value: float,
     ray: mi.Ray3f,
     seed: int,
     max_depth: int,
     cut: set[int],
-    live: tuple[int, ...],
+    attached: tuple[int, ...],
 ) -> dict[str, mi.Color3f]:
     """The estimates of each sample."""
     found: dict[str, mi.Color3f] = {}
@@ -99,10 +101,10 @@ def _along(
     sampler = mi.load_dict({"type": "independent"})
     _reseed(sampler, seed, 0, lanes)
     with dr.suspend_grad():
-        x = find_vertex(world, ray, mi.Bool(True), sampler)
+        x = find_vertex(scene_view, ray, mi.Bool(True), sampler)
     total, β = mi.Color3f(x.emitted), mi.Color3f(x.throughput)
     # How throughput and sum change with the parameter: by all bounces, and by the first k alone.
-    ks = (max_depth, *live)
+    ks = (max_depth, *attached)
     dβ = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
     dtotal = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
     lane = dr.arange(mi.UInt32, lanes)
@@ -124,7 +126,7 @@ def _along(
         parameter = mi.Float(value)
         dr.enable_grad(parameter)
         assign(parameter)
-        step = bounce(world, attach_material(world, x), sampler)
+        step = bounce(scene_view, attach_material(scene_view, x), sampler)
         dr.forward(parameter)
         d, dd = dr.detach(step.direct), dr.grad(step.direct)
         w, dw = dr.detach(step.weight), dr.grad(step.weight)
@@ -145,7 +147,7 @@ def _along(
     for depth in cut:  # where all paths had ended before
         found.setdefault(f"cut {depth}", total)
         found.setdefault(f"cut' {depth}", dtotal[max_depth])
-    return found | {f"live {k}": dtotal[k] for k in live}
+    return found | {f"live {k}": dtotal[k] for k in attached}
 
 
 def _reseed(sampler: mi.Sampler, seed: int, number: int, lanes: int) -> None:

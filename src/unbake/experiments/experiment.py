@@ -25,22 +25,21 @@ import drjit as dr
 import mitsuba as mi
 from rich.console import Console
 
-from ..data.jsonfile import write_json
 from ..errors import UserError
-from ..imaging.pictures import write_atomically
-from ..results.bench import machine
+from ..io import write_atomically, write_json
+from ..machine import machine
 from . import Scale
 
 if typing.TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Found = dict[str, Any]
+Findings = dict[str, Any]
 Choice = typing.TypeVar("Choice")
 
 
 @final
 @dataclass(frozen=True)
-class Setting:
+class ExperimentContext:
     """How large an experiment is, and where its files are."""
 
     scale: Scale
@@ -64,7 +63,7 @@ class Setting:
 
 @final
 @dataclass(frozen=True)
-class Part:
+class Job:
     """A part of an experiment.
 
     Args:
@@ -78,7 +77,7 @@ class Part:
 
     name: str
     settings: Mapping[str, Any]
-    work: Callable[[], Found]
+    work: Callable[[], Findings]
     seconds: float | None
     waits: float = 0.0
     files: Sequence[Path] = ()
@@ -86,7 +85,7 @@ class Part:
 
 @final
 @dataclass(frozen=True)
-class Shown:
+class ExperimentResult:
     """What is shown of an experiment.
 
     Args:
@@ -115,12 +114,12 @@ class Experiment:
 
     name: str
     title: str
-    parts: Callable[[Setting], list[Part]]
-    show: Callable[[Setting, Mapping[str, Found]], Shown]
+    parts: Callable[[ExperimentContext], list[Job]]
+    show: Callable[[ExperimentContext, Mapping[str, Findings]], ExperimentResult]
     plots: bool = False
 
 
-def reproduce(experiment: Experiment, setting: Setting, *, plan: bool = False) -> None:
+def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool = False) -> None:
     """Do what is left of an experiment, and write its data, table and figure to OUT/NAME.
 
     A part that fails does not keep others from being done.
@@ -135,58 +134,58 @@ def reproduce(experiment: Experiment, setting: Setting, *, plan: bool = False) -
     """
     if experiment.plots and find_spec("matplotlib") is None:
         raise UserError("figures need matplotlib", remedy="pip install 'unbake[plots]'")
-    parts = experiment.parts(setting)
-    left = [part for part in parts if "found" not in _kept(experiment, setting, part)]
-    _tell_plan(experiment, setting, parts, left)
+    parts = experiment.parts(context)
+    left = [part for part in parts if "found" not in _kept(experiment, context, part)]
+    _tell_plan(experiment, context, parts, left)
     if plan:
         return
-    setting.work.mkdir(parents=True, exist_ok=True)
+    context.work.mkdir(parents=True, exist_ok=True)
     failed: list[tuple[str, UserError]] = []
     for part in left:
-        setting.console.rule(part.name, align="left")
+        context.console.rule(part.name, align="left")
         try:
-            _do(experiment, setting, part)
+            _do(experiment, context, part)
         except UserError as error:
             failed.append((part.name, error))
-            setting.tell(f"error: {error}")
+            context.tell(f"error: {error}")
     if failed:
         name, error = failed[0]
         raise UserError(f"{experiment.name}, {name}: {error.what}", error.where, error.remedy)
-    kept = {part.name: _kept(experiment, setting, part) for part in parts}
-    shown = experiment.show(setting, {name: k["found"] for name, k in kept.items()})
-    _write(experiment, setting, shown, kept)
-    setting.tell(shown.tables)
-    setting.tell(f"wrote {setting.out / experiment.name}")
+    kept = {part.name: _kept(experiment, context, part) for part in parts}
+    shown = experiment.show(context, {name: k["found"] for name, k in kept.items()})
+    _write(experiment, context, shown, kept)
+    context.tell(shown.tables)
+    context.tell(f"wrote {context.out / experiment.name}")
 
 
-def _do(experiment: Experiment, setting: Setting, part: Part) -> None:
+def _do(experiment: Experiment, context: ExperimentContext, part: Job) -> None:
     """Do a part and keep what it found; if it is stopped, how long it took so far."""
     kept = {"settings": dict(part.settings), "machine": machine()}
-    before, start = _kept(experiment, setting, part).get("seconds", 0.0), time.perf_counter()
+    before, start = _kept(experiment, context, part).get("seconds", 0.0), time.perf_counter()
     try:
         kept["found"] = part.work()
     finally:
         kept["seconds"] = round(before + time.perf_counter() - start, 2)
-        write_json(_file(experiment, setting, part), kept)
+        write_json(_file(experiment, context, part), kept)
         # Memory of one part is not to be missed by the next.
         gc.collect()
         dr.flush_malloc_cache()
 
 
 def _tell_plan(
-    experiment: Experiment, setting: Setting, parts: list[Part], left: list[Part]
+    experiment: Experiment, context: ExperimentContext, parts: list[Job], left: list[Job]
 ) -> None:
-    setting.tell(f"{experiment.name}: {experiment.title} ({setting.scale} scale)")
+    context.tell(f"{experiment.name}: {experiment.title} ({context.scale} scale)")
     if not left:
-        setting.tell(f"all {len(parts)} parts are done")
+        context.tell(f"all {len(parts)} parts are done")
         return
     told = f"{len(parts) - len(left)} of {len(parts)} parts are done, "
     known = [part.seconds for part in left if part.seconds is not None]
     if len(known) < len(left):
-        setting.tell(told + "nobody has measured how long the others take at this scale")
+        context.tell(told + "nobody has measured how long the others take at this scale")
         return
     seconds = sum(known) * _slowness() + sum(part.waits for part in left)
-    setting.tell(told + f"the others take about {duration(seconds)} on this machine")
+    context.tell(told + f"the others take about {duration(seconds)} on this machine")
 
 
 def duration(seconds: float) -> str:
@@ -201,14 +200,14 @@ def duration(seconds: float) -> str:
 # ------------------------------------------------------------------------------ What is kept of it
 
 
-def _file(experiment: Experiment, setting: Setting, part: Part) -> Path:
-    return setting.work / experiment.name / f"{part.name}.json"
+def _file(experiment: Experiment, context: ExperimentContext, part: Job) -> Path:
+    return context.work / experiment.name / f"{part.name}.json"
 
 
-def _kept(experiment: Experiment, setting: Setting, part: Part) -> Found:
+def _kept(experiment: Experiment, context: ExperimentContext, part: Job) -> Findings:
     """What was written of a part with the same settings; `found` is in it if it was done."""
     try:
-        kept = json.loads(_file(experiment, setting, part).read_text(encoding="utf-8"))
+        kept = json.loads(_file(experiment, context, part).read_text(encoding="utf-8"))
         if kept["settings"] != json.loads(json.dumps(dict(part.settings))):
             return {}
         if not all(file.is_file() for file in part.files):
@@ -219,13 +218,16 @@ def _kept(experiment: Experiment, setting: Setting, part: Part) -> Found:
 
 
 def _write(
-    experiment: Experiment, setting: Setting, shown: Shown, kept: Mapping[str, Found]
+    experiment: Experiment,
+    context: ExperimentContext,
+    shown: ExperimentResult,
+    kept: Mapping[str, Findings],
 ) -> None:
-    folder = setting.out / experiment.name
+    folder = context.out / experiment.name
     data = {
         "experiment": experiment.name,
         "title": experiment.title,
-        "scale": setting.scale,
+        "scale": context.scale,
         # Parts may have been done on different ones.
         "machines": list({json.dumps(k["machine"]): k["machine"] for k in kept.values()}.values()),
         "seconds": round(sum(k["seconds"] for k in kept.values()), 1),

@@ -8,11 +8,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..acquisition.capture import CaptureSettings
+from ..comparison.bench_methods import bench_methods
+from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig
-from ..data.capture import CaptureSettings
-from ..results.bench_methods import bench_methods
-from ..results.contender import Contender
-from .experiment import Experiment, Found, Part, Setting, Shown, markdown, save_figure
+from .experiment import (
+    Experiment,
+    ExperimentContext,
+    ExperimentResult,
+    Findings,
+    Job,
+    markdown,
+    save_figure,
+)
 from .scenes import PaperScene, scenes_at
 
 METHODS = {
@@ -34,42 +42,46 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
 }
 
 
-def _parts(setting: Setting) -> list[Part]:
-    steps = setting.pick(4, 24, 60)
+def _parts(context: ExperimentContext) -> list[Job]:
+    steps = context.pick(4, 24, 60)
     parts = []
-    for scene in scenes_at(setting):
-        scene.require(setting)
+    for scene in scenes_at(context):
+        scene.require(context)
         # What a step takes has nothing to do with how good photographs are.
         shots = dataclasses.replace(
-            scene.capture_settings(setting), resolution=setting.pick(16, 64, 128), spp=1
+            scene.capture_settings(context), resolution=context.pick(16, 64, 128), spp=1
         )
-        config = scene.settings(setting)
+        config = scene.settings(context)
         parts.append(
-            Part(
+            Job(
                 scene.folder,
                 {"steps": steps, "methods": list(METHODS), "fit": dataclasses.asdict(config)}
-                | scene.described(setting, shots),
-                functools.partial(_measure, setting, scene, shots, config, steps),
-                setting.pick(15.0, 90.0, None),
+                | scene.described(context, shots),
+                functools.partial(_measure, context, scene, shots, config, steps),
+                context.pick(15.0, 90.0, None),
             )
         )
     return parts
 
 
 def _measure(
-    setting: Setting, scene: PaperScene, shots: CaptureSettings, config: FitConfig, steps: int
-) -> Found:
-    data = scene.captured(setting, shots)
-    contenders = [Contender.of(name) for name in METHODS.values()]
-    result = bench_methods(data, contenders, config, steps, None, setting.console)
+    context: ExperimentContext,
+    scene: PaperScene,
+    shots: CaptureSettings,
+    config: FitConfig,
+    steps: int,
+) -> Findings:
+    data = scene.captured(context, shots)
+    variants = [MethodVariant.of(name) for name in METHODS.values()]
+    result = bench_methods(data, variants, config, steps, None, context.console)
     kept = ("milliseconds_per_step", "error")
     found = zip(METHODS, result["rows"], strict=True)
     return {name: {k: row[k] for k in kept if k in row} for name, row in found}
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
     rows, lines = [], []
-    for scene in scenes_at(setting):
+    for scene in scenes_at(context):
         measured, theirs = found[scene.folder], PUBLISHED.get(scene.name, {})
         times = {name: measured[name].get("milliseconds_per_step") for name in METHODS}
         ours, cells = times["ours"], []
@@ -85,7 +97,7 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
         lines.append([scene.label, "failed" if ours is None else f"{ours:.0f} ms", *cells])
     others = [f"{name} / ours" for name in METHODS if name != "ours"]
     caption = "In brackets: the authors' bars, on their scenes and an RTX 3090.\n\n"
-    return Shown(
+    return ExperimentResult(
         rows, caption + markdown(["scene", "ours", *others], lines), lambda path: _draw(path, rows)
     )
 

@@ -12,28 +12,21 @@ from typing import final
 import mitsuba as mi
 import numpy as np
 
-from ..data.batches import CameraRays
-from ..data.camera import Camera
-from ..data.scene import ParsedScene, parse, referenced
+from ..dataset.camera import Camera
+from ..dataset.pixels import CameraRays
 from ..errors import UserError
-from ..imaging.pictures import (
-    block_means,
-    false_colour,
-    montage,
-    shrink,
-    tonemap,
-    write_atomically,
-    write_png,
-)
+from ..imaging.pictures import block_means, false_colour, montage, shrink, tonemap, write_png
+from ..io import write_atomically
+from ..scene.parse import ParsedScene, parse, referenced
 from ..transport.render import render_radiance
-from ..transport.vertex import World
+from ..transport.vertex import SceneView
 from .derivatives import Estimates, estimate
 from .experiment import (
     Experiment,
-    Found,
-    Part,
-    Setting,
-    Shown,
+    ExperimentContext,
+    ExperimentResult,
+    Findings,
+    Job,
     copy_file,
     markdown,
     save_figure,
@@ -71,14 +64,14 @@ _PUBLISHED = Path(__file__).parent / "published" / "fig4.csv"
 class _Wood:
     """STAIRCASE, seen as its authors did, and the roughness of its wood."""
 
-    world: World
+    scene_view: SceneView
     rays: CameraRays
     camera: Camera
     assign: Callable[[mi.Float], None]
 
     @staticmethod
-    def of(setting: Setting, shrunk: int) -> _Wood:
-        parsed = parse(STAIRCASE.unpacked(setting))
+    def of(context: ExperimentContext, shrunk: int) -> _Wood:
+        parsed = parse(STAIRCASE.unpacked(context))
         texture, found = mi.load_dict({"type": "uniform", "value": 0.5}), False
         for node in parsed.principled_nodes():
             if WOOD in _picture(parsed, node):
@@ -95,12 +88,12 @@ class _Wood:
 
         camera = Camera.from_mitsuba(scene.sensors()[0])
         camera = camera.rescaled(camera.width // shrunk, camera.height // shrunk)
-        world = World.of(scene, None, 8)
-        return _Wood(world, CameraRays.of([camera]), camera, assign)
+        scene_view = SceneView.of(scene, None, 8)
+        return _Wood(scene_view, CameraRays.of([camera]), camera, assign)
 
     def estimate(self, value: float, spp: int, seed: int) -> Estimates:
         return estimate(
-            self.world,
+            self.scene_view,
             self.assign,
             value,
             self.rays.through,
@@ -122,72 +115,72 @@ def _picture(parsed: ParsedScene, node: object) -> str:
 # ------------------------------------------------------------------------------------------- parts
 
 
-def _parts(setting: Setting) -> list[Part]:
-    STAIRCASE.require(setting)
+def _parts(context: ExperimentContext) -> list[Job]:
+    STAIRCASE.require(context)
     known = {"max_depth": MAX_DEPTH, "albedo_power": STAIRCASE.albedo_power}
-    table = {"shrunk": _shrunk(setting), "spp": setting.pick(4, 256, 1024)}
-    picture = {"shrunk": setting.pick(80, 6, 2), "spp": setting.pick(4, 64, 1024)}
-    picture["zoom"] = setting.pick(1, 3, 1)
+    table = {"shrunk": _shrunk(context), "spp": context.pick(4, 256, 1024)}
+    picture = {"shrunk": context.pick(80, 6, 2), "spp": context.pick(4, 64, 1024)}
+    picture["zoom"] = context.pick(1, 3, 1)
     parts = [
-        Part(
-            _arrays(setting, value).stem,
+        Job(
+            _arrays(context, value).stem,
             table | known | {"value": value},
-            functools.partial(_at, setting, value, **table),
-            setting.pick(15.0, 32.0, None),
-            files=[_arrays(setting, value)],
+            functools.partial(_at, context, value, **table),
+            context.pick(15.0, 32.0, None),
+            files=[_arrays(context, value)],
         )
-        for value in _values(setting)
+        for value in _values(context)
     ]
-    work = functools.partial(_pictures, setting, **picture)
-    seconds = setting.pick(15.0, 60.0, None)
+    work = functools.partial(_pictures, context, **picture)
+    seconds = context.pick(15.0, 60.0, None)
     return [
         *parts,
-        Part("pictures", picture | known, work, seconds, files=[_picture_file(setting)]),
+        Job("pictures", picture | known, work, seconds, files=[_picture_file(context)]),
     ]
 
 
-def _shrunk(setting: Setting) -> int:
+def _shrunk(context: ExperimentContext) -> int:
     """By how much the scene's own film is divided in what is rendered for the table."""
-    return setting.pick(80, 16, 8)
+    return context.pick(80, 16, 8)
 
 
-def _values(setting: Setting) -> tuple[float, ...]:
-    return VALUES[::7] if setting.scale == "smoke" else VALUES
+def _values(context: ExperimentContext) -> tuple[float, ...]:
+    return VALUES[::7] if context.scale == "smoke" else VALUES
 
 
-def _arrays(setting: Setting, value: float) -> Path:
-    return setting.work / "fig4" / f"value-{value:.2f}.npz"
+def _arrays(context: ExperimentContext, value: float) -> Path:
+    return context.work / "fig4" / f"value-{value:.2f}.npz"
 
 
-def _picture_file(setting: Setting) -> Path:
-    return setting.work / "fig4" / "pictures.png"
+def _picture_file(context: ExperimentContext) -> Path:
+    return context.work / "fig4" / "pictures.png"
 
 
-def _at(setting: Setting, value: float, shrunk: int, spp: int) -> Found:
+def _at(context: ExperimentContext, value: float, shrunk: int, spp: int) -> Findings:
     """Images and derivatives of all methods at one roughness, kept as an array beside the part.
 
     Two independent passes: an error from one and a derivative from the other make an unbiased
     gradient. The target, from a third one, has no noise in common with either.
     """
-    wood = _Wood.of(setting, shrunk)
+    wood = _Wood.of(context, shrunk)
     a, b = (wood.estimate(value, spp, seed) for seed in (1, 2))
     wood.assign(mi.Float(value))
     target = render_radiance(
-        wood.world,
+        wood.scene_view,
         wood.rays.through,
         wood.rays.pixels,
         4 * spp,
         seed=3,
         max_depth=MAX_DEPTH,
         rr_depth=5,
-        see_lights=True,
+        hide_emitters=False,
     )
     arrays = {"target": target}
     for name, e in (("a", a), ("b", b)):
         for method, (image, derivative) in _methods(e).items():
             arrays[f"{name} {method} image"] = image.astype(np.float32)
             arrays[f"{name} {method} derivative"] = derivative.astype(np.float32)
-    file = _arrays(setting, value)
+    file = _arrays(context, value)
     write_atomically(file, lambda path: _save(path, arrays))
     return {"height": wood.camera.height, "width": wood.camera.width}
 
@@ -204,22 +197,22 @@ def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found | {f"ours, k = {k}": (e.image, e.live[k]) for k in LIVE}
 
 
-def _pictures(setting: Setting, shrunk: int, spp: int, zoom: int) -> Found:
+def _pictures(context: ExperimentContext, shrunk: int, spp: int, zoom: int) -> Findings:
     """The first row of the figure: derivatives at a roughness of 0.5."""
-    wood = _Wood.of(setting, shrunk)
+    wood = _Wood.of(context, shrunk)
     e = wood.estimate(0.5, spp, 1)
     shape = (wood.camera.height, wood.camera.width, 3)
     found = {m: np.abs(d).mean(-1).reshape(shape[:2]) for m, (_, d) in _methods(e).items()}
     # A few paths of much light would hide all the others: means of small blocks, where there is
     # room for it, and a scale that most pixels of the reference stay below.
-    longest = max(shape[:2]) // 2 if setting.scale != "smoke" else max(shape[:2])
+    longest = max(shape[:2]) // 2 if context.scale != "smoke" else max(shape[:2])
     found = {method: shrink(picture, longest) for method, picture in found.items()}
     scale = max(float(np.percentile(found["reference"], 95)), 1e-6)
     cells = [shrink(tonemap(e.image.reshape(shape)).astype(float), longest).astype(np.uint8)]
     cells += [false_colour(picture, scale) for picture in found.values()]
     cells = [cell.repeat(zoom, 0).repeat(zoom, 1) for cell in cells]
     half = -(-len(cells) // 2)
-    write_png(_picture_file(setting), montage([cells[:half], cells[half:]]))
+    write_png(_picture_file(context), montage([cells[:half], cells[half:]]))
     return {"shown": ["image", *found], "scale": scale}
 
 
@@ -308,14 +301,14 @@ def published_tables() -> dict[str, tuple[list[float], np.ndarray]]:
     return tables
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
-    copy_file(_picture_file(setting), setting.out / "fig4")
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+    copy_file(_picture_file(context), context.out / "fig4")
     arrays = {}
-    for value in _values(setting):
-        with np.load(_arrays(setting, value)) as file:
+    for value in _values(context):
+        with np.load(_arrays(context, value)) as file:
             arrays[value] = dict(file)
-    film = found[_arrays(setting, _values(setting)[0]).stem]
-    arrays = smoothed(arrays, film["height"], film["width"], COARSE // _shrunk(setting))
+    film = found[_arrays(context, _values(context)[0]).stem]
+    arrays = smoothed(arrays, film["height"], film["width"], COARSE // _shrunk(context))
     tables = {method: gradient_table(arrays, method) for method in METHODS}
     theirs = published_tables()
     rows, lines = [], []
@@ -334,7 +327,7 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
         for i, c in enumerate(values)
         for j, t in enumerate(values)
     ]
-    return Shown(
+    return ExperimentResult(
         [*rows, *everything],
         caption + markdown(titles, lines),
         lambda path: _draw(path, tables, theirs),

@@ -13,17 +13,26 @@ from typing import final
 
 import drjit as dr
 
+from ..acquisition.built_in import write_scene
+from ..acquisition.capture import CaptureSettings, capture
+from ..comparison.method_variant import MethodVariant
 from ..config import DenseGridConfig, FitConfig, PathConfig, PriorName
-from ..data.capture import CaptureSettings, capture
-from ..data.procedural import write_scene
-from ..data.scene import parse, to_principled, write
-from ..data.views import Dataset
+from ..dataset.views import Dataset
 from ..errors import UserError
-from ..fit.memory import peak_bytes
-from ..fit.step import lacks_memory
-from ..results.bench import Begun, begin
-from ..results.contender import Contender
-from .experiment import Experiment, Found, Part, Setting, Shown, digest, markdown, save_figure
+from ..profiling.bench_step import FreshFit, begin_fit
+from ..scene.parse import parse, to_principled, write
+from ..training.memory import peak_bytes
+from ..training.step import lacks_memory
+from .experiment import (
+    Experiment,
+    ExperimentContext,
+    ExperimentResult,
+    Findings,
+    Job,
+    digest,
+    markdown,
+    save_figure,
+)
 from .table2 import PUBLISHED as PATHS
 
 
@@ -33,7 +42,7 @@ class _Curve:
     """A method of the figure."""
 
     name: str
-    contender: str
+    variant: str
     prior: PriorName = "extra-bounce"
     #: Whether the path's loop is one kernel (a mega kernel) or one for each bounce. Ours and AD-PT
     #: have no loop.
@@ -54,30 +63,30 @@ CURVES = (
 TURNS = 2
 
 
-def _parts(setting: Setting) -> list[Part]:
-    albedos = setting.pick([0.3, 0.7], list(PATHS), list(PATHS))
+def _parts(context: ExperimentContext) -> list[Job]:
+    albedos = context.pick([0.3, 0.7], list(PATHS), list(PATHS))
     cost = {0.3: 40, 0.5: 45, 0.7: 60, 0.9: 130, 0.95: 220, 0.97: 330}
     settings = {
-        "grid": setting.pick(8, 64, 256),
-        "pixels": setting.pick(64, 1024, 65536),
-        "spp": setting.pick(4, 16, 16),
-        "steps": setting.pick(2, 6, 10),
+        "grid": context.pick(8, 64, 256),
+        "pixels": context.pick(64, 1024, 65536),
+        "spp": context.pick(4, 16, 16),
+        "steps": context.pick(2, 6, 10),
     }
     return [
-        Part(
+        Job(
             f"albedo-{albedo}",
             settings | {"albedo": albedo, "max_depth": PATHS[albedo][0]},
-            lambda albedo=albedo: _measure(setting, albedo, **settings),
-            setting.pick(8.0, cost[albedo], None),
+            lambda albedo=albedo: _measure(context, albedo, **settings),
+            context.pick(8.0, cost[albedo], None),
         )
         for albedo in albedos
     ]
 
 
 def _measure(
-    setting: Setting, albedo: float, *, grid: int, pixels: int, spp: int, steps: int
-) -> Found:
-    dataset = _cube(setting, albedo)
+    context: ExperimentContext, albedo: float, *, grid: int, pixels: int, spp: int, steps: int
+) -> Findings:
+    dataset = _cube(context, albedo)
     shared = FitConfig(
         pixels=pixels,
         spp=spp,
@@ -86,13 +95,13 @@ def _measure(
         grid=DenseGridConfig(albedo=grid, roughness=grid, radiance=grid),
         path=PathConfig(max_depth=PATHS[albedo][0], rr_depth=1),
     )
-    found: Found = {curve.name: {"seconds": []} for curve in CURVES}
+    found: Findings = {curve.name: {"seconds": []} for curve in CURVES}
     for turn in range(TURNS):
         for curve in CURVES:
             row = found[curve.name]
             if "error" in row:
                 continue
-            config = Contender.of(curve.contender).settings(shared)
+            config = MethodVariant.of(curve.variant).settings(shared)
             if config.method == "ours":
                 config = replace(config, prior=curve.prior)
             try:
@@ -102,16 +111,16 @@ def _measure(
                 if isinstance(error, RuntimeError) and not lacks_memory(error):
                     raise
                 row["error"] = str(error)
-                setting.tell(f"albedo {albedo}, {curve.name}: {error}")
+                context.tell(f"albedo {albedo}, {curve.name}: {error}")
                 continue
             row["seconds"] += times
             row["memory"] = memory
             told = f"{1e3 * statistics.median(times):.0f} ms"
-            setting.tell(f"turn {turn + 1}, albedo {albedo}, {curve.name}: {told}")
+            context.tell(f"turn {turn + 1}, albedo {albedo}, {curve.name}: {told}")
     return found
 
 
-def _cube(setting: Setting, albedo: float) -> Dataset:
+def _cube(context: ExperimentContext, albedo: float) -> Dataset:
     """A small data set of the cube, whose walls scatter as diffuse ones do.
 
     What is unknown is the albedo of `principled` BSDFs. Without their specular lobe, and with the
@@ -119,9 +128,9 @@ def _cube(setting: Setting, albedo: float) -> Dataset:
     Table 2, which they would not be otherwise.
     """
     small = CaptureSettings(views=8, held_out=0, resolution=32, spp=4, max_depth=16)
-    folder = setting.work / "data" / f"cube-{albedo}-{digest(asdict(small))}"
+    folder = context.work / "data" / f"cube-{albedo}-{digest(asdict(small))}"
     if not folder.exists():
-        scenes = setting.work / "scenes"
+        scenes = context.work / "scenes"
         scene = parse(write_scene("cube", scenes / f"cube-{albedo}", albedo=albedo))
         to_principled(scene)
         for node in scene.principled_nodes():
@@ -144,7 +153,7 @@ def _steps(
     """
     gc.collect()
     dr.flush_malloc_cache()
-    fit = begin(dataset, config)
+    fit = begin_fit(dataset, config)
     _paint(fit, albedo)
     still = dict.fromkeys(("albedo", "roughness", "radiance"), 0.0)
 
@@ -167,7 +176,7 @@ def _steps(
     return times, memory
 
 
-def _paint(fit: Begun, albedo: float) -> None:
+def _paint(fit: FreshFit, albedo: float) -> None:
     """Let the albedo's grid say what the walls are: it decides how long paths are."""
     raw = math.log(albedo / (1 - albedo))
     for name, value in list(fit.state.phi.items()):
@@ -175,7 +184,7 @@ def _paint(fit: Begun, albedo: float) -> None:
             fit.state.phi[name] = dr.full(type(value), raw, value.shape)
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
     for part, methods in found.items():
         good = {name: m for name, m in methods.items() if "error" not in m}
@@ -203,7 +212,7 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
         titles = ["method", *(f"{albedo:g}" for albedo in albedos)]
         titles += ["the authors'"] if key == "milliseconds" else []
         tables.append(f"{title}, at an albedo of:\n\n{markdown(titles, lines)}")
-    return Shown(rows, "\n\n".join(tables), lambda path: _draw(path, rows))
+    return ExperimentResult(rows, "\n\n".join(tables), lambda path: _draw(path, rows))
 
 
 def _cell(row: Mapping[str, object], key: str, digits: int) -> str | None:

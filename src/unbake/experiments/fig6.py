@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..imaging.pictures import write_png
-from .experiment import Experiment, Found, Part, Setting, Shown, markdown
-from .ladder import MATERIALS, QUALITIES, Ladder, at_equal_samples, decibels
+from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
+from .scene_fits import MATERIALS, QUALITIES, SceneFits, at_equal_samples, decibels
 from .scenes import scenes_at
 
 #: Columns of the figure.
@@ -15,30 +15,30 @@ METHODS = {"direct": "direct", "PRB": "prb", "ours": "ours", "no prior": "no-pri
 VIEWS = (0, 1)
 
 
-def _ladders(setting: Setting) -> list[Ladder]:
-    return [Ladder.of(setting, scene, METHODS.values()) for scene in scenes_at(setting)]
+def _all_fits(context: ExperimentContext) -> list[SceneFits]:
+    return [SceneFits.of(context, scene, METHODS.values()) for scene in scenes_at(context)]
 
 
-def _parts(setting: Setting) -> list[Part]:
-    return [part for ladder in _ladders(setting) for part in ladder.parts(setting)]
+def _parts(context: ExperimentContext) -> list[Job]:
+    return [part for scene_fits in _all_fits(context) for part in scene_fits.parts(context)]
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
-    for ladder in _ladders(setting):
-        scene = ladder.scene
+    for scene_fits in _all_fits(context):
+        scene = scene_fits.scene
         methods = found[scene.folder]
         equal = at_equal_samples(methods)
-        write_png(setting.out / "fig6" / f"{scene.folder}.png", ladder.picture(setting, VIEWS))
+        write_png(context.out / "fig6" / f"{scene.folder}.png", scene_fits.picture(context, VIEWS))
         for title, method in METHODS.items():
             row = methods[method]
             head = {"scene": scene.label, "method": title}
             length = {k: row[k] for k in ("steps", "samples", "seconds")}
             same = {f"{k}_at_equal_samples": v for k, v in equal[method].items()}
-            *views, mean = ladder.qualities(setting, method, row)
+            *views, mean = scene_fits.qualities(context, method, row)
             rows.append(head | mean | length | same)
             rows += [head | views[number] for number in VIEWS]
-    return Shown(rows, _tables(rows))
+    return ExperimentResult(rows, _tables(rows))
 
 
 def _tables(rows: list[dict]) -> str:

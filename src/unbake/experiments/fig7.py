@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..imaging.pictures import write_png
-from .experiment import Experiment, Found, Part, Setting, Shown, markdown
-from .ladder import ABLATION, QUALITIES, Ladder, decibels
+from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
+from .scene_fits import ABLATION, QUALITIES, SceneFits, decibels
 from .scenes import scenes_at
 
 #: Columns of the figure.
@@ -15,29 +15,29 @@ METHODS = ABLATION | {"ours without prior": "no-prior"}
 VIEW = 0
 
 
-def _ladder(setting: Setting) -> Ladder:
+def _scene_fits(context: ExperimentContext) -> SceneFits:
     # As in Figure 6, so that what both show is fitted once.
-    return Ladder.of(setting, scenes_at(setting)[0], METHODS.values())
+    return SceneFits.of(context, scenes_at(context)[0], METHODS.values())
 
 
-def _parts(setting: Setting) -> list[Part]:
-    return _ladder(setting).parts(setting)
+def _parts(context: ExperimentContext) -> list[Job]:
+    return _scene_fits(context).parts(context)
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
-    ladder = _ladder(setting)
-    fits = found[ladder.scene.folder]
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+    scene_fits = _scene_fits(context)
+    fits = found[scene_fits.scene.folder]
     rows = [
-        {"step": title} | ladder.row(setting, method, fits[method])
+        {"step": title} | scene_fits.row(context, method, fits[method])
         for title, method in METHODS.items()
     ]
     table = markdown(
         ["step", "steps", "albedo", "roughness", "rendering"],
         [[r["step"], r["steps"], *(decibels(r[k]) for k in QUALITIES)] for r in rows],
     )
-    caption = f"{ladder.scene.label}; PSNR in dB, mean over held-out views\n\n"
-    sheet = ladder.picture(setting, [VIEW])
-    return Shown(rows, caption + table, lambda path: write_png(path, sheet))
+    caption = f"{scene_fits.scene.label}; PSNR in dB, mean over held-out views\n\n"
+    sheet = scene_fits.picture(context, [VIEW])
+    return ExperimentResult(rows, caption + table, lambda path: write_png(path, sheet))
 
 
 EXPERIMENT = Experiment("fig7", "The ablation, for materials (Fig. 7)", _parts, _show)

@@ -7,50 +7,52 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..data.lights import true_environment
+from ..dataset.lights import true_environment
 from ..imaging.pictures import montage, read_exr, tonemap, write_png
-from .experiment import Experiment, Found, Part, Setting, Shown, markdown
-from .ladder import ABLATION, Ladder, decibels, exposure
+from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
+from .scene_fits import ABLATION, SceneFits, decibels, exposure
 from .scenes import scenes_at
 
 #: The held-out view that is shown below the maps.
 VIEW = 0
 
 
-def _ladder(setting: Setting) -> Ladder:
-    scene = next(scene for scene in scenes_at(setting) if not scene.room)
-    ladder = Ladder.of(setting, scene, ABLATION.values())
-    config = dataclasses.replace(ladder.config, unknown="lighting", score_seconds=0.0)
-    return dataclasses.replace(ladder, config=config)
+def _scene_fits(context: ExperimentContext) -> SceneFits:
+    scene = next(scene for scene in scenes_at(context) if not scene.room)
+    scene_fits = SceneFits.of(context, scene, ABLATION.values())
+    config = dataclasses.replace(scene_fits.config, unknown="lighting", score_seconds=0.0)
+    return dataclasses.replace(scene_fits, config=config)
 
 
-def _parts(setting: Setting) -> list[Part]:
-    return _ladder(setting).parts(setting)
+def _parts(context: ExperimentContext) -> list[Job]:
+    return _scene_fits(context).parts(context)
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
-    ladder = _ladder(setting)
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+    scene_fits = _scene_fits(context)
     rows, lines = [], []
     for title, method in ABLATION.items():
-        fit = found[ladder.scene.folder][method]
-        row = {"step": title} | ladder.row(setting, method, fit) | fit["environment"]
+        fit = found[scene_fits.scene.folder][method]
+        row = {"step": title} | scene_fits.row(context, method, fit) | fit["environment"]
         rows.append({key: value for key, value in row.items() if value is not None})
         off, relit = f"{100 * row['sh_error']:.1f} %", decibels(row["relight_psnr"])
         lines.append([title, row["steps"], off, relit, decibels(row["render_psnr"])])
     titles = ["step", "steps", "low frequencies off", "relighting", "rendering"]
-    caption = f"{ladder.scene.label}, materials known; PSNR in dB, "
+    caption = f"{scene_fits.scene.label}, materials known; PSNR in dB, "
     caption += "renderings: mean over held-out views\n\n"
-    sheet = _picture(setting, ladder)
-    return Shown(rows, caption + markdown(titles, lines), lambda path: write_png(path, sheet))
+    sheet = _picture(context, scene_fits)
+    return ExperimentResult(
+        rows, caption + markdown(titles, lines), lambda path: write_png(path, sheet)
+    )
 
 
-def _picture(setting: Setting, ladder: Ladder) -> np.ndarray:
+def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
     """The maps that were found, and a view lit by them; the truth on the right."""
-    view = ladder.heldout(setting)[VIEW]
-    folders = [ladder.evaluation(setting, method) for method in ABLATION.values()]
+    view = scene_fits.heldout(context)[VIEW]
+    folders = [scene_fits.evaluation(context, method) for method in ABLATION.values()]
     maps = [read_exr(folder / "environment.exr") for folder in folders]
     renderings = [folder / view.split / f"{view.name}_render.exr" for folder in folders]
-    truth = true_environment(ladder.scene.data(setting))
+    truth = true_environment(scene_fits.scene.data(context))
     photograph = read_exr(view.image)
     images = [
         exposure(photograph) * picture for picture in (*map(read_exr, renderings), photograph)

@@ -13,13 +13,13 @@ from typing import Any, final
 import mitsuba as mi
 import numpy as np
 
+from ..acquisition.capture import CaptureSettings, capture
 from ..config import FitConfig, from_toml
-from ..data.capture import CaptureSettings, capture
-from ..data.scene import ParsedScene, parse, referenced, to_principled, write
-from ..data.views import Dataset
+from ..dataset.views import Dataset
 from ..errors import UserError
 from ..imaging.pictures import read_exr, tonemap, write_exr, write_png
-from .experiment import Found, Part, Setting, digest
+from ..scene.parse import ParsedScene, parse, referenced, to_principled, write
+from .experiment import ExperimentContext, Findings, Job, digest
 
 _CAMERAS = Path(__file__).parent / "cameras"
 
@@ -120,28 +120,28 @@ class PaperScene:
         """What stands in the place of the scene's own light, as it is known."""
         return None if self.room else self.environment or "its own map, clamped at zero"
 
-    def require(self, setting: Setting) -> None:
+    def require(self, context: ExperimentContext) -> None:
         """Find out whether the scene is there, before anything takes hours.
 
         Raises:
             UserError: it is not.
         """
         for name in (self.folder, "envmaps_blender") if self.environment else (self.folder,):
-            _found(setting, name)
+            _found(context, name)
 
-    def unpacked(self, setting: Setting) -> Path:
+    def unpacked(self, context: ExperimentContext) -> Path:
         """The scene's XML file, of the published scene or of what was changed in it.
 
         Raises:
             UserError: the scene is not among the published ones at hand, or damaged.
         """
-        source = _unpacked(setting, self.folder) / self.file
+        source = _unpacked(context, self.folder) / self.file
         if not source.is_file():
             raise UserError("the published scene lacks this file", source)
         if self.room and self.albedo_power == 1.0:
             return source
         changes = {"power": self.albedo_power, "lit_by": self.lit_by}
-        changed = setting.work / "scenes" / f"{self.folder}-{digest(changes)}"
+        changed = context.work / "scenes" / f"{self.folder}-{digest(changes)}"
         if not (changed / "scene.xml").is_file():
             changed.mkdir(parents=True, exist_ok=True)
             parsed = parse(source)
@@ -150,14 +150,14 @@ class PaperScene:
                 _raise_albedo(parsed, self.albedo_power, changed)
             if not self.room:
                 map_ = self.environment
-                map_ = map_ and _unpacked(setting, "envmaps_blender") / map_
+                map_ = map_ and _unpacked(context, "envmaps_blender") / map_
                 _set_environment(parsed, map_, changed)
             write(parsed, changed)
         return changed / "scene.xml"
 
-    def settings(self, setting: Setting) -> FitConfig:
+    def settings(self, context: ExperimentContext) -> FitConfig:
         """The settings of fits, apart from method and length."""
-        match setting.scale:
+        match context.scale:
             case "smoke":
                 return from_toml(_SMOKE)
             case "cpu":
@@ -165,59 +165,61 @@ class PaperScene:
         pixels, spp = (16384, 16) if self.folder == "staircase" else (4096, 64)
         return from_toml(f'preset = "paper"\npixels = {pixels}\nspp = {spp}\n')
 
-    def capture_settings(self, setting: Setting) -> CaptureSettings:
+    def capture_settings(self, context: ExperimentContext) -> CaptureSettings:
         """How photographs are rendered."""
-        size = setting.pick(16, 256 if self.folder == "staircase" else 128, 512)
-        spp = setting.pick(4, self.spp, 8 * self.spp)
+        size = context.pick(16, 256 if self.folder == "staircase" else 128, 512)
+        spp = context.pick(4, self.spp, 8 * self.spp)
         return CaptureSettings(resolution=size, spp=spp, max_depth=64)
 
-    def described(self, setting: Setting, shots: CaptureSettings | None = None) -> dict[str, Any]:
+    def described(
+        self, context: ExperimentContext, shots: CaptureSettings | None = None
+    ) -> dict[str, Any]:
         """All that decides what the data set is."""
         return {
-            "photographs": asdict(shots or self.capture_settings(setting)),
+            "photographs": asdict(shots or self.capture_settings(context)),
             "albedo_power": self.albedo_power,
             "lit_by": self.lit_by,
             "cameras": hashlib.sha256(self.cameras.read_bytes()).hexdigest(),
         }
 
-    def data(self, setting: Setting, shots: CaptureSettings | None = None) -> Path:
+    def data(self, context: ExperimentContext, shots: CaptureSettings | None = None) -> Path:
         """The folder of the scene's data set: other settings have another one."""
-        name = f"{self.folder}-{digest(self.described(setting, shots))}"
-        return setting.work / "data" / name
+        name = f"{self.folder}-{digest(self.described(context, shots))}"
+        return context.work / "data" / name
 
-    def captured(self, setting: Setting, shots: CaptureSettings | None = None) -> Path:
+    def captured(self, context: ExperimentContext, shots: CaptureSettings | None = None) -> Path:
         """The data set's folder, after it was rendered if it is not there."""
-        folder = self.data(setting, shots)
+        folder = self.data(context, shots)
         if not folder.exists():
             capture(
-                str(self.unpacked(setting)),
+                str(self.unpacked(context)),
                 folder,
-                shots or self.capture_settings(setting),
+                shots or self.capture_settings(context),
                 cameras=self.cameras,
-                tell=setting.tell,
+                tell=context.tell,
             )
         return folder
 
-    def capture(self, setting: Setting) -> Part:
+    def capture(self, context: ExperimentContext) -> Job:
         """The part of an experiment that renders the data set, if no other one has done it.
 
         Raises:
             UserError: the published scene is not at hand.
         """
-        self.require(setting)
-        shots, folder = self.capture_settings(setting), self.data(setting)
+        self.require(context)
+        shots, folder = self.capture_settings(context), self.data(context)
 
-        def work() -> Found:
-            dataset = Dataset.load(self.captured(setting))
+        def work() -> Findings:
+            dataset = Dataset.load(self.captured(context))
             return {"train": len(dataset.train), "heldout": len(dataset.heldout)}
 
         samples = (self.views + 6) * shots.resolution**2 * shots.spp
         seconds = 1.0 if folder.exists() else 5 + samples / 600_000
-        return Part(
+        return Job(
             f"{self.folder}-data",
-            self.described(setting),
+            self.described(context),
             work,
-            setting.pick(seconds, seconds, None),
+            context.pick(seconds, seconds, None),
             files=[folder / "transforms.json"],
         )
 
@@ -279,29 +281,29 @@ SCENES = (
 )
 
 
-def scenes_at(setting: Setting) -> tuple[PaperScene, ...]:
+def scenes_at(context: ExperimentContext) -> tuple[PaperScene, ...]:
     """The scenes of an experiment: all of them, or the quickest one to see that it runs."""
-    return SCENES[-1:] if setting.scale == "smoke" else SCENES
+    return SCENES[-1:] if context.scale == "smoke" else SCENES
 
 
-def _found(setting: Setting, name: str) -> Path:
+def _found(context: ExperimentContext, name: str) -> Path:
     """The folder of a published scene, or the archive where there is only that."""
-    folder, archive = setting.scenes / name, setting.scenes / f"{name}.tar.xz"
-    for place in (folder, setting.out / "work" / "published" / name):
+    folder, archive = context.scenes / name, context.scenes / f"{name}.tar.xz"
+    for place in (folder, context.out / "work" / "published" / name):
         if place.is_dir():
             return place
     if not archive.is_file():
         remedy = "--scenes names a folder with the scenes, unpacked or as .tar.xz"
-        raise UserError(f"there is no published scene {name!r} here", setting.scenes, remedy)
+        raise UserError(f"there is no published scene {name!r} here", context.scenes, remedy)
     return archive
 
 
-def _unpacked(setting: Setting, name: str) -> Path:
+def _unpacked(context: ExperimentContext, name: str) -> Path:
     """The folder of a published scene; unpacks its archive where there is only that."""
-    found = _found(setting, name)
+    found = _found(context, name)
     if found.is_dir():
         return found
-    own = setting.out / "work" / "published" / name
+    own = context.out / "work" / "published" / name
     partial = own.with_name(f"{name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

@@ -8,15 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.batches import CameraRays
-from ..data.camera import read_cameras
-from ..data.placement import coverage
-from ..data.scene import parse, to_principled
+from ..acquisition.placement import coverage
+from ..dataset.camera import read_cameras
+from ..dataset.pixels import CameraRays
 from ..imaging.pictures import montage, tonemap, write_png
+from ..scene.parse import parse, to_principled
+from ..transport.path_tracer import path_lengths
 from ..transport.render import parts_of, render_radiance
-from ..transport.series import path_lengths
-from ..transport.vertex import World
-from .experiment import Experiment, Found, Part, Setting, Shown, copy_file, markdown
+from ..transport.vertex import SceneView
+from .experiment import (
+    Experiment,
+    ExperimentContext,
+    ExperimentResult,
+    Findings,
+    Job,
+    copy_file,
+    markdown,
+)
 from .scenes import SCENES, PaperScene
 
 #: Scene: mean path length, views, samples a pixel, log2 of pixels a step (paper).
@@ -34,49 +42,58 @@ PUBLISHED = {
 MAX_DEPTH, SURVIVAL = 15, 0.95
 
 
-def _parts(setting: Setting) -> list[Part]:
-    pixels, spp = setting.pick((8, 4), (64, 16), (128, 64))
-    scenes = SCENES[:1] if setting.scale == "smoke" else SCENES
+def _parts(context: ExperimentContext) -> list[Job]:
+    pixels, spp = context.pick((8, 4), (64, 16), (128, 64))
+    scenes = SCENES[:1] if context.scale == "smoke" else SCENES
     parts = []
     for scene in scenes:
-        scene.require(setting)
+        scene.require(context)
         parts.append(
-            Part(
+            Job(
                 scene.folder,
-                {"pixels": pixels, "spp": spp} | scene.described(setting),
-                functools.partial(_measure, setting, scene, pixels, spp),
-                setting.pick(25.0, 30.0, None),
-                files=[_views(setting, scene)],
+                {"pixels": pixels, "spp": spp} | scene.described(context),
+                functools.partial(_measure, context, scene, pixels, spp),
+                context.pick(25.0, 30.0, None),
+                files=[_views(context, scene)],
             )
         )
     return parts
 
 
-def _views(setting: Setting, scene: PaperScene) -> Path:
-    return setting.work / "table1" / f"{scene.folder}.png"
+def _views(context: ExperimentContext, scene: PaperScene) -> Path:
+    return context.work / "table1" / f"{scene.folder}.png"
 
 
-def _measure(setting: Setting, scene: PaperScene, pixels: int, spp: int) -> Found:
-    parsed = parse(scene.unpacked(setting))
+def _measure(context: ExperimentContext, scene: PaperScene, pixels: int, spp: int) -> Findings:
+    parsed = parse(scene.unpacked(context))
     to_principled(parsed)
     loaded = parsed.instantiate()
-    world = World.of(loaded, None, 8)
+    scene_view = SceneView.of(loaded, None, 8)
     posed = read_cameras(scene.cameras, pixels, pixels)
     cameras = [camera for _, camera in posed]
     rays = CameraRays.of(cameras)
     lengths = [
         np.array(
-            path_lengths(world, ray, seed, max_depth=MAX_DEPTH, rr_depth=2, most_likely=SURVIVAL)
+            path_lengths(
+                scene_view, ray, seed, max_depth=MAX_DEPTH, rr_depth=2, most_likely=SURVIVAL
+            )
         )
         for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
     ]
     image = render_radiance(
-        world, rays.through, rays.pixels, spp, seed=1, max_depth=16, rr_depth=5, see_lights=True
+        scene_view,
+        rays.through,
+        rays.pixels,
+        spp,
+        seed=1,
+        max_depth=16,
+        rr_depth=5,
+        hide_emitters=False,
     )
     views = image.reshape(-1, pixels, pixels, 3)
     across = 16
     rows = [[tonemap(v) for v in views[i : i + across]] for i in range(0, len(views), across)]
-    write_png(_views(setting, scene), montage(rows))
+    write_png(_views(context, scene), montage(rows))
     lengths = np.concatenate(lengths)
     trained = [camera for split, camera in posed if split == "train"]
     return {
@@ -88,13 +105,13 @@ def _measure(setting: Setting, scene: PaperScene, pixels: int, spp: int) -> Foun
     }
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
     for scene in SCENES:
         if scene.folder not in found:
             continue
-        copy_file(_views(setting, scene), setting.out / "table1")
-        config, shots = scene.settings(setting), scene.capture_settings(setting)
+        copy_file(_views(context, scene), context.out / "table1")
+        config, shots = scene.settings(context), scene.capture_settings(context)
         length, views, spp, batch = PUBLISHED[scene.name]
         rows.append(
             {"scene": scene.name, "label": scene.label}
@@ -133,7 +150,7 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
             for r in rows
         ],
     )
-    return Shown(rows, table)
+    return ExperimentResult(rows, table)
 
 
 EXPERIMENT = Experiment("table1", "Scenes, views and path lengths (Table 1)", _parts, _show)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.batches import CameraRays
-from ..data.camera import Camera
-from ..data.procedural import default_cameras, write_scene
-from ..data.scene import parse
+from ..acquisition.built_in import default_cameras, write_scene
+from ..dataset.camera import Camera
+from ..dataset.pixels import CameraRays
+from ..scene.parse import parse
+from ..transport.path_tracer import path_lengths
 from ..transport.render import parts_of
-from ..transport.series import path_lengths
-from ..transport.vertex import World
-from .experiment import Experiment, Found, Part, Setting, Shown, markdown
+from ..transport.vertex import SceneView
+from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
 
 #: Albedo: the longest path, and the mean, that the paper tells.
 PUBLISHED = {
@@ -29,40 +29,40 @@ PUBLISHED = {
 ENDLESS = 4096
 
 
-def _parts(setting: Setting) -> list[Part]:
-    pixels, spp = setting.pick((8, 32), (32, 64), (128, 64))
+def _parts(context: ExperimentContext) -> list[Job]:
+    pixels, spp = context.pick((8, 32), (32, 64), (128, 64))
     return [
-        Part(
+        Job(
             f"albedo-{albedo}",
             {"albedo": albedo, "pixels": pixels, "spp": spp},
-            lambda albedo=albedo: _measure(setting.work / "scenes", albedo, pixels, spp),
-            setting.pick(0.5, 1.5, None),
+            lambda albedo=albedo: _measure(context.work / "scenes", albedo, pixels, spp),
+            context.pick(0.5, 1.5, None),
         )
         for albedo in PUBLISHED
     ]
 
 
-def _measure(folder: Path, albedo: float, pixels: int, spp: int) -> Found:
+def _measure(folder: Path, albedo: float, pixels: int, spp: int) -> Findings:
     """Lengths of the paths of a path tracer whose Russian roulette absorbs as the walls do."""
     scene = parse(write_scene("cube", folder / f"cube-{albedo}", albedo=albedo)).instantiate()
-    world = World.of(scene, None, 0)
+    scene_view = SceneView.of(scene, None, 0)
     cameras = [
         Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], pixels, pixels)
         for c in default_cameras("cube", 8, 0)
     ]
     rays = CameraRays.of(cameras)
     limit, _ = PUBLISHED[albedo]
-    found: Found = {"limit": limit}
+    found: Findings = {"limit": limit}
     for name, most in (("limited", limit), ("endless", ENDLESS)):
         lengths = [
-            np.array(path_lengths(world, ray, seed, max_depth=most, rr_depth=2))
+            np.array(path_lengths(scene_view, ray, seed, max_depth=most, rr_depth=2))
             for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
         ]
         found[name] = float(np.concatenate(lengths).mean(dtype=np.float64))
     return found
 
 
-def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
+def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
     for albedo, (limit, mean) in PUBLISHED.items():
         measured = found[f"albedo-{albedo}"]
@@ -82,7 +82,7 @@ def _show(setting: Setting, found: Mapping[str, Found]) -> Shown:
         [*titles, "mean, no limit", "1 / (1 − ρ)"],
         [[r["albedo"], r["limit"], *(f"{x:.2f}" for x in list(r.values())[2:])] for r in rows],
     )
-    return Shown(rows, table)
+    return ExperimentResult(rows, table)
 
 
 EXPERIMENT = Experiment("table2", "Lengths of paths in the cube (Table 2)", _parts, _show)

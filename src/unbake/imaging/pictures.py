@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import base64
-import contextlib
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
-from unbake.errors import UserError
+from ..errors import UserError
+from ..io import write_atomically
 
 MAGMA = (
     (0, 0, 4), (10, 8, 34), (29, 17, 71), (54, 16, 107), (81, 18, 124), (106, 28, 129),
@@ -75,25 +74,6 @@ def write_png(path: Path, array: np.ndarray) -> None:
 def png_data_uri(array: np.ndarray) -> str:
     """A `data:image/png;base64,…` address of an (H, W) or (H, W, C) uint8 sRGB picture."""
     return "data:image/png;base64," + base64.b64encode(_png(array)).decode("ascii")
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it to `path`.
-
-    Raises:
-        UserError: the folder cannot be made or written.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        raise UserError(f"the file cannot be written ({error})", path) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:

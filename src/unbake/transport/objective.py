@@ -9,12 +9,12 @@ from types import MappingProxyType
 import drjit as dr
 import mitsuba as mi
 
-from .image import Needs, PathSample, lhs, rhs
+from .path_sample import PathSample, Requirements, lhs, rhs
 from .prior import residual, residual_norm
 
 
 @dataclass(frozen=True)
-class Live:
+class Attached:
     """Which edges of a term pass gradients."""
 
     scene: bool = False  #: materials at the first vertices, and lights, to φ
@@ -27,40 +27,40 @@ PHOTOMETRIC, PRIOR, EXTRA, LHS = "photometric", "prior", "prior_extra", "lhs"
 #: Method → term → what it trains. A term that is absent is not part of the method.
 #: Photometric: Eq. 5 with Eq. 12. Prior: Eq. 10. Extra: the same at x₂. LHS: Eq. 14.
 #: From `direct` to `ours` the rows are the ablation of Fig. 7 and 8, each with one thing more.
-METHODS: Mapping[str, Mapping[str, Live]] = MappingProxyType(
+METHODS: Mapping[str, Mapping[str, Attached]] = MappingProxyType(
     {
-        "direct": {PHOTOMETRIC: Live(scene=True)},
+        "direct": {PHOTOMETRIC: Attached(scene=True)},
         "with-prior": {
-            PHOTOMETRIC: Live(scene=True),
-            PRIOR: Live(scene=True, lhs=True),
+            PHOTOMETRIC: Attached(scene=True),
+            PRIOR: Attached(scene=True, lhs=True),
         },
         "with-stop-gradient": {
-            PHOTOMETRIC: Live(scene=True),
-            PRIOR: Live(lhs=True),
+            PHOTOMETRIC: Attached(scene=True),
+            PRIOR: Attached(lhs=True),
         },
         "with-second-bounce": {
-            PHOTOMETRIC: Live(scene=True),
-            PRIOR: Live(lhs=True),
-            EXTRA: Live(lhs=True),
+            PHOTOMETRIC: Attached(scene=True),
+            PRIOR: Attached(lhs=True),
+            EXTRA: Attached(lhs=True),
         },
         "ours": {
-            PHOTOMETRIC: Live(scene=True),
-            PRIOR: Live(lhs=True),
-            EXTRA: Live(lhs=True),
-            LHS: Live(lhs=True),
+            PHOTOMETRIC: Attached(scene=True),
+            PRIOR: Attached(lhs=True),
+            EXTRA: Attached(lhs=True),
+            LHS: Attached(lhs=True),
         },
         "ours, one-bounce": {
-            PHOTOMETRIC: Live(scene=True),
-            PRIOR: Live(lhs=True),
-            LHS: Live(lhs=True),
+            PHOTOMETRIC: Attached(scene=True),
+            PRIOR: Attached(lhs=True),
+            LHS: Attached(lhs=True),
         },
         "no-prior": {
-            PHOTOMETRIC: Live(scene=True),
-            LHS: Live(lhs=True),
+            PHOTOMETRIC: Attached(scene=True),
+            LHS: Attached(lhs=True),
         },
         # Paths are followed to their end: all light is in the image, and there is no cache.
-        "ad-pt": {PHOTOMETRIC: Live(scene=True)},
-        "prb": {PHOTOMETRIC: Live(scene=True)},
+        "ad-pt": {PHOTOMETRIC: Attached(scene=True)},
+        "prb": {PHOTOMETRIC: Attached(scene=True)},
     }
 )
 
@@ -90,14 +90,14 @@ class RelativeL2:
         return dr.rcp(dr.square(reference) + self.epsilon)
 
 
-def needs(terms: Mapping[str, Live], bounces: int = 1) -> Needs:
+def requirements(terms: Mapping[str, Attached], bounces: int = 1) -> Requirements:
     """What a method's path samples must hold, with so many differentiable bounces."""
     residuals = 2 if EXTRA in terms else 1 if PRIOR in terms else 0
-    return Needs(bounces, residuals, LHS in terms)
+    return Requirements(bounces, residuals, LHS in terms)
 
 
 def objective(
-    terms: Mapping[str, Live],
+    terms: Mapping[str, Attached],
     sample: PathSample,
     target: mi.Color3f,
     spp: int,
@@ -122,11 +122,11 @@ def objective(
     """
     values: dict[str, mi.Float] = {}
     weight = loss.weight(target)
-    for term, live in terms.items():
+    for term, attached in terms.items():
         paths = sample if term == PHOTOMETRIC else (sample.learned or sample)
-        scattered = paths if live.scene else dr.detach(paths)
-        seen = [L if live.lhs else dr.detach(L) for L in paths.radiance]
-        incoming = [L if live.rhs else dr.detach(L) for L in paths.radiance]
+        scattered = paths if attached.scene else dr.detach(paths)
+        seen = [L if attached.lhs else dr.detach(L) for L in paths.radiance]
+        incoming = [L if attached.rhs else dr.detach(L) for L in paths.radiance]
         match term:
             case "photometric":
                 pixels = rhs(scattered, incoming[bounces], bounces)
@@ -139,8 +139,8 @@ def objective(
                 values[term] = residual_norm(second, seen[1], loss.epsilon)
             case "lhs":
                 pixels = lhs(scattered, seen[0])
-                some = dr.width(scattered.x1.valid) // dr.width(target)
-                values[term] = squared_error(pixels, target, some, weight, None)
+                subset = dr.width(scattered.x1.valid) // dr.width(target)
+                values[term] = squared_error(pixels, target, subset, weight, None)
     return values
 
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..fields.materials import carry, with_joint_gradients
-from .vertex import Scattering, Vertex, World, evaluate, find_vertex, mis_weight
+from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
 
 
 @dataclass
@@ -23,44 +23,44 @@ class Bounce:
     next: Vertex
 
 
-def attach_material(world: World, vertex: Vertex) -> Vertex:
+def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
     """Evaluate the material fields at a vertex, once, and put them on its surface interaction.
 
     Gradients arrive in φ wherever the BSDF is evaluated afterwards. Without fields the scene's own
     textures stay in charge and only the albedo is looked up.
     """
-    if world.materials is None:
-        return attach_albedo(world, vertex)
+    if scene_view.materials is None:
+        return attach_albedo(scene_view, vertex)
     si = vertex.si
-    material = with_joint_gradients(world.materials.evaluate(si, vertex.valid))
+    material = with_joint_gradients(scene_view.materials.evaluate(si, vertex.valid))
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
     return replace(vertex, si=si, albedo=dr.detach(material.albedo))
 
 
-def attach_albedo(world: World, vertex: Vertex) -> Vertex:
+def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
     """Look up the albedo alone, where light goes no further and only L_θ wants to know it."""
-    if world.materials is None:
+    if scene_view.materials is None:
         albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
     else:
-        albedo = world.materials.albedo_at(vertex.si, vertex.valid)
+        albedo = scene_view.materials.albedo_at(vertex.si, vertex.valid)
     return replace(vertex, albedo=dr.detach(albedo))
 
 
-def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
+def bounce(scene_view: SceneView, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
     """Sample T at a vertex: one emitter sample and one BSDF sample, combined by MIS.
 
     Sampling is detached; the BSDF is evaluated with gradients (value / detached density).
 
     Paper: Eq. 1, Eq. 8, Sec. 4.2, 5.2.
     """
-    scene, si, bsdf, active = world.scene, vertex.si, vertex.bsdf, vertex.valid
+    scene, si, bsdf, active = scene_view.scene, vertex.si, vertex.bsdf, vertex.valid
     ctx = mi.BSDFContext()
     # A cut-out stopped the ray with probability `opacity`, so that only its material scatters here.
     # Mitsuba scales that material's value and density by the opacity, and samples it where the
     # first random number is below the opacity. (A context without the `Null` lobe does the
     # opposite of what it should: it lets every ray pass.)
-    opacity = vertex.opacity if world.has_chains else mi.Float(1)
+    opacity = vertex.opacity if scene_view.has_chains else mi.Float(1)
     solid = dr.rcp(opacity)
 
     # -------------------------------- Emitter sampling --------------------------------
@@ -88,7 +88,7 @@ def bounce(world: World, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
     # Evaluated here, all together: reductions further on would each compute them again.
     evaluate(sampler, direct, weight, ray, goes_on, bs.pdf, delta)
     origin = Scattering(dr.detach(si), bs.pdf * solid, delta)
-    return Bounce(direct, weight, find_vertex(world, ray, goes_on, sampler, origin=origin))
+    return Bounce(direct, weight, find_vertex(scene_view, ray, goes_on, sampler, origin=origin))
 
 
 def transported(step: Bounce, radiance: mi.Color3f) -> mi.Color3f:

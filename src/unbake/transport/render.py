@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from .operator import attach_material
-from .series import path_traced
-from .vertex import World, find_vertex
+from .path_tracer import path_traced
+from .vertex import SceneView, find_vertex
 
 #: Camera rays through pixels: pixel numbers and positions inside the pixels to world space rays.
 RayGenerator = Callable[[mi.UInt32, mi.Point2f], mi.Ray3f]
@@ -20,7 +20,7 @@ WAVEFRONT = 1 << 20
 
 
 def render_radiance(
-    world: World,
+    scene_view: SceneView,
     through: RayGenerator,
     pixels: int,
     spp: int,
@@ -28,7 +28,7 @@ def render_radiance(
     seed: int,
     max_depth: int,
     rr_depth: int,
-    see_lights: bool,
+    hide_emitters: bool,
 ) -> np.ndarray:
     """Path trace pixels with full global illumination (box filter).
 
@@ -40,19 +40,19 @@ def render_radiance(
     image = np.zeros((pixels, 3), np.float32)
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
         radiance = path_traced(
-            world,
+            scene_view,
             ray,
             part_seed,
             max_depth=max_depth,
             rr_depth=rr_depth,
-            see_lights=see_lights,
+            hide_emitters=hide_emitters,
         )
         image[part] = np.stack([_pixel_means(c, spp) for c in radiance], -1)
     return image
 
 
 def render_materials(
-    world: World, through: RayGenerator, pixels: int, spp: int, *, seed: int
+    scene_view: SceneView, through: RayGenerator, pixels: int, spp: int, *, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the materials are at the surfaces that pixels see (cut-outs let rays pass).
 
@@ -64,15 +64,15 @@ def render_materials(
     albedo = np.zeros((pixels, 3), np.float32)
     roughness, coverage = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
     sampler = mi.load_dict({"type": "independent"})
-    sought = _sought(world.scene)
+    optimized = _optimized(scene_view.scene)
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
         sampler.seed(dr.opaque(mi.UInt32, part_seed), dr.width(ray))
         with dr.suspend_grad():
-            v = attach_material(world, find_vertex(world, ray, mi.Bool(True), sampler))
+            v = attach_material(scene_view, find_vertex(scene_view, ray, mi.Bool(True), sampler))
             shape = dr.reinterpret_array(mi.UInt32, v.si.shape)
             counted = v.valid & v.direct_view
-            counted &= dr.gather(mi.Bool, sought, shape, counted)
-            rough = v.si.dn_dv.x if world.materials is not None else mi.Float(0)
+            counted &= dr.gather(mi.Bool, optimized, shape, counted)
+            rough = v.si.dn_dv.x if scene_view.materials is not None else mi.Float(0)
             weighted = [dr.select(counted, x, 0) for x in (*v.albedo, rough, mi.Float(1))]
             dr.eval(weighted)
         *colour, rough, weight = [_pixel_means(x, spp) for x in weighted]
@@ -103,7 +103,7 @@ def _pixel_means(samples: mi.Float, spp: int) -> np.ndarray:
     return np.array(dr.block_sum(samples, spp)) / spp
 
 
-def _sought(scene: mi.Scene) -> mi.Bool:
+def _optimized(scene: mi.Scene) -> mi.Bool:
     """For each shape, by its number in Dr.Jit's registry, whether its material is sought."""
     # Shapes of groups, which rays meet through instances, are not among `scene.shapes()`.
     shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]

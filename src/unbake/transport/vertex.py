@@ -15,7 +15,7 @@ from ..fields.materials import Materials
 
 
 @dataclass(frozen=True)
-class World:
+class SceneView:
     """What light travels through.
 
     Args:
@@ -30,17 +30,17 @@ class World:
     materials: Materials | None
     max_specular: int
     has_chains: bool
-    has_lamps: bool
+    has_area_emitters: bool
 
     @staticmethod
-    def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> World:
+    def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> SceneView:
         """The world of a scene; looks at every BSDF once."""
         flags = [int(shape.bsdf().flags()) for shape in scene.shapes() if shape.bsdf() is not None]
         chains = any(not f & int(mi.BSDFFlags.Smooth) or f & int(mi.BSDFFlags.Null) for f in flags)
-        lamps = any(shape.emitter() is not None for shape in scene.shapes())
-        return World(scene, materials, max_specular, chains, lamps)
+        area_emitters = any(shape.emitter() is not None for shape in scene.shapes())
+        return SceneView(scene, materials, max_specular, chains, area_emitters)
 
-    def with_scene(self, scene: mi.Scene) -> World:
+    def with_scene(self, scene: mi.Scene) -> SceneView:
         """The same world around this handle of its scene (frozen functions bring their own)."""
         return replace(self, scene=scene)
 
@@ -88,20 +88,20 @@ class Scattering:
 
 
 def find_vertex(
-    world: World,
+    scene_view: SceneView,
     ray: mi.Ray3f,
     active: mi.Bool,
     sampler: mi.Sampler,
     *,
     origin: Scattering | None = None,
-    see_lights: bool = True,
+    hide_emitters: bool = False,
 ) -> Vertex:
     """Follow a ray through mirrors, glass and cut-outs to the first surface that scatters.
 
     Args:
         origin: the BSDF sample that made the ray; None for a ray from the camera.
-        see_lights: whether environment and surfaces that emit are met at once; otherwise the ray
-            passes them, as `hide_emitters` has it in Mitsuba.
+        hide_emitters: whether a camera ray passes through area emitters and sees no environment,
+            as in Mitsuba's integrators.
 
     Returns:
         The vertex, evaluated; its material is not yet attached. Only `emitted` passes gradients, to
@@ -109,19 +109,19 @@ def find_vertex(
 
     Paper: Sec. 7.
     """
-    scene = world.scene
+    scene = scene_view.scene
     with dr.suspend_grad():
         ray, active = mi.Ray3f(ray), mi.Bool(active)
         pi = scene.ray_intersect_preliminary(ray, origin is None, active)
-        if world.has_lamps and not see_lights:
-            pi, ray = _behind_lamps(scene, pi, ray, active)
+        if scene_view.has_area_emitters and hide_emitters:
+            pi, ray = _behind_area_emitters(scene, pi, ray, active)
         first = si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        seen = active & (si.is_valid() | see_lights)
-        weight = _emission_weight(world, si, origin, active)
+        seen = active & (si.is_valid() | (not hide_emitters))
+        weight = _emission_weight(scene_view, si, origin, active)
         valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
         direct_view = mi.Bool(valid)
-        if world.has_chains:
-            chain = _follow_chain(world, pi, ray, valid, sampler)
+        if scene_view.has_chains:
+            chain = _follow_chain(scene_view, pi, ray, valid, sampler)
             pi, ray, β, passed, opacity, specular, moved = chain
             direct_view &= ~specular
             valid = valid & pi.is_valid()
@@ -129,7 +129,7 @@ def find_vertex(
 
     # The light that is met passes gradients: lighting may be unknown.
     emitted = weight * first.emitter(scene).eval(first, seen)
-    if world.has_chains:
+    if scene_view.has_chains:
         emitted += passed + β * si.emitter(scene, moved).eval(si, moved)
     unknown = dr.zeros(mi.Color3f)
     vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, unknown)
@@ -137,36 +137,36 @@ def find_vertex(
     return vertex
 
 
-def _behind_lamps(
+def _behind_area_emitters(
     scene: mi.Scene, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
     """Where rays go that pass surfaces which emit light, and the rays from behind those."""
     pi = mi.PreliminaryIntersection3f(pi)
-    lamp = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
-    ray = dr.select(lamp, si.spawn_ray(ray.d), ray)
+    on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_emitter)
+    ray = dr.select(on_emitter, si.spawn_ray(ray.d), ray)
     # The helper of Mitsuba's integrators; which one it is makes no difference.
     integrator = mi.load_dict({"type": "path"})
-    pi[lamp] = integrator.skip_area_emitters(scene, ray, True, lamp)
+    pi[on_emitter] = integrator.skip_area_emitters(scene, ray, True, on_emitter)
     return pi, ray
 
 
 def _emission_weight(
-    world: World, si: mi.SurfaceInteraction3f, origin: Scattering | None, active: mi.Bool
+    scene_view: SceneView, si: mi.SurfaceInteraction3f, origin: Scattering | None, active: mi.Bool
 ) -> mi.Float:
     """MIS weight of emission that a BSDF sample met; 1 for the camera and for delta lobes."""
     if origin is None:
         return mi.Float(1)
-    emitter = si.emitter(world.scene, active)
+    emitter = si.emitter(scene_view.scene, active)
     lit = active & (emitter != None) & ~origin.delta  # noqa: E711
-    ds = mi.DirectionSample3f(world.scene, si, origin.si)
-    pdf = world.scene.pdf_emitter_direction(origin.si, ds, lit)
+    ds = mi.DirectionSample3f(scene_view.scene, si, origin.si)
+    pdf = scene_view.scene.pdf_emitter_direction(origin.si, ds, lit)
     return dr.select(lit, mis_weight(origin.pdf, pdf), 1)
 
 
 @dr.syntax
 def _follow_chain(
-    world: World,
+    scene_view: SceneView,
     pi: mi.PreliminaryIntersection3f,
     ray: mi.Ray3f,
     active: mi.Bool,
@@ -180,7 +180,7 @@ def _follow_chain(
         whether there was anything specular, and whether light met at the end comes in addition (the
         ray has left its first surface and has not ended in black).
     """
-    scene, limit, ctx = world.scene, world.max_specular, mi.BSDFContext()
+    scene, limit, ctx = scene_view.scene, scene_view.max_specular, mi.BSDFContext()
     pi = mi.PreliminaryIntersection3f(pi)
     active = mi.Bool(active)
     β = mi.Color3f(1)

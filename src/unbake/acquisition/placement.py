@@ -1,0 +1,409 @@
+"""Where to put cameras so that they cover a scene: all over a room, or around an object.
+
+The paper places the cameras of its rooms by hand "to cover the entire scene" and samples those of
+its objects on the hemisphere around them. Paper: Sec. 6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import mitsuba as mi
+import numpy as np
+
+from unbake.dataset.camera import Camera, LookAt
+from unbake.errors import UserError
+from unbake.scene import free_space
+
+# Enough that neighbouring candidates differ by less than a photographer's adjustments
+_POSITIONS = 240
+_POINTS = 3000
+_AZIMUTHS = 12
+_PITCHES = (-60.0, -28.0, 0.0, 28.0, 60.0)
+_GRID = 8
+_VIEWERS = 16
+_OVEREXPOSED = 30.0
+
+# A surface seen once squarely and from near leaves a third of its value to further views
+_VALUE = 1.1
+_FREE_POSITIONS = 512
+_REMEDY = "Give a camera file instead"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Possible views: eyes (n, 3), forward directions (n, 3) and typical depths (n,), and how much
+    of what is to know about each surface point a view tells, (n, points) float32 in [0, 1]."""
+
+    eye: np.ndarray
+    forward: np.ndarray
+    depth: np.ndarray
+    value: np.ndarray
+
+    def take(self, chosen: np.ndarray) -> _Candidates:
+        return _Candidates(
+            self.eye[chosen], self.forward[chosen], self.depth[chosen], self.value[chosen]
+        )
+
+
+def is_room(scene: mi.Scene) -> bool:
+    """Whether the scene surrounds its cameras (a room) rather than being surrounded (an object).
+
+    True where surfaces take up 75 % of all directions, on average over the space that the scene's
+    sensors show between its bounding box and its surfaces; without sensors, over the part of the
+    bounding box outside closed objects.
+    """
+    probes = free_space.sensor_probes(scene, 0)
+    if not scene.sensors():
+        low, high, _ = free_space.bounds(scene)
+        probes = low + (high - low) * np.random.default_rng(0).random((64, 3))
+    probes = probes[~free_space.inside_geometry(scene, probes)]
+    if len(probes) == 0:
+        return False
+    return bool(free_space.enclosure(scene, probes).mean() >= free_space.ROOM_ENCLOSURE)
+
+
+def place(scene: mi.Scene, views: int, held_out: int, *, seed: int = 0) -> list[tuple[str, LookAt]]:
+    """Cameras as `place_room` or `place_object` finds them, whichever the scene is."""
+    placed = place_room if is_room(scene) else place_object
+    return placed(scene, views, held_out, seed=seed)
+
+
+def place_room(
+    scene: mi.Scene, views: int, held_out: int, *, fov: float = 75.0, seed: int = 0
+) -> list[tuple[str, LookAt]]:
+    """Cameras inside a room that together cover its surfaces.
+
+    Candidates stand in free space (see `freespace.free_positions`) and look all around, up and
+    down; those with their nose on something are dropped. Training views are chosen one after the
+    other by what they add: a surface counts the more, the more squarely and the nearer it is seen,
+    and each view of it leaves less for the next ones. Surfaces far darker or brighter than what
+    the scene's sensors show count down to a quarter, small shapes more than their area. Held-out
+    views look, from elsewhere, at surfaces that training views see.
+
+    Args:
+        scene: the room.
+        views: number of training views.
+        held_out: number of held-out views.
+        fov: horizontal (and vertical) field of view in degrees.
+        seed: of all random choices; the same seed gives the same cameras.
+
+    Returns:
+        (split, placement) pairs, training views first.
+
+    Raises:
+        UserError: the scene has no free space to stand in, or too little for that many views.
+    """
+    _check_counts(views, held_out)
+    diagonal = free_space.bounds(scene)[2]
+    up = free_space.up_axis(scene)
+    positions = free_space.free_positions(scene, _POSITIONS, seed)
+    if len(positions) == 0:
+        raise UserError("no free space for a camera in the scene", remedy=_REMEDY)
+    points = free_space.sample_surface(scene, _POINTS, seed, power=0.5)
+    seen = free_space.sees(scene, positions, points)
+    candidates = _candidates(scene, positions, points, seen, up, fov, seed)
+    if len(candidates.eye) < views + held_out:
+        raise UserError(f"no room for {views + held_out} cameras in the scene", remedy=_REMEDY)
+    light = _importance(scene, positions, points, seen, seed)
+    train = _greedy(candidates, views, light, [], diagonal)
+    trained = 1 - np.prod(1 - candidates.value[train], axis=0, dtype=np.float64)
+    tests = _greedy(candidates, held_out, light * trained, train, diagonal)
+    chosen = [("train", i) for i in train] + [("heldout", i) for i in tests]
+    return [(split, _look_at(candidates, i, up, fov)) for split, i in chosen]
+
+
+def place_object(
+    scene: mi.Scene, views: int, held_out: int, *, fov: float = 40.0, seed: int = 0
+) -> list[tuple[str, LookAt]]:
+    """Cameras on the upper hemisphere around an object, looking at its centre.
+
+    Positions are spread evenly; the held-out ones lie in between the training ones, evenly from
+    the horizon to the top. All have one distance, at which the object just fits into all (square)
+    images. A ground plane, flat and level and larger than all the rest, is no part of the object.
+
+    Args:
+        scene: the object.
+        views: number of training views.
+        held_out: number of held-out views.
+        fov: horizontal field of view in degrees.
+        seed: turns the cameras around the up axis; the same seed gives the same cameras.
+
+    Returns:
+        (split, placement) pairs, training views first.
+
+    Raises:
+        UserError: no views are asked for, or the scene is empty.
+
+    Paper: Sec. 6.
+    """
+    _check_counts(views, held_out)
+    up = free_space.up_axis(scene)
+    low, high = _object_box(scene, up)
+    centre, radius = _sphere(low, high)
+    count = views + held_out
+    # The horizon itself and the pole show least and upset the up direction
+    height = 0.08 + 0.87 * (np.arange(count) + 0.5) / count
+    turn = 2 * math.pi * np.random.default_rng(seed).random()
+    angle = turn + np.arange(count) * math.pi * (3 - math.sqrt(5))
+    side, front = _horizon(up)
+    level = np.sqrt(1 - height**2)[:, None]
+    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * front
+    outward = level * around + height[:, None] * up
+    points = free_space.sample_surface(scene, _POINTS, 0).position
+    points = points[((low <= points) & (points <= high)).all(axis=1)] - centre
+    eyes = centre + _fitting_distance(points, radius, outward, up, fov) * outward
+    middle = ((np.arange(held_out) + 0.5) * count / max(held_out, 1)).astype(int)
+    tests = set(middle.tolist())
+    train = [i for i in range(count) if i not in tests]
+    chosen = [("train", i) for i in train] + [("heldout", i) for i in sorted(tests)]
+    return [
+        (split, LookAt(_triple(eyes[i]), _triple(centre), _triple(up), fov)) for split, i in chosen
+    ]
+
+
+def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -> float:
+    """The fraction of the reachable surface area that at least one camera sees, in [0, 1].
+
+    Surfaces are those whose material is sought (no emitters, no mirrors and glass). Reachable is
+    what a camera sees from some position where one can stand: in a room from 512 positions of its
+    free space (`freespace.free_positions`), around an object from 512 positions on the sphere of
+    twice its radius, below it as well; what a given camera sees is always reachable. The backs of
+    walls and the insides of furniture are not.
+
+    Args:
+        scene: the scene.
+        cameras: the training views.
+        samples: number of surface points tested, spread by area.
+    """
+    points = free_space.sample_surface(scene, samples, 1)
+    seen = np.zeros(len(points.position), dtype=bool)
+    for camera in cameras:
+        framed = np.flatnonzero(~seen & _in_frame(camera, points.position))
+        seen[framed] = free_space.sees(scene, camera.origin[None], _subset(points, framed))[0]
+    reachable = seen.copy()
+    for position in _standpoints(scene):
+        hidden = np.flatnonzero(~reachable)
+        reachable[hidden] = free_space.sees(scene, position[None], _subset(points, hidden))[0]
+    return float(seen.sum() / max(reachable.sum(), 1))
+
+
+def _candidates(
+    scene: mi.Scene,
+    positions: np.ndarray,
+    points: free_space.SurfacePoints,
+    seen: np.ndarray,
+    up: np.ndarray,
+    fov: float,
+    seed: int,
+) -> _Candidates:
+    """All views from all positions that show surfaces from a decent distance."""
+    eyes, forwards = _all_views(positions, up, np.random.default_rng(seed))
+    half = math.tan(math.radians(fov) / 2)
+    depths = _view_depths(scene, eyes, forwards, up, half)
+    # No interpolation: between a wall and nothing there is no depth
+    near, median = np.quantile(depths, (0.1, 0.5), axis=1, method="lower")
+    usual = np.median(median[np.isfinite(median)]) if np.isfinite(median).any() else 0.0
+    kept = np.flatnonzero(np.isfinite(median) & (median > 0.5 * usual) & (near > 0.25 * usual))
+    value = np.zeros((len(kept), len(points.position)), dtype=np.float32)
+    owner = kept // (len(eyes) // len(positions))
+    for index, position in enumerate(positions):
+        start, stop = np.searchsorted(owner, (index, index + 1))
+        shown = np.flatnonzero(seen[index])
+        framed = _framed(points.position[shown] - position, forwards[kept[start:stop]], up, half)
+        worth = _worth(position, _subset(points, shown), usual)
+        value[start:stop, shown] = framed * worth
+    return _Candidates(eyes[kept], forwards[kept], median[kept], value)
+
+
+def _framed(way: np.ndarray, forwards: np.ndarray, up: np.ndarray, half: float) -> np.ndarray:
+    """Which points, (m, 3) from the eye, lie in square images along n directions: (n, m) bool."""
+    axes = np.stack([*_axes(forwards, up), half * forwards])
+    # Threads of a matrix product cost more than these three terms
+    x, y, reach = np.einsum("ani,mi->anm", axes.astype(np.float32), way.astype(np.float32))
+    return (np.abs(x) < reach) & (np.abs(y) < reach)
+
+
+def _importance(
+    scene: mi.Scene,
+    positions: np.ndarray,
+    points: free_space.SurfacePoints,
+    seen: np.ndarray,
+    seed: int,
+) -> np.ndarray:
+    """How much surface points count by the light that leaves them, (n,) in [0.25, 1].
+
+    Full weight goes to what lies within the exposure of the scene's own sensors. An image of a dark
+    corner is mostly noise, and a lamp room behind a door must not outweigh the room itself.
+    """
+    rng = np.random.default_rng(seed)
+    light = np.zeros(len(points.position))
+    for turn in range(_VIEWERS):
+        viewer = positions[np.argmax(seen * rng.random(seen.shape), axis=0)]
+        light += free_space.radiance(scene, viewer, points.position, seed + turn) / _VIEWERS
+    shown = free_space.sees(scene, free_space.sensor_probes(scene, seed)[:32], points).any(axis=0)
+    shown = shown if shown.any() else seen.any(axis=0)
+    usual = np.median(light[shown]) if shown.any() else 0.0
+    if usual == 0:
+        return np.ones(len(points.position))
+    exposure = light / usual
+    return 0.25 + 0.75 * exposure / (exposure + 0.5) / (1 + exposure / _OVEREXPOSED)
+
+
+def _worth(eye: np.ndarray, points: free_space.SurfacePoints, usual: float) -> np.ndarray:
+    """What a view tells about the points it shows, by angle and by pixels per area, in [0, 1]."""
+    way = eye - points.position
+    distance = np.linalg.norm(way, axis=1)
+    cosine = np.abs(np.einsum("ij,ij->i", way, points.normal)) / distance
+    told = cosine * np.minimum(1.0, (1.5 * usual / distance) ** 2)
+    return (1 - np.exp(-_VALUE * told)).astype(np.float32)
+
+
+def _greedy(
+    candidates: _Candidates, count: int, weight: np.ndarray, taken: list[int], diagonal: float
+) -> list[int]:
+    """The views that add most, one after the other, keeping away from `taken` and each other."""
+    remaining = weight.astype(np.float32)
+    novelty = np.ones(len(candidates.eye))
+    for view in taken:
+        novelty *= _difference(candidates, view, diagonal)
+    chosen: list[int] = []
+    for _ in range(count):
+        view = int(np.argmax(novelty * (candidates.value @ remaining)))
+        chosen.append(view)
+        remaining = remaining * (1 - candidates.value[view])
+        novelty *= _difference(candidates, view, diagonal)
+        novelty[view] = -1.0
+    return chosen
+
+
+def _difference(candidates: _Candidates, view: int, diagonal: float) -> np.ndarray:
+    """How different all candidates are from one of them: 0 (the same view) to 1, (n,)."""
+    away = np.linalg.norm(candidates.eye - candidates.eye[view], axis=1) / (0.12 * diagonal)
+    aligned = np.clip(candidates.forward @ candidates.forward[view], 0.0, 1.0)
+    return 1 - np.exp(-(away**2)) * aligned**2
+
+
+def _all_views(
+    positions: np.ndarray, up: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eyes and forward directions (positions * directions, 3), ordered by position."""
+    side, front = _horizon(up)
+    azimuth = np.arange(_AZIMUTHS) * 2 * math.pi / _AZIMUTHS
+    forwards = []
+    for turn in rng.random(len(positions)) * 2 * math.pi / _AZIMUTHS:
+        around = np.cos(azimuth + turn)[:, None] * side + np.sin(azimuth + turn)[:, None] * front
+        for pitch in np.radians(_PITCHES):
+            forwards.append(math.cos(pitch) * around + math.sin(pitch) * up)
+    eyes = np.repeat(positions, _AZIMUTHS * len(_PITCHES), axis=0)
+    return eyes, np.concatenate(forwards) if forwards else eyes
+
+
+def _view_depths(
+    scene: mi.Scene, eyes: np.ndarray, forwards: np.ndarray, up: np.ndarray, half: float
+) -> np.ndarray:
+    """Distances along a grid of view rays, (n, rays); infinite where a ray leaves the scene."""
+    right, above = _axes(forwards, up)
+    film = (2 * (np.arange(_GRID) + 0.5) / _GRID - 1) * half
+    x, y = (a.ravel() for a in np.meshgrid(film, film))
+    rays = (
+        forwards[:, None] + x[None, :, None] * right[:, None] + y[None, :, None] * above[:, None]
+    ).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance = free_space.trace(scene, np.repeat(eyes, len(x), axis=0), rays).distance
+    return distance.reshape(len(eyes), len(x))
+
+
+def _axes(forwards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The right and the upward image axis (n, 3) of cameras that look along `forwards`."""
+    right = np.cross(forwards, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return right, np.cross(right, forwards)
+
+
+def _in_frame(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) project into the image, (n,) bool; occlusion is not considered."""
+    local = (points - camera.origin) @ camera.to_world[:3, :3]
+    depth = -local[:, 2]
+    front = depth > 0
+    depth = np.where(front, depth, 1.0)
+    x = camera.cx + camera.fl_x * local[:, 0] / depth
+    y = camera.cy - camera.fl_y * local[:, 1] / depth
+    return front & (0 <= x) & (x < camera.width) & (0 <= y) & (y < camera.height)
+
+
+def _standpoints(scene: mi.Scene) -> np.ndarray:
+    if is_room(scene):
+        return free_space.free_positions(scene, _FREE_POSITIONS, 1)
+    centre, radius = _sphere(*_object_box(scene, free_space.up_axis(scene)))
+    return centre + 2 * radius * free_space.sphere_directions(_FREE_POSITIONS)
+
+
+def _object_box(scene: mi.Scene, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (3,) of the object, its ground plane left out."""
+    boxes = []
+    for shape in scene.shapes():
+        box = shape.bbox()
+        corners = np.array([np.array(box.min).ravel(), np.array(box.max).ravel()], dtype=np.float64)
+        if np.isfinite(corners).all():
+            boxes.append(corners)
+    if not boxes:
+        raise UserError("the scene has no shapes", remedy="Give a scene with geometry")
+    extents = np.array([np.ptp(box, axis=0) for box in boxes])
+    flat = extents @ np.abs(up) < 0.01 * extents.max(axis=1)
+    rest = [box for box, level in zip(boxes, flat, strict=True) if not level]
+    if rest:
+        size = np.ptp(np.concatenate(rest), axis=0).max()
+        kept = [b for b, e in zip(boxes, extents, strict=True) if e.max() < 1.5 * size]
+        boxes = kept or rest
+    corners = np.concatenate(boxes)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def _sphere(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of the sphere around a box."""
+    return 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
+
+
+def _fitting_distance(
+    points: np.ndarray, radius: float, outward: np.ndarray, up: np.ndarray, fov: float
+) -> float:
+    """How far from the centre cameras must be to show all points (m, 3) and leave a margin."""
+    if len(points) == 0:
+        return radius / math.sin(math.radians(fov) / 2)
+    right, above = _axes(-outward, up)
+    sides = np.maximum(np.abs(right @ points.T), np.abs(above @ points.T))
+    margin = 0.92 * math.tan(math.radians(fov) / 2)
+    return float((sides / margin + outward @ points.T).max())
+
+
+def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) which span the plane perpendicular to the up axis."""
+    side = np.roll(np.abs(up), 1)
+    return side, np.cross(up, side)
+
+
+def _look_at(candidates: _Candidates, view: int, up: np.ndarray, fov: float) -> LookAt:
+    eye = candidates.eye[view]
+    target = eye + candidates.depth[view] * candidates.forward[view]
+    return LookAt(_triple(eye), _triple(target), _triple(up), fov)
+
+
+def _subset(points: free_space.SurfacePoints, chosen: np.ndarray) -> free_space.SurfacePoints:
+    return free_space.SurfacePoints(points.position[chosen], points.normal[chosen])
+
+
+def _triple(vector: np.ndarray) -> tuple[float, float, float]:
+    return (float(vector[0]), float(vector[1]), float(vector[2]))
+
+
+def _check_counts(views: int, held_out: int) -> None:
+    if views < 1 or held_out < 0:
+        raise UserError(
+            f"{views} training and {held_out} held-out views are asked for",
+            remedy="At least one training view is needed",
+        )

@@ -1,0 +1,51 @@
+"""A method as it takes part in a comparison."""
+
+from __future__ import annotations
+
+import typing
+from dataclasses import dataclass, replace
+from typing import final
+
+from ..config import Estimator, FitConfig, MethodName, Representation
+from ..errors import UserError
+
+
+@final
+@dataclass(frozen=True)
+class MethodVariant:
+    """A method, how it represents materials, and its estimator; None: as shared settings say."""
+
+    method: MethodName
+    representation: Representation | None = None
+    estimator: Estimator | None = None
+
+    @staticmethod
+    def of(text: str) -> MethodVariant:
+        """Read `METHOD`, `METHOD:REPRESENTATION` or `METHOD:REPRESENTATION:ESTIMATOR`.
+
+        Raises:
+            UserError: there is no such method, representation or estimator.
+        """
+        choices = {"method": MethodName, "representation": Representation, "estimator": Estimator}
+        words = text.split(":")
+        if len(words) > len(choices):
+            raise UserError(f"{text!r} has too many parts", "--methods", "METHOD:REPRESENTATION")
+        said: dict[str, typing.Any] = dict(zip(choices, words, strict=False))
+        for what, word in said.items():
+            known = typing.get_args(choices[what])
+            if word not in known:
+                remedy = f"There are {', '.join(known)}"
+                raise UserError(f"no {what} named {word!r}", "--methods", remedy)
+        return MethodVariant(**said)
+
+    @property
+    def name(self) -> str:
+        """Name of its run: `ours`, `prb-bitmap`."""
+        return "-".join(filter(None, (self.method, self.representation, self.estimator)))
+
+    def settings(self, shared: FitConfig) -> FitConfig:
+        """The shared settings with this method; what `ours` alone knows goes for the others."""
+        own = replace(shared, bounces=1, prior="extra-bounce") if self.method != "ours" else shared
+        representation = self.representation or shared.representation
+        estimator = self.estimator or shared.estimator
+        return replace(own, method=self.method, representation=representation, estimator=estimator)

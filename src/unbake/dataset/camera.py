@@ -1,0 +1,400 @@
+"""Pinhole cameras: one convention inside, Mitsuba's and nerfstudio's at the borders."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import mitsuba as mi
+import numpy as np
+
+from unbake.errors import UserError
+from unbake.io import array, integer, number, read_json
+
+SPLITS = ("train", "heldout")
+
+# OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
+_FLIP = np.diag([-1.0, 1.0, -1.0, 1.0])
+# Text files round rotations to a few digits; a worse matrix is a mistake, not rounding.
+_RIGID_TOLERANCE = 1e-3
+_SQUARE_TOLERANCE = 1e-4
+_PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_NO_CAMERA_FILE = "A camera file holds a list 'cameras', or the 'frames' of a transforms.json"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Pixel (i, j), counted from the top left, looks from the last column of `to_world` along
+    `to_world[:3, :3] @ ((i + 0.5 - cx) / fl_x, -(j + 0.5 - cy) / fl_y, -1)`.
+
+    Args:
+        to_world: (4, 4) float64, camera to world, world units, OpenGL axes (x right, y up, looks
+            along -z).
+        fl_x, fl_y: focal lengths in pixels.
+        cx, cy: principal point in pixels from the left and the top edge.
+        width, height: image size in pixels.
+
+    Raises:
+        UserError: the pose is not a finite, right-handed rigid motion, a focal length is not
+            positive, or the image is empty.
+    """
+
+    to_world: np.ndarray
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        pose = _rigid(np.array(self.to_world, dtype=np.float64))
+        pose.setflags(write=False)
+        object.__setattr__(self, "to_world", pose)
+        if self.width < 1 or self.height < 1:
+            raise UserError(
+                f"the image size {self.width} x {self.height} is empty",
+                remedy="Width and height are positive pixel counts",
+            )
+        if not (0 < self.fl_x < math.inf and 0 < self.fl_y < math.inf):
+            raise UserError(
+                f"the focal length ({self.fl_x:g}, {self.fl_y:g}) is not positive",
+                remedy="fl_x and fl_y are in pixels; check the field of view",
+            )
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise UserError(f"the principal point ({self.cx:g}, {self.cy:g}) is not finite")
+
+    @classmethod
+    def look_at(
+        cls,
+        origin: Sequence[float],
+        target: Sequence[float],
+        up: Sequence[float],
+        fov_degrees: float,
+        width: int,
+        height: int,
+    ) -> Camera:
+        """A camera at `origin` that looks at `target`, with the principal point in the middle.
+
+        Args:
+            origin, target, up: (3,) in world units; `up` need not be perpendicular to the view.
+            fov_degrees: horizontal field of view, between 0 and 180 degrees.
+            width, height: image size in pixels.
+
+        Raises:
+            UserError: the points coincide, `up` is parallel to the view, or the field of view is
+                out of range.
+        """
+        if not 0 < fov_degrees < 180:
+            raise UserError(
+                f"the field of view {fov_degrees:g} is not between 0 and 180 degrees",
+                remedy="'fov' is the horizontal field of view in degrees",
+            )
+        position = np.asarray(origin, dtype=np.float64)
+        back = position - np.asarray(target, dtype=np.float64)
+        right = np.cross(np.asarray(up, dtype=np.float64), back)
+        scale = np.linalg.norm(back) * np.linalg.norm(up)
+        if not (scale > 0 and np.linalg.norm(right) > 1e-6 * scale):
+            raise UserError(
+                "origin, target and up do not define a view",
+                remedy="The target must differ from the origin, and up from the view direction",
+            )
+        back = back / np.linalg.norm(back)
+        right = right / np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(back, right), back, position], axis=1)
+        focal = 0.5 * width / math.tan(math.radians(fov_degrees) / 2)
+        return cls(pose, focal, focal, width / 2, height / 2, width, height)
+
+    @property
+    def origin(self) -> np.ndarray:
+        """The centre of projection, (3,) in world units."""
+        return self.to_world[:3, 3]
+
+    def rescaled(self, width: int, height: int) -> Camera:
+        """The same view with another pixel count.
+
+        The horizontal field of view stays, and so does the shape of the pixels: where the aspect
+        ratio changes, rows are added or cut evenly at the top and the bottom.
+        """
+        scale = width / self.width
+        return Camera(
+            self.to_world,
+            self.fl_x * scale,
+            self.fl_y * scale,
+            self.cx * scale,
+            height / 2 + (self.cy - self.height / 2) * scale,
+            width,
+            height,
+        )
+
+    def rays(self, px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions, (n, 3) each in world space, through film positions.
+
+        Args:
+            px, py: (n,) in pixels from the left and the top edge; pixel centres are at k + 0.5.
+        """
+        x, y = (px - self.cx) / self.fl_x, -(py - self.cy) / self.fl_y
+        local = np.stack([x, y, -np.ones_like(x)], axis=1)
+        local /= np.linalg.norm(local, axis=1, keepdims=True)
+        directions = local @ self.to_world[:3, :3].T
+        return np.broadcast_to(self.origin, directions.shape), directions
+
+    def sensor(self, spp: int) -> dict[str, Any]:
+        """The Mitsuba `perspective` sensor that renders this camera, as a dictionary.
+
+        The film is float32 RGBA in linear RGB with a box filter.
+
+        Args:
+            spp: samples per pixel.
+
+        Raises:
+            UserError: fl_x and fl_y differ, which Mitsuba's camera cannot express.
+        """
+        if abs(self.fl_x / self.fl_y - 1) > _SQUARE_TOLERANCE:
+            raise UserError(
+                f"pixels are not square: fl_x is {self.fl_x:g} and fl_y is {self.fl_y:g}",
+                remedy="Resample the image so that both focal lengths agree",
+            )
+        return {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(self.to_world @ _FLIP),
+            "fov": math.degrees(2 * math.atan(0.5 * self.width / self.fl_x)),
+            "fov_axis": "x",
+            "principal_point_offset_x": 0.5 - self.cx / self.width,
+            "principal_point_offset_y": 0.5 - self.cy / self.height,
+            # The defaults clip what is nearer than 0.01 world units, which is much of a small scene
+            "near_clip": 1e-4,
+            "far_clip": 1e6,
+            "film": {
+                "type": "hdrfilm",
+                "width": self.width,
+                "height": self.height,
+                "pixel_format": "rgba",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": spp},
+        }
+
+    @classmethod
+    def from_mitsuba(cls, sensor: mi.Sensor) -> Camera:
+        """The camera of a Mitsuba `perspective` sensor, its film's crop window included.
+
+        Raises:
+            UserError: the sensor is not a perspective camera, or it mirrors the image.
+        """
+        params = mi.traverse(sensor)
+        if "x_fov" not in params:
+            raise UserError(
+                f"the sensor {sensor.class_name()} is not a perspective camera",
+                remedy="Use a scene with a 'perspective' sensor, or give a camera file",
+            )
+        film = sensor.film()
+        width, height = (int(v) for v in film.size())
+        crop_width, crop_height = (int(v) for v in film.crop_size())
+        left, top = (int(v) for v in film.crop_offset())
+        focal = 0.5 * width / math.tan(math.radians(_scalar(params["x_fov"])) / 2)
+        cx = width * (0.5 - _scalar(params["principal_point_offset_x"])) - left
+        cy = height * (0.5 - _scalar(params["principal_point_offset_y"])) - top
+        matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+        return cls(matrix @ _FLIP, focal, focal, cx, cy, crop_width, crop_height)
+
+
+@final
+@dataclass(frozen=True)
+class LookAt:
+    """Where a camera stands and what it looks at: one entry of a camera file.
+
+    Args:
+        origin, target, up: (3,) in world units.
+        fov: horizontal field of view in degrees.
+    """
+
+    origin: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+    fov: float
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera with that many pixels; errors as in `Camera.look_at`."""
+        return Camera.look_at(self.origin, self.target, self.up, self.fov, width, height)
+
+
+def frame_name(split: str, index: int) -> str:
+    """The name of a view: its split and its number in that split, as in `train_000`."""
+    return f"{split}_{index:03d}"
+
+
+def write_camera_file(path: Path, cameras: Sequence[tuple[str, LookAt]]) -> None:
+    """Write (split, placement) pairs as a camera file: JSON, one camera a line, world units."""
+    counts = dict.fromkeys(SPLITS, 0)
+    lines = []
+    for split, placed in cameras:
+        entry = {
+            "name": frame_name(split, counts[split]),
+            "split": split,
+            "origin": _rounded(placed.origin),
+            "target": _rounded(placed.target),
+            "up": _rounded(placed.up),
+            "fov": placed.fov,
+        }
+        counts[split] += 1
+        lines.append("  " + json.dumps(entry))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('{"cameras": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
+
+
+def read_cameras(path: Path, width: int, height: int) -> list[tuple[str, Camera]]:
+    """Read (split, camera) pairs from a camera file or a nerfstudio `transforms.json`.
+
+    A camera file is `{"cameras": [{"name", "split", "origin", "target", "up", "fov"}]}` or the
+    list alone; `split` is "train" where it is missing. Horizontal fields of view stay as in the
+    file (see `Camera.rescaled`).
+
+    Args:
+        path: the file.
+        width, height: image size in pixels of the cameras returned.
+
+    Raises:
+        UserError: the file is missing or not JSON, or an entry lacks a key or is no valid camera.
+    """
+    content = read_json(path)
+    if isinstance(content, dict) and "frames" in content:
+        entries = content["frames"]
+    else:
+        entries = content.get("cameras") if isinstance(content, dict) else content
+    if not isinstance(entries, list) or not entries:
+        raise UserError("no cameras in the file", path, _NO_CAMERA_FILE)
+    cameras = []
+    for index, entry in enumerate(entries):
+        where = f"{path}: camera {index}"
+        if not isinstance(entry, dict):
+            raise UserError("the entry is not an object", where, _NO_CAMERA_FILE)
+        split = read_split(entry, where)
+        if "transform_matrix" in entry:
+            camera = camera_from_frame(entry, content, where, (width, height))
+        else:
+            camera = _camera_from_entry(entry, where, width, height)
+        cameras.append((split, camera.rescaled(width, height)))
+    return cameras
+
+
+def camera_from_frame(
+    frame: dict[str, Any], top: dict[str, Any], where: str, size: tuple[int, int] | None = None
+) -> Camera:
+    """The camera of one frame of a `transforms.json`.
+
+    Args:
+        frame: the frame; what it lacks is taken from `top`.
+        top: the file's top level: `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, or `camera_angle_x`.
+        where: file and frame, for error messages.
+        size: (width, height) in pixels where neither has `w` and `h`.
+
+    Raises:
+        UserError: a key is missing or of the wrong type, the lens is distorted, or the values are
+            no valid camera.
+    """
+    both = {**top, **frame}
+    _check_lens(both, where)
+    if size is None or ("w" in both and "h" in both):
+        size = (integer(both, "w", where), integer(both, "h", where))
+    width, height = size
+    matrix = array(frame, "transform_matrix", (4, 4), where)
+    fl_x = _focal(both, "fl_x", "camera_angle_x", width, where)
+    if fl_x is None:
+        raise UserError(
+            "the key 'fl_x' is missing", where, "Give 'fl_x' in pixels, or 'camera_angle_x'"
+        )
+    fl_y = _focal(both, "fl_y", "camera_angle_y", height, where) or fl_x
+    cx = number(both, "cx", where) if "cx" in both else width / 2
+    cy = number(both, "cy", where) if "cy" in both else height / 2
+    try:
+        return Camera(matrix, fl_x, fl_y, cx, cy, width, height)
+    except UserError as error:
+        raise UserError(error.what, where, error.remedy) from None
+
+
+def read_split(entry: dict[str, Any], where: str) -> str:
+    """The split of a frame, "train" where it names none."""
+    split = entry.get("split", "train")
+    if split not in SPLITS:
+        raise UserError(f"unknown split {split!r}", where, "The splits are 'train' and 'heldout'")
+    return split
+
+
+def _camera_from_entry(entry: dict[str, Any], where: str, width: int, height: int) -> Camera:
+    origin, target, up = (array(entry, key, (3,), where) for key in ("origin", "target", "up"))
+    fov = number(entry, "fov", where)
+    try:
+        return Camera.look_at(origin, target, up, fov, width, height)
+    except UserError as error:
+        raise UserError(error.what, where, error.remedy) from None
+
+
+def _rigid(matrix: np.ndarray) -> np.ndarray:
+    """The rigid motion next to `matrix`, or an error where that is far."""
+    remedy = "'transform_matrix' is camera to world: a rotation and a position, no scale"
+    if matrix.shape != (4, 4):
+        raise UserError(f"the pose has shape {matrix.shape}", remedy=remedy)
+    if not np.isfinite(matrix).all():
+        raise UserError("the pose has NaN or infinite entries", remedy=remedy)
+    rotation = matrix[:3, :3]
+    determinant = np.linalg.det(rotation)
+    if abs(determinant) < 1e-6:
+        raise UserError("the pose is singular", remedy=remedy)
+    if determinant < 0:
+        raise UserError(
+            "the pose is left-handed, it mirrors the image",
+            remedy="Negate one axis: the convention is x right, y up, looking along -z",
+        )
+    left, _, right = np.linalg.svd(rotation)
+    nearest = left @ right
+    if np.abs(nearest - rotation).max() > _RIGID_TOLERANCE:
+        raise UserError("the pose is not a rigid motion", remedy=remedy)
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise UserError("the last row of the pose is not 0 0 0 1", remedy=remedy)
+    pose = matrix.copy()
+    # A matrix that is as good as its number format allows stays as it is, bit for bit.
+    if np.abs(nearest - rotation).max() > 1e-12:
+        pose[:3, :3] = nearest
+    return pose
+
+
+def _check_lens(keys: dict[str, Any], where: str) -> None:
+    remedy = "Undistort the images first; only pinhole cameras are supported"
+    model = keys.get("camera_model", "PINHOLE")
+    if model not in _PINHOLE_MODELS:
+        raise UserError(f"unknown camera_model {model!r}", where, remedy)
+    distorted = [key for key in _DISTORTION if key in keys and number(keys, key, where) != 0]
+    if distorted:
+        raise UserError(f"lens distortion in {', '.join(distorted)}", where, remedy)
+
+
+def _focal(keys: dict[str, Any], focal: str, angle: str, pixels: int, where: str) -> float | None:
+    if focal in keys:
+        return number(keys, focal, where)
+    if angle not in keys:
+        return None
+    radians = number(keys, angle, where)
+    if not 0 < radians < math.pi:
+        raise UserError(
+            f"{angle!r} is {radians:g}", where, "It is a field of view in radians, between 0 and π"
+        )
+    return 0.5 * pixels / math.tan(radians / 2)
+
+
+def _rounded(vector: Sequence[float]) -> list[float]:
+    return [round(float(v), 5) for v in vector]
+
+
+def _scalar(value: Any) -> float:
+    return float(np.asarray(value).ravel()[0])

@@ -1,0 +1,192 @@
+"""The photographs of a fit, decoded once: in memory, or where they are many, in a mapped file."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from ..errors import UserError
+from ..io import write_json
+from .camera import Camera
+from .views import Dataset, View, read_image
+
+#: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
+#: set's folder, of which the system keeps in memory what it has room for.
+IN_MEMORY = 512 << 20
+#: The folder of that file, in the data set's.
+CACHE = ".cache"
+#: Linear RGB, and the same of the photograph blurred.
+_COLUMNS = 6
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Linear RGB of all pixels of several views, row by row and view after view.
+
+    Args:
+        table: shape (pixels, 6), float32: radiance, and radiance blurred over 5 x 5 pixels.
+        chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
+            background pixels say nothing about the scene and only those with alpha > 0 are taken
+            (the paper: at least half of them).
+        mean: mean radiance of the pixels to train on.
+
+    Paper: Sec. 5.4.
+    """
+
+    table: np.ndarray
+    chosen: np.ndarray | None
+    mean: float
+
+    @property
+    def count(self) -> int:
+        """Number of pixels to train on."""
+        return len(self.table if self.chosen is None else self.chosen)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the pixels take, unless they lie in a file."""
+        held = [a for a in (self.table, self.chosen) if a is not None]
+        return sum(a.nbytes for a in held if not isinstance(a, np.memmap))
+
+    @staticmethod
+    def of(
+        cameras: Sequence[Camera], rgb: np.ndarray, alpha: np.ndarray, *, foreground_only: bool
+    ) -> Photographs:
+        """Photographs that are in memory already.
+
+        Args:
+            cameras: one a view.
+            rgb: linear RGB of all views' pixels, row by row, view after view, shape (pixels, 3).
+            alpha: coverage of the same pixels, shape (pixels,).
+            foreground_only: train only on pixels with alpha > 0.
+        """
+        table = np.empty((len(rgb), _COLUMNS), np.float32)
+        images = zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
+        return _fill(table, images, foreground_only)
+
+    @staticmethod
+    def load(dataset: Dataset, clip_negative: bool) -> Photographs:
+        """The training views of a data set; every image is read once, also over many fits.
+
+        Raises:
+            UserError: an image is bad, or there are too many for memory and the data set's folder
+                cannot be written to.
+        """
+        views = dataset.train
+        hidden = dataset.background == "hidden"
+        count = sum(view.camera.width * view.camera.height for view in views)
+        if 4 * _COLUMNS * count <= IN_MEMORY:
+            table = np.empty((count, _COLUMNS), np.float32)
+            return _fill(table, _decoded(views, clip_negative), hidden)
+        return _cached(dataset, views, count, clip_negative, hidden)
+
+
+def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:
+    return np.split(pixels, np.cumsum([c.width * c.height for c in cameras])[:-1])
+
+
+def _decoded(views: Sequence[View], clip_negative: bool) -> Iterator[tuple[Camera, np.ndarray]]:
+    for view in views:
+        camera = view.camera
+        yield camera, read_image(view.image, camera.width, camera.height, clip_negative)
+
+
+def _fill(
+    table: np.ndarray, images: Iterable[tuple[Camera, np.ndarray]], foreground_only: bool
+) -> Photographs:
+    """Put images, RGBA, into a table one after the other."""
+    start, total, seen = 0, 0.0, []
+    for camera, pixels in images:
+        stop = start + len(pixels)
+        rgb, foreground = pixels[:, :3], pixels[:, 3] > 0
+        table[start:stop, :3] = rgb
+        table[start:stop, 3:] = _blurred(rgb.reshape(camera.height, camera.width, 3))
+        counted = rgb[foreground] if foreground_only else rgb
+        total += float(counted.sum(dtype=np.float64))
+        if foreground_only:
+            seen.append(start + np.flatnonzero(foreground))
+        start = stop
+    chosen = np.concatenate(seen).astype(np.uint32) if foreground_only else None
+    count = len(table) if chosen is None else len(chosen)
+    return Photographs(table, chosen, total / max(3 * count, 1))
+
+
+def _blurred(image: np.ndarray, radius: int = 2) -> np.ndarray:
+    """Every pixel the mean of the (2 radius + 1)² pixels around it; shape (pixels, 3)."""
+    padded = np.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * radius + 1,) * 2, (0, 1))
+    return windows.mean((-2, -1), dtype=np.float32).reshape(-1, 3)
+
+
+# ------------------------------------------------------------------------------- The mapped file
+
+
+def _cached(
+    dataset: Dataset, views: Sequence[View], count: int, clip_negative: bool, hidden: bool
+) -> Photographs:
+    """Photographs in a file that is made where it is missing, or made from other images."""
+    folder = dataset.folder / CACHE
+    key = {
+        "images": [[str(v.image), v.image.stat().st_mtime_ns] for v in views if v.image.is_file()],
+        "pixels": count,
+        "clip_negative": clip_negative,
+        "foreground_only": hidden,
+    }
+    found = _open_cache(folder, key)
+    if found is None:
+        try:
+            _write_cache(folder, views, key)
+        except OSError as error:
+            raise UserError(
+                f"the decoded photographs cannot be written ({error.strerror})",
+                folder,
+                f"They take {4 * _COLUMNS * count / 1e9:.1f} GB. Make room, or the folder writable",
+            ) from None
+        found = _open_cache(folder, key)
+    return found
+
+
+def _open_cache(folder: Path, key: dict) -> Photographs | None:
+    """What is in the files, if they are whole and of these photographs."""
+    try:
+        stored = json.loads((folder / "key.json").read_text(encoding="utf-8"))
+        if stored != {"key": key, "mean": stored["mean"]}:
+            return None
+        table, chosen = np.load(folder / "photographs.npy", mmap_mode="r"), None
+        if key["foreground_only"]:
+            chosen = np.load(folder / "foreground.npy", mmap_mode="r")
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Photographs(table, chosen, stored["mean"])
+
+
+def _write_cache(folder: Path, views: Sequence[View], key: dict) -> None:
+    folder.mkdir(exist_ok=True)
+    # The key is written last: without it the rest is taken for unfinished.
+    (folder / "key.json").unlink(missing_ok=True)
+    path = folder / "photographs.npy"
+    table = np.lib.format.open_memmap(path, "w+", np.float32, (key["pixels"], _COLUMNS))
+    try:
+        _reserve(path)
+    except OSError:
+        path.unlink()
+        raise
+    made = _fill(table, _decoded(views, key["clip_negative"]), key["foreground_only"])
+    table.flush()
+    if made.chosen is not None:
+        np.save(folder / "foreground.npy", made.chosen)
+    write_json(folder / "key.json", {"key": key, "mean": made.mean})
+
+
+def _reserve(path: Path) -> None:
+    """Take the room of a file at once: a mapped file that finds the disk full kills the process."""
+    if hasattr(os, "posix_fallocate"):  # not on macOS
+        with open(path, "r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)

@@ -1,0 +1,351 @@
+"""The views of a data folder: posed HDR images, each read once and checked when it is."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import mitsuba as mi
+import numpy as np
+
+from unbake.dataset.camera import Camera, camera_from_frame, read_split
+from unbake.errors import UserError
+from unbake.io import read_json, text
+from unbake.scene import free_space
+
+TRANSFORMS = "transforms.json"
+BACKGROUNDS = ("visible", "hidden")
+
+_HDR_SUFFIXES = (".exr", ".hdr", ".pfm", ".rgbe")
+_LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".webp", ".gif", ".tif", ".tiff", ".ppm")
+_HEAD = 1 << 16  # bytes of a file that are read to know its size
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_NEED_HDR = "Give linear HDR images (OpenEXR); tone-mapped 8-bit images hold no radiance"
+_MAKE_DATA = "Render a data set from a scene with `unbake capture SCENE --out DATA`"
+_REPLACE = "Write the image again, or remove its frame from transforms.json"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class View:
+    """One posed image.
+
+    Args:
+        name: the image's file name without its suffix, unique in the data set.
+        split: "train" or "heldout".
+        camera: pose and intrinsics, in the image's pixels.
+        image: linear RGB radiance, alpha 1 where a surface is seen; inside the data folder.
+        albedo, roughness: truth images, None where the data set has none.
+    """
+
+    name: str
+    split: str
+    camera: Camera
+    image: Path
+    albedo: Path | None
+    roughness: Path | None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A data folder.
+
+    Args:
+        folder: where it lies.
+        scene: the Mitsuba scene file, inside the folder.
+        background: "visible" where images show the environment behind the scene, else "hidden".
+        views: all views, in the order of the file.
+        render: how the images were rendered; empty where they were not.
+        coverage: fraction of surface area that training views see, in [0, 1]; None if unknown.
+    """
+
+    folder: Path
+    scene: Path
+    background: str
+    views: tuple[View, ...]
+    render: dict[str, Any]
+    coverage: float | None
+
+    @property
+    def train(self) -> tuple[View, ...]:
+        """The views to learn from."""
+        return tuple(view for view in self.views if view.split == "train")
+
+    @property
+    def heldout(self) -> tuple[View, ...]:
+        """The views to judge by."""
+        return tuple(view for view in self.views if view.split == "heldout")
+
+    @classmethod
+    def load(cls, folder: Path) -> Dataset:
+        """Read a data folder and check all of it but the pixels: those when they are read.
+
+        Args:
+            folder: has a nerfstudio `transforms.json`; frames without "split" are for training.
+
+        Raises:
+            UserError: anything is missing, malformed, outside the folder, or not a valid camera,
+                or an image is not HDR or of another size than its frame says. It names the file
+                and the remedy.
+        """
+        folder = Path(folder)
+        file = folder / TRANSFORMS
+        if folder.is_file():
+            raise UserError("is a file, not a data folder", folder, _MAKE_DATA)
+        if not folder.is_dir():
+            raise UserError("the data folder does not exist", folder, "Check the path")
+        if not file.is_file():
+            raise UserError(f"no {TRANSFORMS} in the folder", folder, "Is this a data folder?")
+        top = read_json(file)
+        if not isinstance(top, dict):
+            raise UserError("the file does not hold a JSON object", file, "Repair it")
+        scene = _inside(folder, text(top, "scene", str(file)), f"{file}: 'scene'")
+        if not scene.is_file():
+            raise UserError("the scene file does not exist", scene, f"Set 'scene' in {file}")
+        views = _read_views(folder, file, top)
+        for view in views:
+            for image in (view.image, view.albedo, view.roughness):
+                if image is not None:
+                    _check_header(image, view.camera.width, view.camera.height)
+        return cls(folder, scene, _background(top, file), views, *_provenance(top, file))
+
+    def save(self, folder: Path) -> None:
+        """Write `transforms.json` into a folder, atomically; images are not touched.
+
+        Args:
+            folder: the data folder, in which scene and images lie.
+
+        Raises:
+            UserError: a file lies outside the folder.
+        """
+        folder = Path(folder)
+        content = {
+            "scene": _relative(folder, self.scene),
+            "background": self.background,
+            "render": self.render,
+            "coverage": self.coverage,
+            "frames": [_frame(folder, view) for view in self.views],
+        }
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(
+            "w", encoding="utf-8", dir=folder, prefix=".transforms-", delete=False
+        ) as file:
+            try:
+                json.dump(content, file, indent=1, allow_nan=False)
+                file.write("\n")
+                file.flush()
+                os.fsync(file.fileno())
+                # Temporary files are private to their owner, a data set is not
+                os.chmod(file.name, 0o644)
+                os.replace(file.name, folder / TRANSFORMS)
+            except BaseException:
+                os.unlink(file.name)
+                raise
+
+
+def read_image(path: Path, width: int, height: int, clip_negative: bool = False) -> np.ndarray:
+    """One HDR image, row by row: (width * height, 4) float32, linear RGB and alpha (1 if absent).
+
+    Raises:
+        UserError: it is missing, unreadable, no HDR image, of another size, or has pixels that
+            are NaN, infinite, or (without `clip_negative`) negative.
+    """
+    # The header first: a damaged one may ask for more memory than there is
+    _check_header(path, width, height)
+    try:
+        bitmap = mi.Bitmap(str(path))
+        size = tuple(bitmap.size())
+        _check_size((int(size[0]), int(size[1])), width, height, path)
+        kind = mi.Bitmap.PixelFormat
+        if bitmap.pixel_format() not in (kind.RGB, kind.RGBA, kind.Y, kind.YA):
+            raise UserError("the image has other channels than RGB and alpha", path, _REPLACE)
+        bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, False)
+    except (RuntimeError, MemoryError, ValueError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise UserError(f"the image cannot be read ({reason})", path, _REPLACE) from None
+    return _valid_pixels(np.array(bitmap).reshape(-1, 4), path, clip_negative)
+
+
+def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
+    """The names of the cameras that stand inside geometry or with their nose on it.
+
+    A camera is named when its position is inside an object (the rule is told in
+    `freespace.inside_geometry`), or when over half of 256 rays spread over its image hit something
+    nearer than 0.1 % of the scene's diagonal. Both are signs of a wrong pose, not proof of one.
+
+    Args:
+        scene: the scene that the cameras look at.
+        cameras: name to camera.
+    """
+    if not cameras:
+        return []
+    inside = free_space.inside_geometry(scene, np.array([c.origin for c in cameras.values()]))
+    near = free_space.CONTACT * free_space.bounds(scene)[2]
+    film = (np.arange(16) + 0.5) / 16
+    x, y = (axis.ravel() for axis in np.meshgrid(film, film))
+    named = []
+    for (name, camera), trapped in zip(cameras.items(), inside, strict=True):
+        origins, directions = camera.rays(x * camera.width, y * camera.height)
+        touching = free_space.trace(scene, origins, directions).distance < near
+        if trapped or touching.mean() > 0.5:
+            named.append(name)
+    return named
+
+
+def _read_views(folder: Path, file: Path, top: dict[str, Any]) -> tuple[View, ...]:
+    frames = top.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise UserError("'frames' is not a list of frames", file, "Each view is one frame")
+    views, names = [], set()
+    for index, frame in enumerate(frames):
+        where = f"{file}: frame {index}"
+        if not isinstance(frame, dict):
+            raise UserError("the frame is not an object", where, "Each view is one frame")
+        view = _read_view(folder, frame, top, where)
+        if view.name in names:
+            raise UserError(f"two frames are named {view.name!r}", where, "Rename one image")
+        names.add(view.name)
+        views.append(view)
+    if not any(view.split == "train" for view in views):
+        raise UserError("no view has the split 'train'", file, "There is nothing to learn from")
+    return tuple(views)
+
+
+def _read_view(folder: Path, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
+    image = _inside(folder, text(frame, "file_path", where), f"{where}: 'file_path'")
+    where = f"{where} ({image.name})"
+    split = read_split(frame, where)
+    camera = camera_from_frame(frame, top, where)
+    truth = folder / "truth"
+    albedo, roughness = (truth / kind / f"{image.stem}.exr" for kind in ("albedo", "roughness"))
+    return View(
+        image.stem,
+        split,
+        camera,
+        image,
+        albedo if albedo.is_file() else None,
+        roughness if roughness.is_file() else None,
+    )
+
+
+def _valid_pixels(pixels: np.ndarray, path: Path, clip_negative: bool) -> np.ndarray:
+    count = int((~np.isfinite(pixels)).any(axis=1).sum())
+    if count:
+        raise UserError(
+            f"{count} of {len(pixels)} pixels are NaN or infinite",
+            path,
+            "No measurement is like that: render or convert the image again",
+        )
+    count = int((pixels < 0).any(axis=1).sum())
+    if count and not clip_negative:
+        raise UserError(
+            f"{count} of {len(pixels)} pixels are negative",
+            path,
+            "Pass --clip-negative to take them as zero",
+        )
+    return np.maximum(pixels, 0)
+
+
+def _check_header(path: Path, width: int, height: int) -> None:
+    """Refuse what cannot be an HDR image of that size, without reading its pixels."""
+    if path.suffix.lower() in _LDR_SUFFIXES:
+        raise UserError("the image is low dynamic range", path, _NEED_HDR)
+    if not path.is_file():
+        raise UserError("the image does not exist", path, _REPLACE)
+    if path.suffix.lower() not in _HDR_SUFFIXES:
+        raise UserError(f"unknown image format {path.suffix!r}", path, _NEED_HDR)
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError as error:
+        raise UserError(f"the image cannot be read ({error.strerror})", path, _REPLACE) from None
+    size = _exr_size(head)
+    if path.suffix.lower() == ".exr" and size is None:
+        # A long header, full of a renderer's notes, may tell the size later on
+        if not head.startswith(_EXR_MAGIC):
+            raise UserError("the image cannot be read (it is not OpenEXR)", path, _REPLACE)
+        if len(head) < _HEAD:
+            raise UserError("the image cannot be read (it is cut off)", path, _REPLACE)
+    _check_size(size, width, height, path)
+
+
+def _check_size(size: tuple[int, int] | None, width: int, height: int, path: Path) -> None:
+    if size is not None and size != (width, height):
+        raise UserError(
+            f"the image has {size[0]} x {size[1]} pixels, its frame says {width} x {height}",
+            path,
+            "Correct 'w' and 'h', or use the image that belongs to the camera",
+        )
+
+
+def _exr_size(head: bytes) -> tuple[int, int] | None:
+    """Width and height in an OpenEXR header, None where it is not there or comes later."""
+    key = b"dataWindow\0box2i\0\x10\0\0\0"
+    at = head.find(key)
+    if not head.startswith(_EXR_MAGIC) or at < 0 or len(head) < at + len(key) + 16:
+        return None
+    left, top, right, bottom = struct.unpack_from("<4i", head, at + len(key))
+    return right - left + 1, bottom - top + 1
+
+
+def _inside(folder: Path, name: str, where: str) -> Path:
+    """A path of the data set, relative to its folder, which it must not leave."""
+    try:
+        resolved = (folder / name).resolve()
+        inside = resolved.is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):
+        raise UserError(f"{name!r} is not a path", where, "Correct it") from None
+    if not inside:
+        raise UserError(
+            f"{name!r} lies outside the data folder", where, f"Move the file into {folder}"
+        )
+    return folder / name
+
+
+def _relative(folder: Path, path: Path) -> str:
+    resolved, root = path.resolve(), folder.resolve()
+    if not resolved.is_relative_to(root):
+        raise UserError("the file lies outside the data folder", path, f"Move it into {folder}")
+    return resolved.relative_to(root).as_posix()
+
+
+def _frame(folder: Path, view: View) -> dict[str, Any]:
+    camera = view.camera
+    return {
+        "file_path": _relative(folder, view.image),
+        "split": view.split,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "transform_matrix": camera.to_world.tolist(),
+    }
+
+
+def _background(top: dict[str, Any], file: Path) -> str:
+    background = top.get("background", "visible")
+    if background not in BACKGROUNDS:
+        raise UserError(f"unknown background {background!r}", file, "It is 'visible' or 'hidden'")
+    return background
+
+
+def _provenance(top: dict[str, Any], file: Path) -> tuple[dict[str, Any], float | None]:
+    render, coverage = top.get("render", {}), top.get("coverage")
+    if not isinstance(render, dict):
+        raise UserError("'render' is not an object", file, "Remove it if it is unknown")
+    if coverage is None:
+        return render, None
+    number = isinstance(coverage, int | float) and not isinstance(coverage, bool)
+    if not number or not math.isfinite(coverage) or not 0 <= coverage <= 1:
+        raise UserError("'coverage' is not a number from 0 to 1", file, "Set it to null")
+    return render, float(coverage)

@@ -1,0 +1,226 @@
+"""How good a run is: its materials and its renderings against the photographs and the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..config import FitConfig
+from ..dataset.lights import ROWS, true_environment
+from ..dataset.pixels import CameraRays
+from ..dataset.views import View
+from ..imaging.metrics import mean_psnr, psnr
+from ..imaging.pictures import montage, to_bytes, tonemap, write_exr, write_png
+from ..io import write_json
+from ..training.recovered import Recovered, load_run
+from ..training.validation import GroundTruth, MaterialBuffers, finite, read_view
+from ..transport.objective import METHODS, requirements
+from ..transport.render import render_radiance
+from . import lighting
+
+DEFINITIONS = {
+    "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
+    "value of a split is the mean over its views. Renderings: both pictures clipped to [0,1], "
+    "because one caustic pixel of a photograph would decide all; render_psnr_unclamped does not. "
+    "Albedo and roughness are not clipped",
+    "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
+    "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
+    "one number for all views, which brings it nearest to the truth in the least squares sense",
+    "mask": "pixels all of whose samples see a material that is sought: emitters, mirrors, glass "
+    "and background are left out; without truth images every foreground pixel counts",
+}
+
+
+METRICS = ("render_psnr", "render_psnr_unclamped", "albedo_psnr", "roughness_psnr")
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How the recovered scene is rendered."""
+
+    spp: int = 64  #: camera samples a pixel
+    max_depth: int = 48  #: bounces, plus one; specular ones are not counted
+    rr_depth: int = 5  #: bounces before Russian roulette
+    train_views: int = 4  #: training views to render; all held-out views are rendered
+    material_spp: int = 16  #: camera samples a pixel of the albedo and roughness pictures
+    clip_negative: bool = False  #: take negative pixels as zero; also where the fit did
+
+
+def evaluate(
+    run: Path,
+    settings: EvaluationSettings | None = None,
+    *,
+    tell: Callable[[str], None] = print,
+) -> dict:
+    """Render a run's views with the recovered materials and compare.
+
+    Renderings are path traced with full global illumination; the radiance field plays no part.
+
+    Args:
+        run: folder of a fit.
+        settings: how to render.
+        tell: called with lines of progress.
+
+    Returns:
+        What it writes to `evaluation/metrics.json`; pictures go beside it.
+
+    Raises:
+        UserError: the run or its data set cannot be read.
+
+    Paper: Sec. 6, Fig. 6.
+    """
+    settings = settings or EvaluationSettings()
+    recovered = load_run(run)
+    dataset = recovered.dataset
+    spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
+    views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
+    rows, materials = [], []
+    for view in views:
+        folder = run / "evaluation" / view.split
+        row, seen, truth = _evaluate_view(recovered, view, folder, settings)
+        rows.append(row)
+        materials.append((seen, truth))
+        values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in row if k.endswith("_psnr"))
+        tell(f"{view.name}: {', '.join(values)}")
+    light = _evaluate_light(recovered, run / "evaluation", tell)
+    if recovered.config.unknown == "materials+lighting":
+        light["albedo_scale"] = _align_albedo(rows, materials)
+    metrics = description(recovered.config) | {
+        "steps": recovered.progress.step,
+        "samples": recovered.progress.samples,
+        "seconds": round(recovered.progress.seconds, 2),
+        "heldout": _summary(rows, "heldout"),
+        "train": _summary(rows, "train"),
+        **light,
+        "per_view": rows,
+        "definitions": DEFINITIONS | (lighting.DEFINITIONS if light else {}),
+        "data": str(dataset.folder),
+        "render": {"spp": settings.spp, "max_depth": settings.max_depth},
+    }
+    write_json(run / "evaluation" / "metrics.json", metrics)
+    return metrics
+
+
+def description(config: FitConfig) -> dict:
+    """What tells a run from another: unknown, method, representations and estimator.
+
+    `representation` is that of the materials (φ), None where they are known, `radiance` that of
+    L_θ, None where the method has no radiance field.
+    """
+    cached = requirements(METHODS[config.method]).radiance
+    return {
+        "unknown": config.unknown,
+        "method": config.method,
+        "bounces": config.bounces,
+        "prior": config.prior,
+        "representation": config.representation if config.learns_materials else None,
+        "radiance": config.radiance_representation if cached else None,
+        "estimator": "split-halves" if config.halves else "two-pass",
+    }
+
+
+def _evaluate_view(
+    recovered: Recovered, view: View, folder: Path, settings: EvaluationSettings
+) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
+    problem, camera = recovered.problem, view.camera
+    rays = CameraRays.of([camera])
+    radiance = render_radiance(
+        problem.scene_view,
+        rays.through,
+        rays.pixels,
+        settings.spp,
+        seed=1,
+        max_depth=settings.max_depth,
+        rr_depth=settings.rr_depth,
+        hide_emitters=problem.hide_emitters,
+    ).reshape(camera.height, camera.width, 3)
+    photograph = read_view(view.image, view, settings.clip_negative or recovered.clip_negative)
+    truth, seen = GroundTruth.of(view), None
+    alpha, mask = photograph[..., 3], photograph[..., 3] >= 1
+    if recovered.config.learns_materials:
+        (seen,) = MaterialBuffers.of(problem, [view], settings.material_spp, seed=1)
+        alpha = seen.coverage
+    if truth is not None:
+        mask = truth.known if seen is None else seen.mask(truth)
+
+    pictures = {"render": (radiance, tonemap(radiance))}
+    if seen is not None:
+        grey = np.repeat(seen.roughness[..., None], 3, -1)
+        pictures["albedo"] = seen.albedo, tonemap(seen.albedo)
+        pictures["roughness"] = grey, to_bytes(grey)
+    for name, (linear, shown) in pictures.items():
+        write_exr(folder / f"{view.name}_{name}.exr", np.dstack([linear, alpha]))
+        write_png(folder / f"{view.name}_{name}.png", shown)
+
+    row = {"name": view.name, "split": view.split} | dict.fromkeys(METRICS)
+    if mask.any():
+        row |= _render_psnr(radiance, photograph[..., :3], mask)
+    if seen is not None and truth is not None:
+        row |= seen.psnr(truth)
+    return row, seen, truth
+
+
+def _evaluate_light(recovered: Recovered, folder: Path, tell: Callable[[str], None]) -> dict:
+    """Numbers and pictures of recovered light; nothing where light was known."""
+    problem, data = recovered.problem, recovered.dataset.folder
+    found: dict[str, Any] = {}
+    if problem.environment is not None:
+        map_ = problem.environment.to_latlong(ROWS)
+        truth = true_environment(data)
+        write_exr(folder / "environment.exr", map_)
+        shown = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
+        write_png(folder / "environment.png", montage(shown))
+        found["environment"] = None
+        if truth is not None:
+            found["environment"] = numbers = lighting.compare_environments(map_, truth)
+            tell(", ".join(f"environment {k} {v:.3g}" for k, v in numbers.items()))
+    if problem.emission is not None:
+        found["emission"] = [asdict(x) for x in lighting.recovered_lights(problem, data)]
+        for row in found["emission"]:
+            error = row["emission_error"]
+            off = "" if error is None else f", {100 * error:.2f} % off"
+            tell(f"{row['name']}: {' '.join(f'{x:.4g}' for x in row['strength'])}{off}")
+    return found
+
+
+def _align_albedo(
+    rows: list[dict], materials: list[tuple[MaterialBuffers, GroundTruth]]
+) -> list[float] | None:
+    """Add `albedo_psnr_aligned` to rows; returns the factor of each channel, one for all views.
+
+    Between albedo and light, photographs may not tell the scale.
+    """
+    known = [(s, t, s.mask(t)) if s and t else None for s, t in materials]
+    counted = [(s.albedo[m], t.albedo[m]) for s, t, m in filter(None, known)]
+    for row in rows:
+        row["albedo_psnr_aligned"] = None
+    if not any(len(found) for found, _ in counted):
+        return None
+    above = sum((found * true).sum(0) for found, true in counted)
+    scale = above / np.maximum(sum((found**2).sum(0) for found, _ in counted), 1e-12)
+    for row, view in zip(rows, known, strict=True):
+        if view is not None and view[2].any():
+            seen, truth, mask = view
+            row["albedo_psnr_aligned"] = finite(psnr(seen.albedo * scale, truth.albedo, mask))
+    return [float(x) for x in scale]
+
+
+def _render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> dict:
+    return {
+        "render_psnr": finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)),
+        "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
+    }
+
+
+def _summary(rows: list[dict], split: str) -> dict:
+    chosen = [row for row in rows if row["split"] == split]
+    metrics = [*METRICS, *(["albedo_psnr_aligned"] if "albedo_psnr_aligned" in rows[0] else [])]
+    return {"views": len(chosen)} | {k: mean_psnr(row[k] for row in chosen) for k in metrics}
+
+
+def _db(value: float | None) -> str:
+    return "—" if value is None else f"{value:.1f} dB"

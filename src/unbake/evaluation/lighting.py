@@ -1,0 +1,177 @@
+"""How good recovered light is: the environment map, what it lights, and the lights' colours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.lights import true_emission
+from ..imaging.metrics import psnr
+from ..training.problem import Problem
+
+#: Spherical harmonics up to this order are what surfaces that are not mirrors see of the light.
+ORDER = 3
+RELIT_HEIGHT = 40
+RELIT_SAMPLES = 256
+#: Below it a norm is that of darkness; errors are relative to no less.
+DARK = 1e-9
+
+DEFINITIONS = {
+    "sh_error": f"|c - c*| / |c*|, c the spherical harmonics coefficients of the map up to order "
+    f"{ORDER}, all channels together",
+    "relight_psnr": "PSNR, peak 1, of a picture of a white, a grey glossy and a metal ball side by "
+    "side lit by the recovered and by the true map (path traced, linear RGB, same seed), over the "
+    "pixels that see a ball; both divided by the 99th percentile of the true picture and clipped "
+    "to [0,1]",
+    "aligned": "the same after each channel of the recovered map has been multiplied by the number "
+    "that brings its coefficients nearest to the true ones in the least squares sense",
+    "emission_error": "|c - c*| / |c*| of a light's radiance, RGB",
+}
+
+
+@dataclass(frozen=True)
+class RecoveredLight:
+    """A light whose strength was sought, and how far from the truth it was found."""
+
+    name: str
+    strength: list[float]  # linear RGB
+    truth: list[float] | None
+    emission_error: float | None
+
+
+def recovered_lights(problem: Problem, data: Path) -> list[RecoveredLight]:
+    """The lights' strengths beside the true ones of the data set, where those are known.
+
+    Raises:
+        UserError: the data set's truth cannot be read.
+    """
+    if problem.emission is None:
+        return []
+    known, found = true_emission(data), np.array(problem.emission.values).T
+    lights = []
+    for name, strength in zip(problem.lights, found, strict=True):
+        truth, error = known.get(name), None
+        if truth is not None:
+            error = _relative_error(strength, truth)
+        true = None if truth is None else truth.tolist()
+        lights.append(RecoveredLight(name, [float(x) for x in strength], true, error))
+    return lights
+
+
+def compare_environments(found: np.ndarray, truth: np.ndarray) -> dict:
+    """How near a map is to the true one, plainly and after alignment of its scale.
+
+    Args:
+        found, truth: linear RGB radiance in the layout of `latlong`, shape (h, 2 h, 3).
+
+    Paper: Sec. 6.4, Fig. 8.
+    """
+    aligned = found * environment_scale(found, truth)
+    return {
+        "sh_error": sh_error(found, truth),
+        "sh_error_aligned": sh_error(aligned, truth),
+        "relight_psnr": relight_psnr(found, truth),
+        "relight_psnr_aligned": relight_psnr(aligned, truth),
+    }
+
+
+def environment_scale(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Of each channel, the factor that brings the low frequencies of a map nearest to another's."""
+    c, true = sh_coefficients(found), sh_coefficients(truth)
+    return (c * true).sum(0) / np.maximum((c * c).sum(0), DARK)
+
+
+def sh_error(found: np.ndarray, truth: np.ndarray) -> float:
+    """Relative error of the low frequencies of a map; see `DEFINITIONS`."""
+    return _relative_error(sh_coefficients(found), sh_coefficients(truth))
+
+
+def sh_coefficients(image: np.ndarray) -> np.ndarray:
+    """Real spherical harmonics coefficients of a map, ((ORDER + 1)², 3), m from -l to l.
+
+    θ and φ are those of the picture, from its top and from its left edge.
+    """
+    rows = len(image)
+    θ = np.pi * np.arange(rows) / (rows - 1)
+    φ = np.pi * (np.arange(2 * rows) + 0.5) / rows
+    weighted = image * _solid_angles(rows)[..., None]
+    basis = []
+    for order in range(ORDER + 1):
+        for m in range(-order, order + 1):
+            k = math.sqrt((2 * order + 1) / (4 * math.pi))
+            k *= math.sqrt(math.factorial(order - abs(m)) / math.factorial(order + abs(m)))
+            around = (
+                np.ones_like(φ)
+                if m == 0
+                else np.sqrt(2) * (np.cos(m * φ) if m > 0 else np.sin(-m * φ))
+            )
+            basis.append(k * np.outer(_legendre(order, abs(m), np.cos(θ)), around))
+    return np.einsum("khw,hwc->kc", np.array(basis), weighted)
+
+
+def relight_psnr(found: np.ndarray, truth: np.ndarray) -> float:
+    """How alike things look under a map and under the true one; see `DEFINITIONS`."""
+    true, seen = relit(truth)
+    white = max(float(np.percentile(true[seen], 99)), DARK)
+    pictures = [np.clip(picture / white, 0, 1) for picture in (relit(found)[0], true)]
+    # Equal pictures have no number; JSON has no infinity.
+    return min(psnr(*pictures, seen), 120.0)
+
+
+def relit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Three balls under a map, in nothing else: no direction is up.
+
+    Returns:
+        Linear RGB, (RELIT_HEIGHT, 3 RELIT_HEIGHT, 3), and where balls are.
+    """
+    materials = [
+        {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}},
+        {"type": "principled", "base_color": {"type": "rgb", "value": 0.4}, "roughness": 0.3},
+        {"type": "roughconductor", "alpha": 0.2},
+    ]
+    scene = {
+        "type": "scene",
+        "light": {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32))},
+    }
+    for i, material in enumerate(materials):
+        ball = {"type": "sphere", "center": [2.2 * (i - 1), 0, 0], "bsdf": material}
+        scene[f"ball{i}"] = ball
+    film = {
+        "type": "hdrfilm",
+        "width": 3 * RELIT_HEIGHT,
+        "height": RELIT_HEIGHT,
+        "pixel_format": "rgba",
+        "rfilter": {"type": "box"},
+    }
+    away = mi.ScalarTransform4f().look_at([0, 0, 20], [0, 0, 0], [0, 1, 0])
+    sensor = mi.load_dict({"type": "perspective", "fov": 19, "to_world": away, "film": film})
+    path = mi.load_dict({"type": "path", "max_depth": 6, "hide_emitters": True})
+    image = np.array(mi.render(mi.load_dict(scene), None, sensor, path, spp=RELIT_SAMPLES, seed=0))
+    return image[..., :3], image[..., 3] > 0.999
+
+
+def _relative_error(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(found - truth) / max(np.linalg.norm(truth), DARK))
+
+
+def _solid_angles(rows: int) -> np.ndarray:
+    """Of each texel of a map, (rows, 2 rows); the first and the last row are the poles."""
+    edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0, 1))
+    return np.repeat((edges[:-1] - edges[1:])[:, None] * np.pi / rows, 2 * rows, 1)
+
+
+def _legendre(order: int, m: int, x: np.ndarray) -> np.ndarray:
+    """Associated Legendre polynomial P_l^m without the Condon–Shortley phase."""
+    p = np.ones_like(x)
+    for i in range(1, m + 1):
+        p = p * (2 * i - 1) * np.sqrt(np.maximum(1 - x * x, 0))
+    if order == m:
+        return p
+    last, p = p, x * (2 * m + 1) * p
+    for n in range(m + 2, order + 1):
+        last, p = p, ((2 * n - 1) * x * p - (n + m - 1) * last) / (n - m)
+    return p

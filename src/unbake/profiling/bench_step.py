@@ -1,0 +1,210 @@
+"""Where the time of a training step goes."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+from rich.console import Console
+from rich.table import Table
+
+from ..acquisition.capture import CaptureSettings, capture
+from ..config import FitConfig
+from ..dataset.pixels import PixelSource
+from ..dataset.views import Dataset
+from ..io import write_json
+from ..machine import machine
+from ..training.monitor import memory_mb
+from ..training.problem import Problem, make_problem, training_pixels
+from ..training.schedule import learning_rates
+from ..training.step import State, TrainingStep, initial_state
+from .phases import Phases, kernel_history, milliseconds
+from .roofline import roofline
+
+#: Steps before anything is measured.
+WARM_UP = 20
+#: Steps that are taken apart, to take the median of.
+APART = 7
+
+
+@dataclass(frozen=True)
+class FreshFit:
+    """A fit before its first step."""
+
+    problem: Problem
+    pixels: PixelSource
+    step: TrainingStep
+    state: State
+
+
+def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
+    """A fit of a data set that writes nothing."""
+    pixels = training_pixels(dataset, clip_negative=False)
+    mean = pixels.photographs.mean
+    problem = make_problem(dataset.scene, dataset.background, config, mean)
+    return FreshFit(problem, pixels, TrainingStep(problem, pixels, config), initial_state(problem))
+
+
+@contextmanager
+def small_data(data: Path | None, scene: str) -> Iterator[Path]:
+    """A data set's folder: the one given, or a small capture of a scene, for a while.
+
+    Args:
+        scene: a built-in scene's name, or a Mitsuba XML file.
+    """
+    if data is not None:
+        yield data
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        small = CaptureSettings(views=4, held_out=0, resolution=64, spp=8)
+        made = Path(folder) / Path(scene).stem
+        capture(scene, made, small, tell=lambda line: None)
+        yield made
+
+
+def bench_step(
+    data: Path, config: FitConfig, steps: int, out: Path | None, console: Console
+) -> dict:
+    """Measure the training step on a data set, and take it apart.
+
+    Times are medians after warm-up. A camera sample is one path from the camera with its RHS and
+    all gradients; those that L_θ learns of have their LHS and both residuals as well.
+
+    Args:
+        data: a data set's folder.
+        config: settings of the step.
+        steps: to take the median of.
+        out: JSON file to write.
+
+    Returns:
+        All that is printed.
+    """
+    dataset = Dataset.load(data)
+    fit = begin_fit(dataset, config)
+    result = {"machine": machine(), "data": dataset.folder.name}
+    result |= {"method": config.method, "settings": _settings(config)}
+    result |= _replayed(fit.step, fit.state, config, steps)
+    result["parts"] = _taken_apart(fit.step, fit.state)
+    result["memory_mb"] = _memory(fit.pixels, fit.state)
+    result["floor"] = roofline(fit.problem, fit.pixels, fit.state, config)
+    _print(result, console)
+    if out is not None:
+        write_json(out, result)
+    return result
+
+
+def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -> dict:
+    """The step as a fit takes it: wall time, time in kernels, and what is left for the host."""
+    rates = learning_rates(config, config.warm_up, 0.0)
+    for i in range(WARM_UP):
+        step(state, i, rates)
+    dr.sync_thread()
+    wall, python = [], []
+    for i in range(WARM_UP, WARM_UP + steps):
+        start = time.perf_counter()
+        step(state, i, rates)
+        dr.sync_thread()
+        wall.append(time.perf_counter() - start)
+    for i in range(steps):
+        start = time.perf_counter()
+        step.prepare(state, i, rates)
+        python.append(time.perf_counter() - start)
+        dr.sync_thread()
+    in_kernels = []
+    for i in range(WARM_UP + steps, WARM_UP + steps + APART):
+        with kernel_history() as kernels:
+            step(state, i, rates)
+        in_kernels.append(milliseconds(kernels))
+    seconds = statistics.median(wall)
+    return {
+        "milliseconds_per_step": 1e3 * seconds,
+        "milliseconds_in_python": 1e3 * statistics.median(python),
+        "milliseconds_in_kernels": statistics.median(in_kernels),
+        "samples_per_second": config.samples_per_step / seconds,
+        "launches": len(kernels),
+        "compiled": sum(k["cache_hit"] is False for k in kernels if "cache_hit" in k),
+        "recordings": step.recordings(),
+    }
+
+
+def _taken_apart(step: TrainingStep, state: State) -> dict:
+    """Milliseconds and launches of each part of a step, medians over steps traced anew."""
+    recorded = []
+    for i in range(APART + 1):
+        parts = Phases()
+        with parts.recorded():
+            step.unfrozen(state, i)
+        recorded.append(parts.kernels)
+    return {
+        name: {
+            "milliseconds": statistics.median(milliseconds(one[name]) for one in recorded[1:]),
+            "launches": len(kernels),
+            "products": milliseconds(k for k in kernels if "Gemm" in str(k["type"])),
+        }
+        for name, kernels in recorded[-1].items()
+        if kernels
+    }
+
+
+def _memory(pixels: PixelSource, state: State) -> dict:
+    """Megabytes of this process, and what of them is known by owner."""
+    owned = {
+        name: 3 * 4 * sum(dr.width(a) for a in adam.values()) for name, adam in state.optimizers()
+    }
+    owned["photographs"] = pixels.photographs.bytes
+    unit = 1 if sys.platform == "darwin" else 1024
+    now = memory_mb()
+    peak = max(now, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6)
+    return {"now": now, "peak": peak} | {name: size / 1e6 for name, size in owned.items()}
+
+
+def _settings(config: FitConfig) -> dict:
+    return {
+        "preset": config.preset,
+        "pixels": config.pixels,
+        "spp": config.spp,
+        "radiance_spp": config.radiance_samples,
+        "radiance": f"{config.radiance.width} x {config.radiance.hidden}",
+        "albedo": f"{config.albedo.width} x {config.albedo.hidden}",
+        "roughness": f"{config.roughness.width} x {config.roughness.hidden}",
+    }
+
+
+def _print(result: dict, console: Console) -> None:
+    s, wall = result["settings"], result["milliseconds_per_step"]
+    console.print(
+        f"{result['method']}, {s['pixels']} pixels x {s['spp']} samples, radiance net "
+        f"{s['radiance']} of {s['radiance_spp']} samples, albedo net {s['albedo']}, "
+        f"roughness net {s['roughness']}"
+    )
+    console.print(
+        f"{wall:.1f} ms a step, [bold]{result['samples_per_second'] / 1e3:.0f} k samples/s[/]; "
+        f"{result['milliseconds_in_kernels']:.1f} ms of it in {result['launches']} kernels, "
+        f"{result['compiled']} compiled, {result['milliseconds_in_python']:.1f} ms in Python "
+        f"({result['milliseconds_in_python'] / wall:.0%}); traced {result['recordings']} times"
+    )
+    table = Table("the step taken apart", "launches", "ms", "of it products", "share")
+    total = sum(row["milliseconds"] for row in result["parts"].values())
+    for name, row in sorted(result["parts"].items(), key=lambda item: -item[1]["milliseconds"]):
+        ms = row["milliseconds"]
+        cells = f"{ms:.2f}", f"{row['products']:.2f}", f"{ms / total:.0%}"
+        table.add_row(name, str(row["launches"]), *cells)
+    console.print(table)
+    memory = result["memory_mb"]
+    console.print("memory, MB: " + ", ".join(f"{name} {mb:.0f}" for name, mb in memory.items()))
+    least = result["floor"]
+    if least is not None:
+        ms = least["milliseconds"]
+        console.print(
+            f"floor {ms['all']:.1f} ms (rays {ms['rays']:.1f}, products "
+            f"{ms['multiply_adds']:.1f}, bytes {ms['bytes']:.1f}); the step takes "
+            f"{wall / ms['all']:.1f} times as long"
+        )

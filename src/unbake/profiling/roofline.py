@@ -1,0 +1,216 @@
+"""The least time that a training step could take on this machine, from rates measured on it."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..config import FitConfig
+from ..dataset.pixels import PixelSource
+from ..fields.grid import DenseGrid
+from ..fields.materials import Volume
+from ..fields.network import Network
+from ..training.problem import Problem
+from ..training.step import State
+from ..transport.objective import METHODS, requirements
+from ..transport.path_sample import Requirements, where_radiance_is_learned
+from .phases import kernel_history, milliseconds
+
+#: A parameter, its gradient and both moments of Adam: read, and all but the gradient written.
+_ADAM_FLOATS = 7
+#: A gradient costs one product for the inputs and one for the weights, beside the value's.
+_WITH_GRADIENT = 3
+#: How often each rate is measured, after a warm-up, to take the median of.
+_TIMES = 5
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a step cannot do without."""
+
+    rays: float
+    multiply_adds: float
+    bytes: float
+
+    def __add__(self, other: Work) -> Work:
+        return Work(
+            self.rays + other.rays,
+            self.multiply_adds + other.multiply_adds,
+            self.bytes + other.bytes,
+        )
+
+    def times(self, factor: float) -> Work:
+        """The same so many times."""
+        return Work(self.rays * factor, self.multiply_adds * factor, self.bytes * factor)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What this machine does in a second."""
+
+    rays: float
+    multiply_adds: float
+    bytes: float
+
+
+def roofline(problem: Problem, pixels: PixelSource, state: State, config: FitConfig) -> dict | None:
+    """The floor of a step: its rays, products and bytes, each at the machine's measured rate.
+
+    Rays are measured on the scene itself; multiply-adds as one large product of matrices; bytes as
+    the sum of two large arrays. What else a step does (BSDFs, emitter sampling, losses) counts as
+    free. The parts share the same cores, so that their times add up.
+
+    Returns:
+        The amounts, the rates and the milliseconds; None for methods that follow paths to their
+        end, whose number of rays depends on the scene.
+    """
+    if config.follows_paths:
+        return None
+    work, rates = _work(problem, state, config), _rates(problem, pixels, config)
+    each = {
+        "rays": 1e3 * work.rays / rates.rays,
+        "multiply_adds": 1e3 * work.multiply_adds / rates.multiply_adds,
+        "bytes": 1e3 * work.bytes / rates.bytes,
+    }
+    return {
+        "work": vars(work),
+        "rates": vars(rates),
+        "milliseconds": each | {"all": sum(each.values())},
+    }
+
+
+# ------------------------------------------------------------------------------------ What is done
+
+
+def _work(problem: Problem, state: State, config: FitConfig) -> Work:
+    terms = METHODS["ours, one-bounce" if config.prior == "one-bounce" else config.method]
+    wanted = requirements(terms, config.bounces)
+    arrays = [a for _, adam in state.optimizers() for a in adam.values()]
+    adam = Work(0, 0, 4 * _ADAM_FLOATS * sum(dr.width(a) for a in arrays))
+    work = adam + _of_the_image(problem, wanted).times(config.samples_per_step)
+    if not wanted.radiance:
+        return work
+    each = config.radiance_samples
+    learning = _of_learning(problem, wanted, all_samples=each == config.spp)
+    return work + learning.times(config.pixels * each)
+
+
+def _of_the_image(problem: Problem, wanted: Requirements) -> Work:
+    """Work of one camera sample that meets a surface at each of its vertices."""
+    # From the camera; then at each vertex one to an emitter and one by the BSDF.
+    work = Work(1 + 2 * wanted.bounces, 0, 0)
+    for _ in range(wanted.bounces):
+        work += _materials(problem, gradient=True)
+    if wanted.radiance:
+        work += _albedo(problem) + _radiance(problem, gradient=False)
+    return work
+
+
+def _of_learning(problem: Problem, wanted: Requirements, *, all_samples: bool) -> Work:
+    """What comes in addition where L_θ learns of the sample."""
+    bounces = max(0, wanted.residuals - wanted.bounces)
+    work = Work(2 * bounces, 0, 0)
+    for _ in range(bounces):
+        work += _materials(problem, gradient=False)
+    learned, constant = where_radiance_is_learned(wanted)
+    for number in learned | constant:
+        work += _radiance(problem, gradient=number in learned)
+    if not all_samples:
+        return work + _albedo(problem) if bounces else work
+    # Where learning needs what the image asks at its end, it is asked once for both.
+    shared = wanted.bounces + 1 in learned | constant
+    return work + _radiance(problem, gradient=False).times(-1) if shared else work
+
+
+def _materials(problem: Problem, *, gradient: bool) -> Work:
+    work = Work(0, 0, 0)
+    if problem.materials is not None:
+        for field in problem.materials.fields.values():
+            work += _evaluation(field, gradient=gradient)
+    return work
+
+
+def _albedo(problem: Problem) -> Work:
+    if problem.materials is None:
+        return Work(0, 0, 0)
+    return _evaluation(problem.materials.fields["albedo"], gradient=False)
+
+
+def _radiance(problem: Problem, *, gradient: bool) -> Work:
+    return _evaluation(problem.radiance.function, gradient=gradient)
+
+
+def _evaluation(field: object, *, gradient: bool) -> Work:
+    """Work of asking a field once, and of its gradient."""
+    function = field.function if isinstance(field, Volume) else field
+    match function:
+        case Network():
+            products = sum(weights.shape[0] * weights.shape[1] for weights, _ in function.layers)
+            floats = 8 * function.grid.n_output_features
+        case DenseGrid():
+            products, floats = 0, 8 * function.grid.n_output_features
+        case _:
+            products, floats = 0, 4 * function.channels
+    # The gradient of a lookup reads and writes where the lookup read.
+    once = Work(0, products, 4 * floats)
+    return once.times(_WITH_GRADIENT if gradient else 1)
+
+
+# ---------------------------------------------------------------------------------------- How fast
+
+
+def _rates(problem: Problem, pixels: PixelSource, config: FitConfig) -> Rates:
+    return Rates(_ray_rate(problem.scene_view.scene, pixels, config), _product_rate(), _bandwidth())
+
+
+def _ray_rate(scene: mi.Scene, pixels: PixelSource, config: FitConfig) -> float:
+    """Closest hits per second of rays that leave what the cameras see in all directions."""
+    count = (1 << 18) // config.spp * config.spp
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, 0), count)
+    with dr.suspend_grad():
+        drawn = pixels.draw(1, count // config.spp)
+        seen = drawn.batch(pixels.rays, sampler, config.spp).ray
+        si = scene.ray_intersect(seen)
+        local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        local.z = dr.copysign(local.z, si.wi.z)
+        away = si.spawn_ray(si.to_world(local))
+        valid = si.is_valid()
+        dr.eval(away, valid)
+
+        def trace() -> None:
+            dr.eval(scene.ray_intersect_preliminary(away, False, valid).t)
+
+        # Lanes whose camera ray met nothing trace nothing.
+        return float(dr.count(valid)[0]) / _seconds(trace)
+
+
+def _product_rate() -> float:
+    """Multiply-adds per second of a product of large matrices, float32."""
+    size, width = 256, 1 << 14
+    a = dr.full(mi.TensorXf, 0.5, (size, size))
+    b = dr.full(mi.TensorXf, 0.5, (size, width))
+    dr.make_opaque(a, b)
+    return size * size * width / _seconds(lambda: dr.eval(a @ b))
+
+
+def _bandwidth() -> float:
+    """Bytes per second read and written where arrays are far larger than caches."""
+    count = 1 << 25
+    a, b = dr.full(mi.Float, 1, count), dr.full(mi.Float, 2, count)
+    dr.make_opaque(a, b)
+    return 3 * 4 * count / _seconds(lambda: dr.eval(a + b))
+
+
+def _seconds(work: Callable[[], None]) -> float:
+    """Median time of the kernels that some work launches."""
+    times = []
+    for _ in range(_TIMES + 1):
+        with kernel_history() as kernels:
+            work()
+        times.append(milliseconds(kernels) / 1e3)
+    return statistics.median(times[1:])

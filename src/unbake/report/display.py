@@ -1,0 +1,132 @@
+"""Numbers as a page writes them, and what makes pictures of several runs compare."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unbake.errors import UserError
+from unbake.imaging import pictures
+from unbake.report.runs import Run
+
+LONGEST_SIDE = 640  # pixels of an embedded picture: keeps a page of 24 views near 50 MB
+DASH = "—"
+Choice = Callable[[Iterable[float]], float]  # max or min
+
+
+# ------------------------------------------------------------------------------------------ numbers
+
+
+def number(value: object) -> float | None:
+    """A number that can be shown, or None for null and not-a-number."""
+    good = isinstance(value, int | float) and not math.isnan(value)
+    return float(value) if good else None
+
+
+def decibels(value: float | None) -> str:
+    if value is None:
+        return DASH
+    text = "∞" if math.isinf(value) else f"{abs(value):.2f}"
+    return f"−{text}" if value < 0 else text
+
+
+def percent(value: float | None) -> str:
+    return DASH if value is None else f"{100 * value:.2f}"
+
+
+def best(values: Iterable[float | None], choose: Choice = max) -> float | None:
+    """The best of values, or None where there is nothing to choose between."""
+    known = [value for value in values if value is not None]
+    return choose(known) if len(known) > 1 else None
+
+
+def marked(
+    values: Sequence[float | None], write: Callable[[float | None], str], choose: Choice = max
+) -> list[dict[str, Any]]:
+    """Values as text, with the best of them marked."""
+    chosen = best(values, choose)
+    return [{"text": write(v), "best": v is not None and v == chosen} for v in values]
+
+
+# ----------------------------------------------------------------------------------------- pictures
+
+
+def evaluated(run: Run, file: str) -> Path:
+    """A picture that the run's evaluation left; UserError where it is gone."""
+    path = run.path / "evaluation" / file
+    if not path.is_file():
+        raise UserError(
+            "an evaluated picture is gone", path, f"Run `unbake evaluate {run.path}` again"
+        )
+    return path
+
+
+def rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) linear RGB and (H, W) bool, True where alpha (if any) is at least one half."""
+    pixels = pictures.read_exr(path)
+    if pixels.shape[2] < 3:
+        pixels = pixels[..., :1].repeat(3, axis=2)
+    mask = pixels[..., 3] >= 0.5 if pixels.shape[2] > 3 else np.ones(pixels.shape[:2], bool)
+    return pixels[..., :3], mask
+
+
+def error(image: np.ndarray, reference: np.ndarray, path: Path) -> np.ndarray:
+    """`absolute_error` of a picture, (H, W); UserError where its size is not the reference's."""
+    if image.shape != reference.shape:
+        raise UserError(
+            f"the picture has {image.shape[1]} x {image.shape[0]} pixels, "
+            f"its ground truth {reference.shape[1]} x {reference.shape[0]}",
+            path,
+            "Evaluate the run again",
+        )
+    return pictures.absolute_error(image, reference)
+
+
+def tonemapped(linear: np.ndarray, exposure: float) -> str:
+    """Linear RGB as a picture to embed, at an exposure in stops."""
+    small = pictures.shrink(linear, LONGEST_SIDE)
+    return pictures.png_data_uri(pictures.tonemap(small, exposure))
+
+
+def painted(values: np.ndarray, scale: float, mask: np.ndarray) -> str:
+    """Errors (H, W) as a false-colour picture to embed; `scale` is the brightest colour."""
+    inside = pictures.shrink(mask, LONGEST_SIDE) >= 0.5
+    small = pictures.shrink(values, LONGEST_SIDE)
+    return pictures.png_data_uri(pictures.false_colour(small, scale, inside))
+
+
+def exposure(light: list[np.ndarray]) -> float:
+    """Stops that bring the 95th percentile of radiance to 0.8, in half stops."""
+    bright = _percentile(light, 95)
+    return round(2 * math.log2(0.8 / bright)) / 2 if bright > 0 else 0.0
+
+
+def error_scale(errors: list[list[np.ndarray]]) -> float:
+    """A scale for the errors of all runs.
+
+    It is rounded up to 1, 2 or 5 times 10^n from the best run's 97th percentile, so that a bad run
+    does not turn all others black.
+    """
+    high = np.array([_percentile(parts, 97) for parts in errors])
+    high = high[high > 1e-6]  # a run that agrees up to rounding needs no scale
+    return _round_up(float(high.min())) if len(high) else 0.01
+
+
+def sample(values: np.ndarray, limit: int = 4096) -> np.ndarray:
+    """Some thousand of the finite values, evenly spaced."""
+    values = values[np.isfinite(values)]
+    return values[:: max(1, len(values) // limit)]
+
+
+def _percentile(parts: list[np.ndarray], percent: float) -> float:
+    values = np.concatenate([np.zeros(0), *parts])
+    return float(np.percentile(values, percent)) if len(values) else 0.0
+
+
+def _round_up(value: float) -> float:
+    decade = 10.0 ** math.floor(math.log10(value))
+    return next(m * decade for m in (1, 2, 5, 10) if m * decade >= value * (1 - 1e-9))

@@ -1,0 +1,112 @@
+"""What a page says of recovered light: environment maps side by side, and the lights' strengths."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unbake.dataset.lights import true_environment
+from unbake.report import display
+from unbake.report.runs import Run
+
+#: Numbers of an environment map: how they are written, and which is best.
+NUMBERS = {
+    "sh_error": (display.percent, min),
+    "sh_error_aligned": (display.percent, min),
+    "relight_psnr": (display.decibels, max),
+    "relight_psnr_aligned": (display.decibels, max),
+}
+
+
+def light_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
+    """The section's contents for the template: `maps` and `lights`, each None where not sought.
+
+    Raises:
+        UserError: a map is gone, cannot be read, or has another size than the true one.
+    """
+    if not any(run.seeks("environment") or run.seeks("emission") for run in runs):
+        return None
+    return {"maps": _maps(runs, data), "lights": _lights(runs)}
+
+
+def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
+    """Maps at one exposure, which suits the truth where it is known, and their errors."""
+    if not any(run.seeks("environment") for run in runs):
+        return None
+    truth = true_environment(data)
+    found: list[np.ndarray | None] = []
+    errors: list[np.ndarray | None] = []
+    for run in runs:
+        path = display.evaluated(run, "environment.exr") if run.seeks("environment") else None
+        found.append(None if path is None else display.rgb(path)[0])
+        known = path is not None and truth is not None
+        errors.append(display.error(found[-1], truth, path) if known else None)
+    lit = [map_ for map_ in found if map_ is not None] if truth is None else [truth]
+    exposure = display.exposure([display.sample(map_.mean(axis=2)) for map_ in lit])
+    scale = display.error_scale([[display.sample(e)] for e in errors if e is not None])
+
+    numbers = _numbers(runs)
+    cells = [
+        {
+            "picture": None if map_ is None else display.tonemapped(map_, exposure),
+            "error": None if off is None else display.painted(off, scale, np.ones(off.shape, bool)),
+            "empty": "known, not sought",
+            "number": f"SH error {low['text']} %" if low["text"] != display.DASH else display.DASH,
+            "best": low["best"],
+        }
+        for map_, off, low in zip(found, errors, numbers["sh_error"], strict=True)
+    ]
+    height, width = lit[0].shape[:2]
+    return {
+        "quantity": "environment",
+        "truth": None if truth is None else display.tonemapped(truth, exposure),
+        "scale": scale,
+        "cells": cells,
+        "width": width,
+        "height": height,
+        "exposure": exposure,
+        "rows": list(zip(*numbers.values(), strict=True)),
+        "compared": any(run.metrics.get("environment") for run in runs),
+    }
+
+
+def _numbers(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
+    """By quantity, a cell a run."""
+    said = [run.metrics.get("environment") or {} for run in runs]
+    return {
+        key: display.marked([display.number(numbers.get(key)) for numbers in said], write, choose)
+        for key, (write, choose) in NUMBERS.items()
+    }
+
+
+def _lights(runs: list[Run]) -> list[dict[str, Any]] | None:
+    """One row a light: its true strength, and each run's with its error."""
+    if not any(run.seeks("emission") for run in runs):
+        return None
+    found = [{row["name"]: row for row in run.metrics.get("emission") or ()} for run in runs]
+    rows = []
+    for name in dict.fromkeys(name for lights in found for name in lights):
+        said = [lights.get(name, {}) for lights in found]
+        truth = next((light["truth"] for light in said if light.get("truth")), None)
+        errors = [display.number(light.get("emission_error")) for light in said]
+        cells = [
+            cell | {"strength": _colour(light.get("strength")), "sought": run.seeks("emission")}
+            for cell, light, run in zip(
+                display.marked(errors, display.percent, min), said, runs, strict=True
+            )
+        ]
+        rows.append({"name": name, "truth": _colour(truth), "cells": cells})
+    return rows
+
+
+def _colour(strength: object) -> str:
+    """Linear RGB with four digits of its largest channel."""
+    values = [display.number(x) for x in strength] if isinstance(strength, list) else []
+    if len(values) != 3 or None in values:
+        return display.DASH
+    largest = max(abs(x) for x in values)
+    digits = 3 - math.floor(math.log10(largest)) if 0 < largest < math.inf else 2
+    return "\N{EN SPACE}".join(f"{x:.{min(max(digits, 0), 6)}f}" for x in values)

@@ -1,0 +1,399 @@
+"""One self-contained HTML page that compares runs on the same data: numbers, pictures, charts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import jinja2
+import numpy as np
+
+from unbake.errors import UserError
+from unbake.evaluation.convergence import score_curve, time_to_quality
+from unbake.imaging import pictures
+from unbake.io import write_atomically
+from unbake.report import charts, display
+from unbake.report.lighting import light_section
+from unbake.report.runs import Run, View, data_folder, labels, read_json, read_run, read_views
+
+TEMPLATE = Path(__file__).with_name("report.html.jinja")
+SPLITS = ("heldout", "train")
+QUANTITIES = ("render", "albedo", "roughness")
+PSNRS = {
+    "render_psnr": "Rendering",
+    "albedo_psnr": "Albedo",
+    "albedo_psnr_aligned": "Aligned albedo",
+    "roughness_psnr": "Roughness",
+}
+#: What an evaluation defines, and the name on the page; by the part of the page.
+DEFINED = {
+    "psnr": "PSNR",
+    "albedo_psnr_aligned": "Aligned albedo",
+    "colour_space": "Colour space",
+    "mask": "Mask",
+}
+LIGHT_DEFINED = {
+    "environment": {
+        "sh_error": "SH error",
+        "relight_psnr": "Relighting PSNR",
+        "aligned": "Aligned",
+    },
+    "emission": {"emission_error": "Error"},
+}
+LOSSES = {
+    "photometric": "Photometric loss",
+    "prior": "Prior loss",
+    "prior_extra": "Prior loss, extra bounce",
+    "lhs": "LHS loss",
+}
+SCORES = {"albedo_psnr": "Held-out albedo PSNR", "roughness_psnr": "Held-out roughness PSNR"}
+OPTIMIZED = {
+    "materials": "Materials",
+    "lighting": "Lighting",
+    "materials+lighting": "Materials and lighting",
+    "emission": "Lights",
+}
+FORMS = {"neural": "network", "grid": "3D grid", "bitmap": "bitmaps"}
+VALIDATION = {"albedo_psnr": "Albedo PSNR", "roughness_psnr": "Roughness PSNR"}
+AXES = {"step": "step", "seconds": "training time, seconds"}  # key in the log: title of the axis
+
+
+@final
+@dataclass(frozen=True)
+class Display:
+    """How values become colours, the same for every run and view, so that they compare."""
+
+    exposure: float  # stops
+    error: dict[str, float]  # the brightest colour, a quantity
+
+
+def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | None = None) -> Path:
+    """Write one HTML page that compares evaluated runs with the ground truth and each other.
+
+    The page holds its pictures, styles and script itself and loads nothing from anywhere.
+    Pictures of renderings and albedo are linear RGB seen through the sRGB curve; roughness is shown
+    without a curve. Larger pictures than 640 pixels are averaged down; PSNRs are those of
+    `evaluation/metrics.json`, from full resolution.
+
+    Args:
+        runs: run folders, all evaluated on the same data.
+        out: the page's file; it appears complete or not at all.
+        failed: further runs that came to nothing, by name: why.
+
+    Returns:
+        `out`.
+
+    Raises:
+        UserError: a run was not evaluated, runs differ in data, or a file is gone or malformed.
+    """
+    if not runs:
+        raise UserError("a report needs at least one run")
+    loaded = [read_run(path, label) for path, label in labels(runs)]
+    data = data_folder(loaded)
+    transforms = read_json(data / "transforms.json", "Give back the data that the run was fit to")
+    views = read_views(data, transforms, loaded)
+    display = _display(loaded, views)
+    groups = [
+        {
+            "split": split,
+            "total": sum(frame.get("split") == split for frame in transforms["frames"]),
+            "views": [_view_block(view, loaded, display) for view in views if view.split == split],
+        }
+        for split in SPLITS
+    ]
+    page = (
+        _environment()
+        .from_string(TEMPLATE.read_text(encoding="utf-8"))
+        .render(
+            scene=data.name,
+            transforms=transforms,
+            runs=loaded,
+            psnrs=_psnrs(loaded).values(),
+            rows=_table(loaded),
+            light=light_section(loaded, data),
+            optimized=_optimized(loaded),
+            materials=any(run.seeks("albedo") for run in loaded),
+            failed=failed or {},
+            groups=groups,
+            display=display,
+            longest=display.LONGEST_SIDE,
+            magma=pictures.MAGMA,
+            chart=charts,
+            losses=_loss_charts(loaded),
+            scores=_score_charts(loaded),
+            race=_race(loaded),
+            validation=_validation_charts(loaded),
+            validated=sorted(
+                {r["split"] for log in _validations(loaded) for r in log if "split" in r}
+            ),
+            settings=_settings(loaded),
+            definitions=_definitions(loaded),
+        )
+    )
+    out = Path(out)
+    write_atomically(out, lambda path: path.write_text(page, encoding="utf-8"))
+    return out
+
+
+# ----------------------------------------------------------------------------------------- pictures
+
+
+def _recovered(run: Run, view: View, quantity: str) -> Path | None:
+    """Where a run's picture of a view lies; None where there is none to be expected."""
+    if not run.view(view.name) or not run.seeks(quantity):
+        return None
+    return display.evaluated(run, f"{view.split}/{view.name}_{quantity}.exr")
+
+
+def _display(runs: list[Run], views: list[View]) -> Display:
+    """Exposure and error scales that suit all pictures of the page at once."""
+    light: list[np.ndarray] = []
+    errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
+    for view in views:
+        for quantity, path in view.truth.items():
+            reference, mask = display.rgb(path)
+            if quantity == "render":
+                light.append(display.sample(reference.mean(axis=2)[mask]))
+            for run, parts in zip(runs, errors[quantity], strict=True):
+                recovered = _recovered(run, view, quantity)
+                if recovered is not None:
+                    error = display.error(display.rgb(recovered)[0], reference, recovered)
+                    parts.append(display.sample(error[mask]))
+    scales = {quantity: display.error_scale(errors[quantity]) for quantity in QUANTITIES}
+    return Display(display.exposure(light), scales)
+
+
+def _view_block(view: View, runs: list[Run], display: Display) -> dict[str, Any]:
+    """A view's pictures for the template: a column a quantity, in it truth and runs."""
+    height, width = display.rgb(view.truth["render"])[0].shape[:2]
+    quantities = [q for q in QUANTITIES if any(run.seeks(q) for run in runs)]
+    columns = [_column(view, runs, quantity, display) for quantity in quantities]
+    return {"name": view.name, "width": width, "height": height, "columns": columns}
+
+
+def _column(view: View, runs: list[Run], quantity: str, display: Display) -> dict[str, Any]:
+    def paint(linear: np.ndarray) -> str:
+        if quantity == "roughness":
+            small = pictures.shrink(linear, display.LONGEST_SIDE)
+            return pictures.png_data_uri(pictures.to_bytes(small))
+        return display.tonemapped(linear, display.exposure if quantity == "render" else 0.0)
+
+    values = [display.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
+    scale = display.error[quantity]
+    reference, mask = display.rgb(view.truth[quantity]) if quantity in view.truth else (None, None)
+    cells = []
+    for run, psnr in zip(runs, display.marked(values, display.decibels), strict=True):
+        path = _recovered(run, view, quantity)
+        empty = "not evaluated" if run.seeks(quantity) else "known, not sought"
+        cell: dict[str, Any] = {"picture": None, "error": None, "empty": empty}
+        if path is not None:
+            image = display.rgb(path)[0]
+            cell["picture"] = paint(image)
+            if reference is not None and mask is not None:
+                cell["error"] = display.painted(display.error(image, reference, path), scale, mask)
+        unit = "" if psnr["text"] == display.DASH else " dB"
+        cells.append(cell | {"number": psnr["text"] + unit, "best": psnr["best"]})
+    truth = None if reference is None else paint(reference)
+    return {"quantity": quantity, "truth": truth, "scale": scale, "cells": cells}
+
+
+# ------------------------------------------------------------------------------------------ numbers
+
+
+def _psnrs(runs: list[Run]) -> dict[str, str]:
+    """The PSNRs of the table and their headings: of what was sought, aligned where some run is."""
+    aligned = any("albedo_psnr_aligned" in (run.metrics.get("heldout") or {}) for run in runs)
+    optimized = {key for key in PSNRS if any(run.seeks(key.split("_")[0]) for run in runs)}
+    return {
+        key: name
+        for key, name in PSNRS.items()
+        if key in optimized and (aligned or key != "albedo_psnr_aligned")
+    }
+
+
+def _table(runs: list[Run]) -> list[dict[str, Any]]:
+    """One row a run: for each split and quantity its mean PSNR, the best of each column marked."""
+    columns = []
+    for split, key in ((split, key) for split in SPLITS for key in _psnrs(runs)):
+        values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+        columns.append(display.marked(values, display.decibels))
+    return [
+        {
+            "run": run,
+            "details": _details(run.metrics),
+            "steps": _count(run.metrics.get("steps")),
+            "samples": _count(run.metrics.get("samples")),
+            "seconds": _seconds(run.metrics.get("seconds")),
+            "cells": row,
+        }
+        for run, row in zip(runs, zip(*columns, strict=True), strict=True)
+    ]
+
+
+def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What a method works with, as text, symbol and subscript; empty for old evaluations."""
+    if "estimator" not in metrics:
+        return []
+    said = {key: str(metrics.get(key)) for key in ("representation", "radiance", "estimator")}
+    details = [(form, "φ", "")] if (form := FORMS.get(said["representation"])) else []
+    details.append((FORMS.get(said["radiance"], "no"), "L", "θ"))
+    if _unknown(metrics) != "materials":
+        details.append((f"{OPTIMIZED.get(_unknown(metrics), 'something').lower()} sought", "", ""))
+    if metrics.get("bounces", 1) != 1:
+        details.append((f"{metrics['bounces']} bounces", "", ""))
+    if metrics.get("prior", "extra-bounce") != "extra-bounce":
+        details.append((f"{metrics['prior']} prior".replace("-", " "), "", ""))
+    passes = {"split-halves": "split halves", "two-pass": "two passes"}
+    return [*details, (passes.get(said["estimator"], said["estimator"]), "", "")]
+
+
+def _unknown(metrics: dict[str, Any]) -> str:
+    return str(metrics.get("unknown", "materials"))
+
+
+def _optimized(runs: list[Run]) -> str:
+    """What the runs recovered, for the title."""
+    kinds = {_unknown(run.metrics) for run in runs}
+    if len(kinds) == 1:
+        return OPTIMIZED.get(kinds.pop(), "Scene")
+    return "Materials and lighting" if any("materials" in k for k in kinds) else "Lighting"
+
+
+def _count(value: object) -> str:
+    number = display.number(value)
+    if number is None:
+        return "—"
+    for unit, size in (("G", 1e9), ("M", 1e6)):
+        if number >= size:
+            return f"{number / size:.3g}\N{NO-BREAK SPACE}{unit}"
+    return f"{number:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def _seconds(value: object) -> str:
+    number = display.number(value)
+    if number is None:
+        return "—"
+    return f"{number:.1f}" if number < 100 else _count(round(number))
+
+
+def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
+    """What the numbers of the page's parts mean, as each evaluation says."""
+    psnrs = _psnrs(runs)
+    told = {k: v for k, v in DEFINED.items() if k in psnrs or k not in PSNRS}
+    numbers = [_told(run, told) | _rendering(run) for run in runs]
+    light = {
+        kind: [_told(run, words) if run.seeks(kind) else {} for run in runs]
+        for kind, words in LIGHT_DEFINED.items()
+    }
+    return {part: _grouped(runs, said) for part, said in ({"numbers": numbers} | light).items()}
+
+
+def _told(run: Run, names: dict[str, str]) -> dict[str, str]:
+    said = run.metrics.get("definitions") or {}
+    return {name: str(said[key]) for key, name in names.items() if said.get(key)}
+
+
+def _rendering(run: Run) -> dict[str, str]:
+    said = run.metrics.get("render") or {}
+    spp, depth = said.get("spp", display.DASH), said.get("max_depth", display.DASH)
+    return {"Rendered with": f"{spp} samples a pixel, path depth {depth}"} if said else {}
+
+
+def _grouped(runs: list[Run], said: list[dict[str, str]]) -> list[dict[str, Any]]:
+    """One entry for runs that say the same; none for those that say nothing."""
+    entries: list[dict[str, Any]] = []
+    for run, words in zip(runs, said, strict=True):
+        same = next((entry for entry in entries if entry["words"] == words), None)
+        if same is not None:
+            same["labels"].append(run.label)
+        elif words:
+            entries.append({"words": words, "labels": [run.label]})
+    return entries
+
+
+def _settings(runs: list[Run]) -> dict[str, list[tuple[str, list[str]]]]:
+    """Settings that differ between runs, and those that all share."""
+    keys = list(dict.fromkeys(key for run in runs for key in run.config))
+    rows = [(key, [_setting(run.config.get(key)) for run in runs]) for key in keys]
+    return {
+        "differing": [row for row in rows if len(set(row[1])) > 1],
+        "shared": [row for row in rows if len(set(row[1])) == 1],
+    }
+
+
+def _setting(value: object) -> str:
+    if value is None:
+        return "—"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+# ------------------------------------------------------------------------------------------- curves
+
+
+def _loss_charts(runs: list[Run]) -> list[dict[str, Any]]:
+    logs = [run.log for run in runs]
+    return [
+        {"title": title, "unit": "relative L2, no unit", "chart": drawn}
+        for x_key, x_title in AXES.items()
+        for key, title in LOSSES.items()
+        if (drawn := charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), True))
+    ]
+
+
+def _score_charts(runs: list[Run]) -> list[dict[str, Any]]:
+    logs = [score_curve(run.log) for run in runs]
+    return [
+        {"title": title, "unit": "dB", "chart": drawn}
+        for x_key, x_title in reversed(AXES.items())
+        for key, title in SCORES.items()
+        if (drawn := charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), False))
+    ]
+
+
+def _race(runs: list[Run]) -> list[dict[str, Any]]:
+    """When each run reached each run's last score; empty where there is nothing to compare."""
+    targets = time_to_quality({run.label: score_curve(run.log) for run in runs})
+    if len(targets) < 2:
+        return []
+    index = {run.label: i for i, run in enumerate(runs)}
+    return [
+        {
+            "run": index[target.run],
+            "target": display.decibels(target.albedo_psnr),
+            "times": [
+                {"text": _seconds(t), "best": t is not None and t == _first(target.seconds)}
+                for t in target.seconds.values()
+            ],
+        }
+        for target in targets
+    ]
+
+
+def _first(times: Mapping[str, float | None]) -> float | None:
+    return min((t for t in times.values() if t is not None), default=None)
+
+
+def _validation_charts(runs: list[Run]) -> list[dict[str, Any]]:
+    """Of one view; nothing where all views were scored, which tells more."""
+    logs = _validations(runs)
+    if all(score_curve(run.log) for run, log in zip(runs, logs, strict=True) if log):
+        return []
+    return [
+        {"title": title, "unit": "dB", "chart": drawn}
+        for x_key, x_title in AXES.items()
+        for key, title in VALIDATION.items()
+        if (drawn := charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), False))
+    ]
+
+
+def _validations(runs: list[Run]) -> list[list[dict[str, Any]]]:
+    """For each run its log records that hold a validation, with its numbers lifted up."""
+    return [[r | r["validation"] for r in run.log if r.get("validation")] for run in runs]
+
+
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )

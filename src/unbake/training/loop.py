@@ -1,0 +1,227 @@
+"""The training loop, top to bottom."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+
+from ..config import FitConfig, read_toml, to_toml
+from ..dataset.views import Dataset
+from ..errors import UserError
+from ..io import write_atomically
+from .checkpoint import Progress, load_checkpoint, save_checkpoint
+from .monitor import Monitor, forget_after, memory_mb
+from .preview import Preview
+from .problem import camera_warnings, make_problem, training_pixels
+from .recovered import Origin, read_origin, write_origin
+from .schedule import learning_rates
+from .step import TrainingStep, initial_state
+from .validation import Score
+
+#: Steps between readings of the loss; reading waits for the machine.
+READ_EVERY = 20
+#: Steps between looks at the clock, where time is the limit or decides when to score. Looking waits
+#: for the machine, too.
+TIME_EVERY = 4
+#: Consecutive steps without a finite loss after which a fit gives up.
+GIVE_UP_AFTER = 100
+
+
+def fit(
+    data: Path,
+    run: Path,
+    config: FitConfig,
+    *,
+    resume: bool = False,
+    clip_negative: bool = False,
+    console: Console | None = None,
+) -> Progress:
+    """Recover materials or lighting of a scene from its photographs.
+
+    Args:
+        data: a data set's folder, with `transforms.json`.
+        run: the folder to write: settings, log, checkpoints and previews.
+        config: what to do; ignored, but for `steps` and `seconds`, when resuming.
+        resume: go on with the run's newest checkpoint.
+        clip_negative: take negative pixels as zero.
+
+    Returns:
+        How far the fit came. Ctrl-C ends it early, with a checkpoint.
+
+    Raises:
+        UserError: the data set or the run's folder cannot be used, or the loss does not stay
+            finite.
+
+    Paper: Sec. 4, 5.4.
+    """
+    console = console or Console()
+    config = _resumed_config(run, config) if resume else _refuse_second_run(run, config)
+    dataset = Dataset.load(data)
+    clip_negative = clip_negative or (resume and read_origin(run).clip_negative)
+    pixels = training_pixels(dataset, clip_negative=clip_negative)
+    mean_radiance = pixels.photographs.mean
+    if resume:
+        _require_same_photographs(run, data, mean_radiance)
+    problem = make_problem(dataset.scene, dataset.background, config, mean_radiance)
+    for warning in camera_warnings(dataset, problem.scene_view.scene):
+        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
+
+    state = initial_state(problem)
+    progress = Progress()
+    if resume:
+        progress = load_checkpoint(run / "checkpoints", state) or progress
+        console.print(f"going on after step {progress.step}", highlight=False)
+    step = TrainingStep(problem, pixels, config)
+    preview = Preview(problem, dataset, run / "previews")
+    scored = config.learns_materials and config.score_seconds
+    score = Score(problem, dataset.heldout) if scored else None
+    step.require_memory(state)
+    # Here all input is known to be good, and the folder is made.
+    _write_settings(run, config, Origin(str(data.resolve()), mean_radiance, clip_negative))
+    forget_after(run / "log.jsonl", progress.step)
+
+    total = config.seconds or config.steps
+    saved_at = shown_at = scored_at = progress.seconds
+    recent: list[dict[str, mi.Float]] = []
+    skipped = 0
+    with Monitor(run / "log.jsonl", console, total) as monitor, _stop_on_interrupt() as stop:
+        if score is not None and not progress.step:
+            monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
+        clock = time.perf_counter() - progress.seconds
+        # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
+        last = _done(config, progress) >= total
+        while not last:
+            # Rates depend on how much is done: on steps, or on time where time is the limit.
+            done = _done(config, progress) / total
+            rates = learning_rates(config, progress.step, done)
+            recent.append(step(state, progress.step, rates))
+            progress.step += 1
+            progress.samples += config.samples_per_step
+            last = _done(config, progress) >= total or bool(stop)
+
+            full = len(recent) >= READ_EVERY
+            timed = config.seconds or score is not None
+            if full or last or (timed and progress.step % TIME_EVERY == 0):
+                dr.sync_thread()
+                progress.seconds = time.perf_counter() - clock
+                last = last or _done(config, progress) >= total
+            due = score is not None and progress.seconds - scored_at >= config.score_seconds
+            if not (full or last or due):
+                continue
+
+            entry = _log_entry(recent, progress, rates["albedo"])
+            skipped = skipped + entry["skipped"] if entry["skipped"] == len(recent) else 0
+            recent.clear()
+            # Scores, checkpoints and previews are not training: the clock stands still.
+            if score is not None and (due or last):
+                state.publish(problem)
+                entry["score"] = score.measure()
+                scored_at = progress.seconds
+            monitor.record(_done(config, progress), entry)
+            if skipped >= GIVE_UP_AFTER:
+                raise UserError(
+                    f"the loss was not finite in the last {skipped} steps",
+                    where=run,
+                    remedy="Lower learning_rate, or look for extreme pixels in the images",
+                )
+            if last or progress.seconds - saved_at >= config.checkpoint_seconds:
+                save_checkpoint(run / "checkpoints", state, progress)
+                saved_at = progress.seconds
+            if last or progress.seconds - shown_at >= config.preview_seconds:
+                state.publish(problem)
+                for line in preview.show(progress):
+                    monitor.validation(line)
+                shown_at = progress.seconds
+            clock = time.perf_counter() - progress.seconds
+    if stop:
+        console.print(f"stopped at step {progress.step}; go on with --resume", highlight=False)
+    return progress
+
+
+def _done(config: FitConfig, progress: Progress) -> float:
+    return progress.seconds if config.seconds else progress.step
+
+
+def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: float) -> dict:
+    """A line of the log: means over the steps since the last one."""
+    entry: dict = {
+        "step": progress.step,
+        "seconds": progress.seconds,
+        "samples": progress.samples,
+    }
+    for term in recent[0] if recent else ():
+        values = [float(losses[term][0]) for losses in recent]
+        if term == "skipped":
+            entry[term] = int(sum(values))
+            continue
+        finite = [v for v in values if math.isfinite(v)]
+        entry[term] = sum(finite) / len(finite) if finite else math.nan
+    entry |= {
+        "samples_per_second": progress.samples / max(progress.seconds, 1e-9),
+        "memory_mb": memory_mb(),
+        "learning_rate": rate,
+    }
+    return entry
+
+
+def _refuse_second_run(run: Path, config: FitConfig) -> FitConfig:
+    """The settings as they are; an error rather than two runs mixed in one folder."""
+    if (run / "config.toml").exists():
+        raise UserError(
+            "there is a run in this folder already",
+            where=run,
+            remedy="Go on with --resume, or give another --out",
+        )
+    return config
+
+
+def _write_settings(run: Path, config: FitConfig, origin: Origin) -> None:
+    write_origin(run, origin)
+    text = to_toml(config)
+    write_atomically(run / "config.toml", lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _resumed_config(run: Path, config: FitConfig) -> FitConfig:
+    """The settings a run was started with, but for how long it should go on."""
+    if not (run / "config.toml").is_file():
+        raise UserError("there is no run to resume in this folder", run, "Leave out --resume")
+    stored = read_toml(run / "config.toml")
+    return dataclasses.replace(stored, steps=config.steps, seconds=config.seconds)
+
+
+def _require_same_photographs(run: Path, data: Path, mean_radiance: float) -> None:
+    """A data set may have moved; another one would ruin what was learned without a word."""
+    origin = read_origin(run)
+    if not math.isclose(origin.mean_radiance, mean_radiance, rel_tol=1e-4):
+        raise UserError(
+            f"these are not the photographs that the run {run} was started with",
+            where=data,
+            remedy=f"Give {origin.data}, or start another run",
+        )
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[list[bool]]:
+    """A list that fills on Ctrl-C or SIGTERM; a second Ctrl-C ends the program at once."""
+    stop: list[bool] = []
+
+    def handler(number: int, frame: object) -> None:
+        if stop:
+            raise KeyboardInterrupt
+        stop.append(True)
+
+    previous = {s: signal.signal(s, handler) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for s, old in previous.items():
+            signal.signal(s, old)

@@ -1,0 +1,119 @@
+"""What a fit tells while it runs: a progress display and a JSONL log."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from pathlib import Path
+from typing import IO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..errors import UserError
+from ..io import write_atomically
+
+#: Seconds between lines where there is no terminal.
+QUIET_SECONDS = 10.0
+
+
+def memory_mb() -> float:
+    """Resident memory of this process now, in MB."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 1e6
+    except OSError:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def forget_after(log: Path, step: int) -> None:
+    """Drop the lines of a log that lie after a step, and what a killed fit left half-written.
+
+    A resumed fit takes those steps again.
+    """
+    kept = []
+    for line in log.read_text(encoding="utf-8").splitlines() if log.is_file() else ():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
+        except (ValueError, KeyError, TypeError):
+            continue
+    write_atomically(log, lambda path: path.write_text("".join(kept), encoding="utf-8"))
+
+
+class Monitor:
+    """Shows progress and appends to `log.jsonl`; a context manager.
+
+    A bar with loss terms, samples/s, time left and memory on a terminal, plain lines elsewhere.
+    """
+
+    def __init__(self, log: Path, console: Console, total: float) -> None:
+        self._path = log
+        self._file: IO[str] | None = None
+        self._console = console
+        self._total = total
+        self._last_line = -QUIET_SECONDS
+        self._bar = Progress(
+            TextColumn("{task.percentage:3.0f} %"),
+            BarColumn(bar_width=24),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.description}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("compiling the first step …", total=total)
+
+    def __enter__(self) -> Monitor:
+        self._file = open(self._path, "a", encoding="utf-8")
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+        self._file.close()
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def record(self, done: float, entry: dict) -> None:
+        """Show and log the state after a step.
+
+        Args:
+            done: in the unit of the total.
+            entry: the line of the log; its loss terms are shown.
+        """
+        self._write(entry)
+        terms = ("photometric", "prior", "prior_extra", "lhs")
+        losses = "  ".join(f"{t} {entry[t]:.4f}" for t in terms if t in entry)
+        speed = f"{entry['samples_per_second'] / 1e3:.0f} k samples/s"
+        line = f"step {entry['step']}  {losses}  {speed}  {entry['memory_mb']:.0f} MB"
+        self._bar.update(self._task, completed=done, description=line)
+        if not self._console.is_terminal and entry["seconds"] - self._last_line >= QUIET_SECONDS:
+            self._last_line = entry["seconds"]
+            left = "" if not done else f"  {entry['seconds'] * (self._total / done - 1):.0f} s left"
+            self.say(f"{100 * done / self._total:3.0f} %  {line}{left}")
+
+    def validation(self, entry: dict) -> None:
+        """Log and print how good the materials are by now, or how strong the lights."""
+        self._write(entry)
+        v = entry["validation"]
+        if "emission" in v:
+            strengths = ((name, *(f"{x:.4g}" for x in rgb)) for name, rgb in v["emission"].items())
+            text = ", ".join(" ".join(words) for words in strengths)
+        else:
+            text = (
+                f"{v['split']} view, albedo {v['albedo_psnr']:.1f} dB, "
+                f"roughness {v['roughness_psnr']:.1f} dB"
+            )
+        self.say(f"step {entry['step']}, {entry['seconds']:.0f} s: {text}")
+
+    def _write(self, entry: dict) -> None:
+        rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in entry.items()}
+        try:
+            self._file.write(json.dumps(rounded) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise UserError(f"the log cannot be written ({error.strerror})", self._path) from None

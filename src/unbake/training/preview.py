@@ -1,0 +1,71 @@
+"""What is learned so far: pictures, and how far materials are from the truth."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..dataset.lights import ROWS, true_environment
+from ..dataset.views import Dataset, View
+from ..imaging.pictures import montage, to_bytes, tonemap, write_png
+from .checkpoint import Progress
+from .problem import Problem
+from .validation import SAMPLES, GroundTruth, MaterialBuffers
+
+
+class Preview:
+    """Shows the unknowns: materials in one view, a held-out one if there is any; light as a whole.
+
+    Raises:
+        UserError: a truth image of that view, or of the environment, cannot be read.
+    """
+
+    def __init__(self, problem: Problem, dataset: Dataset, folder: Path) -> None:
+        self._problem = problem
+        self._folder = folder
+        self._view: View = (dataset.heldout or dataset.train)[0]
+        self._truth = None if problem.materials is None else GroundTruth.of(self._view)
+        known = None if problem.environment is None else true_environment(dataset.folder)
+        self._environment = [] if known is None else [[tonemap(known)]]
+
+    def show(self, progress: Progress) -> list[dict]:
+        """Show what the fields say now.
+
+        Albedo and roughness, and the environment map, go to `step-NNNNNN.png`, above the truth
+        where that is known. Lights have no picture.
+
+        Returns:
+            Lines for the log: materials against the truth, and the strength of lights.
+        """
+        sheets, found = [], []
+        if self._problem.materials is not None:
+            tiles, values = self._materials()
+            sheets.append([montage(tiles)])
+            found += [values] if values else []
+        if self._problem.environment is not None:
+            map_ = tonemap(self._problem.environment.to_latlong(ROWS))
+            sheets.append([montage([[map_], *self._environment])])
+        if self._problem.emission is not None:
+            strengths = np.array(self._problem.emission.values).T.tolist()
+            found.append({"emission": dict(zip(self._problem.lights, strengths, strict=True))})
+        if sheets:
+            file = self._folder / f"step-{progress.step:06d}.png"
+            write_png(file, montage(sheets, gap=0))
+        return [{**asdict(progress), "validation": values} for values in found]
+
+    def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:
+        """Pictures of them and of the truth; PSNRs where there is truth."""
+        (seen,) = MaterialBuffers.of(self._problem, [self._view], SAMPLES, seed=0)
+        tiles = [[tonemap(seen.albedo), _grey(seen.roughness)]]
+        if self._truth is None:
+            return tiles, {}
+        tiles.append([tonemap(self._truth.albedo), _grey(self._truth.roughness)])
+        values = seen.psnr(self._truth)
+        return tiles, {} if None in values.values() else {"split": self._view.split} | values
+
+
+def _grey(values: np.ndarray) -> np.ndarray:
+    return to_bytes(np.repeat(values[..., None], 3, -1))

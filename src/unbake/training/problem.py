@@ -1,0 +1,174 @@
+"""From a data set and settings to what is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..config import FitConfig
+from ..dataset.photographs import Photographs
+from ..dataset.pixels import CameraRays, PixelSource
+from ..dataset.views import Dataset, check_cameras
+from ..errors import UserError
+from ..fields.domain import Domain
+from ..fields.emission import Emission, emission_textures
+from ..fields.envmap import EnvironmentMap, environment_emitter
+from ..fields.materials import Materials, make_materials
+from ..fields.radiance import RadianceField, make_radiance
+from ..fields.texture import material_textures, slots_of
+from ..scene import parse as scenes
+from ..transport.objective import METHODS, requirements
+from ..transport.vertex import SceneView
+
+Parameters = Mapping[str, mi.Float | mi.TensorXf]
+
+
+@dataclass
+class Problem:
+    """A world with unknowns φ in it, and its radiance field if the method has one.
+
+    What is None is known, and as the scene says.
+    """
+
+    scene_view: SceneView
+    materials: Materials | None
+    environment: EnvironmentMap | None
+    emission: Emission | None
+    lights: list[str]  #: names of the lights whose strength is unknown
+    radiance: RadianceField | None
+    hide_emitters: bool
+    half_precision: bool  #: in products of its networks
+
+    def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The trainable arrays φ by name; the first word tells of which unknown."""
+        named: dict[str, mi.Float | mi.TensorXf] = {}
+        if self.materials is not None:
+            named |= self.materials.parameters()
+        for word, light in self._lighting():
+            named |= {f"{word}.{key}": value for key, value in light.parameters().items()}
+        return named
+
+    def assign(self, parameters: Parameters) -> None:
+        """Use these arrays from now on, whatever was derived from others."""
+        if self.materials is not None:
+            self.materials.assign(parameters)
+        for word, light in self._lighting():
+            light.assign({key: parameters[f"{word}.{key}"] for key in light.parameters()})
+            light.prepare()
+
+    def read_by_scene(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The arrays that the scene's textures and emitters look into."""
+        arrays: dict[str, mi.Float | mi.TensorXf] = {}
+        if self.materials is not None:
+            arrays |= self.materials.parameters()
+        if self.environment is not None:
+            arrays["environment"] = self.environment.texels
+        if self.emission is not None:
+            arrays |= {f"emission.{i}": c for i, c in enumerate(self.emission.values)}
+        return arrays
+
+    def _lighting(self) -> list[tuple[str, EnvironmentMap | Emission]]:
+        both = [("environment", self.environment), ("emission", self.emission)]
+        return [(word, light) for word, light in both if light is not None]
+
+
+def make_problem(scene: Path, background: str, config: FitConfig, scale: float) -> Problem:
+    """Put fresh fields in the place of what is unknown of a scene.
+
+    Args:
+        scene: the Mitsuba scene; what it says of the unknowns is ignored.
+        background: `visible` or `hidden`.
+        scale: radiance of the untrained radiance field, environment and lights.
+
+    Raises:
+        UserError: the scene cannot be loaded, has no emitter or nothing to fit, or has meshes
+            without the texture coordinates that bitmaps need.
+    """
+    parsed = scenes.parse(scene)
+    scenes.to_principled(parsed)
+    seeds = np.random.SeedSequence(config.seed).generate_state(2)
+    materials = environment = emission = None
+    lights: list[str] = []
+    if config.learns_materials:
+        materials = _unknown_materials(parsed, config, int(seeds[0]))
+    if config.learns_environment:
+        environment = EnvironmentMap(config.lighting.resolution, scale=scale)
+        scenes.set_environment(parsed, environment_emitter(environment))
+    if config.unknown == "emission":
+        emission, lights = _unknown_emission(parsed, scale)
+    loaded = parsed.instantiate()
+    scenes.require_emitters(loaded, scene)
+    domain = Domain.of(loaded.bbox())
+    if materials is not None:
+        materials.domain = domain
+        if config.representation == "bitmap":
+            scenes.require_unwrapped(loaded, scene)
+            materials.slots = slots_of(loaded)
+
+    radiance = None
+    if requirements(METHODS[config.method]).radiance:
+        radiance = make_radiance(config, domain, scale=scale, seed=int(seeds[1]))
+    scene_view = SceneView.of(loaded, materials, config.transport.max_specular)
+    return Problem(
+        scene_view,
+        materials,
+        environment,
+        emission,
+        lights,
+        radiance,
+        background == "hidden",
+        config.half_precision,
+    )
+
+
+def _unknown_materials(parsed: scenes.ParsedScene, config: FitConfig, seed: int) -> Materials:
+    names = scenes.material_names(parsed)
+    materials = make_materials(config, names, seed=seed)
+    if config.representation == "bitmap":
+        each = [material_textures(materials, slot) for slot in range(len(names))]
+        scenes.set_own_textures(parsed, each)
+    else:
+        scenes.set_textures(parsed, *material_textures(materials))
+    return materials
+
+
+def _unknown_emission(parsed: scenes.ParsedScene, scale: float) -> tuple[Emission, list[str]]:
+    made: list[Emission] = []
+
+    def textures(count: int) -> list[mi.Texture]:
+        made.append(Emission(count, scale=scale))
+        return emission_textures(made[0])
+
+    lights = scenes.set_emission(parsed, textures)
+    return made[0], [light.name for light in lights]
+
+
+def training_pixels(dataset: Dataset, *, clip_negative: bool) -> PixelSource:
+    """The pixels of the training views.
+
+    Raises:
+        UserError: there is no training view, an image is bad, or all pixels are black.
+    """
+    views = dataset.train
+    if not views:
+        raise UserError(
+            "no training view", dataset.folder, 'Give frames of transforms.json "split": "train"'
+        )
+    photographs = Photographs.load(dataset, clip_negative)
+    if not photographs.count:
+        raise UserError("no foreground pixel in any training view", dataset.folder)
+    if photographs.mean <= 0:
+        raise UserError("all training images are black", dataset.folder)
+    return PixelSource(CameraRays.of([view.camera for view in views]), photographs)
+
+
+def camera_warnings(dataset: Dataset, scene: mi.Scene) -> list[str]:
+    """One line for each camera that seems to stand inside geometry."""
+    with dr.suspend_grad():
+        inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
+    return [f"{name}: the camera seems to stand inside geometry" for name in inside]

@@ -1,0 +1,122 @@
+"""How far recovered materials are from the truth, view by view, also while they are learned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..dataset.pixels import CameraRays
+from ..dataset.views import View, read_image
+from ..imaging.metrics import mean_psnr, psnr
+from ..transport.render import render_materials
+from .problem import Problem
+
+#: Camera samples a pixel of a score in training.
+SAMPLES = 4
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """The true materials that a view sees."""
+
+    albedo: np.ndarray  # linear RGB, (H, W, 3)
+    roughness: np.ndarray  # perceptual, (H, W)
+    known: np.ndarray  # (H, W) bool: the whole pixel sees a material that is sought
+
+    @staticmethod
+    def of(view: View) -> GroundTruth | None:
+        """The truth images of a view; None where it lacks one.
+
+        Raises:
+            UserError: an image cannot be read.
+        """
+        if view.albedo is None or view.roughness is None:
+            return None
+        albedo, roughness = read_view(view.albedo, view), read_view(view.roughness, view)
+        return GroundTruth(albedo[..., :3], roughness[..., 0], albedo[..., 3] >= 1)
+
+
+@dataclass(frozen=True)
+class MaterialBuffers:
+    """The recovered materials that a view sees."""
+
+    albedo: np.ndarray  # linear RGB, (H, W, 3)
+    roughness: np.ndarray  # perceptual, (H, W)
+    coverage: np.ndarray  # (H, W): fraction of samples that see a material which is sought
+
+    @staticmethod
+    def of(problem: Problem, views: Sequence[View], spp: int, seed: int) -> list[MaterialBuffers]:
+        """What the fields say now, view by view, from `spp` camera samples a pixel."""
+        rays = CameraRays.of([view.camera for view in views])
+        albedo, roughness, coverage = render_materials(
+            problem.scene_view, rays.through, rays.pixels, spp, seed=seed
+        )
+        seen, first = [], 0
+        for view in views:
+            h, w = view.camera.height, view.camera.width
+            part = slice(first, first + h * w)
+            first += h * w
+            shaped = albedo[part].reshape(h, w, 3), roughness[part].reshape(h, w)
+            seen.append(MaterialBuffers(*shaped, coverage[part].reshape(h, w)))
+        return seen
+
+    def mask(self, truth: GroundTruth) -> np.ndarray:
+        """The pixels that count, (H, W) bool: what they see is sought and known throughout."""
+        return truth.known & (self.coverage >= 1)
+
+    def psnr(self, truth: GroundTruth) -> dict[str, float | None]:
+        """`albedo_psnr` and `roughness_psnr` in dB, linear and not clipped.
+
+        None where no pixel counts, and where two pictures are equal: JSON has no infinity.
+
+        Raises:
+            UserError: a value is not finite.
+
+        Paper: Sec. 6, Fig. 6.
+        """
+        mask = self.mask(truth)
+        if not mask.any():
+            return {"albedo_psnr": None, "roughness_psnr": None}
+        return {
+            "albedo_psnr": finite(psnr(self.albedo, truth.albedo, mask)),
+            "roughness_psnr": finite(psnr(self.roughness, truth.roughness, mask)),
+        }
+
+
+class Score:
+    """Scores the materials on views with ground truth, which is read once.
+
+    Raises:
+        UserError: a truth image cannot be read.
+    """
+
+    def __init__(self, problem: Problem, views: Sequence[View]) -> None:
+        self._problem = problem
+        pairs = [(view, GroundTruth.of(view)) for view in views]
+        self._views = [view for view, truth in pairs if truth is not None]
+        self._truths = [truth for _, truth in pairs if truth is not None]
+
+    def measure(self, spp: int = SAMPLES, seed: int = 0) -> dict[str, float | int | None]:
+        """Means over the views: `views`, `albedo_psnr` and `roughness_psnr` in dB.
+
+        With the same seed every score has the same samples: scores differ by what was learned.
+        """
+        seen = MaterialBuffers.of(self._problem, self._views, spp, seed) if self._views else []
+        rows = [s.psnr(truth) for s, truth in zip(seen, self._truths, strict=True)]
+        means = {k: mean_psnr(r[k] for r in rows) for k in ("albedo_psnr", "roughness_psnr")}
+        return {"views": len(rows)} | means
+
+
+def read_view(image: Path, view: View, clip_negative: bool = False) -> np.ndarray:
+    """An image of a view, (H, W, 4) float32, linear RGB and alpha; errors as in `read_image`."""
+    width, height = view.camera.width, view.camera.height
+    return read_image(image, width, height, clip_negative).reshape(height, width, 4)
+
+
+def finite(value: float) -> float | None:
+    """The value, or None in place of infinity and not-a-number, which JSON lacks."""
+    return value if math.isfinite(value) else None

@@ -1,0 +1,238 @@
+"""What a pixel's samples see: the right-hand and the left-hand side of the rendering equation.
+
+    L(x, ω) = E(x, ω) + T(L)(x, ω)
+     LHS         RHS
+
+`trace` walks two surface vertices behind the camera and gathers all that every loss term needs,
+each piece evaluated once. Which of the pieces pass gradients is decided elsewhere, in
+`objective.py`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+from ..fields.radiance import RadianceField
+from .operator import Bounce, attach_albedo, attach_material, bounce, transported
+from .vertex import SceneView, Vertex, find_vertex
+
+Piece = TypeVar("Piece")
+
+
+@dataclass
+class PathSample:
+    """One camera sample a lane: x₁, bounces from x₁, x₂, …, and L_θ at those vertices.
+
+    The first bounces pass gradients to φ, the radiance at the first vertices to θ: those that
+    `Requirements` asked for.
+    """
+
+    x1: Vertex
+    bounces: list[Bounce]  # from x₁, x₂, …; the next vertex of each is where the next one starts
+    radiance: list[mi.Color3f]  # L_θ at x₁, x₂, …; zero where nobody needs it
+    learned: PathSample | None = None  # the samples that L_θ learns of; None: all of these
+
+    def vertex(self, number: int) -> Vertex:
+        """x₁, x₂, …"""
+        return self.x1 if number == 1 else self.bounces[number - 2].next
+
+    def place(self, number: int, vertex: Vertex) -> None:
+        """Replace x₁, x₂, … by the same with more known about it."""
+        if number == 1:
+            self.x1 = vertex
+        else:
+            self.bounces[number - 2].next = vertex
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """Which pieces of a path sample a method uses; the others are not computed."""
+
+    bounces: int  #: k, of the image: differentiable
+    residuals: int  #: number of first vertices where the residual is taken: 0, 1 or 2
+    lhs: bool  #: whether the radiance field is seen directly
+
+    @property
+    def radiance(self) -> bool:
+        """Whether there is a radiance field."""
+        return self.lhs or self.residuals > 0
+
+
+@dataclass
+class SampleSubset:
+    """Some of the camera samples: L_θ learns of them, and the others only make the image.
+
+    Args:
+        lanes: their numbers.
+        sampler: for as many lanes.
+    """
+
+    lanes: mi.UInt32
+    sampler: mi.Sampler
+
+
+def trace(
+    scene_view: SceneView,
+    radiance: RadianceField | None,
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    requirements: Requirements,
+    *,
+    hide_emitters: bool = False,
+    subset: SampleSubset | None = None,
+) -> PathSample:
+    """Trace one path sample for each camera ray.
+
+    Materials are evaluated once a vertex, and L_θ once where the image and residuals both need it.
+
+    Args:
+        some: the samples that L_θ learns of; None: all.
+
+    Paper: Sec. 4.2, 6.3, Fig. 2.
+    """
+    x1 = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
+    sample = learned = PathSample(x1, [], [])
+    _prolong(scene_view, sample, requirements.bounces, sampler, requirements)
+    if subset is not None and requirements.radiance:
+        _end(scene_view, sample)
+        x1, bounces = _gather(sample.x1, subset), [_gather(b, subset) for b in sample.bounces]
+        sample.learned = learned = PathSample(x1, bounces, [])
+        sampler = subset.sampler
+    _prolong(scene_view, learned, requirements.residuals, sampler, requirements)
+    if requirements.radiance and (
+        learned is sample or requirements.residuals > requirements.bounces
+    ):
+        _end(scene_view, learned)
+    for paths in (sample, learned):
+        paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
+    if requirements.radiance:
+        with_gradients, without = where_radiance_is_learned(requirements)
+        _look_up(radiance, learned, with_gradients)
+        last = {requirements.bounces + 1}  # where the image ends
+        with dr.suspend_grad():
+            if learned is sample:
+                without |= last - with_gradients
+            else:
+                _look_up(radiance, sample, last)
+            _look_up(radiance, learned, without)
+    return sample
+
+
+def _prolong(
+    scene_view: SceneView,
+    sample: PathSample,
+    bounces: int,
+    sampler: mi.Sampler,
+    requirements: Requirements,
+) -> None:
+    """Add bounces to a path until it has so many."""
+    for number in range(len(sample.bounces) + 1, bounces + 1):
+        with dr.suspend_grad(when=number > requirements.bounces):
+            x = attach_material(scene_view, sample.vertex(number))
+            sample.place(number, x)
+            sample.bounces.append(bounce(scene_view, x, sampler))
+
+
+def _end(scene_view: SceneView, sample: PathSample) -> None:
+    """Let L_θ know the albedo where a path ends: no more light is scattered there."""
+    last = len(sample.bounces) + 1
+    with dr.suspend_grad():
+        sample.place(last, attach_albedo(scene_view, sample.vertex(last)))
+
+
+def _gather(piece: Piece, subset: SampleSubset) -> Piece:
+    """Some lanes of a vertex or a bounce, and of all that it consists of."""
+    if not dataclasses.is_dataclass(piece):
+        return dr.gather(type(piece), piece, subset.lanes)
+    parts = {f.name: _gather(getattr(piece, f.name), subset) for f in dataclasses.fields(piece)}
+    return dataclasses.replace(piece, **parts)
+
+
+def where_radiance_is_learned(requirements: Requirements) -> tuple[set[int], set[int]]:
+    """Numbers of the vertices whose L_θ learning needs: with gradients to θ, and without.
+
+    A residual at xᵢ compares L(xᵢ) with L(xᵢ₊₁).
+    """
+    learned = set(range(1, requirements.residuals + 1)) | ({1} if requirements.lhs else set())
+    return learned, {i + 1 for i in range(1, requirements.residuals + 1)} - learned
+
+
+def _look_up(radiance: RadianceField, sample: PathSample, numbers: set[int]) -> None:
+    found = reflected_radiance(radiance, *(sample.vertex(i) for i in sorted(numbers)))
+    for number, value in zip(sorted(numbers), found, strict=True):
+        sample.radiance[number - 1] = value
+
+
+def reflected_radiance(radiance: RadianceField, *vertices: Vertex) -> list[mi.Color3f]:
+    """L_θ at several vertices, towards where each was seen from, in one evaluation of it."""
+    v = vertices
+    if not v:
+        return []
+    if len(v) == 1:
+        return [radiance.evaluate(v[0].si.p, v[0].w, v[0].n, v[0].albedo, v[0].valid)]
+    together = radiance.evaluate(
+        _join([mi.Point3f(x.si.p) for x in v]),
+        _join([mi.Vector3f(x.w) for x in v]),
+        _join([x.n for x in v]),
+        _join([x.albedo for x in v]),
+        dr.concat([x.valid for x in v]),
+    )
+    parts, offset = [], 0
+    for x in v:
+        lanes = dr.arange(mi.UInt32, offset, offset + dr.width(x.valid))
+        parts.append(dr.gather(mi.Color3f, together, lanes))
+        offset += dr.width(x.valid)
+    return parts
+
+
+def _join(vectors: list) -> object:
+    """Lanes of several vectors, one after the other."""
+    columns = [dr.concat([v[i] for v in vectors]) for i in range(3)]
+    return type(vectors[0])(columns)
+
+
+def lhs(sample: PathSample, radiance: mi.Color3f) -> mi.Color3f:
+    """The radiance field seen directly, E + L(x₁), per camera sample, where L at x₁ is `radiance`.
+
+    Paper: Eq. 13, Sec. 4.3.
+    """
+    return sample.x1.emitted + sample.x1.throughput * radiance
+
+
+def rhs(sample: PathSample, radiance: mi.Color3f, bounces: int = 1) -> mi.Color3f:
+    """E + T(L)(x₁) per camera sample, where L at x₂ is `radiance`; or k bounces in place of one.
+
+    With k bounces, Σ_{i<k} Tⁱ(E) + Tᵏ(L), where `radiance` is L at x_{k+1}.
+
+    Paper: Eq. 2, Eq. 12, Sec. 6.3.
+    """
+    for number in range(bounces, 0, -1):
+        radiance = transported(sample.bounces[number - 1], radiance)
+        if number > 1:
+            radiance = dr.custom(_Evaluated, radiance)
+    return sample.x1.emitted + sample.x1.throughput * radiance
+
+
+class _Evaluated(dr.CustomOp):
+    """Identity that evaluates its value, and on the way back its gradient.
+
+    So all bounces share one kernel, rather than each having a longer one with the products of
+    others in it: they are compiled once, and nothing is computed again by each further bounce.
+    """
+
+    def eval(self, radiance):
+        dr.eval(radiance)
+        return mi.Color3f(radiance)
+
+    def backward(self):
+        gradient = self.grad_out()
+        dr.eval(gradient)
+        self.set_grad_in("radiance", gradient)
+
+    def name(self) -> str:
+        return "radiance of a bounce"

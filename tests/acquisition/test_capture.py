@@ -1,0 +1,139 @@
+"""Capture from scene files: truth is what the scene says, and nothing is lost on the way."""
+
+import numpy as np
+import pytest
+
+from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.dataset.camera import LookAt, write_camera_file
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.imaging.pictures import read_exr, write_exr
+from unbake.scene.parse import parse
+
+SMALL = CaptureSettings(views=2, held_out=1, resolution=24, spp=8, max_depth=6)
+OBJECT = """<scene version="3.0.0">
+  <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
+  <shape type="sphere"><point name="center" x="-1.1" y="0" z="0"/>
+    <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.6 0.3 0.1"/>
+      <float name="alpha" value="0.09"/></bsdf></shape>
+  <shape type="sphere"><point name="center" x="1.1" y="0" z="0"/>
+    <bsdf type="dielectric"/></shape>
+</scene>
+"""
+WALL = """<scene version="3.0.0">
+  <emitter type="constant"/>
+  <shape type="rectangle"><bsdf type="twosided"><bsdf type="principled">
+    <texture type="bitmap" name="base_color"><string name="filename" value="paint.exr"/>
+      <string name="filter_type" value="nearest"/><boolean name="raw" value="true"/></texture>
+    <texture type="bitmap" name="roughness"><string name="filename" value="rough.exr"/>
+      <string name="filter_type" value="nearest"/><boolean name="raw" value="true"/></texture>
+  </bsdf></bsdf></shape>
+</scene>
+"""
+
+
+def front(folder, distance=4.0, split="train"):
+    """A camera file with one view along -z."""
+    look = LookAt((0, 0, distance), (0, 0, 0), (0, 1, 0), 2 * np.degrees(np.arctan(1 / distance)))
+    write_camera_file(folder / "cameras.json", [(split, look)])
+    return folder / "cameras.json"
+
+
+@pytest.fixture
+def told():
+    return []
+
+
+@pytest.fixture
+def objects(tmp_path, told):
+    """An opaque and a glass ball before a sky, captured."""
+    sky = 0.2 + np.random.default_rng(0).random((8, 16, 3))
+    write_exr(tmp_path / "sky.exr", sky)
+    (tmp_path / "scene.xml").write_text(OBJECT)
+    look = LookAt((0, 0, 6), (0, 0, 0), (0, 1, 0), 50.0)
+    write_camera_file(tmp_path / "cameras.json", [("train", look), ("heldout", look)])
+    return capture(
+        str(tmp_path / "scene.xml"),
+        tmp_path / "data",
+        SMALL,
+        cameras=tmp_path / "cameras.json",
+        tell=told.append,
+    )
+
+
+def test_an_object_stands_before_a_hidden_background(objects, told):
+    assert objects.background == "hidden" and "1 BSDFs made principled" in told
+    photograph = read_exr(objects.train[0].image)
+    assert np.isfinite(photograph).all()
+    assert (photograph[0] == 0).all() and (photograph[:, :2] == 0).all()
+    opaque, glass = photograph[12, 6], photograph[12, 17]
+    assert opaque[3] == glass[3] == 1
+    # Glass shows the sky behind it although the sky itself is hidden
+    assert glass[:3].min() > 0.05 and opaque[:3].min() > 0.01
+
+
+def test_only_what_is_sought_has_truth(objects):
+    albedo, roughness = (read_exr(p) for p in (objects.train[0].albedo, objects.train[0].roughness))
+    assert np.allclose(albedo[12, 6], [0.6, 0.3, 0.1, 1], atol=1e-3)
+    assert np.allclose(roughness[12, 6], [0.3, 0.3, 0.3, 1], atol=1e-3)
+    assert (albedo[12, 17] == 0).all() and (roughness[12, 17] == 0).all()
+    assert (albedo[0] == 0).all()
+
+
+def test_glass_is_kept(objects):
+    plugins = [node.props.plugin_name() for node in parse(objects.scene).state.nodes]
+    assert plugins.count("dielectric") == 1 and plugins.count("principled") == 1
+    assert plugins.count("envmap") == 1 and "roughplastic" not in plugins
+
+
+def test_bitmap_textures_are_the_truth_pixel_by_pixel(tmp_path):
+    rng = np.random.default_rng(2)
+    paint, rough = rng.uniform(0.1, 0.9, (8, 8, 3)), rng.uniform(0.2, 0.9, (8, 8))
+    write_exr(tmp_path / "paint.exr", paint)
+    write_exr(tmp_path / "rough.exr", rough)
+    (tmp_path / "scene.xml").write_text(WALL)
+    data = capture(
+        str(tmp_path / "scene.xml"),
+        tmp_path / "data",
+        SMALL,
+        cameras=front(tmp_path),
+        tell=lambda line: None,
+    )
+    # The wall fills the image, so that each texel covers 3 x 3 pixels; the middle one is pure.
+    # v runs upwards, rows run downwards.
+    paint, rough = paint[::-1], rough[::-1]
+    albedo, roughness = (read_exr(p) for p in (data.train[0].albedo, data.train[0].roughness))
+    assert (albedo[..., 3] == 1).all() and (roughness[..., 3] == 1).all()
+    assert np.allclose(albedo[1::3, 1::3, :3], paint, atol=1e-3)
+    assert np.allclose(roughness[1::3, 1::3, 0], rough, atol=1e-3)
+    names = {p.name for p in (data.scene.parent).rglob("*") if p.is_file()}
+    assert names == {"scene.xml", "paint.exr", "rough.exr"}
+
+
+def test_a_capture_is_the_same_twice_and_another_with_another_seed(tmp_path):
+    images = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        settings = CaptureSettings(views=1, held_out=0, resolution=8, spp=4, max_depth=4, seed=seed)
+        data = capture("cube", tmp_path / name, settings, tell=lambda line: None)
+        images.append(read_exr(data.train[0].image))
+    assert np.array_equal(images[0], images[1]) and not np.array_equal(images[0], images[2])
+
+
+def test_what_is_captured_can_be_loaded_from_anywhere(cornell, tmp_path):
+    data = Dataset.load(cornell)
+    assert [v.name for v in data.views] == ["train_000", "train_001", "heldout_000"]
+    assert all(v.albedo and v.roughness for v in data.views)
+    text = (cornell / "transforms.json").read_text() + data.scene.read_text()
+    assert str(cornell.parent) not in text
+
+
+@pytest.mark.parametrize("failure", [UserError("no"), KeyboardInterrupt(), OSError(28, "full")])
+def test_a_capture_that_fails_leaves_nothing(failure, tmp_path, monkeypatch):
+    def fail(*words):
+        raise failure
+
+    monkeypatch.setattr("unbake.acquisition.capture._truth", fail)
+    settings = CaptureSettings(views=1, held_out=0, resolution=4, spp=1)
+    with pytest.raises((UserError, KeyboardInterrupt)):
+        capture("cube", tmp_path / "data", settings, tell=lambda line: None)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,230 @@
+"""Camera placement: in the open, looking at everything, and reproducible."""
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unbake.acquisition.placement import coverage, is_room, place_object, place_room
+from unbake.dataset.camera import Camera
+from unbake.dataset.views import check_cameras
+from unbake.errors import UserError
+from unbake.scene import free_space
+
+MATTE = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+SIDES = [([0, 1, 0], angle) for angle in (0, 90, 180, 270)]
+SIDES += [([1, 0, 0], angle) for angle in (90, 270)]
+
+
+def walls(flipped=False, scale=(1, 1, 1)):
+    """The six sides of the box [-1, 1]^3 times `scale`, normals inwards unless flipped."""
+    shapes = {}
+    for index, (axis, angle) in enumerate(SIDES):
+        to_world = mi.ScalarTransform4f().scale(list(scale)).rotate(axis, angle)
+        shape = {"type": "rectangle", "to_world": to_world.translate([0, 0, -1]), "bsdf": MATTE}
+        shapes[f"wall{index}"] = shape | {"flip_normals": flipped}
+    return shapes
+
+
+def box(centre, scale):
+    to_world = mi.ScalarTransform4f().translate(list(centre)).scale(scale)
+    return {"type": "cube", "to_world": to_world, "bsdf": MATTE}
+
+
+def on_emitter(centre):
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}
+    to_world = mi.ScalarTransform4f().translate(list(centre)).scale(0.1)
+    return {"type": "sphere", "to_world": to_world, "light": light}
+
+
+def sensor(origin, target, up=(0, 1, 0)):
+    return Camera.look_at(origin, target, up, 60.0, 8, 8).sensor(1)
+
+
+def scene(**shapes):
+    # Mitsuba cannot merge rectangles with cubes
+    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """A lit room with a cupboard (hollow, closed) in a corner, and a ball far outside."""
+    return scene(
+        **walls(),
+        cupboard=box((0.5, -0.5, 0.5), 0.49),
+        on_emitter=on_emitter((-0.3, 0.85, -0.3)),
+        outside={"type": "sphere", "center": [2.5, 0, 0], "radius": 0.2},
+        sensor=sensor((-0.6, 0, -0.6), (0, 0, 0)),
+    )
+
+
+@pytest.fixture(scope="module")
+def placed(room):
+    return place_room(room, 10, 4, fov=80.0)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball at (1, 2, 3) of radius 2 above a large floor, lit by the sky."""
+    floor = mi.ScalarTransform4f().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(40)
+    return scene(
+        ball={"type": "sphere", "center": [1, 2, 3], "radius": 2, "bsdf": MATTE},
+        floor={"type": "rectangle", "to_world": floor, "bsdf": MATTE},
+        sky={"type": "constant"},
+        sensor=sensor((1, 6, 12), (1, 2, 3)),
+    )
+
+
+def test_a_room_has_cameras_of_both_splits(placed):
+    assert [split for split, _ in placed] == ["train"] * 10 + ["heldout"] * 4
+    poses = np.array([look_at.camera(8, 8).to_world for _, look_at in placed])
+    for one in range(len(poses)):
+        for other in range(one):
+            assert np.abs(poses[one] - poses[other]).max() > 0.05
+    assert all(look_at.fov == 80.0 and look_at.up == (0, 1, 0) for _, look_at in placed)
+
+
+def test_cameras_stand_in_the_free_space_of_the_room(room, placed):
+    eyes = np.array([look_at.origin for _, look_at in placed])
+    assert np.abs(eyes).max() < 1.0
+    in_cupboard = (np.abs(eyes - [0.5, -0.5, 0.5]) < 0.49).all(axis=1)
+    assert not in_cupboard.any()
+    assert not check_cameras(room, {str(i): c.camera(8, 8) for i, (_, c) in enumerate(placed)})
+    hits = [
+        free_space.trace(room, np.tile(e, (200, 1)), free_space.sphere_directions(200))
+        for e in eyes
+    ]
+    assert min(h.distance.min() for h in hits) > 0.09
+
+
+def test_cameras_look_at_surfaces_from_a_distance(room, placed):
+    for _, look_at in placed:
+        way = np.subtract(look_at.target, look_at.origin)
+        assert np.linalg.norm(way) > 0.4
+
+
+def test_the_training_views_cover_the_room_and_held_out_views_look_at_the_same(room, placed):
+    train = [c.camera(8, 8) for split, c in placed if split == "train"]
+    held_out = [c.camera(8, 8) for split, c in placed if split == "heldout"]
+    whole = coverage(room, train, 4000)
+    assert 0.97 < whole <= 1.0
+    # What only the held-out views see is hardly anything
+    assert coverage(room, train + held_out, 4000) - whole < 0.01
+    assert coverage(room, held_out, 4000) > 0.5
+    assert coverage(room, train[:2], 4000) < whole
+
+
+def test_a_seed_means_the_same_cameras_on_another_day(room, placed):
+    assert place_room(room, 10, 4, fov=80.0) == placed
+    assert place_room(room, 10, 4, fov=80.0, seed=1) != placed
+
+
+def test_rooms_are_told_from_objects(room, ball):
+    assert is_room(room)
+    assert is_room(scene(**walls()))
+    assert is_room(scene(**walls(flipped=True), sensor=sensor((0.5, 0, 0), (0, 0, 0))))
+    assert not is_room(ball)
+    assert not is_room(scene(ball={"type": "sphere"}))
+    assert not is_room(scene(box=box((0, 0, 0), 1.0), sensor=sensor((0, 3, 5), (0, 0, 0))))
+
+
+def test_a_box_without_its_front_is_a_room_seen_from_outside():
+    shapes = walls()
+    del shapes["wall2"]
+    cornell = scene(**shapes, sensor=sensor((0, 0, 4), (0, 0, 0)))
+    assert is_room(cornell)
+    assert all(np.abs(c.origin).max() < 1 for _, c in place_room(cornell, 4, 0))
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1), (0, -1, 0), (1, 0, 0)])
+def test_up_is_the_axis_that_the_sensor_stands_on(up):
+    side = np.roll(up, 1).astype(float)
+    eye = 0.5 * side + 0.3 * np.array(up)
+    tilted = scene(**walls(), sensor=sensor(eye, (0, 0, 0), up))
+    assert free_space.up_axis(tilted).tolist() == list(up)
+    assert all(look_at.up == up for _, look_at in place_object(tilted, 2, 1))
+
+
+def test_up_is_y_without_a_sensor():
+    assert free_space.up_axis(scene(ball={"type": "sphere"})).tolist() == [0, 1, 0]
+
+
+def test_an_object_is_seen_from_the_upper_hemisphere(ball):
+    placed = place_object(ball, 12, 4)
+    assert [split for split, _ in placed] == ["train"] * 12 + ["heldout"] * 4
+    eyes = np.array([look_at.origin for _, look_at in placed]) - [1, 2, 3]
+    distance = np.linalg.norm(eyes, axis=1)
+    assert np.allclose(distance, distance[0])
+    # The ball just fits into the image
+    assert 2 < distance[0] * math.sin(math.radians(20)) < 1.1 * 2
+    assert (eyes[:, 1] > 0).all()
+    assert all(np.allclose(look_at.target, [1, 2, 3]) for _, look_at in placed)
+    height = eyes[:, 1] / distance
+    for heights in (height[:12], height[12:]):
+        assert heights.min() < 0.3 and heights.max() > 0.7
+    octants = {(x > 0, z > 0) for x, _, z in eyes[:12]}
+    assert len(octants) == 4
+    assert place_object(ball, 12, 4) == placed
+    assert place_object(ball, 12, 4, seed=1) != placed
+    assert coverage(ball, [placed[0][1].camera(8, 8)], 2000) > 0
+
+
+def test_coverage_is_the_fraction_of_area_in_sight():
+    empty = scene(**walls(), sensor=sensor((0, 0, 0), (0, 0, 1)))
+
+    def seen(*directions):
+        """Coverage by square views from the centre, each of which shows exactly one wall."""
+        ups = [(0, 1, 0) if d[1] == 0 else (1, 0, 0) for d in directions]
+        views = [
+            Camera.look_at((0, 0, 0), d, up, 90.0, 8, 8)
+            for d, up in zip(directions, ups, strict=True)
+        ]
+        return coverage(empty, views, 5000)
+
+    axes = [tuple(sign * row) for row in np.eye(3) for sign in (1, -1)]
+    assert seen() == 0.0
+    assert seen(axes[4]) == pytest.approx(1 / 6, abs=0.02)
+    assert seen(axes[4], axes[4]) == seen(axes[4])
+    assert seen(*axes) == pytest.approx(1.0, abs=2e-3)
+    ball = scene(ball={"type": "sphere"})
+    far = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 60.0, 8, 8)
+    assert coverage(ball, [far], 5000) == pytest.approx((1 - 1 / 4) / 2, abs=0.02)
+
+
+def test_what_nobody_can_see_does_not_count(room):
+    # The cupboard stands on the floor and hides some of it; its own inside is no surface to see
+    train = [
+        Camera.look_at((-0.6, 0.5, -0.6), t, (0, 1, 0), 170.0, 8, 8)
+        for t in ((1, 0, 1), (-1, 0, -1), (1, 0.1, -1), (-1, 0, 1))
+    ]
+    assert coverage(room, train, 4000) > 0.9
+
+
+def test_small_shapes_get_more_points_when_asked_for():
+    both = scene(large=walls()["wall0"], small=box((0, 0, 5), 0.1))
+    shares = []
+    for power in (1.0, 0.5):
+        points = free_space.sample_surface(both, 4000, 0, power)
+        shares.append((points.position[:, 2] > 1).mean())
+        assert np.allclose(np.linalg.norm(points.normal, axis=1), 1)
+    areas = np.array([4.0, 0.24])
+    assert shares[0] == pytest.approx(areas[1] / areas.sum(), abs=0.015)
+    assert shares[1] == pytest.approx(areas[1] ** 0.5 / (areas**0.5).sum(), abs=0.03)
+
+
+@pytest.mark.parametrize("place", [place_room, place_object])
+def test_no_views_are_refused(room, place):
+    with pytest.raises(UserError, match="0 training"):
+        place(room, 0, 1)
+    with pytest.raises(UserError, match="-1 held-out"):
+        place(room, 1, -1)
+
+
+def test_scenes_that_no_camera_fits_into_are_refused():
+    with pytest.raises(UserError, match="no free space"):
+        place_room(scene(wall=walls()["wall0"]), 2, 1)
+    with pytest.raises(UserError, match="no room for 90000 cameras"):
+        place_room(scene(**walls()), 90000, 0)
+    with pytest.raises(UserError, match="no shapes"):
+        place_object(scene(sky={"type": "constant"}), 2, 1)

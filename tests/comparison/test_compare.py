@@ -1,0 +1,218 @@
+"""Comparisons: complete, taken up again, honest about what failed."""
+
+import json
+import os
+import shutil
+import signal
+
+import pytest
+
+from unbake.comparison import compare as module
+from unbake.comparison.method_variant import MethodVariant
+from unbake.config import FitConfig, read_toml
+from unbake.errors import UserError
+from unbake.imaging.pictures import read_exr, write_exr
+from unbake.training import loop
+
+
+@pytest.fixture
+def compare(unbake, cornell, tiny, tmp_path):
+    """`compare("ours", "direct", "--steps", 5)` into the folder `out`."""
+
+    def run(*methods, steps=8, extra=(), data=cornell):
+        return unbake("compare", data, "--methods", *methods, "--out", tmp_path / "out",
+                      "--settings", tiny, "--steps", steps, "--score-seconds", 0.000001,
+                      "--evaluate-spp", 2, *extra)  # fmt: skip
+
+    return run
+
+
+def result(tmp_path):
+    return json.loads((tmp_path / "out" / "compare.json").read_text())
+
+
+def contents(folder):
+    return {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.rglob("*") if p.is_file()}
+
+
+def test_two_methods_side_by_side(compare, tmp_path):
+    outcome = compare("ours", "direct")
+    assert outcome.status == 0 and outcome.err == ""
+    out = tmp_path / "out"
+    assert {p.name for p in out.iterdir()} == {"ours", "direct", "compare.json", "report.html"}
+    found = result(tmp_path)
+    assert list(found["methods"]) == ["ours", "direct"]
+    for name, row in found["methods"].items():
+        config = read_toml(out / name / "config.toml")
+        assert config.method == row["method"] == name
+        assert (row["steps"], row["samples"], config.steps) == (8, 8 * 256, 8)
+        rate = 1e3 * 256 / row["milliseconds_per_step"]
+        assert row["samples_per_second"] == pytest.approx(rate)
+        assert 0 < row["milliseconds_per_step"] < 1e3 * row["seconds"]
+        assert row["start_up_seconds"] >= 0 and row["memory_mb"] > 10
+        assert row["estimator"] == "split-halves" and row["representation"] == "neural"
+        assert row["radiance"] == {"ours": "neural", "direct": None}[name]
+        metrics = json.loads((out / name / "evaluation" / "metrics.json").read_text())
+        assert row["heldout"] == metrics["heldout"] and row["train"] == metrics["train"]
+        assert [point["step"] for point in row["score"]] == [0, 4, 8]
+        gap = row["score"][-1]["albedo_psnr"] - row["heldout"]["albedo_psnr"]
+        assert abs(gap) < 0.5
+    assert found["machine"]["cores"] >= 1 and found["evaluation"]["spp"] == 2
+    assert found["settings"]["pixels"] == 64
+    for target in found["time_to_quality"]:
+        assert target["albedo_psnr"] == found["methods"][target["run"]]["score"][-1]["albedo_psnr"]
+        assert target["seconds"].keys() == {"ours", "direct"}
+        own = target["seconds"][target["run"]]
+        assert 0 <= own <= found["methods"][target["run"]]["score"][-1]["seconds"]
+    assert "ms/step" in outcome.out and "Seconds to that quality" in outcome.out
+    page = (out / "report.html").read_text()
+    assert "Time to quality" in page and "Held-out albedo PSNR" in page
+    assert "split halves" in page and "Validation during training" not in page
+
+
+def test_only_the_method_differs(compare, tmp_path):
+    assert compare("ours", "direct", steps=2).status == 0
+    ours, direct = (
+        vars(read_toml(tmp_path / "out" / n / "config.toml")) for n in ("ours", "direct")
+    )
+    assert {key for key in ours if ours[key] != direct[key]} == {"method"}
+
+
+def test_finished_runs_are_kept(compare, tmp_path):
+    assert compare("direct", steps=3).status == 0
+    run = tmp_path / "out" / "direct"
+    kept = {p for p in run.rglob("*") if p.parent.name in ("checkpoints", "heldout", "previews")}
+    before = {p: v for p, v in contents(run).items() if p in kept}
+    log = (run / "log.jsonl").read_text()
+    assert compare("direct", "ours", steps=3).status == 0
+    assert before == {p: v for p, v in contents(run).items() if p in kept} and len(before) > 4
+    assert log == (run / "log.jsonl").read_text()
+    assert list(result(tmp_path)["methods"]) == ["direct", "ours"]
+
+
+def test_another_quality_of_evaluation_is_evaluated_anew(compare, tmp_path):
+    assert compare("direct", steps=2).status == 0
+    assert compare("direct", steps=2, extra=("--evaluate-spp", 3)).status == 0
+    metrics = json.loads((tmp_path / "out/direct/evaluation/metrics.json").read_text())
+    assert metrics["render"]["spp"] == result(tmp_path)["evaluation"]["spp"] == 3
+
+
+def test_an_interrupted_comparison_goes_on(compare, tmp_path, monkeypatch):
+    real = loop.TrainingStep.__call__
+
+    def interrupted(self, state, step, *rates):
+        if step == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        return real(self, state, step, *rates)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.TrainingStep, "__call__", interrupted)
+        outcome = compare("direct", "ours")
+    assert outcome.status == 130 and "the same command goes on" in outcome.out
+    assert not (tmp_path / "out" / "ours").exists()
+    assert not (tmp_path / "out" / "compare.json").exists()
+    outcome = compare("direct", "ours")
+    assert outcome.status == 0 and "going on after step 5" in outcome.out
+    assert [row["steps"] for row in result(tmp_path)["methods"].values()] == [8, 8]
+    assert [p["step"] for p in result(tmp_path)["methods"]["direct"]["score"]] == [0, 4, 5, 8]
+
+
+def test_a_method_that_fails_is_recorded_and_the_others_go_on(compare, tmp_path, monkeypatch):
+    real = module.fit
+
+    def out_of_memory(data, run, config, **named):
+        if config.method == "ours":
+            raise UserError("out of memory: a <step> needs 9 GB", "ours", "Lower --batch")
+        return real(data, run, config, **named)
+
+    monkeypatch.setattr(module, "fit", out_of_memory)
+    outcome = compare("ours", "direct", steps=3)
+    assert outcome.status == 1 and "Traceback" not in outcome.err
+    said = "ours: out of memory: a <step> needs 9 GB. Lower --batch"
+    assert f"error: {said}" in outcome.out
+    found = result(tmp_path)
+    assert found["methods"]["ours"]["error"] == said
+    assert found["methods"]["ours"]["method"] == "ours"
+    assert found["methods"]["direct"]["steps"] == 3
+    assert [t["run"] for t in found["time_to_quality"]] == ["direct"]
+    assert found["time_to_quality"][0]["seconds"]["ours"] is None
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "a &lt;step&gt; needs 9 GB" in page
+
+    monkeypatch.setattr(module, "fit", real)
+    assert compare("ours", "direct", steps=3).status == 0
+    assert "error" not in result(tmp_path)["methods"]["ours"]
+
+
+def test_where_every_method_fails_the_first_error_is_told(compare, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    image = data / "images" / "train_000.exr"
+    write_exr(image, -1 - read_exr(image))
+    outcome = compare("direct", data=data)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "pixels are negative" in outcome.err
+    assert not (tmp_path / "out" / "compare.json").exists()
+    assert compare("direct", data=data, steps=2, extra=("--clip-negative",)).status == 0
+
+
+def test_without_truth_there_are_no_scores_and_no_race(compare, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    shutil.rmtree(data / "truth")
+    assert compare("direct", "ours", steps=2, data=data).status == 0
+    found = result(tmp_path)
+    assert found["time_to_quality"] == []
+    assert found["methods"]["ours"]["heldout"]["albedo_psnr"] is None
+    assert found["methods"]["ours"]["heldout"]["render_psnr"] is not None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("best",), "--methods: no method named 'best'. There are ours, "),
+        (("ours:voxels",), "--methods: no representation named 'voxels'. There are neural, grid"),
+        (("ours:",), "--methods: no representation named ''"),
+        (("ours", "ours"), "--methods: a method is given twice"),
+        (("ours", "--seconds", 3), "--steps: cannot be given together with --seconds"),
+        (("ours", "--preset", "cpu"), "--preset: cannot be given together with --settings"),
+        (("ours", "--score-seconds", -1), "--score-seconds: must be 0 or more"),
+        (("ours", "--evaluate-spp", 0), "--evaluate-spp: must be 1 or more"),
+        (("ours", "--spp", 3), "--spp: must be an even number"),
+    ],
+)
+def test_a_wrong_word_is_named(words, message, compare, tmp_path):
+    methods = [word for word in words if str(word).partition(":")[0] in ("ours", "best")]
+    outcome = compare(*methods, extra=words[len(methods) :])
+    assert outcome.status == 2 and outcome.err.startswith(f"error: {message}"), outcome.err
+    assert outcome.err.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_data_that_is_not_there_is_named(compare, tmp_path):
+    outcome = compare("ours", data=tmp_path / "none")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "none: the data folder does not exist" in outcome.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_runs_of_other_settings_or_data_are_not_mixed_in(compare, cornell, tmp_path):
+    assert compare("direct", steps=2).status == 0
+    before = contents(tmp_path / "out")
+    for outcome in (
+        compare("direct", steps=3),
+        compare("ours", "direct", steps=2, extra=("--seed", 5, "--batch", 16)),
+        compare("direct", steps=2, data=shutil.copytree(cornell, tmp_path / "other")),
+    ):
+        assert outcome.status == 2 and outcome.err.count("\n") == 1
+        assert "direct: the run in this folder" in outcome.err
+        assert contents(tmp_path / "out") == before
+    assert "has other data. Give another --out" in outcome.err
+
+
+def test_a_contender_is_a_method_and_maybe_a_representation():
+    shared = FitConfig(bounces=3, prior="one-bounce")
+    plain, bitmap = MethodVariant.of("ours"), MethodVariant.of("prb:bitmap")
+    assert (plain.name, bitmap.name) == ("ours", "prb-bitmap")
+    assert plain.settings(shared) == shared
+    chosen = bitmap.settings(shared)
+    assert (chosen.method, chosen.representation) == ("prb", "bitmap")
+    # Those are settings of ours alone, which the others refuse.
+    assert (chosen.bounces, chosen.prior) == (1, "extra-bounce")

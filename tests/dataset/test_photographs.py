@@ -1,0 +1,144 @@
+"""Photographs: the same in memory and in a mapped file, which is made once and never stale."""
+
+import os
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unbake.dataset import photographs as module
+from unbake.dataset.camera import Camera
+from unbake.dataset.photographs import Photographs
+from unbake.dataset.pixels import CameraRays, PixelSource
+from unbake.dataset.views import Dataset, View
+from unbake.errors import UserError
+
+WIDTH, HEIGHT = 7, 5
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Three training views and a held-out one; a third of the pixels are background."""
+
+    def make(background="hidden"):
+        rng = np.random.default_rng(4)
+        camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, WIDTH, HEIGHT)
+        views = []
+        for i in range(4):
+            rgba = rng.uniform(0, 2, (HEIGHT, WIDTH, 4)).astype(np.float32)
+            rgba[..., 3] = rng.random((HEIGHT, WIDTH)) > 1 / 3
+            image = tmp_path / f"{i}.exr"
+            mi.Bitmap(rgba).write(str(image))
+            split = "heldout" if i == 3 else "train"
+            views.append(View(f"{i}", split, camera, image, None, None))
+        return Dataset(tmp_path, tmp_path / "s.xml", background, views, {}, None)
+
+    return make
+
+
+@pytest.fixture
+def on_disk(monkeypatch):
+    """Every data set is too large for memory."""
+    monkeypatch.setattr(module, "IN_MEMORY", 0)
+
+
+def rgba(dataset):
+    return np.concatenate([np.array(mi.Bitmap(str(v.image))).reshape(-1, 4) for v in dataset.train])
+
+
+@pytest.mark.parametrize("background", ["hidden", "visible"])
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_pixels_are_those_of_the_images(dataset, background, where, monkeypatch):
+    if where == "disk":
+        monkeypatch.setattr(module, "IN_MEMORY", 0)
+    made = dataset(background)
+    found, truth = Photographs.load(made, False), rgba(made)
+    assert isinstance(found.table, np.memmap) == (where == "disk")
+    assert (found.bytes == 0) == (where == "disk")
+    np.testing.assert_array_equal(found.table[:, :3], truth[:, :3])
+    counted = truth[:, 3] > 0 if background == "hidden" else np.ones(len(truth), bool)
+    assert found.count == counted.sum()
+    if background == "hidden":
+        np.testing.assert_array_equal(found.chosen, np.flatnonzero(counted))
+    assert found.mean == pytest.approx(truth[counted, :3].mean(), rel=1e-5)
+    # The blurred photographs, far from their edges
+    first = truth[: WIDTH * HEIGHT, :3].reshape(HEIGHT, WIDTH, 3)
+    expected = first[0:5, 1:6].mean((0, 1))
+    np.testing.assert_allclose(found.table[2 * WIDTH + 3, 3:], expected, rtol=1e-5)
+
+
+def test_batches_are_the_same_from_memory_and_from_a_file(dataset, monkeypatch):
+    made = dataset()
+    rays = CameraRays.of([v.camera for v in made.train])
+    sampler = mi.load_dict({"type": "independent"})
+
+    def drawn():
+        sampler.seed(0, 64)
+        batch = PixelSource(rays, Photographs.load(made, False)).draw(3, 32).batch(rays, sampler, 2)
+        return [np.array(x) for x in (batch.target, batch.smoothed, batch.ray.d)]
+
+    in_memory = drawn()
+    monkeypatch.setattr(module, "IN_MEMORY", 0)
+    for a, b in zip(in_memory, drawn(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
+    made = dataset()
+    first = Photographs.load(made, False)
+
+    def never(*arguments):
+        raise AssertionError("an image was read again")
+
+    monkeypatch.setattr(module, "read_image", never)
+    again = Photographs.load(made, False)
+    np.testing.assert_array_equal(first.table, again.table)
+    assert again.mean == first.mean
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["another image", "clipped", "interrupted", "damaged key", "odd key", "cut table"],
+)
+def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch, change):
+    made = dataset()
+    Photographs.load(made, False)
+    clip = change == "clipped"
+    if change == "another image":
+        image = made.train[1].image
+        mi.Bitmap(np.full((HEIGHT, WIDTH, 4), 0.5, np.float32)).write(str(image))
+        os.utime(image, ns=(1, 1))
+    elif change == "interrupted":
+        (made.folder / module.CACHE / "key.json").unlink()
+    elif change == "damaged key":
+        (made.folder / module.CACHE / "key.json").write_text("{")
+    elif change == "odd key":
+        (made.folder / module.CACHE / "key.json").write_text("[]")
+    elif change == "cut table":
+        os.truncate(made.folder / module.CACHE / "photographs.npy", 40)
+    read = []
+    decode = module.read_image
+    monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))
+    found = Photographs.load(made, clip)
+    assert len(read) == len(made.train)
+    np.testing.assert_array_equal(found.table[:, :3], rgba(made)[:, :3])
+
+
+def test_a_bad_image_leaves_no_file_that_looks_whole(dataset, on_disk):
+    made = dataset()
+    made.train[2].image.write_bytes(b"no image")
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"2\.exr"):
+            Photographs.load(made, False)
+
+
+def test_no_room_for_the_file_is_told_in_one_line(dataset, on_disk, monkeypatch):
+    def full(*arguments, **named):
+        raise OSError(28, "No space left on device")
+
+    made = dataset()
+    monkeypatch.setattr(module.os, "posix_fallocate", full)
+    with pytest.raises(UserError, match="cannot be written .No space left") as caught:
+        Photographs.load(made, False)
+    assert "Make room" in caught.value.remedy
+    assert not list(made.folder.glob("**/photographs.npy"))

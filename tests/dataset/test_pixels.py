@@ -1,0 +1,172 @@
+"""Batches: rays go through the right pixels, which come with their own targets, evenly drawn."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unbake.dataset.camera import Camera
+from unbake.dataset.pixels import CameraRays, PixelSource
+
+SIZES = [(5, 3), (4, 4), (1, 7), (6, 2)]
+
+
+def cameras():
+    """Four views of different sizes, poses and lenses."""
+    rng = np.random.default_rng(3)
+    views = []
+    for index, (width, height) in enumerate(SIZES):
+        view = Camera.look_at(rng.normal(size=3) * 3, (0.1, 0.2, 0), (0, 1, 0.1), 50, width, height)
+        # Off-centre principal points
+        views.append(
+            Camera(
+                view.to_world,
+                view.fl_x,
+                view.fl_y,
+                view.cx + 0.3 * index,
+                view.cy - 0.2 * index,
+                width,
+                height,
+            )  # fmt: skip
+        )
+    return views
+
+
+def numbered():
+    """For each pixel of all views: its view, column and row."""
+    return [
+        (view, x, y)
+        for view, (width, height) in enumerate(SIZES)
+        for y in range(height)
+        for x in range(width)
+    ]
+
+
+def rows(vector):
+    return np.array(vector).T
+
+
+def sampler(lanes, seed=0):
+    made = mi.load_dict({"type": "independent"})
+    made.seed(seed, lanes)
+    return made
+
+
+def drawn(source, seed, pixels, spp):
+    """A batch."""
+    return source.draw(seed, pixels).batch(source.rays, sampler(spp * pixels, seed), spp)
+
+
+@pytest.fixture
+def source():
+    """Pixels whose colour is their number, and which are foreground where that is odd."""
+
+    def make(foreground_only=False):
+        number = np.arange(len(numbered()))
+        rgb = np.stack([number, 100 + number, 200 + number], 1).astype(np.float32)
+        alpha = (number % 2).astype(np.float32)
+        return PixelSource.of(cameras(), rgb, alpha, foreground_only=foreground_only)
+
+    return make
+
+
+def test_rays_are_those_of_mitsubas_perspective_camera():
+    views, pixels = cameras(), numbered()
+    offset = np.random.default_rng(1).random((2, len(pixels))).astype(np.float32)
+    ray = CameraRays.of(views).through(
+        mi.UInt32(np.arange(len(pixels))), mi.Point2f(mi.Float(offset[0]), mi.Float(offset[1]))
+    )
+    for index, (view, x, y) in enumerate(pixels):
+        camera = views[view]
+        sensor = mi.load_dict(camera.sensor(1))
+        film = mi.Point2f(
+            (x + float(offset[0, index])) / camera.width,
+            (y + float(offset[1, index])) / camera.height,
+        )
+        expected, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
+        assert np.allclose(rows(ray.d)[index], rows(expected.d)[0], atol=2e-5)
+        # Mitsuba's rays start on the near plane
+        way = rows(expected.o)[0] - rows(ray.o)[index]
+        assert np.abs(np.cross(way, rows(ray.d)[index])).max() < 1e-4
+    assert np.allclose(np.linalg.norm(rows(ray.d), axis=1), 1, atol=1e-6)
+
+
+def test_rays_are_those_of_the_camera():
+    views, pixels = cameras(), numbered()
+    ray = CameraRays.of(views).through(mi.UInt32(np.arange(len(pixels))), mi.Point2f(0.25, 0.75))
+    for index, (view, x, y) in enumerate(pixels):
+        origin, direction = views[view].rays(np.array([x + 0.25]), np.array([y + 0.75]))
+        assert np.allclose(rows(ray.d)[index], direction[0], atol=1e-6)
+        assert np.allclose(rows(ray.o)[index], origin[0], atol=1e-6)
+
+
+def pixel_of(ray_d, ray_o, views):
+    """The number of the pixel that a ray goes through."""
+    first = np.cumsum([0, *(w * h for w, h in SIZES)])
+    view = int(np.argmin([np.linalg.norm(ray_o - v.origin) for v in views]))
+    camera = views[view]
+    x, y, z = camera.to_world[:3, :3].T @ ray_d.astype(np.float64)
+    column = camera.cx + camera.fl_x * x / -z
+    row = camera.cy - camera.fl_y * y / -z
+    return first[view] + int(row) * camera.width + int(column)
+
+
+@pytest.mark.parametrize("foreground_only", [False, True])
+def test_targets_are_the_pixels_that_the_rays_go_through(source, foreground_only):
+    views, spp, pixels = cameras(), 3, 200
+    batch = drawn(source(foreground_only), 5, pixels, spp)
+    target = rows(batch.target)
+    assert target.shape == (pixels, 3) and dr.width(batch.ray) == spp * pixels
+    assert np.array_equal(target[:, 1:] - target[:, :1], np.tile([100, 200], (pixels, 1)))
+    directions, origins = rows(batch.ray.d), rows(batch.ray.o)
+    for lane in range(spp * pixels):
+        assert pixel_of(directions[lane], origins[lane], views) == target[lane // spp, 0]
+    if foreground_only:
+        assert (target[:, 0] % 2 == 1).all()
+
+
+def test_samples_fill_their_pixel_evenly(source):
+    views, spp = cameras(), 4096
+    batch = drawn(source(), 2, 1, spp)
+    number = int(rows(batch.target)[0, 0])
+    view, x, y = numbered()[number]
+    camera = views[view]
+    local = rows(batch.ray.d).astype(np.float64) @ camera.to_world[:3, :3]
+    across = camera.cx + camera.fl_x * local[:, 0] / -local[:, 2] - x
+    down = camera.cy - camera.fl_y * local[:, 1] / -local[:, 2] - y
+    for place in (across, down):
+        assert place.min() > -1e-4 and place.max() < 1 + 1e-4
+        counts = np.histogram(place, bins=8, range=(0, 1))[0]
+        assert np.abs(counts - spp / 8).max() < 5 * np.sqrt(spp / 8)
+
+
+@pytest.mark.parametrize("foreground_only", [False, True])
+def test_all_pixels_are_drawn_equally_often(source, foreground_only):
+    made, pixels = source(foreground_only), 1000
+    counts = np.zeros(len(numbered()))
+    for seed in range(20):
+        batch = drawn(made, seed, pixels, 1)
+        numbers, times = np.unique(rows(batch.target)[:, 0].astype(int), return_counts=True)
+        counts[numbers] += times
+    chosen = np.arange(len(counts)) % 2 == 1 if foreground_only else np.ones(len(counts), bool)
+    assert counts[~chosen].sum() == 0
+    expected = 20 * pixels / chosen.sum()
+    # χ² with as many degrees of freedom as pixels, less one: mean k and variance 2 k
+    freedom = chosen.sum() - 1
+    chi2 = ((counts[chosen] - expected) ** 2 / expected).sum()
+    assert abs(chi2 - freedom) < 5 * np.sqrt(2 * freedom)
+
+
+def test_seeds_decide_the_pixels(source):
+    made = source()
+    draws = [rows(drawn(made, s, 64, 1).target) for s in (1, 1, 2)]
+    assert np.array_equal(draws[0], draws[1]) and not np.array_equal(draws[0], draws[2])
+
+
+def test_one_view_of_one_pixel():
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, 1, 1)
+    made = PixelSource.of(
+        [camera], np.full((1, 3), 0.5, np.float32), np.ones(1), foreground_only=True
+    )
+    batch = drawn(made, 0, 2, 4)
+    assert (rows(batch.target) == 0.5).all() and (rows(batch.ray.d)[:, 2] < -0.9).all()

@@ -1,0 +1,326 @@
+"""Data folders: what is written is read back, and every mistake is one clear error."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unbake.dataset.camera import Camera
+from unbake.dataset.views import Dataset, View, check_cameras, read_image
+from unbake.errors import UserError
+
+WIDTH, HEIGHT = 6, 4
+
+
+def write_exr(path, pixels):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mi.Bitmap(np.ascontiguousarray(pixels, dtype=np.float32)).write(str(path))
+
+
+def picture(index, channels=4):
+    pixels = np.arange(HEIGHT * WIDTH * channels, dtype=np.float32) + 100 * index
+    pixels = pixels.reshape(HEIGHT, WIDTH, channels) / 64
+    if channels == 4:
+        pixels[..., 3] = (np.arange(WIDTH) > index)[None]
+    return pixels
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two training views and a held-out one, the first with truth images."""
+    data = tmp_path / "data"
+    (data / "scene").mkdir(parents=True)
+    (data / "scene" / "scene.xml").write_text("<scene version='3.0.0'/>")
+    names = [("train_000", "train"), ("train_001", "train"), ("heldout_000", "heldout")]
+    views = []
+    for index, (name, split) in enumerate(names):
+        image = data / "images" / f"{name}.exr"
+        write_exr(image, picture(index))
+        camera = Camera.look_at((index, 1, 2), (0, 0, 0), (0, 1, 0), 50.0, WIDTH, HEIGHT)
+        views.append(View(name, split, camera, image, None, None))
+    for kind in ("albedo", "roughness"):
+        write_exr(data / "truth" / kind / "train_000.exr", picture(0))
+    scene, render = data / "scene" / "scene.xml", {"spp": 16, "integrator": "path"}
+    Dataset(data, scene, "hidden", tuple(views), render, 0.75).save(data)
+    return data
+
+
+def change(folder, edit):
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    edit(content)
+    file.write_text(json.dumps(content))
+
+
+def refused(folder, message):
+    with pytest.raises(UserError, match=message) as caught:
+        Dataset.load(folder)
+    assert caught.value.where and caught.value.remedy
+    return caught.value
+
+
+def pixels_of(view, clip_negative=False):
+    return read_image(view.image, view.camera.width, view.camera.height, clip_negative)
+
+
+def refused_pixels(folder, message, clip_negative=False):
+    """Headers are good, so that only reading the pixels tells."""
+    views = Dataset.load(folder).views
+    with pytest.raises(UserError, match=message) as caught:
+        for view in views:
+            pixels_of(view, clip_negative)
+    assert caught.value.where and caught.value.remedy
+    return caught.value
+
+
+def test_a_saved_data_set_is_loaded_again(folder):
+    data = Dataset.load(folder)
+    assert (data.background, data.coverage) == ("hidden", 0.75)
+    assert data.render == {"spp": 16, "integrator": "path"}
+    assert data.scene == folder / "scene" / "scene.xml"
+    assert [v.name for v in data.train] == ["train_000", "train_001"]
+    assert [v.name for v in data.heldout] == ["heldout_000"]
+    first, second = data.train
+    assert first.albedo == folder / "truth" / "albedo" / "train_000.exr"
+    assert first.roughness.is_file() and second.albedo is None and second.roughness is None
+    expected = Camera.look_at((1, 1, 2), (0, 0, 0), (0, 1, 0), 50.0, WIDTH, HEIGHT)
+    assert np.array_equal(second.camera.to_world, expected.to_world)
+    assert second.camera.fl_x == expected.fl_x
+
+
+def test_saving_leaves_one_file_and_replaces_it_whole(folder):
+    data = Dataset.load(folder)
+    before = (folder / "transforms.json").read_bytes()
+    data.save(folder)
+    assert (folder / "transforms.json").read_bytes() == before
+    broken = Dataset(folder, data.scene, "hidden", data.views, {"spp": float("nan")}, None)
+    with pytest.raises(ValueError):
+        broken.save(folder)
+    assert (folder / "transforms.json").read_bytes() == before
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "images",
+        "scene",
+        "transforms.json",
+        "truth",
+    ]
+
+
+def test_files_outside_the_folder_are_not_saved(folder, tmp_path):
+    with pytest.raises(UserError, match="lies outside the data folder"):
+        Dataset.load(folder).save(tmp_path / "elsewhere")
+
+
+def test_pixels_come_row_by_row(folder):
+    for i, view in enumerate(Dataset.load(folder).views):
+        pixels = pixels_of(view)
+        assert pixels.dtype == np.float32
+        assert np.array_equal(pixels, picture(i).reshape(-1, 4))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_images_without_alpha_are_opaque(tmp_path, channels):
+    pixels = picture(1, channels)
+    write_exr(tmp_path / "a.exr", pixels)
+    read = read_image(tmp_path / "a.exr", WIDTH, HEIGHT)
+    assert np.array_equal(read[:, :3], np.broadcast_to(pixels, (HEIGHT, WIDTH, 3)).reshape(-1, 3))
+    assert (read[:, 3] == 1).all()
+
+
+def test_nerfstudio_data_need_no_keys_of_ours(folder):
+    def strip(content):
+        frames = content["frames"]
+        for frame in frames:
+            for key in ("split", "fl_x", "fl_y", "cx", "cy", "w", "h"):
+                frame.pop(key)
+        extra = {"fl_x": 7.5, "w": WIDTH, "h": HEIGHT, "k1": 0.0, "camera_model": "OPENCV"}
+        content.clear()
+        content |= {"frames": frames, "scene": "scene/scene.xml", **extra}
+
+    change(folder, strip)
+    data = Dataset.load(folder)
+    assert len(data.train) == 3 and not data.heldout
+    assert (data.background, data.render, data.coverage) == ("visible", {}, None)
+    assert data.train[0].camera.fl_y == 7.5 and data.train[0].camera.cx == WIDTH / 2
+
+
+def set_frame(key, value):
+    return lambda content: content["frames"][1].__setitem__(key, value)
+
+
+def set_top(key, value):
+    return lambda content: content.__setitem__(key, value)
+
+
+def all_heldout(content):
+    for frame in content["frames"]:
+        frame["split"] = "heldout"
+
+
+MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
+NAN_POSE = [[float("nan")] * 4] * 4
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (set_top("frames", []), "'frames' is not a list of frames"),
+        (set_top("frames", {}), "'frames' is not a list of frames"),
+        (set_top("frames", [1]), "frame 0: the frame is not an object"),
+        (lambda c: c.pop("frames"), "'frames' is not a list of frames"),
+        (lambda c: c.pop("scene"), "the key 'scene' is missing"),
+        (set_top("scene", 3), "'scene' is not a text"),
+        (set_top("scene", "scene/other.xml"), "other.xml: the scene file does not exist"),
+        (set_top("scene", "../scene.xml"), "lies outside the data folder"),
+        (set_top("scene", "/etc/passwd"), "lies outside the data folder"),
+        (set_top("background", "black"), "unknown background 'black'"),
+        (set_top("background", ["hidden"]), "unknown background"),
+        (set_top("render", []), "'render' is not an object"),
+        (set_top("coverage", "most"), "'coverage' is not a number"),
+        (set_top("coverage", 1.5), "'coverage' is not a number from 0 to 1"),
+        (all_heldout, "no view has the split 'train'"),
+        (lambda c: c["frames"][1].pop("file_path"), "frame 1: the key 'file_path' is missing"),
+        (set_frame("file_path", "images/none.exr"), "none.exr: the image does not exist"),
+        (set_frame("file_path", "images/train_000.exr"), "two frames are named 'train_000'"),
+        (set_frame("file_path", "other/train_000.exr"), "two frames are named 'train_000'"),
+        (set_frame("file_path", "../../a.exr"), "'../../a.exr' lies outside"),
+        (set_frame("file_path", "a\0.exr"), "is not a path"),
+        (set_frame("file_path", "file:///a.exr"), "the image does not exist"),
+        (set_frame("file_path", "C:\\a.exr"), "the image does not exist"),
+        (set_frame("file_path", "images"), "the image does not exist"),
+        (set_frame("split", "val"), r"frame 1 \(train_001.exr\): unknown split 'val'"),
+        (set_frame("transform_matrix", MIRRORED), r"\(train_001.exr\): the pose is left-handed"),
+        (set_frame("transform_matrix", NAN_POSE), "the pose has NaN"),
+        (set_frame("transform_matrix", [[0] * 4] * 4), "the pose is singular"),
+        (set_frame("transform_matrix", (2 * np.eye(4)).tolist()), "not a rigid motion"),
+        (set_frame("transform_matrix", [1, 2]), "not an array of 4 x 4 numbers"),
+        (set_frame("transform_matrix", [[1], [1, 2]]), "not an array of 4 x 4 numbers"),
+        (set_frame("fl_x", -3), "the focal length"),
+        (set_frame("fl_x", None), "'fl_x' is not a number"),
+        (set_frame("w", "6"), "'w' is not a number"),
+        (set_frame("w", WIDTH + 1), "train_001.exr: the image has 6 x 4 pixels"),
+        (set_frame("h", 10**9), "its frame says 6 x 1000000000"),
+    ],
+)
+def test_a_wrong_entry_is_one_clear_error(folder, edit, message):
+    change(folder, edit)
+    refused(folder, message)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", "\x80", "[" * 100000])
+def test_a_file_that_is_no_json_object_is_refused(folder, content):
+    (folder / "transforms.json").write_text(content, encoding="latin-1")
+    refused(folder, "transforms.json: the file (is not readable JSON|does not hold)")
+
+
+def test_a_missing_folder_or_file_is_named(folder, tmp_path):
+    refused(tmp_path / "none", "the data folder does not exist")
+    (folder / "transforms.json").unlink()
+    refused(folder, "no transforms.json in the folder")
+
+
+def test_a_link_out_of_the_folder_is_refused(folder, tmp_path):
+    write_exr(tmp_path / "secret.exr", picture(0))
+    (folder / "images" / "train_001.exr").unlink()
+    (folder / "images" / "train_001.exr").symlink_to(tmp_path / "secret.exr")
+    refused(folder, "lies outside the data folder")
+
+
+@pytest.mark.parametrize("name", ["photo.png", "photo.JPG", "photo.tiff"])
+def test_low_dynamic_range_is_refused(folder, name):
+    (folder / "images" / name).write_bytes(b"anything")
+    change(folder, set_frame("file_path", f"images/{name}"))
+    assert "OpenEXR" in refused(folder, "low dynamic range").remedy
+
+
+def test_an_unknown_format_is_refused(folder):
+    (folder / "images" / "a.raw").write_bytes(b"anything")
+    change(folder, set_frame("file_path", "images/a.raw"))
+    refused(folder, "unknown image format '.raw'")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("channel", [1, 3])
+def test_pixels_that_are_not_finite_are_counted_and_never_accepted(folder, value, channel):
+    pixels = picture(1)
+    pixels[1, 2, channel] = pixels[3, 4, channel] = value
+    write_exr(folder / "images" / "train_001.exr", pixels)
+    for clip in (False, True):
+        message = "train_001.exr: 2 of 24 pixels are NaN or infinite"
+        refused_pixels(folder, message, clip)
+
+
+def test_negative_pixels_are_refused_or_clipped(folder):
+    pixels = picture(1)
+    pixels[1, 2, 0] = -0.5
+    write_exr(folder / "images" / "train_001.exr", pixels)
+    error = refused_pixels(folder, "train_001.exr: 1 of 24 pixels are negative")
+    assert "--clip-negative" in error.remedy
+    clipped = pixels_of(Dataset.load(folder).train[1], clip_negative=True)
+    assert clipped.min() == 0 and np.array_equal(clipped[:, 1], picture(1)[..., 1].ravel())
+
+
+def test_a_damaged_truth_image_is_named(folder):
+    (folder / "truth" / "albedo" / "train_000.exr").write_bytes(b"v/1\x01")
+    refused(folder, "albedo/train_000.exr: the image cannot be read")
+
+
+def test_damaged_images_are_refused_before_memory_is_taken(folder):
+    image = folder / "images" / "train_001.exr"
+    whole = image.read_bytes()
+    for length in (0, 3):
+        image.write_bytes(whole[:length])
+        refused(folder, "train_001.exr: the image cannot be read")
+    for length in (200, len(whole) // 2, len(whole) - 1):
+        image.write_bytes(whole[:length])
+        refused_pixels(folder, "train_001.exr: the image cannot be read")
+    huge = bytearray(whole)
+    at = whole.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
+    huge[at : at + 8] = b"\xff\xff\xff\x3f" * 2
+    image.write_bytes(huge)
+    refused(folder, "the image has 1073741824 x 1073741824 pixels")
+
+
+def test_other_channels_are_refused(tmp_path):
+    write_exr(tmp_path / "a.exr", np.zeros((HEIGHT, WIDTH, 7)))
+    with pytest.raises(UserError, match="other channels"):
+        read_image(tmp_path / "a.exr", WIDTH, HEIGHT)
+
+
+def room(flipped):
+    """The cube [-1, 1]^3 of six twosided walls, a box in one corner; normals in or outwards."""
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    turns = [([0, 1, 0], angle) for angle in (0, 90, 180, 270)]
+    turns += [([1, 0, 0], angle) for angle in (90, 270)]
+    shapes = {}
+    for index, (axis, angle) in enumerate(turns):
+        to_world = mi.ScalarTransform4f().rotate(axis, angle).translate([0, 0, -1])
+        shape = {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+        shapes[f"wall{index}"] = shape | {"flip_normals": flipped}
+    box = mi.ScalarTransform4f().translate([0.5, -0.6, 0.5]).scale(0.4)
+    shapes["box"] = {"type": "cube", "to_world": box, "bsdf": bsdf}
+    # Mitsuba cannot merge rectangles with cubes
+    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+
+@pytest.mark.parametrize("flipped", [False, True], ids=["inward", "outward"])
+def test_cameras_in_or_on_geometry_are_named(flipped):
+    def camera(*origin, target=(0.0, 0.0, -1.0)):
+        return Camera.look_at(origin, target, (0, 1, 0), 60.0, 16, 16)
+
+    cameras = {
+        "free": camera(-0.5, 0.0, 0.5),
+        "corner": camera(-0.9, 0.9, 0.9),
+        "near the box": camera(0.5, 0.0, 0.4),
+        "in the box": camera(0.5, -0.6, 0.5),
+        "nose on the wall": camera(0.1, 0.0, -0.999, target=(0.1, 0.0, -2.0)),
+    }
+    assert check_cameras(room(flipped), cameras) == ["in the box", "nose on the wall"]
+
+
+def test_cameras_outside_an_object_are_fine_and_inside_are_named():
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    outside = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 40.0, 8, 8)
+    inside = Camera.look_at((0, 0, 0.3), (0, 0, 0), (0, 1, 0), 40.0, 8, 8)
+    assert check_cameras(scene, {"outside": outside, "inside": inside}) == ["inside"]
+    assert check_cameras(scene, {}) == []

@@ -1,0 +1,67 @@
+"""What logs tell: time of a step, score curves, time to quality."""
+
+import pytest
+
+from unbake.evaluation.convergence import (
+    milliseconds_per_step,
+    score_curve,
+    seconds_to,
+    time_to_quality,
+)
+
+
+def curve(*points):
+    return [{"seconds": t, "step": i, "albedo_psnr": v} for i, (t, v) in enumerate(points)]
+
+
+def test_a_step_takes_the_median_of_what_it_takes_after_the_first_ones():
+    log = [{"step": s, "seconds": t} for s, t in ((0, 0.0), (20, 9.0), (40, 10.0), (60, 11.0))]
+    assert milliseconds_per_step(log) == pytest.approx(50)
+    # A hiccup counts as many steps as it holds, and repeated lines of a step count once.
+    log += [{"step": 60, "seconds": 11.0, "validation": {}}, {"step": 61, "seconds": 16.0}]
+    assert milliseconds_per_step(log) == pytest.approx(50)
+
+
+def test_a_log_without_a_measurement_gives_none():
+    assert milliseconds_per_step([]) is None
+    assert (
+        milliseconds_per_step([{"step": 0, "seconds": 0.0}, {"step": 20, "seconds": 9.0}]) is None
+    )
+    slow = [{"step": s, "seconds": t} for s, t in ((0, 0), (1, 30), (2, 60), (4, 64), (6, 68))]
+    assert milliseconds_per_step(slow) == pytest.approx(2000)
+
+
+def test_a_score_curve_has_each_step_once_and_in_order():
+    def line(step, value):
+        return {"step": step, "seconds": step / 2, "score": {"albedo_psnr": value}}
+
+    log = [line(20, 9.0), {"step": 30, "seconds": 15.0}, line(0, 1.0), line(20, 8.0)]
+    found = score_curve(log)
+    assert [p["step"] for p in found] == [0, 20]
+    assert found[1] == {"seconds": 10, "step": 20, "albedo_psnr": 8.0, "roughness_psnr": None}
+
+
+def test_a_target_is_reached_on_a_straight_line_between_scores():
+    assert seconds_to(curve((0, 10), (10, 20), (20, 22)), 15) == pytest.approx(5)
+    assert seconds_to(curve((0, 10), (10, 20), (20, 22)), 22) == pytest.approx(20)
+
+
+def test_a_crossing_in_the_noise_does_not_count():
+    noisy = curve((0, 10), (10, 21), (20, 19), (30, 23), (40, 22))
+    assert seconds_to(noisy, 20) == pytest.approx(22.5)
+
+
+@pytest.mark.parametrize(
+    ("points", "seconds"),
+    [([(0, 10), (10, 30), (20, 19)], None), ([], None), ([(0, None)], None), ([(3, 25)], 3)],
+)
+def test_a_curve_that_ends_below_never_reached_it(points, seconds):
+    assert seconds_to(curve(*points), 20) == seconds
+
+
+def test_every_run_sets_a_target_for_all():
+    fast, slow = curve((0, 10), (4, 20), (8, 20)), curve((0, 10), (10, 15))
+    targets = time_to_quality({"fast": fast, "slow": slow, "none": []})
+    assert [(t.run, t.albedo_psnr) for t in targets] == [("fast", 20), ("slow", 15)]
+    assert targets[0].seconds == {"fast": 4, "slow": None, "none": None}
+    assert targets[1].seconds == {"fast": 2, "slow": 10, "none": None}

@@ -1,0 +1,534 @@
+"""The report: complete, self-contained, safe, and clear about what is missing."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unbake.errors import UserError
+from unbake.imaging import pictures
+from unbake.report import charts
+from unbake.report.page import write_report
+
+SIZE = (24, 32)
+TRAINING, HELDOUT = 6, 2
+EVIL = '<script>alert("1")<'
+
+
+def _save(path: Path, rgb: np.ndarray, alpha: np.ndarray | None = None) -> None:
+    pictures.write_exr(path, rgb if alpha is None else np.dstack([rgb, alpha]))
+
+
+def _truth(index: int) -> dict[str, np.ndarray]:
+    """A made-up picture, its albedo and its roughness, and where they count."""
+    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] / 32
+    albedo = np.stack([x, y, 0.5 + 0.4 * np.sin(9 * x + index)], axis=-1)
+    roughness = np.repeat((0.2 + 0.6 * y)[..., None], 3, axis=2)
+    mask = (x - 0.5) ** 2 + (y - 0.4) ** 2 < 0.1
+    return {"render": 2 * albedo * (1 - x)[..., None], "albedo": albedo, "roughness": roughness,
+            "mask": mask.astype(float)}  # fmt: skip
+
+
+def _names(prefix: str = "") -> list[tuple[str, str]]:
+    training = [(f"{prefix}train_{i:03d}", "train") for i in range(TRAINING)]
+    return training + [(f"{prefix}heldout_{i:03d}", "heldout") for i in range(HELDOUT)]
+
+
+def _make_data(folder: Path, prefix: str = "", known: bool = True) -> Path:
+    frames = []
+    for index, (name, split) in enumerate(_names(prefix)):
+        truth = _truth(index)
+        _save(folder / "images" / f"{name}.exr", truth["render"], np.ones(SIZE))
+        for kind in ("albedo", "roughness") if known else ():
+            _save(folder / "truth" / kind / f"{name}.exr", truth[kind], truth["mask"])
+        frames.append({"file_path": f"images/{name}.exr", "split": split})
+    transforms = {
+        "scene": "scene/scene.xml",
+        "background": "visible",
+        "coverage": 0.93,
+        "render": {"integrator": "path", "max_depth": 8, "spp": 64},
+        "frames": frames,
+    }
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    return folder
+
+
+def _make_run(
+    folder: Path, data: Path, method: str, noise: float, prefix: str = "", known: bool = True
+) -> Path:
+    rng = np.random.default_rng(3)
+    rows = []
+    for index, (name, split) in enumerate(_names(prefix)):
+        row: dict[str, object] = {"name": name, "split": split}
+        for kind in ("render", "albedo", "roughness"):
+            picture = _truth(index)[kind] + noise * rng.standard_normal((*SIZE, 3))
+            _save(folder / "evaluation" / split / f"{name}_{kind}.exr", picture)
+            has_truth = known or kind == "render"
+            row[f"{kind}_psnr"] = -20 * math.log10(noise) + index if has_truth else None
+        rows.append(row)
+    means = {key: rows[0][key] for key in rows[0] if key.endswith("psnr")}
+    metrics = {
+        "method": method, "steps": 200, "samples": 1_638_400, "seconds": 12.5,
+        "heldout": {"views": HELDOUT} | means, "train": {"views": TRAINING} | means,
+        "per_view": rows, "data": str(data), "render": {"spp": 64, "max_depth": 8},
+        "definitions": {"psnr": "10 log10(1/MSE)", "colour_space": "linear", "mask": "alpha"},
+    }  # fmt: skip
+    (folder / "evaluation" / "metrics.json").write_text(json.dumps(metrics))
+    (folder / "config.toml").write_text(
+        f"method = {json.dumps(method)}\nsteps = 200\n[radiance]\nwidth = 32\nflag = true\n"
+    )
+    with (folder / "log.jsonl").open("w") as log:
+        for step in range(200):
+            loss = math.exp(-step / 50) + noise
+            record = {"step": step, "seconds": step / 16, "photometric": loss, "lhs": 2 * loss}
+            log.write(json.dumps(record | {"prior": 0.0 if method == "direct" else loss}) + "\n")
+            if step % 50 == 0:
+                scores = {"split": "heldout", "albedo_psnr": step / 9, "roughness_psnr": step / 12}
+                log.write(json.dumps(record | {"validation": scores}) + "\n")
+        log.write('{"step": 200, "seco')
+    return folder
+
+
+class _Page(HTMLParser):
+    """Collects the tags and attributes of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def count(self, tag: str) -> int:
+        return sum(name == tag for name, _ in self.tags)
+
+    def images(self) -> list[str]:
+        return [str(a["alt"]) for name, a in self.tags if name == "img" and a["alt"]]
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> tuple[Path, list[Path]]:
+    data = _make_data(tmp_path / "room")
+    ours = _make_run(tmp_path / "runs" / "ours", data, "ours", 0.01)
+    return data, [ours, _make_run(tmp_path / "runs" / "direct", data, "direct", 0.1)]
+
+
+def test_the_page_shows_every_view_run_and_number(made, tmp_path: Path):
+    out = write_report(made[1], tmp_path / "out" / "report.html")
+    assert [p.name for p in out.parent.iterdir()] == ["report.html"]
+    text = out.read_text(encoding="utf-8")
+    page = _Page(text)
+    for name in ("heldout_000", "heldout_001", "train_000", "train_002", "train_003", "train_005"):
+        for quantity in ("Rendering", "Albedo", "Roughness"):
+            shown = [alt for alt in page.images() if name in alt and alt.startswith(quantity)]
+            assert len(shown) == 1 + 2 + 2, (name, quantity)
+    assert "train_001" not in text
+    assert "4 of 6 views, evenly spaced" in text
+    assert text.index("heldout_000") < text.index("train_000")
+    assert page.count("svg") == 4 + 6
+    assert "40.00" in text and "20.00" in text and "1.64\N{NO-BREAK SPACE}M" in text
+    assert '<td class="n best first">40.00</td>' in text
+    assert "10 log10(1/MSE)" in text
+
+
+def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    differing, shared = text.split("What differs between the runs.")[1].split("<details>")
+    assert "method" in differing and "steps" not in differing
+    assert "radiance.width" in shared and "<td>true</td>" in shared
+
+
+def test_the_page_loads_nothing(made, tmp_path: Path):
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    for tag, attributes in _Page(text).tags:
+        for key in ("src", "href", "srcset", "action", "data", "poster"):
+            assert str(attributes.get(key, "#")).startswith(("data:image/png;", "#")), tag
+    assert "://" not in text and "url(" not in text and "@import" not in text
+    assert "default-src 'none'" in text
+
+
+def test_names_cannot_inject_markup(tmp_path: Path):
+    data = _make_data(tmp_path / EVIL, prefix=EVIL)
+    run = _make_run(tmp_path / "runs" / EVIL, data, "</script><script>alert(2)</script>", 0.1, EVIL)
+    text = write_report([run], tmp_path / "report.html").read_text()
+    assert _Page(text).count("script") == 1
+    assert "<script>alert" not in text and "&lt;script&gt;alert" in text
+
+
+def test_a_finished_page_is_the_same_each_time(made, tmp_path: Path):
+    first = write_report(made[1], tmp_path / "a.html").read_bytes()
+    assert write_report(made[1], tmp_path / "b.html").read_bytes() == first
+
+
+def test_photographs_without_truth_are_shown_as_recovered(tmp_path: Path):
+    data = _make_data(tmp_path / "photos", known=False)
+    run = _make_run(tmp_path / "run", data, "ours", 0.1, known=False)
+    text = write_report([run], tmp_path / "report.html").read_text()
+    images = [alt for alt in _Page(text).images() if "heldout_000" in alt]
+    assert len(images) == 3 + 1 + 1
+    assert "no ground truth" in text and '<td class="n">—</td>' in text
+
+
+def test_a_relative_data_path_starts_at_the_run(made, tmp_path: Path):
+    _edit(made[1][0], lambda metrics: metrics.update(data="../../room"))
+    assert write_report(made[1], tmp_path / "report.html").is_file()
+
+
+def test_runs_of_the_same_name_are_told_apart(made, tmp_path: Path):
+    twin = _make_run(tmp_path / "older" / "ours", made[0], "ours", 0.2)
+    text = write_report([made[1][0], twin], tmp_path / "report.html").read_text()
+    assert "runs/ours" in text and "older/ours" in text
+
+
+FACTS: dict[str, object] = {
+    "unknown": "materials", "bounces": 1, "prior": "extra-bounce", "representation": "neural",
+    "radiance": "neural", "estimator": "split-halves",
+}  # fmt: skip
+
+
+def _words(text: str) -> str:
+    """A page's text without its markup."""
+    return " ".join(re.sub(r"<[^>]*>", "", text).split())
+
+
+def test_each_run_tells_what_it_works_with(made, tmp_path: Path):
+    _edit(made[1][0], lambda m: m.update(FACTS, bounces=3, prior="one-bounce"))
+    other = {"representation": "bitmap", "radiance": None, "estimator": "two-pass"}
+    _edit(made[1][1], lambda m: m.update(FACTS, method="prb", **other))
+    text = _words(write_report(made[1], tmp_path / "report.html").read_text())
+    told = "φ network, Lθ network, 3 bounces, one bounce prior, split halves"
+    assert f"ours {told}" in text or f"ours{told}" in text
+    assert "prbφ bitmaps, no Lθ, two passes" in text
+    assert "Materials recovered in room" in text
+
+
+def _score(run: Path, values: dict[int, float]) -> None:
+    with (run / "log.jsonl").open("w") as log:
+        for step, value in values.items():
+            scores = {"views": 2, "albedo_psnr": value, "roughness_psnr": value / 2}
+            log.write(json.dumps({"step": step, "seconds": step / 4, "score": scores}) + "\n")
+
+
+def test_scores_become_curves_and_a_race(made, tmp_path: Path):
+    _score(made[1][0], {0: 10.0, 40: 30.0, 80: 31.0})
+    _score(made[1][1], {0: 10.0, 40: 20.0})
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert _Page(text).count("svg") == 4
+    assert "Held-out albedo PSNR" in text and "Validation during training" not in text
+    rows = re.findall(r"<tr>.*?</tr>", text.split('class="race"')[1].split("</table>")[0], re.S)
+    assert [re.findall(r'<td class="(.*?)">(.*?)</td>', row) for row in rows[1:]] == [
+        [("n", "31.00"), ("n best", "20.0"), ("n", "—")],
+        [("n", "20.00"), ("n best", "5.0"), ("n", "10.0")],
+    ]
+
+
+def test_one_run_is_no_race(made, tmp_path: Path):
+    _score(made[1][0], {0: 10.0, 40: 30.0})
+    assert "Time to quality" not in write_report(made[1], tmp_path / "report.html").read_text()
+
+
+def _environment() -> np.ndarray:
+    """A made-up environment map, far brighter than 1 in places."""
+    y, x = np.mgrid[0:128, 0:256] / 128
+    return np.stack([8 * np.exp(-9 * (x - y) ** 2), 4 * y, x], axis=-1)
+
+
+def _seek_light(run: Path, noise: float, unknown: str = "materials+lighting") -> None:
+    """Make a run one that sought the environment map, and say that it found it up to noise."""
+    map_ = _environment() + noise
+    _save(run / "evaluation" / "environment.exr", map_)
+    numbers = {"sh_error": noise, "sh_error_aligned": noise / 2}
+    numbers |= {"relight_psnr": 4 / noise, "relight_psnr_aligned": 5 / noise}
+    _edit(run, lambda m: m.update(FACTS, unknown=unknown, environment=numbers))
+    _edit(run, lambda m: m["definitions"].update(sh_error="|c - c*|", relight_psnr="balls"))
+
+
+def _seek_lamps(run: Path, area_emitters: dict[str, tuple[list[float], float | None]]) -> None:
+    """Make a run one that sought the strength of lights; by name, strength and error."""
+    rows = [
+        {"name": name, "strength": strength, "emission_error": error,
+         "truth": None if error is None else [17, 15.8, 13.8]}
+        for name, (strength, error) in area_emitters.items()
+    ]  # fmt: skip
+    _know_materials(run)
+    _edit(run, lambda m: m.update(unknown="emission", emission=rows))
+    _edit(run, lambda m: m["definitions"].update(emission_error="of a colour"))
+
+
+def _know_materials(run: Path) -> None:
+    """Make a run one whose materials are known: no numbers of them, no pictures."""
+    unsought = {"albedo_psnr": None, "roughness_psnr": None}
+    _seek_light(run, 0.1, "lighting")
+
+    def change(metrics: dict) -> None:
+        metrics.update(representation=None)
+        for row in (*metrics["per_view"], metrics["heldout"], metrics["train"]):
+            row.update(unsought)
+
+    _edit(run, change)
+    for kind in ("albedo", "roughness"):
+        for path in run.rglob(f"*_{kind}.exr"):
+            path.unlink()
+
+
+def test_a_run_with_known_materials_beside_one_that_seeks_them(made, tmp_path: Path):
+    _know_materials(made[1][1])
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    shown = [alt for alt in _Page(text).images() if "heldout_000" in alt and "Albedo" in alt]
+    assert len(shown) == 3 and not any("direct" in alt for alt in shown)
+    assert "known, not sought" in text and "lighting sought" in text
+    assert "Materials and lighting recovered" in text
+
+
+def test_runs_with_known_materials_show_renderings_alone(made, tmp_path: Path):
+    for run in made[1]:
+        _know_materials(run)
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    shown = [alt for alt in _Page(text).images() if "heldout_000" in alt]
+    assert len(shown) == 5 and all(alt.startswith("Rendering") for alt in shown)
+    assert "Lighting recovered in room" in text and "not sought" not in text
+
+
+def _section(text: str, name: str) -> str:
+    return text.split(f'<section id="{name}">')[1].split("</section>")[0]
+
+
+def _cells(table: str) -> list[list[tuple[str, str]]]:
+    """The class and the text of each cell, row by row."""
+    rows = re.findall(r"<tr>(.*?)</tr>", table.split("<tbody>")[1], re.S)
+    return [re.findall(r'<td class="(.*?)".*?>(.*?)</td>', row) for row in rows]
+
+
+def test_runs_that_know_the_light_have_no_section_on_it(made, tmp_path: Path):
+    _edit(made[1][0], lambda m: m["definitions"].update(albedo_psnr_aligned="x", sh_error="x"))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert 'href="#light"' not in text and "light recovered" not in _words(text)
+    assert "Aligned" not in text and "SH error" not in text
+
+
+def test_environment_maps_are_shown_beside_the_truth(made, tmp_path: Path):
+    _save(made[0] / "truth" / "environment.exr", _environment(), np.ones((128, 256)))
+    third = _make_run(tmp_path / "runs" / "prb", made[0], "prb", 0.05)
+    _seek_light(made[1][0], 0.04)
+    _seek_light(made[1][1], 0.2, "lighting")
+    text = write_report([*made[1], third], tmp_path / "report.html").read_text()
+    light = _section(text, "light")
+    assert 'href="#light"' in text and "at -2.0 stops" in light and "0.05</span>" in light
+    names = [alt.removeprefix("Environment map") for alt in _Page(light).images()]
+    assert names == [
+        ", ground truth", ", ours", " error, ours, SH error 4.00 %",
+        ", direct", " error, direct, SH error 20.00 %",
+    ]  # fmt: skip
+    best = [("n best first", "4.00"), ("n best", "2.00"), ("n best first", "100.00")]
+    assert _cells(light) == [
+        [*best, ("n best", "125.00")],
+        [("n first", "20.00"), ("n", "10.00"), ("n first", "20.00"), ("n", "25.00")],
+        [("n first soft", "known, not sought")],
+    ]
+    assert 'class="number best">SH error 4.00 %' in light and light.count("best") == 5
+    assert "|c - c*|" in light and "balls" in light
+    assert "|c - c*|" not in _section(text, "numbers")
+    assert "albedo, roughness and light recovered" in _words(text)
+
+
+def test_all_maps_have_the_exposure_that_suits_the_truth(made, tmp_path: Path):
+    _save(made[0] / "truth" / "environment.exr", _environment(), np.ones((128, 256)))
+    _seek_light(made[1][0], 50.0)
+    light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
+    assert "at -2.0 stops" in light
+    truth, ours = re.findall(r'data-kind="picture".*?src="(.*?)"', light, re.S)
+    assert truth == pictures.png_data_uri(pictures.tonemap(_environment(), -2.0))
+    assert ours == pictures.png_data_uri(pictures.tonemap(_environment() + 50, -2.0))
+
+
+def test_maps_without_truth_stand_alone(made, tmp_path: Path):
+    for run in made[1]:
+        _seek_light(run, 0.05)
+        _edit(run, lambda m: m.update(environment=None))
+    light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
+    assert len(_Page(light).images()) == 2 and "no ground truth" in light
+    assert "<table" not in light and "The error is" not in light and "SH error" not in light
+
+
+def test_lights_are_a_table_of_strengths(made, tmp_path: Path):
+    _seek_lamps(made[1][0], {"lamp": ([17.217773, 15.829334, 13.7], 0.0084), EVIL: ([0, 0, 0], 0)})
+    _seek_lamps(made[1][1], {"lamp": ([170.5, 2.25, 0.001], 9.5), "sun": ([1e5, 2, 3], None)})
+    third = _make_run(tmp_path / "runs" / "prb", made[0], "prb", 0.05)
+    text = write_report([*made[1], third], tmp_path / "report.html").read_text()
+    light = _section(text, "light").replace("\N{EN SPACE}", " ")
+    unsought, dash = ("n first soft", "known, not sought"), [("n first", "—"), ("n", "—")]
+    truth, ours = ("n first", "17.00 15.80 13.80"), ("n first", "17.22 15.83 13.70")
+    assert _cells(light) == [
+        [truth, ours, ("n best", "0.84"), ("n first", "170.5 2.2 0.0"), ("n", "950.00"), unsought],
+        [truth, ("n first", "0.00 0.00 0.00"), ("n", "0.00"), *dash, unsought],
+        [("n first", "—"), *dash, ("n first", "100000 2 3"), ("n", "—"), unsought],
+    ]
+    assert "of a colour" in light and _Page(text).images().count("Environment map") == 0
+    assert _Page(text).count("script") == 1
+
+
+def test_lights_alone_are_the_title_and_leave_out_columns_of_materials(made, tmp_path: Path):
+    for run in made[1]:
+        _seek_lamps(run, {"lamp": ([1, 2, 3], 0.1)})
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert "Lights recovered in room" in text and "light recovered" in _words(text)
+    numbers = _section(text, "numbers")
+    assert "Rendering" in numbers and "Albedo" not in numbers and "Roughness" not in numbers
+
+
+def test_an_aligned_albedo_has_its_column(made, tmp_path: Path):
+    aligned = {"albedo_psnr_aligned": 43.21}
+    _seek_light(made[1][0], 0.05)
+    _edit(made[1][0], lambda m: [m[split].update(aligned) for split in ("heldout", "train")])
+    _edit(made[1][0], lambda m: m["definitions"].update(albedo_psnr_aligned="after scaling"))
+    text = _section(write_report(made[1], tmp_path / "report.html").read_text(), "numbers")
+    assert text.count(">Aligned albedo</th>") == 2 and "after scaling" in text
+    ours, direct = _cells(text)
+    assert [cell for _, cell in ours[1:9]] == ["40.00", "40.00", "43.21", "40.00"] * 2
+    assert [cell for _, cell in direct[1:9]] == ["20.00", "20.00", "—", "20.00"] * 2
+    assert [kind for kind, _ in ours if kind.endswith("first")] == ["n best first"] * 2 + [
+        "n first"
+    ]
+
+
+def test_what_failed_is_told_and_cannot_inject_markup(made, tmp_path: Path):
+    page = tmp_path / "report.html"
+    text = write_report(made[1], page, {"ad-pt": f"out of memory {EVIL}"}).read_text()
+    assert "ad-pt came to nothing: out of memory" in _words(text)
+    assert _Page(text).count("script") == 1
+
+
+def _edit(run: Path, change: Callable[[dict], object]) -> None:
+    path = run / "evaluation" / "metrics.json"
+    metrics = json.loads(path.read_text())
+    change(metrics)
+    path.write_text(json.dumps(metrics))
+
+
+def _remove(path: str) -> Callable[[Path, list[Path]], None]:
+    def change(data: Path, runs: list[Path]) -> None:
+        (data.parent / path).unlink()
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_remove("runs/ours/evaluation/metrics.json"), r"metrics\.json.*unbake evaluate \S*ours"),
+        (_remove("runs/ours/config.toml"), r"config\.toml"),
+        (_remove("runs/ours/log.jsonl"), r"log\.jsonl"),
+        (_remove("runs/ours/evaluation/heldout/heldout_001_albedo.exr"), r"heldout_001_albedo"),
+        (_remove("room/images/heldout_001.exr"), r"heldout_001\.exr.*no such picture"),
+        (_remove("room/transforms.json"), r"transforms\.json"),
+        (lambda data, runs: data.rename(data.with_name("moved")), "data .* gone .*room"),
+        (lambda data, runs: _edit(runs[1], lambda m: m.update(data="/")), "other data"),
+        (lambda data, runs: _edit(runs[1], lambda m: m.pop("per_view")), "`per_view`"),
+        (
+            lambda data, runs: _edit(runs[1], lambda m: m["per_view"][0].update(name="x")),
+            "no view named x",
+        ),
+        (
+            lambda data, runs: _save(
+                runs[0] / "evaluation/train/train_000_render.exr", np.zeros((3, 3, 3))
+            ),
+            "3 x 3 pixels",
+        ),
+        (
+            lambda data, runs: (runs[0] / "log.jsonl").write_text('{"st\n{"step": 1}\n'),
+            "line 1 is not JSON",
+        ),
+        (
+            lambda data, runs: (data / "transforms.json").write_text(
+                '{"frames": [{"file_path": "../../x.exr"}]}'
+            ),
+            "does not lie inside",
+        ),
+        (
+            lambda data, runs: (data / "transforms.json").write_text('{"frames": [1]}'),
+            "`frames`",
+        ),
+        (lambda data, runs: _edit(runs[0], lambda m: m["per_view"].append({})), "has no name"),
+        (
+            lambda data, runs: _edit(runs[0], lambda m: m.update(unknown="lighting")),
+            r"environment\.exr.*picture is gone.*unbake evaluate \S*ours",
+        ),
+        (
+            lambda data, runs: (
+                _seek_light(runs[0], 0.1),
+                _save(data / "truth" / "environment.exr", np.zeros((2, 4, 4))),
+            ),
+            r"truth/environment\.exr",
+        ),
+        (
+            lambda data, runs: (
+                _seek_light(runs[0], 0.1),
+                _save(data / "truth" / "environment.exr", _environment(), np.ones((128, 256))),
+                _save(runs[0] / "evaluation" / "environment.exr", np.zeros((2, 4, 3))),
+            ),
+            r"ours/evaluation/environment\.exr.*4 x 2 pixels",
+        ),
+        (lambda data, runs: _edit(runs[0], lambda m: m.update(environment=[])), "`environment` is"),
+        (lambda data, runs: _edit(runs[0], lambda m: m.update(emission=[{}])), "has no name"),
+        (
+            lambda data, runs: _edit(runs[0], lambda m: m.update(unknown="emission")),
+            "`emission` has no light",
+        ),
+        (lambda data, runs: runs.append(runs[0]), "given twice"),
+        (lambda data, runs: runs.clear(), "at least one run"),
+    ],
+)
+def test_what_is_missing_is_named(made, tmp_path: Path, change, said: str):
+    data, runs = made
+    change(data, runs)
+    with pytest.raises(UserError, match=said):
+        write_report(runs, tmp_path / "report.html")
+    assert not list(tmp_path.glob("*.html*"))
+
+
+# ------------------------------------------------------------------------------------------- curves
+
+
+def test_a_resumed_log_draws_each_step_once_and_in_order():
+    log = [{"step": s, "v": v} for s, v in ((0, 1.0), (10, 2.0), (5, 3.0), (10, 4.0))]
+    log += [{"step": 11, "v": math.nan}, {"step": 12}, {"step": 13, "v": None}]
+    drawn = charts.chart([log], "step", "step", lambda r: r.get("v"), False)
+    assert drawn is not None
+    points = re.findall(r"([\d.]+) ([\d.]+)", drawn.lines[0].path)
+    across = [float(x) for x, _ in points]
+    assert len(points) == 3 and across == sorted(across) and not drawn.lines[0].band
+
+
+def test_many_points_are_summarised_with_a_band_inside_the_chart():
+    rng = np.random.default_rng(0)
+    log = [{"step": s, "v": float(v)} for s, v in enumerate(rng.lognormal(0, 2, 5000))]
+    drawn = charts.chart([log, []], "step", "step", lambda r: r["v"], True)
+    assert drawn is not None and len(drawn.lines) == 1
+    line = drawn.lines[0]
+    assert line.path.count("L") == charts.BINS - 1
+    heights = [float(y) for _, y in re.findall(r"([\d.]+) ([\d.]+)", line.path + line.band)]
+    assert charts.TOP <= min(heights) and max(heights) <= charts.BOTTOM
+    assert len(drawn.y_ticks) > 1
+
+
+@pytest.mark.parametrize("logarithmic", [False, True])
+@pytest.mark.parametrize("values", [[5.0], [2.0, 2.0], [1e-9, 1e9], [0.3, 0.31], [1234567.0, 2.0]])
+def test_axes_have_ticks_for_any_range(values: list[float], logarithmic: bool):
+    log = [{"step": i, "v": v} for i, v in enumerate(values)]
+    drawn = charts.chart([log], "step", "step", lambda r: r["v"], logarithmic)
+    assert drawn is not None
+    for ticks in (drawn.x_ticks, drawn.y_ticks):
+        assert 2 <= len(ticks) <= 14
+        assert len({tick.label for tick in ticks}) == len(ticks)
+
+
+def test_a_term_that_no_run_has_draws_no_chart():
+    assert charts.chart([[{"step": 1, "v": 0.0}]], "step", "step", lambda r: r["v"], True) is None

@@ -1,0 +1,343 @@
+"""Fits of unknown light: what they recover, their gradients, their steps, and their errors."""
+
+import dataclasses
+from contextlib import contextmanager
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import (
+    TINY_FIT,
+    assert_only_replayed,
+    built_in_cameras,
+    grey_photographs,
+    pixel_rays,
+    seeded,
+)
+
+from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.config import DenseGridConfig, LightingConfig, from_toml
+from unbake.dataset.lights import true_environment
+from unbake.errors import UserError
+from unbake.evaluation.lighting import recovered_lights, sh_error
+from unbake.training.problem import make_problem, training_pixels
+from unbake.training.regularizers import is_anchored
+from unbake.training.schedule import learning_rates
+from unbake.training.step import TrainingStep, initial_state
+from unbake.transport.objective import METHODS, requirements
+from unbake.transport.path_sample import rhs, trace
+from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
+
+FAST = LightingConfig(resolution=16, learning_rate=0.1)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Captured data sets by the name of their scene, to be read alone."""
+    folder, captured = tmp_path_factory.mktemp("lit"), {}
+
+    def of(name):
+        if name not in captured:
+            small = CaptureSettings(views=4, held_out=1, resolution=24, spp=64, max_depth=8)
+            captured[name] = capture(name, folder / name, small, tell=lambda line: None)
+        return captured[name]
+
+    return of
+
+
+def fitted(dataset, unknown, *, steps=200, **settings):
+    """The problem after a short fit, and the mean radiance that it began with."""
+    settings = {"pixels": 64, "warm_up": 20, "learning_rate": 0.02, "lighting": FAST} | settings
+    config = dataclasses.replace(TINY_FIT, unknown=unknown, **settings)
+    pixels = training_pixels(dataset, clip_negative=False)
+    mean = pixels.photographs.mean
+    problem = make_problem(dataset.scene, dataset.background, config, mean)
+    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    for i in range(steps):
+        terms = step(state, i, learning_rates(config, i, i / steps))
+        if i % 50 == 0:
+            assert np.isfinite(sum(float(v[0]) for v in terms.values()))
+    assert float(terms["skipped"][0]) == 0
+    state.publish(problem)
+    return problem, mean
+
+
+# --------------------------------------------------------------------------------- what is found
+
+
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_the_strength_of_a_lamp_is_found(photographs, method):
+    dataset = photographs("cornell")
+    problem, mean = fitted(dataset, "emission", method=method)
+    (light,) = recovered_lights(problem, dataset.folder)
+    print(light, mean)
+    assert light.truth == pytest.approx([13, 10, 6.5])
+    assert mean < 0.3  # where it began, far from the truth
+    assert light.emission_error < 0.05
+
+
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_low_frequencies_of_an_environment_are_found(photographs, method):
+    dataset = photographs("still")
+    truth = true_environment(dataset.folder)
+    problem, mean = fitted(dataset, "lighting", method=method)
+    found = sh_error(problem.environment.to_latlong(len(truth)), truth)
+    start = sh_error(np.full_like(truth, mean), truth)
+    print(found, start)
+    assert start > 0.7 and found < 0.6 * start
+
+
+def mean_albedo(problem, dataset):
+    rays = pixel_rays([view.camera for view in dataset.train], 1, 0)
+    si = problem.scene_view.scene.ray_intersect(rays)
+    with dr.suspend_grad():
+        albedo = np.array(problem.materials.evaluate(si, si.is_valid()).albedo)
+    return albedo[:, np.array(si.is_valid())].mean(1)
+
+
+def test_the_mean_albedo_is_the_convention_where_nothing_else_tells_it(photographs):
+    dataset = photographs("still")
+    assert dataset.background == "hidden"
+    means = {}
+    for anchor in (1.0, 0.0):
+        lighting = dataclasses.replace(FAST, mean_albedo=0.25, anchor=anchor)
+        problem, _ = fitted(dataset, "materials+lighting", lighting=lighting)
+        means[anchor] = mean_albedo(problem, dataset)
+    print(means)
+    np.testing.assert_allclose(means[1.0], 0.25, atol=0.03)
+    assert means[0.0].min() > 0.35
+    visible = dataclasses.replace(problem, hide_emitters=False)
+    assert not is_anchored(visible, dataclasses.replace(TINY_FIT, unknown="materials+lighting"))
+
+
+# ------------------------------------------------------------------------------------ gradients
+
+DEPTH = 4
+
+
+def radiance(problem, method, ray, seed):
+    """Radiance of camera rays by whole paths, as the training step asks for it."""
+    scene_view, sampler = problem.scene_view, seeded(seed, dr.width(ray))
+    if method == "prb":
+        replay = path_replay(DEPTH, DEPTH, hide_emitters=problem.hide_emitters)
+        with materials_along_paths(scene_view.materials):
+            return path_radiance(replay, scene_view.scene, sampler, ray, problem.read_by_scene())
+    wanted = requirements(METHODS["ad-pt"], DEPTH - 1)
+    sample = trace(scene_view, None, ray, sampler, wanted, hide_emitters=problem.hide_emitters)
+    return rhs(sample, sample.radiance[DEPTH - 1], DEPTH - 1)
+
+
+def weighted(radiance, spp):
+    """A linear objective of three numbers, the channels: means of samples with fixed weights."""
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, (3, dr.width(radiance) // spp))
+    weights = mi.Color3f(np.repeat(weights, spp, axis=1).astype(np.float32))
+    return [dr.mean(channel) for channel in weights * radiance]
+
+
+def with_gradients(built_in, name, unknown, method):
+    """A problem whose light is not the same everywhere, and its parameters."""
+    config = dataclasses.replace(TINY_FIT, unknown=unknown, method=method, lighting=FAST)
+    problem = make_problem(built_in(name), "visible", config, 0.5)
+    rng = np.random.default_rng(0)
+    values = {
+        key: type(value)(rng.normal(0, 0.5, value.shape).astype(np.float32))
+        for key, value in problem.parameters().items()
+    }
+    dr.enable_grad(values)
+    problem.assign(values)
+    return problem, values
+
+
+@pytest.mark.parametrize("method", ["prb", "ad-pt"])
+def test_gradients_of_the_log_of_a_strength_are_its_light(built_in, method):
+    """The picture is linear in the only light: so its own derivative by the log of that."""
+    problem, values = with_gradients(built_in, "cornell", "emission", method)
+    ray = pixel_rays(built_in_cameras("cornell", 12), 16, 1)
+    channels = weighted(radiance(problem, method, ray, 2), 16)
+    expected = [float(c[0]) for c in channels]
+    dr.backward(sum(channels))
+    assert min(expected) > 0.005
+    np.testing.assert_allclose(dr.grad(values["emission.log"]), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["prb", "ad-pt"])
+def test_gradients_reach_every_level_of_the_environment(built_in, method):
+    """Against finite differences. Sampling is detached: its tables stay as they are."""
+    problem, values = with_gradients(built_in, "still", "lighting", method)
+    ray = pixel_rays(built_in_cameras("still", 12), 16, 1)
+    dr.backward(sum(weighted(radiance(problem, method, ray, 2), 16)))
+    tables = {k: v for k, v in problem.environment.tables.items() if k != "texels"}
+    assert set(tables) == {"probability", "columns", "rows"}
+    rng = np.random.default_rng(4)
+    for name, value in values.items():
+        direction = rng.normal(0, 1, dr.width(value)).astype(np.float32)
+        direction *= np.sign(np.array(dr.grad(value)))  # or positive and negative would cancel
+
+        def moved(h, name=name, value=value, direction=direction):
+            with dr.suspend_grad():
+                problem.assign({**values, name: value + h * mi.Float(direction)})
+                problem.environment.tables.update(tables)
+                total = sum(weighted(radiance(problem, method, ray, 2), 16))
+                return float(total[0])
+
+        difference = (moved(0.02) - moved(-0.02)) / 0.04
+        gradient = np.dot(np.array(dr.grad(value), np.float64), direction)
+        print(name, gradient, difference)
+        assert abs(difference) > 1e-3, "a gradient of zero proves nothing"
+        assert gradient == pytest.approx(difference, rel=1e-2)
+
+
+@pytest.mark.parametrize("name", ["cornell", "still"])
+def test_replayed_paths_and_bounces_have_one_gradient(built_in, name):
+    unknown = {"cornell": "emission", "still": "lighting"}[name]
+    gradients = []
+    for method in ("prb", "ad-pt"):
+        problem, values = with_gradients(built_in, name, unknown, method)
+        ray = pixel_rays(built_in_cameras(name, 12), 1024, 1)
+        dr.backward(sum(weighted(radiance(problem, method, ray, 2), 1024)))
+        # Coarse texels: finer ones get few samples each.
+        first = next(iter(values.values()))
+        gradients.append(np.array(dr.grad(first), np.float64))
+    a, b = gradients
+    assert np.abs(a).max() > 1e-2
+    assert np.abs(a - b).max() < 0.03 * np.abs(a).max()
+
+
+# ------------------------------------------------------------------------------------ the step
+
+
+@contextmanager
+def one_thread():
+    """Sums come in one order, so that equal steps give equal numbers.
+
+    Scenes are to be loaded before: OpenEXR waits for ever for a second thread.
+    """
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
+
+
+def start(built_in, unknown, method, background="hidden"):
+    """A fresh fit of grey photographs: its step and its state."""
+    name = "cornell" if unknown == "emission" else "still"
+    config = dataclasses.replace(
+        TINY_FIT,
+        unknown=unknown,
+        method=method,
+        lighting=LightingConfig(resolution=8),
+        # Networks along paths, in virtual calls, take seconds to compile.
+        representation="grid" if method == "prb" else "neural",
+        grid=DenseGridConfig(albedo=5, roughness=3),
+    )
+    problem = make_problem(built_in(name), background, config, 0.2)
+    pixels = grey_photographs(built_in_cameras(name, 8, views=2))
+    return TrainingStep(problem, pixels, config), initial_state(problem)
+
+
+def rates(i):
+    """Learning rates that are others in each step, as those of a fit are."""
+    names = ("albedo", "roughness", "environment", "emission", "radiance")
+    return dict.fromkeys(names, 3e-3 * 0.9**i)
+
+
+def parameters(state):
+    return {
+        f"{name}.{key}": np.array(value).ravel().copy()
+        for name, optimizer in state.optimizers()
+        for key, value in optimizer.items()
+    }
+
+
+KINDS = ["lighting", "emission", "materials+lighting"]
+
+
+@pytest.mark.parametrize("unknown", KINDS)
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_frozen_and_unfrozen_steps_are_the_same(built_in, unknown, method):
+    frozen, state_a = start(built_in, unknown, method)
+    unfrozen, state_b = start(built_in, unknown, method)
+    before = parameters(state_a)
+    seen = []
+    with one_thread():
+        for i in range(5):
+            a = frozen(state_a, i, rates(i))
+            state_b.set_learning_rates(rates(i))
+            b = unfrozen.unfrozen(state_b, i)
+            assert a.keys() == b.keys()
+            assert ("mean_albedo" in a) == (unknown == "materials+lighting")
+            for term in a:
+                pair = float(a[term][0]), float(b[term][0])
+                np.testing.assert_allclose(*pair, rtol=1e-4, atol=1e-6)
+            seen.append(float(a["photometric"][0]))
+    after_a, after_b = parameters(state_a), parameters(state_b)
+    for name, values in after_a.items():
+        assert (values != before[name]).any(), f"{name} was not trained"
+        np.testing.assert_allclose(values, after_b[name], rtol=1e-4, atol=1e-5, err_msg=name)
+    assert len(set(seen)) == len(seen)
+    # The last steps were replayed: the comparison was not one of two traced steps.
+    assert frozen.recordings() < 5
+
+
+@pytest.mark.parametrize("unknown", KINDS)
+def test_nothing_is_compiled_or_traced_after_the_third_step(built_in, unknown):
+    step, state = start(built_in, unknown, "ours")
+    assert_only_replayed(step, state, rates)
+
+
+def test_a_fit_is_not_disturbed_by_light_of_another_one(built_in):
+    """A frozen function calls every emitter there is, and must find what it reads."""
+    steps = [start(built_in, unknown, "direct", "visible") for unknown in KINDS[:2]]
+    for i in range(5):
+        for step, state in steps:
+            assert np.isfinite(float(step(state, i, rates(i))["photometric"][0]))
+    assert all(step.recordings() <= 3 for step, _ in steps)
+
+
+# --------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    ("name", "unknown", "message"),
+    [
+        ("cornell", "lighting", "scene.xml: the scene has no environment map to fit. Add one"),
+        ("cornell", "materials+lighting", "scene.xml: the scene has no environment map to fit"),
+        ("still", "emission", "scene.xml: the scene has no light to fit: no area, point"),
+    ],
+)
+def test_a_scene_without_the_unknown_is_told_before_anything_is_written(
+    name, unknown, message, photographs, unbake, tmp_path
+):
+    data, run = photographs(name).folder, tmp_path / "run"
+    outcome = unbake("fit", data, "--out", run, "--unknown", unknown)
+    assert outcome.status == 2 and not run.exists()
+    assert outcome.err.startswith("error: ") and message in outcome.err
+    assert outcome.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("bounces", [0, 17, 1000])
+def test_bounces_that_would_not_fit_are_refused(bounces, unbake, tmp_path):
+    run = tmp_path / "run"
+    outcome = unbake("fit", "data", "--out", run, "--bounces", bounces)
+    assert outcome.status == 2 and not run.exists()
+    assert outcome.err.startswith("error: --bounces: must be 1 to 16")
+    assert outcome.err.count("\n") == 1
+    with pytest.raises(UserError, match="here.toml: bounces: must be 1 to 16"):
+        from_toml(f"bounces = {bounces}", "here.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("resolution = 12", "lighting.resolution: must be 8, 16, 32"),
+        ("learning_rate = 0.0", "lighting.learning_rate: must be positive"),
+        ("mean_albedo = 1.0", "lighting.mean_albedo: must be between 0 and 1"),
+        ("anchor = -1.0", "lighting.anchor: must be 0 or more"),
+    ],
+)
+def test_wrong_settings_of_lighting_are_named(text, message):
+    with pytest.raises(UserError, match=message):
+        from_toml(f"[lighting]\n{text}", "here.toml")

@@ -1,0 +1,104 @@
+"""Previews: one picture of what is learned above the truth, and lines for the log."""
+
+import dataclasses
+import io
+import json
+import shutil
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from rich.console import Console
+from support import TINY_FIT
+
+from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.config import LightingConfig
+from unbake.dataset.lights import ROWS, true_environment
+from unbake.dataset.views import Dataset
+from unbake.imaging.pictures import tonemap
+from unbake.training.checkpoint import Progress
+from unbake.training.monitor import Monitor
+from unbake.training.preview import Preview
+from unbake.training.problem import make_problem
+
+SIZE, GAP = 16, 2
+START = 0.2  # radiance of the untrained light
+AFTER = Progress(step=40, seconds=18.2, samples=1000)
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A data set under an environment, to be read alone."""
+    folder = tmp_path_factory.mktemp("captured") / "still"
+    small = CaptureSettings(views=2, held_out=1, resolution=SIZE, spp=4, max_depth=4)
+    capture("still", folder, small, tell=lambda line: None)
+    return folder
+
+
+def preview(data, unknown, folder):
+    """Of an untrained problem, written to `folder`: the problem, and the lines for the log."""
+    config = dataclasses.replace(TINY_FIT, unknown=unknown, lighting=LightingConfig(resolution=8))
+    dataset = Dataset.load(data)
+    problem = make_problem(dataset.scene, dataset.background, config, START)
+    return problem, Preview(problem, dataset, folder).show(AFTER)
+
+
+def picture(folder):
+    """The one picture of the folder, (H, W, 3) uint8."""
+    (file,) = folder.iterdir()
+    assert file.name == "step-000040.png"
+    return np.array(mi.Bitmap(str(file)))
+
+
+def tile(sheet, row, height, width, left=GAP):
+    """A tile of a sheet with rows of equal height."""
+    top = GAP + row * (height + GAP)
+    return sheet[top : top + height, left : left + width]
+
+
+def test_an_environment_is_shown_above_the_true_one(still, tmp_path):
+    problem, lines = preview(still, "lighting", tmp_path)
+    sheet = picture(tmp_path)
+    assert sheet.shape == (2 * ROWS + 3 * GAP, 2 * ROWS + 2 * GAP, 3)
+    assert lines == [] and problem.materials is None
+    learned, true = (tile(sheet, row, ROWS, 2 * ROWS) for row in (0, 1))
+    assert (learned == tonemap(np.float32(START))).all()
+    assert np.array_equal(true, tonemap(true_environment(still))) and true.std() > 10
+
+
+def test_without_truth_the_environment_is_shown_alone(still, tmp_path):
+    bare = tmp_path / "bare"
+    shutil.copytree(still, bare, ignore=shutil.ignore_patterns("truth"))
+    preview(bare, "lighting", tmp_path / "out")
+    assert picture(tmp_path / "out").shape == (ROWS + 2 * GAP, 2 * ROWS + 2 * GAP, 3)
+
+
+def test_materials_and_environment_share_a_sheet(still, tmp_path):
+    _, lines = preview(still, "materials+lighting", tmp_path)
+    sheet = picture(tmp_path)
+    materials = 2 * SIZE + 3 * GAP
+    assert sheet.shape == (materials + 2 * ROWS + 3 * GAP, 2 * ROWS + 2 * GAP, 3)
+    true = tile(sheet[materials:], 1, ROWS, 2 * ROWS)
+    assert np.array_equal(true, tonemap(true_environment(still)))
+    assert tile(sheet, 1, SIZE, SIZE).std() > 10  # true albedo
+    assert (sheet[:materials, 2 * SIZE + 3 * GAP :] == 255).all()
+    assert lines[0]["validation"].keys() == {"split", "albedo_psnr", "roughness_psnr"}
+
+
+def test_materials_alone_are_a_sheet_of_four(cornell, tmp_path):
+    _, lines = preview(cornell, "materials", tmp_path)
+    assert picture(tmp_path).shape == (2 * SIZE + 3 * GAP, 2 * SIZE + 3 * GAP, 3)
+    assert lines[0]["step"] == 40 and lines[0]["validation"]["split"] == "heldout"
+
+
+def test_lights_are_told_in_a_line_and_have_no_picture(cornell, tmp_path):
+    problem, lines = preview(cornell, "emission", tmp_path / "previews")
+    assert not (tmp_path / "previews").exists()
+    (name,) = problem.lights
+    assert lines[0]["validation"] == {"emission": {name: pytest.approx([START] * 3)}}
+    said = io.StringIO()
+    with Monitor(tmp_path / "log.jsonl", Console(file=said, width=200), 100) as monitor:
+        monitor.validation(lines[0])
+    assert said.getvalue() == f"step 40, 18 s: {name} 0.2 0.2 0.2\n"
+    logged = json.loads((tmp_path / "log.jsonl").read_text())
+    assert logged["validation"]["emission"].keys() == {name} and logged["step"] == 40

@@ -1,0 +1,90 @@
+"""Learning rates: they decay, those of the unknowns first rise, and every unknown has one."""
+
+import dataclasses
+
+import pytest
+from support import TINY_FIT
+
+from unbake.config import BitmapConfig, DenseGridConfig, FitConfig, LightingConfig
+from unbake.training.problem import make_problem
+from unbake.training.schedule import learning_rates
+from unbake.training.step import initial_state
+
+STEADY = FitConfig(
+    learning_rate=0.2,
+    roughness_learning_rate=0.05,
+    radiance_learning_rate=0.1,
+    final_learning_rate=0.01,
+    warm_up=0,
+    grid=DenseGridConfig(
+        learning_rate=0.3, roughness_learning_rate=0.4, radiance_learning_rate=0.5
+    ),
+    bitmap=BitmapConfig(learning_rate=0.6, roughness_learning_rate=0.7),
+    lighting=LightingConfig(learning_rate=0.8),
+)
+
+
+def changed(**settings):
+    return dataclasses.replace(STEADY, **settings)
+
+
+def test_all_rates_decay_exponentially_and_then_stay():
+    first, half, last, after = (learning_rates(STEADY, 9, done) for done in (0, 0.5, 1, 1.7))
+    for name, rate in first.items():
+        assert half[name] == pytest.approx(0.1 * rate)
+        assert last[name] == pytest.approx(0.01 * rate)
+    assert after == last
+    constant = changed(final_learning_rate=1.0)
+    assert learning_rates(constant, 9, 1) == learning_rates(constant, 9, 0)
+
+
+def test_rates_of_the_unknowns_rise_while_that_of_the_radiance_does_not():
+    rising = changed(warm_up=4)
+    full = learning_rates(rising, 100, 0)
+    for step, share in [(0, 0.2), (1, 0.4), (3, 0.8), (4, 1), (5, 1)]:
+        rates = learning_rates(rising, step, 0)
+        assert rates.pop("radiance") == 0.1
+        for name, rate in rates.items():
+            assert rate == pytest.approx(share * full[name]), (step, name)
+
+
+@pytest.mark.parametrize(
+    ("settings", "albedo", "roughness", "radiance"),
+    [
+        ({}, 0.2, 0.05, 0.1),
+        ({"representation": "grid"}, 0.3, 0.4, 0.1),
+        ({"representation": "bitmap"}, 0.6, 0.7, 0.1),
+        ({"radiance_representation": "grid"}, 0.2, 0.05, 0.5),
+        ({"representation": "grid", "radiance_representation": "grid"}, 0.3, 0.4, 0.5),
+    ],
+    ids=["networks", "grid", "bitmap", "radiance grid", "both grids"],
+)
+def test_each_representation_has_its_rates(settings, albedo, roughness, radiance):
+    lighting = {"environment": 0.8, "emission": 0.8}
+    expected = {"albedo": albedo, "roughness": roughness, "radiance": radiance} | lighting
+    assert learning_rates(changed(**settings), 0, 0) == expected
+
+
+@pytest.mark.parametrize("representation", ["neural", "grid", "bitmap"])
+@pytest.mark.parametrize("unknown", ["materials", "lighting", "materials+lighting", "emission"])
+def test_every_parameter_has_a_rate(unknown, representation, built_in):
+    small = {"grid": DenseGridConfig(albedo=4, roughness=4), "bitmap": BitmapConfig(albedo=4)}
+    config = dataclasses.replace(TINY_FIT, unknown=unknown, representation=representation, **small)
+    scene = "cornell" if unknown in ("materials", "emission") else "still"
+    problem = make_problem(built_in(scene), "visible", config, 0.2)
+    state, rates = initial_state(problem), learning_rates(config, 0, 0)
+    state.set_learning_rates(rates)
+    assert len(state.phi) > 0
+    for name in state.phi:
+        word = name.partition(".")[0]
+        assert float(state.phi.learning_rate(name)[0]) == pytest.approx(rates[word])
+    words = {name.partition(".")[0] for name in state.phi}
+    assert (
+        words
+        == {
+            "materials": {"albedo", "roughness"},
+            "lighting": {"environment"},
+            "materials+lighting": {"albedo", "roughness", "environment"},
+            "emission": {"emission"},
+        }[unknown]
+    )

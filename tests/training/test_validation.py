@@ -1,0 +1,155 @@
+"""Scores in training are the numbers of an evaluation, and cost no training."""
+
+import dataclasses
+import json
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from unbake.config import read_toml
+from unbake.errors import UserError
+from unbake.evaluation.evaluate import EvaluationSettings, evaluate
+from unbake.imaging.pictures import read_exr, write_exr
+from unbake.training.loop import TIME_EVERY, fit
+from unbake.training.recovered import load_run
+from unbake.training.validation import GroundTruth, MaterialBuffers, Score
+
+FEW = EvaluationSettings(spp=2, max_depth=3, train_views=0)
+
+
+@pytest.fixture(scope="module")
+def scored(cornell, tiny, tmp_path_factory):
+    """A run with a score at every reading of the loss."""
+    run = tmp_path_factory.mktemp("scored") / "run"
+    config = dataclasses.replace(read_toml(tiny), steps=24, method="direct", score_seconds=1e-9)
+    fit(cornell, run, config)
+    return run
+
+
+def lines(run):
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def test_scores_are_logged_from_start_to_end(scored):
+    log = [line for line in lines(scored) if "score" in line]
+    assert [line["step"] for line in log] == list(range(0, 25, TIME_EVERY))
+    for line in log:
+        assert {"step", "seconds", "samples", "score"} <= line.keys()
+        assert line["score"]["views"] == 1
+        assert line["samples"] == 256 * line["step"]
+        assert all(np.isfinite(line["score"][k]) for k in ("albedo_psnr", "roughness_psnr"))
+    assert len({line["score"]["albedo_psnr"] for line in log}) == len(log)
+
+
+def test_a_score_is_what_an_evaluation_says(scored):
+    recovered = load_run(scored)
+    score = Score(recovered.problem, recovered.dataset.heldout)
+    logged, said = lines(scored)[-2]["score"], evaluate(scored, FEW, tell=lambda line: None)
+    assert score.measure() == pytest.approx(logged, abs=1e-3)
+    for key in ("albedo_psnr", "roughness_psnr"):
+        # One held-out view: with the same samples and seed, the same picture.
+        same = score.measure(spp=FEW.material_spp, seed=1)
+        assert same[key] == pytest.approx(said["heldout"][key], abs=1e-5)
+        assert logged[key] == pytest.approx(said["heldout"][key], abs=0.5)
+
+
+def test_every_view_gets_its_own_pixels(scored, monkeypatch):
+    recovered = load_run(scored)
+    views = [
+        dataclasses.replace(v, camera=dataclasses.replace(v.camera, width=3 + i, height=2))
+        for i, v in enumerate(recovered.dataset.views)
+    ]
+
+    def numbered(scene_view, through, pixels, spp, *, seed):
+        number = np.arange(pixels, dtype=np.float32)
+        return np.stack([number] * 3, -1), number + 0.25, number + 0.5
+
+    monkeypatch.setattr("unbake.training.validation.render_materials", numbered)
+    seen = MaterialBuffers.of(recovered.problem, views, 4, seed=0)
+    assert [s.coverage.shape for s in seen] == [(2, 3), (2, 4), (2, 5)]
+    for part, first in zip(seen, (0, 6, 14), strict=True):
+        expected = first + np.arange(part.coverage.size).reshape(part.coverage.shape)
+        assert np.array_equal(part.albedo[..., 2], expected)
+        assert np.array_equal(part.roughness, expected + 0.25)
+        assert np.array_equal(part.coverage, expected + 0.5)
+
+
+def test_pixels_that_see_other_things_do_not_count():
+    known = np.array([[True, True, True, False]])
+    truth = GroundTruth(np.full((1, 4, 3), 0.5), np.full((1, 4), 0.5), known)
+    albedo, roughness = np.full((1, 4, 3), 0.5), np.full((1, 4), 0.5)
+    albedo[0, 0], roughness[0, 0] = 0.6, 0.4
+    albedo[0, 2:], roughness[0, 2:] = 1e6, np.nan
+    seen = MaterialBuffers(albedo, roughness, np.array([[1, 1, 0.75, 1]]))
+    assert seen.mask(truth).tolist() == [[True, True, False, False]]
+    expected = 10 * np.log10(2 / 0.1**2)
+    assert seen.psnr(truth) == pytest.approx({"albedo_psnr": expected, "roughness_psnr": expected})
+
+
+def test_what_cannot_be_compared_has_no_number(scored):
+    recovered = load_run(scored)
+    view = recovered.dataset.heldout[0]
+    nameless = dataclasses.replace(view, albedo=None)
+    assert GroundTruth.of(nameless) is None
+    empty = {"views": 0, "albedo_psnr": None, "roughness_psnr": None}
+    assert Score(recovered.problem, [nameless]).measure() == empty
+    truth, (seen,) = GroundTruth.of(view), MaterialBuffers.of(recovered.problem, [view], 4, seed=0)
+    nothing = dataclasses.replace(truth, known=np.zeros_like(truth.known))
+    assert seen.psnr(nothing) == {"albedo_psnr": None, "roughness_psnr": None}
+    equal = dataclasses.replace(truth, albedo=seen.albedo)
+    assert seen.psnr(equal)["albedo_psnr"] is None
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.0, 0), (1e9, 2)])
+def test_scores_are_as_frequent_as_asked_for(seconds, count, cornell, tiny, tmp_path):
+    config = read_toml(tiny)
+    config = dataclasses.replace(config, steps=6, method="direct", score_seconds=seconds)
+    fit(cornell, tmp_path / "run", config)
+    found = [line["step"] for line in lines(tmp_path / "run") if "score" in line]
+    assert found == [0, 6][:count]
+
+
+def test_a_resumed_fit_goes_on_with_its_scores(cornell, tiny, tmp_path):
+    run = tmp_path / "run"
+    config = dataclasses.replace(read_toml(tiny), steps=3, method="direct", score_seconds=1e-9)
+    fit(cornell, run, config)
+    fit(cornell, run, dataclasses.replace(config, steps=5), resume=True)
+    assert [line["step"] for line in lines(run) if "score" in line] == [0, 3, 4, 5]
+
+
+def test_scoring_is_not_part_of_the_training_time(cornell, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(Score, "measure", lambda self: time.sleep(0.5) or {"views": 0})
+    config = dataclasses.replace(read_toml(tiny), steps=12, method="direct", score_seconds=1e-9)
+    start = time.perf_counter()
+    progress = fit(cornell, tmp_path / "run", config)
+    assert time.perf_counter() - start > (1 + 12 / TIME_EVERY) * 0.5
+    # Between the last steps nothing is compiled any more.
+    log = [line for line in lines(tmp_path / "run") if "score" in line]
+    assert log[-1]["seconds"] == pytest.approx(progress.seconds, abs=1e-6)
+    assert min(b["seconds"] - a["seconds"] for a, b in zip(log, log[1:], strict=False)) < 0.4
+
+
+def test_a_truth_that_cannot_be_read_is_named_before_anything_is_written(cornell, tiny, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    image = data / "truth" / "albedo" / "heldout_000.exr"
+    write_exr(image, np.full_like(read_exr(image), np.nan))
+    config = dataclasses.replace(read_toml(tiny), steps=2, score_seconds=1.0)
+    with pytest.raises(UserError, match=r"heldout_000\.exr"):
+        fit(data, tmp_path / "run", config)
+    assert not (tmp_path / "run").exists()
+
+
+def test_known_materials_are_not_evaluated(scored, tmp_path, monkeypatch):
+    run = shutil.copytree(scored, tmp_path / "run", ignore=shutil.ignore_patterns("evaluation"))
+    recovered = load_run(run)
+    recovered.config = dataclasses.replace(recovered.config, unknown="lighting")
+    monkeypatch.setattr("unbake.evaluation.evaluate.load_run", lambda folder: recovered)
+    metrics = evaluate(run, FEW, tell=lambda line: None)
+    assert metrics["unknown"] == "lighting" and metrics["representation"] is None
+    heldout = metrics["heldout"]
+    assert heldout["albedo_psnr"] is heldout["roughness_psnr"] is None
+    assert np.isfinite(heldout["render_psnr"])
+    written = {p.name for p in (run / "evaluation" / "heldout").iterdir()}
+    assert written == {"heldout_000_render.exr", "heldout_000_render.png"}

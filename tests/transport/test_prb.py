@@ -1,0 +1,188 @@
+"""What Mitsuba's path replay gives when it is asked for samples, and what it leaves behind."""
+
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import (
+    TINY_FIT,
+    ConstantMaterials,
+    assert_same_expectation,
+    built_in_cameras,
+    pixel_rays,
+    seeded,
+    stock_path,
+)
+
+from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.fields.texture import material_textures
+from unbake.scene import parse as scenes
+from unbake.training.problem import make_problem
+from unbake.transport.objective import pixel_means, squared_error
+from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
+
+DEPTH = 4
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return pixel_rays(built_in_cameras("cornell", 16), 16, seed=1)
+
+
+@pytest.fixture(scope="module")
+def neural(built_in):
+    """The Cornell box with neural materials that are not smooth."""
+    problem = make_problem(built_in("cornell"), "visible", TINY_FIT, 0.2)
+    rng = np.random.default_rng(1)
+    phi = {k: type(v)(v) for k, v in problem.materials.parameters().items()}
+    for key in (k for k in phi if k.endswith("grid")):
+        phi[key] = mi.Float(rng.uniform(-1, 1, dr.width(phi[key])).astype(np.float32))
+    return problem, phi
+
+
+def backpropagated(neural, ray, *, inside_textures=False):
+    """Radiance, and the gradients of a weighted sum of it."""
+    problem, phi = neural
+    phi = {k: type(v)(v) for k, v in phi.items()}
+    dr.enable_grad(phi)
+    problem.materials.assign(phi)
+    integrator = path_replay(DEPTH, DEPTH, False)
+    with materials_along_paths(problem.materials):
+        problem.materials.carried &= not inside_textures
+        sampler = seeded(2, dr.width(ray))
+        image = path_radiance(integrator, problem.scene_view.scene, sampler, ray, phi)
+        dr.backward(dr.mean(image.x + 2 * image.y + 3 * image.z))
+    return np.array(dr.detach(image)), {k: np.array(dr.grad(v)).ravel() for k, v in phi.items()}
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_radiance_is_that_of_mitsubas_path_tracer(built_in, hidden):
+    scene = mi.load_file(str(built_in("cornell")))
+    ray = pixel_rays(built_in_cameras("cornell", 16), 64, seed=1)
+    integrator = path_replay(6, 5, hidden)
+    ours = path_radiance(integrator, scene, seeded(2, dr.width(ray)), ray, {})
+    theirs = stock_path(scene, ray, 3, max_depth=6, hide_emitters=hidden)
+    assert_same_expectation(ours, theirs, 64)
+
+
+def test_prb_asks_the_fields_once_a_vertex_with_the_result_of_textures(neural, rays):
+    image, gradients = backpropagated(neural, rays)
+    expected, others = backpropagated(neural, rays, inside_textures=True)
+    np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
+    for key, gradient in gradients.items():
+        assert np.abs(gradient).max() > 0, key
+        scale = np.abs(others[key]).max()
+        np.testing.assert_allclose(gradient / scale, others[key] / scale, atol=1e-4, err_msg=key)
+
+
+def test_paths_leave_nothing_behind(neural):
+    problem, _ = neural
+    interaction = mi.PreliminaryIntersection3f.compute_surface_interaction
+    assert problem.materials.carried
+    with pytest.raises(ZeroDivisionError), materials_along_paths(problem.materials):
+        assert problem.materials.carried
+        raise ZeroDivisionError
+    assert problem.materials.carried
+    assert mi.PreliminaryIntersection3f.compute_surface_interaction is interaction
+    with materials_along_paths(None):
+        assert mi.PreliminaryIntersection3f.compute_surface_interaction is interaction
+
+
+def test_the_sampler_goes_on(built_in):
+    """A second pass has other random numbers, as a second estimate needs."""
+    scene = mi.load_file(str(built_in("cornell")))
+    ray = pixel_rays(built_in_cameras("cornell", 16), 1, seed=1)
+    # Each ray 32 times: only what happens along the path makes the samples differ.
+    ray = dr.gather(mi.Ray3f, ray, dr.arange(mi.UInt32, 32 * dr.width(ray)) // 32)
+    integrator, sampler = path_replay(4, 4, False), seeded(2, dr.width(ray))
+    passes = [path_radiance(integrator, scene, sampler, ray, {}).y for _ in range(2)]
+    a, b = (x - x.mean(1)[:, None] for x in (np.array(x).reshape(-1, 32) for x in passes))
+    correlation = (a * b).mean() / np.sqrt((a**2).mean() * (b**2).mean())
+    print(f"{correlation:.4f}")
+    assert abs(correlation) < 0.05
+
+
+LIT_OBJECT = """<scene version="3.0.0">
+  <bsdf type="principled" id="grey"><rgb name="base_color" value="0.5"/></bsdf>
+  <shape type="sphere"><ref id="grey"/></shape>
+  <shape type="rectangle">
+    <transform name="to_world">
+      <scale value="0.5"/>
+      <lookat origin="0, -1.5, 1.5" target="0, 0, 0" up="0, 0, 1"/>
+    </transform>
+    <emitter type="area"><rgb name="radiance" value="4"/></emitter>
+  </shape>
+  <emitter type="constant"><rgb name="radiance" value="0.7"/></emitter>
+</scene>"""
+
+
+def test_hidden_lights_are_those_of_the_photographs(tmp_path):
+    (tmp_path / "lit.xml").write_text(LIT_OBJECT)
+    settings = CaptureSettings(views=2, held_out=0, resolution=16, spp=256, max_depth=5, rr_depth=5)
+    dataset = capture(str(tmp_path / "lit.xml"), tmp_path / "data", settings, tell=lambda _: None)
+    assert dataset.background == "hidden"
+    scene = mi.load_file(str(dataset.scene))
+    cameras = [view.camera for view in dataset.views]
+    ray = pixel_rays(cameras, 256, seed=1)
+    integrator = path_replay(5, 5, True)
+    radiance = path_radiance(integrator, scene, seeded(2, dr.width(ray)), ray, {})
+    image = np.array(pixel_means(radiance, 256)).T
+    photographs = np.concatenate(
+        [np.array(mi.Bitmap(str(v.image)))[..., :3].reshape(-1, 3) for v in dataset.views]
+    )
+    assert (photographs == 0).any(), "no background"
+    np.testing.assert_allclose(image.mean(), photographs.mean(), rtol=5e-3)
+    # Neither environment nor light in view: 0.7 and 4 would show.
+    np.testing.assert_allclose(image, photographs, atol=0.1)
+
+
+# ----------------------------------------------------------------- split halves and two passes
+
+
+class Everywhere(ConstantMaterials):
+    def stand_alone(self):
+        self.carried = False
+
+
+def test_split_halves_and_two_passes_have_one_expectation(built_in):
+    materials = Everywhere(0.6, 0.4)
+    parsed = scenes.parse(built_in("cornell"))
+    scenes.to_principled(parsed)
+    scenes.set_textures(parsed, *material_textures(materials))
+    scene = parsed.instantiate()
+    spp, integrator = 4, path_replay(3, 3, False)
+    cameras = built_in_cameras("cornell", 16)
+    target, weight = mi.Color3f(0.1), mi.Color3f(1)
+    target += dr.zeros(mi.Float, 16 * 16)
+
+    def gradient(seed, halves):
+        materials.albedo = mi.Color3f(0.6)
+        dr.enable_grad(materials.albedo)
+        sampler, phi = seeded(seed, 16 * 16 * spp), {"albedo": materials.albedo}
+        # Rays, too, are others in each pass: where in a pixel they start is part of the noise.
+        ray, other = (pixel_rays(cameras, spp, seed + offset) for offset in (1000, 2000))
+        with materials_along_paths(materials):
+            primal = None
+            if not halves:
+                with dr.suspend_grad():
+                    again = path_radiance(integrator, scene, sampler, other, phi)
+                    primal = pixel_means(again, spp)
+            image = path_radiance(integrator, scene, sampler, ray, phi)
+            dr.backward(squared_error(image, target, spp, weight, primal))
+        return float(dr.grad(materials.albedo).x[0])
+
+    estimates = [np.array([gradient(s, halves) for s in range(60)]) for halves in (True, False)]
+    a, b = (x.mean() for x in estimates)
+    error = np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in estimates))
+    print(f"{a:.5f} and {b:.5f}, standard error {error:.5f}")
+    assert abs(a - b) < 3.5 * error
+    assert error < 0.1 * abs(a), "the test sees nothing"
+
+
+def test_settings_reach_the_integrator():
+    config = dataclasses.replace(TINY_FIT, method="prb")
+    integrator = path_replay(config.path.max_depth, config.path.rr_depth, True)
+    assert (integrator.max_depth, integrator.rr_depth) == (15, 5)
+    assert integrator.hide_emitters
