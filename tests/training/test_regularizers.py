@@ -174,7 +174,7 @@ LAMP = '<emitter type="point"><rgb name="intensity" value="1"/></emitter></scene
 
 
 @pytest.mark.parametrize(
-    ("background", "lamp", "anchor", "anchored"),
+    ("background", "known_light", "anchor", "anchored"),
     [
         ("hidden", False, 1.0, True),
         ("visible", False, 1.0, False),
@@ -184,10 +184,10 @@ LAMP = '<emitter type="point"><rgb name="intensity" value="1"/></emitter></scene
     ids=["hidden background", "visible background", "a known lamp", "no weight"],
 )
 def test_the_scale_is_a_convention_where_photographs_do_not_tell_it(
-    background, on_emitter, anchor, anchored, built_in
+    background, known_light, anchor, anchored, built_in
 ):
     path = built_in("still")
-    if on_emitter:
+    if known_light:
         text = path.read_text().replace("</scene>", LAMP)
         path = path.with_name("with_lamp.xml")
         path.write_text(text)

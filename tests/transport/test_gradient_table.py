@@ -97,7 +97,7 @@ def test_nothing_beyond_the_second_vertex_passes_gradients(problem, rays):
 
 
 @pytest.mark.parametrize("reference", LOSSES)
-@pytest.mark.parametrize(("term", "live"), SYNTHETIC)
+@pytest.mark.parametrize(("term", "attached"), SYNTHETIC)
 def test_a_row_makes_those_pieces_live_that_it_says(problem, rays, term, attached, reference):
     sample, arrays = with_live_pieces(traced(problem, rays))
     values = objective({term: attached}, sample, photographs(rays), SPP, LOSSES[reference])
