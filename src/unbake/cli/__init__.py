@@ -393,10 +393,10 @@ def reproduce(
         plan: Only tell what is left to do, and how long it will take on this machine.
     """
     backend.activate()
-    from ..experiments.experiment import Setting
+    from ..experiments.experiment import ExperimentContext
     from ..experiments.experiment import reproduce as run
 
-    run(experiments.load(what), Setting(scale, out, scenes), plan=plan)
+    run(experiments.load(what), ExperimentContext(scale, out, scenes), plan=plan)
 
 
 def doctor() -> int:

@@ -29,7 +29,8 @@ class Estimates:
         image: with all light.
         derivative: of it.
         cut: by longest path (Mitsuba's meaning, 2 is direct light): image and derivative.
-        live: by the number k of differentiable bounces: the derivative with an exact L after them.
+        attached: by the number k of differentiable bounces, the derivative with an exact L after
+            them.
     """
 
     image: np.ndarray
@@ -62,13 +63,13 @@ def estimate(
         value: of the parameter.
         max_depth: longest path that counts as all light.
         cut: longest paths of methods that end them earlier.
-        live: numbers k.
+        attached: numbers k of differentiable bounces.
 
     Paper: Fig. 4, Sec. 6.3.
     """
     names = ["image", "derivative"]
     names += [f"{what} {depth}" for depth in cut for what in ("cut", "cut'")]
-    names += [f"live {k}" for k in attached]
+    names += [f"attached {k}" for k in attached]
     sums = {name: np.zeros((pixels, 3)) for name in names}
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
         found = _along(
@@ -81,7 +82,7 @@ def estimate(
         sums["image"],
         sums["derivative"],
         {depth: (sums[f"cut {depth}"], sums[f"cut' {depth}"]) for depth in cut},
-        {k: sums[f"live {k}"] for k in attached},
+        {k: sums[f"attached {k}"] for k in attached},
     )
 
 
@@ -147,7 +148,7 @@ def _along(
     for depth in cut:  # where all paths had ended before
         found.setdefault(f"cut {depth}", total)
         found.setdefault(f"cut' {depth}", dtotal[max_depth])
-    return found | {f"live {k}": dtotal[k] for k in attached}
+    return found | {f"attached {k}": dtotal[k] for k in attached}
 
 
 def _reseed(sampler: mi.Sampler, seed: int, number: int, lanes: int) -> None:

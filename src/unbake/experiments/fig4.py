@@ -36,7 +36,7 @@ from .scenes import STAIRCASE
 #: Roughness of the wood of stairs and picture frames: where it is, and where it should be.
 VALUES = tuple(round(0.2 + 0.05 * i, 2) for i in range(15))
 #: Longest paths of PRB, and differentiable bounces of ours.
-CUTS, LIVE = (2, 4, 10, 15, 30), (1, 2, 4)
+CUTS, ATTACHED = (2, 4, 10, 15, 30), (1, 2, 4)
 #: The wood's texture: its materials have no names.
 WOOD = "WoodPanel"
 #: All light, in practice: Russian roulette ends paths before.
@@ -53,7 +53,7 @@ METHODS = (
     "reference",
     "direct",
     *(f"PRB {depth}" for depth in CUTS),
-    *(f"ours, k = {k}" for k in LIVE),
+    *(f"ours, k = {k}" for k in ATTACHED),
 )
 #: The authors' values: method, current and target roughness, gradient.
 _PUBLISHED = Path(__file__).parent / "published" / "fig4.csv"
@@ -102,7 +102,7 @@ class _Wood:
             seed=seed,
             max_depth=MAX_DEPTH,
             cut=CUTS,
-            live=LIVE,
+            attached=ATTACHED,
         )
 
 
@@ -194,7 +194,7 @@ def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """What each method takes for the image, and for its derivative."""
     found = {"reference": (e.image, e.derivative), "direct": e.cut[2]}
     found |= {f"PRB {depth}": e.cut[depth] for depth in CUTS}
-    return found | {f"ours, k = {k}": (e.image, e.live[k]) for k in LIVE}
+    return found | {f"ours, k = {k}": (e.image, e.attached[k]) for k in ATTACHED}
 
 
 def _pictures(context: ExperimentContext, shrunk: int, spp: int, zoom: int) -> Findings:
