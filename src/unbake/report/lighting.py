@@ -93,7 +93,7 @@ def _lights(runs: list[Run]) -> list[dict[str, Any]] | None:
         truth = next((light["truth"] for light in said if light.get("truth")), None)
         errors = [display.number(light.get("emission_error")) for light in said]
         cells = [
-            cell | {"strength": _colour(light.get("strength")), "sought": run.seeks("emission")}
+            cell | {"strength": _colour(light.get("strength")), "optimized": run.seeks("emission")}
             for cell, light, run in zip(
                 display.marked(errors, display.percent, min), said, runs, strict=True
             )

@@ -62,7 +62,7 @@ AXES = {"step": "step", "seconds": "training time, seconds"}  # key in the log: 
 
 @final
 @dataclass(frozen=True)
-class Display:
+class Scaling:
     """How values become colours, the same for every run and view, so that they compare."""
 
     exposure: float  # stops
@@ -94,12 +94,12 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
     data = data_folder(loaded)
     transforms = read_json(data / "transforms.json", "Give back the data that the run was fit to")
     views = read_views(data, transforms, loaded)
-    display = _display(loaded, views)
+    scaling = _scaling(loaded, views)
     groups = [
         {
             "split": split,
             "total": sum(frame.get("split") == split for frame in transforms["frames"]),
-            "views": [_view_block(view, loaded, display) for view in views if view.split == split],
+            "views": [_view_block(view, loaded, scaling) for view in views if view.split == split],
         }
         for split in SPLITS
     ]
@@ -117,7 +117,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             materials=any(run.seeks("albedo") for run in loaded),
             failed=failed or {},
             groups=groups,
-            display=display,
+            exposure=scaling.exposure,
             longest=display.LONGEST_SIDE,
             magma=pictures.MAGMA,
             chart=charts,
@@ -147,7 +147,7 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
     return display.evaluated(run, f"{view.split}/{view.name}_{quantity}.exr")
 
 
-def _display(runs: list[Run], views: list[View]) -> Display:
+def _scaling(runs: list[Run], views: list[View]) -> Scaling:
     """Exposure and error scales that suit all pictures of the page at once."""
     light: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
@@ -162,26 +162,26 @@ def _display(runs: list[Run], views: list[View]) -> Display:
                     error = display.error(display.rgb(recovered)[0], reference, recovered)
                     parts.append(display.sample(error[mask]))
     scales = {quantity: display.error_scale(errors[quantity]) for quantity in QUANTITIES}
-    return Display(display.exposure(light), scales)
+    return Scaling(display.exposure(light), scales)
 
 
-def _view_block(view: View, runs: list[Run], display: Display) -> dict[str, Any]:
+def _view_block(view: View, runs: list[Run], scaling: Scaling) -> dict[str, Any]:
     """A view's pictures for the template: a column a quantity, in it truth and runs."""
     height, width = display.rgb(view.truth["render"])[0].shape[:2]
     quantities = [q for q in QUANTITIES if any(run.seeks(q) for run in runs)]
-    columns = [_column(view, runs, quantity, display) for quantity in quantities]
+    columns = [_column(view, runs, quantity, scaling) for quantity in quantities]
     return {"name": view.name, "width": width, "height": height, "columns": columns}
 
 
-def _column(view: View, runs: list[Run], quantity: str, display: Display) -> dict[str, Any]:
+def _column(view: View, runs: list[Run], quantity: str, scaling: Scaling) -> dict[str, Any]:
     def paint(linear: np.ndarray) -> str:
         if quantity == "roughness":
             small = pictures.shrink(linear, display.LONGEST_SIDE)
             return pictures.png_data_uri(pictures.to_bytes(small))
-        return display.tonemapped(linear, display.exposure if quantity == "render" else 0.0)
+        return display.tonemapped(linear, scaling.exposure if quantity == "render" else 0.0)
 
     values = [display.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
-    scale = display.error[quantity]
+    scale = scaling.error[quantity]
     reference, mask = display.rgb(view.truth[quantity]) if quantity in view.truth else (None, None)
     cells = []
     for run, psnr in zip(runs, display.marked(values, display.decibels), strict=True):
