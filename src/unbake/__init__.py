@@ -1,47 +1,132 @@
-"""unbake: materials or lighting from photographs, with the global illumination taken out.
+"""Recovers materials or lighting from photographs, with the global illumination taken out.
 
-The public names below are loaded when they are first used, after a Mitsuba variant has been chosen
-with `activate`:
-
+    from pathlib import Path
     import unbake
+
     unbake.activate()
     unbake.capture("demo", Path("data"), unbake.CaptureSettings())
     unbake.fit(Path("data"), Path("run"), unbake.preset("cpu"))
     unbake.evaluate(Path("run"))
     unbake.write_report([Path("run")], Path("report.html"))
+
+`import unbake` loads neither Mitsuba nor Dr.Jit. A public name is loaded when it is first used; if
+it needs Mitsuba and no variant has been chosen, `activate()` chooses one for this machine.
 """
 
 from __future__ import annotations
 
 import importlib
+from typing import TYPE_CHECKING
+
+from .errors import UserError as UserError
+
+if TYPE_CHECKING:
+    from .acquisition.capture import CaptureSettings as CaptureSettings
+    from .acquisition.capture import capture as capture
+    from .backend import activate as activate
+    from .config import FitConfig as FitConfig
+    from .config import preset as preset
+    from .config import read_toml as read_toml
+    from .config import to_toml as to_toml
+    from .dataset.camera import Camera as Camera
+    from .dataset.pixels import CameraRays as CameraRays
+    from .dataset.pixels import PixelBatch as PixelBatch
+    from .dataset.pixels import PixelSource as PixelSource
+    from .dataset.pixels import RayBatch as RayBatch
+    from .dataset.views import Dataset as Dataset
+    from .dataset.views import View as View
+    from .evaluation.evaluate import EvaluationSettings as EvaluationSettings
+    from .evaluation.evaluate import evaluate as evaluate
+    from .fields.domain import SurfacePoint as SurfacePoint
+    from .fields.materials import Material as Material
+    from .fields.materials import Materials as Materials
+    from .fields.radiance import RadianceField as RadianceField
+    from .report.page import write_report as write_report
+    from .training.checkpoint import Progress as Progress
+    from .training.checkpoint import load_checkpoint as load_checkpoint
+    from .training.checkpoint import save_checkpoint as save_checkpoint
+    from .training.loop import fit as fit
+    from .training.problem import Problem as Problem
+    from .training.problem import make_problem as make_problem
+    from .training.problem import training_pixels as training_pixels
+    from .training.recovered import load_run as load_run
+    from .training.schedule import learning_rates as learning_rates
+    from .training.step import State as State
+    from .training.step import TrainingStep as TrainingStep
+    from .training.step import initial_state as initial_state
+    from .transport.objective import METHODS as METHODS
+    from .transport.objective import Attached as Attached
+    from .transport.objective import RelativeL2 as RelativeL2
+    from .transport.objective import objective as objective
+    from .transport.objective import requirements as requirements
+    from .transport.path_sample import PathSample as PathSample
+    from .transport.path_sample import Requirements as Requirements
+    from .transport.path_sample import lhs as lhs
+    from .transport.path_sample import rhs as rhs
+    from .transport.path_sample import trace as trace
+    from .transport.path_tracer import path_traced as path_traced
+    from .transport.render import render_radiance as render_radiance
+    from .transport.vertex import SceneView as SceneView
+    from .transport.vertex import Vertex as Vertex
 
 __version__ = "0.1.0"
 
-_HOME = {
-    "activate": "backend",
-    "FitConfig": "config",
-    "preset": "config",
-    "read_toml": "config",
-    "to_toml": "config",
-    "UserError": "errors",
-    "CaptureSettings": "acquisition.capture",
-    "capture": "acquisition.capture",
-    "Dataset": "dataset.views",
-    "fit": "training.loop",
-    "load_run": "training.recovered",
-    "EvaluationSettings": "evaluation.evaluate",
-    "evaluate": "evaluation.evaluate",
-    "write_report": "report.page",
+# The public names by module. A new one goes here and, for type checkers, into the block above.
+_MODULES: dict[str, tuple[str, ...]] = {
+    # The commands.
+    "backend": ("activate",),
+    "errors": ("UserError",),
+    "config": ("FitConfig", "preset", "read_toml", "to_toml"),
+    "acquisition.capture": ("CaptureSettings", "capture"),
+    "training.loop": ("fit",),
+    "training.recovered": ("load_run",),
+    "evaluation.evaluate": ("EvaluationSettings", "evaluate"),
+    "report.page": ("write_report",),
+    # Data sets.
+    "dataset.camera": ("Camera",),
+    "dataset.pixels": ("CameraRays", "PixelBatch", "PixelSource", "RayBatch"),
+    "dataset.views": ("Dataset", "View"),
+    # Unknowns: fields on surfaces.
+    "fields.domain": ("SurfacePoint",),
+    "fields.materials": ("Material", "Materials"),
+    "fields.radiance": ("RadianceField",),
+    # Light transport and the objective.
+    "transport.objective": ("METHODS", "Attached", "RelativeL2", "objective", "requirements"),
+    "transport.path_sample": ("PathSample", "Requirements", "lhs", "rhs", "trace"),
+    "transport.path_tracer": ("path_traced",),
+    "transport.render": ("render_radiance",),
+    "transport.vertex": ("SceneView", "Vertex"),
+    # The parts of a training loop.
+    "training.checkpoint": ("Progress", "load_checkpoint", "save_checkpoint"),
+    "training.problem": ("Problem", "make_problem", "training_pixels"),
+    "training.schedule": ("learning_rates",),
+    "training.step": ("State", "TrainingStep", "initial_state"),
 }
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = sorted(_HOME)
+# Modules above that are imported without Mitsuba.
+_PURE = frozenset({"backend", "config", "errors"})
+
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+class _NoVariant(UserError, AttributeError):
+    """No variant runs here. As an AttributeError too, so that `help` and `hasattr` go on."""
 
 
 def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    module = _HOME[name]
+    if module not in _PURE:
+        from .backend import activate
+
+        try:
+            activate()
+        except UserError as error:
+            raise _NoVariant(error.what, error.where, error.remedy) from None
+    return getattr(importlib.import_module(f".{module}", __name__), name)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,105 @@
+"""The names of `import unbake`: what a script or a notebook meets first."""
+
+import ast
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import unbake
+
+PACKAGE = Path(unbake.__file__).parent
+
+
+def fresh(code: str, **environment: str) -> str:
+    """What a new interpreter prints that runs this code."""
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"PYTHONPATH": str(PACKAGE.parent), **environment},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+def names_for_type_checkers() -> dict[str, str]:
+    """Public name → module, as the `if TYPE_CHECKING` block has it."""
+    tree = ast.parse((PACKAGE / "__init__.py").read_text("utf-8"))
+    (block,) = (n for n in tree.body if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n))
+    imports = [n for n in [*tree.body, *block.body] if isinstance(n, ast.ImportFrom) and n.level]
+    for statement in imports:
+        for alias in statement.names:
+            assert alias.asname == alias.name, "only `X as X` is public to type checkers"
+    return {alias.name: str(n.module) for n in imports for alias in n.names}
+
+
+def modules() -> list[str]:
+    """Every module of the package."""
+    found = [m.name for m in pkgutil.walk_packages([str(PACKAGE)], "unbake.")]
+    assert len(found) > 50
+    return [name for name in found if not name.endswith("__main__")]
+
+
+def test_type_checkers_see_what_is_public():
+    assert names_for_type_checkers() == unbake._HOME
+    assert (PACKAGE / "py.typed").is_file()
+
+
+def test_no_public_name_is_hidden_by_a_module():
+    own = {name.partition(".")[2] for name in modules()}
+    assert "training" in own
+    assert not own & set(unbake.__all__)
+
+
+def test_public_names_stay_the_same_once_everything_is_imported():
+    before = {name: getattr(unbake, name) for name in unbake.__all__}
+    for name in modules():
+        importlib.import_module(name)
+    assert {name for name, value in before.items() if getattr(unbake, name) is not value} == set()
+    assert {name for name, value in before.items() if type(value) is type(unbake)} == set()
+
+
+def test_a_function_can_be_called_again_and_again(tmp_path):
+    for _ in range(2):
+        with pytest.raises(unbake.UserError):
+            unbake.fit(tmp_path / "none", tmp_path / "run", unbake.preset("cpu"))
+
+
+def test_dir_names_everything_public():
+    assert set(unbake.__all__) | {"__version__"} <= set(dir(unbake))
+    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+        _ = unbake.fitt
+
+
+def test_importing_loads_no_mitsuba():
+    pure = [name for name, module in unbake._HOME.items() if module in unbake._PURE]
+    code = f"import sys, unbake; [getattr(unbake, n) for n in {pure}]; print(*sys.modules)"
+    loaded = set(fresh(code).split())
+    assert "unbake.config" in loaded
+    assert not {"mitsuba", "drjit", "numpy", "rich", "tyro"} & loaded
+
+
+def test_help_is_complete_and_chooses_a_variant():
+    text = fresh("import unbake; help(unbake)")
+    shown = re.findall(r"^    (?:class )?(\w+)(?:\(| =|$)", text, flags=re.MULTILINE)
+    assert set(unbake.__all__) - set(shown) == set()
+
+
+def test_without_llvm_the_remedy_is_told_and_help_still_works():
+    code = """
+import unbake
+try:
+    unbake.fit
+except unbake.UserError as error:
+    print(error)
+help(unbake)
+"""
+    nowhere = {"DRJIT_LIBLLVM_PATH": "/nowhere/libLLVM.so", "UNBAKE_VARIANT": "llvm_ad_rgb"}
+    text = fresh(code, **nowhere)
+    assert text.startswith("DRJIT_LIBLLVM_PATH: there is no file")
+    assert "class UserError" in text
