@@ -1,4 +1,4 @@
-"""What experiments have in common: their parts are done once, and their findings are written."""
+"""What experiments have in common: their jobs run once, and their results are written."""
 
 import dataclasses
 import json
@@ -16,20 +16,19 @@ from unbake.experiments.experiment import (
     Experiment,
     ExperimentContext,
     ExperimentResult,
-    Job,
-    duration,
-    markdown,
     reproduce,
 )
 from unbake.experiments.fig4 import agreement, published_tables, smoothed
+from unbake.experiments.jobs import Job
 from unbake.experiments.scene_fits import at_equal_samples
 from unbake.experiments.scenes import SCENES, STAIRCASE
+from unbake.experiments.tables import markdown
 
 
 @pytest.fixture(autouse=True)
 def machine_of_reference(monkeypatch):
     """Nothing is rendered to tell how fast this machine is."""
-    monkeypatch.setattr(experiment, "_slowness", lambda: 1.0)
+    monkeypatch.setattr(experiment, "slowness", lambda: 1.0)
 
 
 def context(folder, **others) -> ExperimentContext:
@@ -45,18 +44,18 @@ def squares(done: list, numbers=(2, 3), offset=0, files=(), plots=False) -> Expe
             file.touch()
         return {"square": number**2 + offset}
 
-    def parts(_):
+    def jobs(_):
         settings = {"offset": offset}
         return [Job(f"of-{n}", settings, partial(work, n), 1.0, files=files) for n in numbers]
 
-    def show(_, found):
-        rows = [{"part": name} | f for name, f in found.items()]
+    def result(_, findings):
+        rows = [{"job": name} | f for name, f in findings.items()]
         return ExperimentResult(rows, markdown(["a", "b"], [[1, None]]))
 
-    return Experiment("squares", "Squares", parts, show, plots)
+    return Experiment("squares", "Squares", jobs, result, plots)
 
 
-def test_parts_that_are_done_are_not_done_again(tmp_path):
+def test_jobs_that_are_done_are_not_done_again(tmp_path):
     done = []
     reproduce(squares(done), context(tmp_path))
     assert done == [2, 3]
@@ -68,7 +67,7 @@ def test_parts_that_are_done_are_not_done_again(tmp_path):
     assert (tmp_path / "squares" / "table.md").read_text().endswith("| 1 | — |\n")
 
 
-def test_parts_with_other_settings_or_damaged_are_done_again(tmp_path):
+def test_jobs_with_other_settings_or_damaged_are_done_again(tmp_path):
     done = []
     reproduce(squares(done), context(tmp_path))
     reproduce(squares(done, offset=1), context(tmp_path))
@@ -78,7 +77,7 @@ def test_parts_with_other_settings_or_damaged_are_done_again(tmp_path):
     assert done == [2, 3, 2, 3, 3]
 
 
-def test_parts_whose_files_are_gone_are_done_again(tmp_path):
+def test_jobs_whose_files_are_gone_are_done_again(tmp_path):
     done, file = [], tmp_path / "picture.png"
     reproduce(squares(done, files=[file]), context(tmp_path))
     reproduce(squares(done, files=[file]), context(tmp_path))
@@ -94,8 +93,8 @@ def test_what_was_done_before_it_was_stopped_is_kept(tmp_path):
     def stop():
         raise KeyboardInterrupt
 
-    parts = [*squares(done).parts(None), Job("last", {}, stop, 1.0)]
-    stopped = Experiment("squares", "", lambda s: parts, squares(done).show)
+    jobs = [*squares(done).jobs(None), Job("last", {}, stop, 1.0)]
+    stopped = Experiment("squares", "", lambda _: jobs, squares(done).result)
     with pytest.raises(KeyboardInterrupt):
         reproduce(stopped, context(tmp_path))
     assert not (tmp_path / "squares").exists()
@@ -103,14 +102,14 @@ def test_what_was_done_before_it_was_stopped_is_kept(tmp_path):
     assert done == [2, 3]
 
 
-def test_a_part_that_fails_does_not_keep_others_from_being_done(tmp_path):
+def test_a_job_that_fails_does_not_keep_others_from_being_done(tmp_path):
     done = []
 
     def fail():
         raise UserError("no luck", remedy="Try again")
 
-    parts = [Job("first", {}, fail, 1.0), *squares(done).parts(None)]
-    failing = Experiment("squares", "", lambda s: parts, squares(done).show)
+    jobs = [Job("first", {}, fail, 1.0), *squares(done).jobs(None)]
+    failing = Experiment("squares", "", lambda _: jobs, squares(done).result)
     with pytest.raises(UserError, match="squares, first: no luck. Try again"):
         reproduce(failing, context(tmp_path))
     assert done == [2, 3] and not (tmp_path / "squares").exists()
@@ -128,13 +127,6 @@ def test_a_plan_does_nothing(tmp_path):
     done = []
     reproduce(squares(done), context(tmp_path), plan=True)
     assert not done and not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("seconds", "told"), [(0.2, "1 s"), (75, "75 s"), (600, "10 min"), (9000, "2.5 h")]
-)
-def test_lengths_of_time_are_told_in_words(seconds, told):
-    assert duration(seconds) == told
 
 
 def test_scenes_that_are_not_there_are_named(tmp_path):

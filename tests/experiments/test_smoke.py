@@ -27,7 +27,7 @@ def rows(unbake, out):
     def run(name, *options, figure=True) -> list[dict]:
         done = unbake("reproduce", name, "--scale", "smoke", "--out", out, *options)
         assert done.status == 0, done.err
-        assert "on this machine" in done.out or "parts are done" in done.out
+        assert "on this machine" in done.out or "jobs are done" in done.out
         folder = out / name
         found = json.loads((folder / "data.json").read_text())["rows"]
         table = (folder / "table.md").read_text()
@@ -73,7 +73,7 @@ def test_fig5_ours_does_not_grow_and_differentiated_paths_do(rows):
 def test_what_was_done_is_not_done_again(rows, unbake, out):
     rows("table2", figure=False)
     again = unbake("reproduce", "table2", "--scale", "smoke", "--out", out)
-    assert again.status == 0 and "all 6 parts are done" in again.out
+    assert again.status == 0 and "all 6 jobs are done" in again.out
 
 
 def test_table1_knows_the_scenes(rows, out, scenes_dir):

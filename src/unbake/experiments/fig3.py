@@ -12,16 +12,10 @@ from ..acquisition.capture import CaptureSettings
 from ..comparison.bench_methods import bench_methods
 from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig
-from .experiment import (
-    Experiment,
-    ExperimentContext,
-    ExperimentResult,
-    Findings,
-    Job,
-    markdown,
-    save_figure,
-)
+from .experiment import Experiment, ExperimentContext, ExperimentResult, save_figure
+from .jobs import Findings, Job
 from .scenes import PaperScene, scenes_at
+from .tables import markdown
 
 METHODS = {
     "ours": "ours",
@@ -42,9 +36,9 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
 }
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
+def _jobs(context: ExperimentContext) -> list[Job]:
     steps = context.pick(4, 24, 60)
-    parts = []
+    jobs = []
     for scene in scenes_at(context):
         scene.require(context)
         # What a step takes has nothing to do with how good photographs are.
@@ -52,7 +46,7 @@ def _parts(context: ExperimentContext) -> list[Job]:
             scene.capture_settings(context), resolution=context.pick(16, 64, 128), spp=1
         )
         config = scene.settings(context)
-        parts.append(
+        jobs.append(
             Job(
                 scene.folder,
                 {"steps": steps, "methods": list(METHODS), "fit": dataclasses.asdict(config)}
@@ -61,7 +55,7 @@ def _parts(context: ExperimentContext) -> list[Job]:
                 context.pick(15.0, 90.0, None),
             )
         )
-    return parts
+    return jobs
 
 
 def _measure(
@@ -75,14 +69,14 @@ def _measure(
     variants = [MethodVariant.of(name) for name in METHODS.values()]
     result = bench_methods(data, variants, config, steps, None, context.console)
     kept = ("milliseconds_per_step", "error")
-    found = zip(METHODS, result["rows"], strict=True)
-    return {name: {k: row[k] for k in kept if k in row} for name, row in found}
+    rows = zip(METHODS, result["rows"], strict=True)
+    return {name: {k: row[k] for k in kept if k in row} for name, row in rows}
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows, lines = [], []
     for scene in scenes_at(context):
-        measured, theirs = found[scene.folder], PUBLISHED.get(scene.name, {})
+        measured, theirs = findings[scene.folder], PUBLISHED.get(scene.name, {})
         times = {name: measured[name].get("milliseconds_per_step") for name in METHODS}
         ours, cells = times["ours"], []
         for name in METHODS:
@@ -103,8 +97,10 @@ def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> Experime
 
 
 def _ratio(row: Mapping[str, Any]) -> str:
-    told = f"{row['times_ours']:.2f}" if "times_ours" in row else "failed"
-    return f"{told} ({row['published_times_ours']:.2f})" if "published_times_ours" in row else told
+    text = f"{row['times_ours']:.2f}" if "times_ours" in row else "failed"
+    if "published_times_ours" not in row:
+        return text
+    return f"{text} ({row['published_times_ours']:.2f})"
 
 
 def _draw(path: Path, rows: list[dict]) -> None:
@@ -132,5 +128,5 @@ def _draw(path: Path, rows: list[dict]) -> None:
 
 
 EXPERIMENT = Experiment(
-    "fig3", "Time of a step, scene by scene (Fig. 3)", _parts, _show, plots=True
+    "fig3", "Time of a step, scene by scene (Fig. 3)", _jobs, _result, plots=True
 )

@@ -21,17 +21,10 @@ from ..scene.parse import ParsedScene, parse, referenced
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
 from .derivatives import Estimates, estimate
-from .experiment import (
-    Experiment,
-    ExperimentContext,
-    ExperimentResult,
-    Findings,
-    Job,
-    copy_file,
-    markdown,
-    save_figure,
-)
+from .experiment import Experiment, ExperimentContext, ExperimentResult, copy_file, save_figure
+from .jobs import Findings, Job
 from .scenes import STAIRCASE
+from .tables import markdown
 
 #: Roughness of the wood of stairs and picture frames: where it is, and where it should be.
 VALUES = tuple(round(0.2 + 0.05 * i, 2) for i in range(15))
@@ -112,16 +105,16 @@ def _picture(parsed: ParsedScene, node: object) -> str:
     return "" if texture is None else str(texture.props.get("filename", ""))
 
 
-# ------------------------------------------------------------------------------------------- parts
+# -------------------------------------------------------------------------------------------- jobs
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
+def _jobs(context: ExperimentContext) -> list[Job]:
     STAIRCASE.require(context)
     known = {"max_depth": MAX_DEPTH, "albedo_power": STAIRCASE.albedo_power}
     table = {"shrunk": _shrunk(context), "spp": context.pick(4, 256, 1024)}
     picture = {"shrunk": context.pick(80, 6, 2), "spp": context.pick(4, 64, 1024)}
     picture["zoom"] = context.pick(1, 3, 1)
-    parts = [
+    jobs = [
         Job(
             _arrays(context, value).stem,
             table | known | {"value": value},
@@ -134,7 +127,7 @@ def _parts(context: ExperimentContext) -> list[Job]:
     work = functools.partial(_pictures, context, **picture)
     seconds = context.pick(15.0, 60.0, None)
     return [
-        *parts,
+        *jobs,
         Job("pictures", picture | known, work, seconds, files=[_picture_file(context)]),
     ]
 
@@ -301,13 +294,13 @@ def published_tables() -> dict[str, tuple[list[float], np.ndarray]]:
     return tables
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     copy_file(_picture_file(context), context.out / "fig4")
     arrays = {}
     for value in _values(context):
         with np.load(_arrays(context, value)) as file:
             arrays[value] = dict(file)
-    film = found[_arrays(context, _values(context)[0]).stem]
+    film = findings[_arrays(context, _values(context)[0]).stem]
     arrays = smoothed(arrays, film["height"], film["width"], COARSE // _shrunk(context))
     tables = {method: gradient_table(arrays, method) for method in METHODS}
     theirs = published_tables()
@@ -355,5 +348,5 @@ def _draw(path: Path, tables: Mapping, theirs: Mapping) -> None:
 
 
 EXPERIMENT = Experiment(
-    "fig4", "Gradients of a roughness in STAIRCASE (Fig. 4)", _parts, _show, plots=True
+    "fig4", "Gradients of a roughness in STAIRCASE (Fig. 4)", _jobs, _result, plots=True
 )

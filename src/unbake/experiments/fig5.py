@@ -23,17 +23,10 @@ from ..profiling.bench_step import FreshFit, begin_fit
 from ..scene.parse import parse, to_principled, write
 from ..training.memory import peak_bytes
 from ..training.step import lacks_memory
-from .experiment import (
-    Experiment,
-    ExperimentContext,
-    ExperimentResult,
-    Findings,
-    Job,
-    digest,
-    markdown,
-    save_figure,
-)
+from .experiment import Experiment, ExperimentContext, ExperimentResult, save_figure
+from .jobs import Findings, Job, digest
 from .table2 import PUBLISHED as PATHS
+from .tables import markdown
 
 
 @final
@@ -63,7 +56,7 @@ CURVES = (
 TURNS = 2
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
+def _jobs(context: ExperimentContext) -> list[Job]:
     albedos = context.pick([0.3, 0.7], list(PATHS), list(PATHS))
     cost = {0.3: 40, 0.5: 45, 0.7: 60, 0.9: 130, 0.95: 220, 0.97: 330}
     settings = {
@@ -184,13 +177,13 @@ def _paint(fit: FreshFit, albedo: float) -> None:
             fit.state.phi[name] = dr.full(type(value), raw, value.shape)
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
-    for part, methods in found.items():
+    for name_of_job, methods in findings.items():
         good = {name: m for name, m in methods.items() if "error" not in m}
         seconds = {name: statistics.median(m["seconds"]) for name, m in good.items()}
         for name, measured in methods.items():
-            row = {"albedo": float(part.removeprefix("albedo-")), "method": name}
+            row = {"albedo": float(name_of_job.removeprefix("albedo-")), "method": name}
             if name in good:
                 memory = measured["memory"]
                 row["milliseconds"] = 1e3 * seconds[name]
@@ -244,5 +237,5 @@ def _draw(path: Path, rows: list[dict]) -> None:
 
 
 EXPERIMENT = Experiment(
-    "fig5", "A step in the cube as paths get longer (Fig. 5)", _parts, _show, plots=True
+    "fig5", "A step in the cube as paths get longer (Fig. 5)", _jobs, _result, plots=True
 )

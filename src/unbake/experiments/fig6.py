@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..imaging.pictures import write_png
-from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
-from .scene_fits import MATERIALS, QUALITIES, SceneFits, at_equal_samples, decibels
+from .experiment import Experiment, ExperimentContext, ExperimentResult
+from .jobs import Findings, Job
+from .scene_fits import MATERIALS, QUALITIES, SceneFits, at_equal_samples
 from .scenes import scenes_at
+from .tables import decibels, markdown
 
 #: Columns of the figure.
 METHODS = {"direct": "direct", "PRB": "prb", "ours": "ours", "no prior": "no-prior"}
@@ -19,15 +21,15 @@ def _all_fits(context: ExperimentContext) -> list[SceneFits]:
     return [SceneFits.of(context, scene, METHODS.values()) for scene in scenes_at(context)]
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
-    return [part for scene_fits in _all_fits(context) for part in scene_fits.parts(context)]
+def _jobs(context: ExperimentContext) -> list[Job]:
+    return [job for scene_fits in _all_fits(context) for job in scene_fits.jobs(context)]
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
     for scene_fits in _all_fits(context):
         scene = scene_fits.scene
-        methods = found[scene.folder]
+        methods = findings[scene.folder]
         equal = at_equal_samples(methods)
         write_png(context.out / "fig6" / f"{scene.folder}.png", scene_fits.picture(context, VIEWS))
         for title, method in METHODS.items():
@@ -63,4 +65,4 @@ def _tables(rows: list[dict]) -> str:
     return "\n\n".join(tables)
 
 
-EXPERIMENT = Experiment("fig6", "Materials of the eight scenes (Fig. 1, 6)", _parts, _show)
+EXPERIMENT = Experiment("fig6", "Materials of the eight scenes (Fig. 1, 6)", _jobs, _result)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..imaging.pictures import write_png
-from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
-from .scene_fits import ABLATION, QUALITIES, SceneFits, decibels
+from .experiment import Experiment, ExperimentContext, ExperimentResult
+from .jobs import Findings, Job
+from .scene_fits import ABLATION, QUALITIES, SceneFits
 from .scenes import scenes_at
+from .tables import decibels, markdown
 
 #: Columns of the figure.
 METHODS = ABLATION | {"ours without prior": "no-prior"}
@@ -20,13 +22,13 @@ def _scene_fits(context: ExperimentContext) -> SceneFits:
     return SceneFits.of(context, scenes_at(context)[0], METHODS.values())
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
-    return _scene_fits(context).parts(context)
+def _jobs(context: ExperimentContext) -> list[Job]:
+    return _scene_fits(context).jobs(context)
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     scene_fits = _scene_fits(context)
-    fits = found[scene_fits.scene.folder]
+    fits = findings[scene_fits.scene.folder]
     rows = [
         {"step": title} | scene_fits.row(context, method, fits[method])
         for title, method in METHODS.items()
@@ -40,4 +42,4 @@ def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> Experime
     return ExperimentResult(rows, caption + table, lambda path: write_png(path, sheet))
 
 
-EXPERIMENT = Experiment("fig7", "The ablation, for materials (Fig. 7)", _parts, _show)
+EXPERIMENT = Experiment("fig7", "The ablation, for materials (Fig. 7)", _jobs, _result)

@@ -9,9 +9,11 @@ import numpy as np
 
 from ..dataset.lights import true_environment
 from ..imaging.pictures import montage, read_exr, tonemap, write_png
-from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
-from .scene_fits import ABLATION, SceneFits, decibels, exposure
+from .experiment import Experiment, ExperimentContext, ExperimentResult
+from .jobs import Findings, Job
+from .scene_fits import ABLATION, SceneFits, exposure
 from .scenes import scenes_at
+from .tables import decibels, markdown
 
 #: The held-out view that is shown below the maps.
 VIEW = 0
@@ -24,15 +26,15 @@ def _scene_fits(context: ExperimentContext) -> SceneFits:
     return dataclasses.replace(scene_fits, config=config)
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
-    return _scene_fits(context).parts(context)
+def _jobs(context: ExperimentContext) -> list[Job]:
+    return _scene_fits(context).jobs(context)
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     scene_fits = _scene_fits(context)
     rows, lines = [], []
     for title, method in ABLATION.items():
-        fit = found[scene_fits.scene.folder][method]
+        fit = findings[scene_fits.scene.folder][method]
         row = {"step": title} | scene_fits.row(context, method, fit) | fit["environment"]
         rows.append({key: value for key, value in row.items() if value is not None})
         off, relit = f"{100 * row['sh_error']:.1f} %", decibels(row["relight_psnr"])
@@ -60,4 +62,4 @@ def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
     return montage([[tonemap(p[..., :3]) for p in row] for row in ([*maps, truth], images)])
 
 
-EXPERIMENT = Experiment("fig8", "The ablation, for the environment (Fig. 8)", _parts, _show)
+EXPERIMENT = Experiment("fig8", "The ablation, for the environment (Fig. 8)", _jobs, _result)

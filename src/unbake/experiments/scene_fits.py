@@ -21,7 +21,8 @@ from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import block_means, montage, read_exr, to_bytes, tonemap
 from ..io import read_json
 from ..report.display import rgb
-from .experiment import ExperimentContext, Findings, Job, digest
+from .experiment import ExperimentContext
+from .jobs import Findings, Job, digest
 from .scenes import PaperScene
 
 #: The ablation, from direct illumination to ours; Figures 7 and 8.
@@ -77,8 +78,8 @@ class SceneFits:
         described = self.scene.described(context) | {"fit": asdict(self.config), "spp": self.spp}
         return context.work / "runs" / f"{self.scene.folder}-{digest(described)}"
 
-    def parts(self, context: ExperimentContext) -> list[Job]:
-        """The parts of an experiment that render the data set, fit and evaluate."""
+    def jobs(self, context: ExperimentContext) -> list[Job]:
+        """Jobs that render the data set, fit the methods and evaluate them."""
         work = functools.partial(self.fitted, context)
         many = len(self.methods)
         # Compiling and evaluation, a method.
@@ -203,8 +204,3 @@ def exposure(photograph: np.ndarray) -> float:
 def _foreground(photograph: np.ndarray) -> np.ndarray:
     shape = photograph.shape[:2]
     return photograph[..., 3] >= 1 if photograph.shape[-1] == 4 else np.ones(shape, bool)
-
-
-def decibels(value: float | None) -> str:
-    """A PSNR as it stands in tables."""
-    return "—" if value is None else f"{value:.1f}"

@@ -19,7 +19,8 @@ from ..dataset.views import Dataset
 from ..errors import UserError
 from ..imaging.pictures import read_exr, tonemap, write_exr, write_png
 from ..scene.parse import ParsedScene, parse, referenced, to_principled, write
-from .experiment import ExperimentContext, Findings, Job, digest
+from .experiment import ExperimentContext
+from .jobs import Findings, Job, digest
 
 _CAMERAS = Path(__file__).parent / "cameras"
 

@@ -16,16 +16,10 @@ from ..scene.parse import parse, to_principled
 from ..transport.path_tracer import path_lengths
 from ..transport.render import parts_of, render_radiance
 from ..transport.vertex import SceneView
-from .experiment import (
-    Experiment,
-    ExperimentContext,
-    ExperimentResult,
-    Findings,
-    Job,
-    copy_file,
-    markdown,
-)
+from .experiment import Experiment, ExperimentContext, ExperimentResult, copy_file
+from .jobs import Findings, Job
 from .scenes import SCENES, PaperScene
+from .tables import markdown
 
 #: Scene: mean path length, views, samples a pixel, log2 of pixels a step (paper).
 PUBLISHED = {
@@ -42,13 +36,13 @@ PUBLISHED = {
 MAX_DEPTH, SURVIVAL = 15, 0.95
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
+def _jobs(context: ExperimentContext) -> list[Job]:
     pixels, spp = context.pick((8, 4), (64, 16), (128, 64))
     scenes = SCENES[:1] if context.scale == "smoke" else SCENES
-    parts = []
+    jobs = []
     for scene in scenes:
         scene.require(context)
-        parts.append(
+        jobs.append(
             Job(
                 scene.folder,
                 {"pixels": pixels, "spp": spp} | scene.described(context),
@@ -57,7 +51,7 @@ def _parts(context: ExperimentContext) -> list[Job]:
                 files=[_views(context, scene)],
             )
         )
-    return parts
+    return jobs
 
 
 def _views(context: ExperimentContext, scene: PaperScene) -> Path:
@@ -105,17 +99,17 @@ def _measure(context: ExperimentContext, scene: PaperScene, pixels: int, spp: in
     }
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
     for scene in SCENES:
-        if scene.folder not in found:
+        if scene.folder not in findings:
             continue
         copy_file(_views(context, scene), context.out / "table1")
         config, shots = scene.settings(context), scene.capture_settings(context)
         length, views, spp, batch = PUBLISHED[scene.name]
         rows.append(
             {"scene": scene.name, "label": scene.label}
-            | found[scene.folder]
+            | findings[scene.folder]
             | {"pixels": shots.resolution, "photograph_spp": shots.spp}
             | {"spp": config.spp, "batch": config.pixels, "published_path_length": length}
             | {"published_views": views, "published_spp": spp, "published_batch": 2**batch}
@@ -153,4 +147,4 @@ def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> Experime
     return ExperimentResult(rows, table)
 
 
-EXPERIMENT = Experiment("table1", "Scenes, views and path lengths (Table 1)", _parts, _show)
+EXPERIMENT = Experiment("table1", "Scenes, views and path lengths (Table 1)", _jobs, _result)

@@ -14,7 +14,9 @@ from ..scene.parse import parse
 from ..transport.path_tracer import path_lengths
 from ..transport.render import parts_of
 from ..transport.vertex import SceneView
-from .experiment import Experiment, ExperimentContext, ExperimentResult, Findings, Job, markdown
+from .experiment import Experiment, ExperimentContext, ExperimentResult
+from .jobs import Findings, Job
+from .tables import markdown
 
 #: Albedo: the longest path, and the mean, that the paper tells.
 PUBLISHED = {
@@ -29,7 +31,7 @@ PUBLISHED = {
 ENDLESS = 4096
 
 
-def _parts(context: ExperimentContext) -> list[Job]:
+def _jobs(context: ExperimentContext) -> list[Job]:
     pixels, spp = context.pick((8, 32), (32, 64), (128, 64))
     return [
         Job(
@@ -62,10 +64,10 @@ def _measure(folder: Path, albedo: float, pixels: int, spp: int) -> Findings:
     return found
 
 
-def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> ExperimentResult:
+def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
     for albedo, (limit, mean) in PUBLISHED.items():
-        measured = found[f"albedo-{albedo}"]
+        measured = findings[f"albedo-{albedo}"]
         rows.append(
             {
                 "albedo": albedo,
@@ -85,4 +87,4 @@ def _show(context: ExperimentContext, found: Mapping[str, Findings]) -> Experime
     return ExperimentResult(rows, table)
 
 
-EXPERIMENT = Experiment("table2", "Lengths of paths in the cube (Table 2)", _parts, _show)
+EXPERIMENT = Experiment("table2", "Lengths of paths in the cube (Table 2)", _jobs, _result)

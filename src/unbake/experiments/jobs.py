@@ -1,0 +1,219 @@
+"""Jobs that are done once: a file keeps what each one finds, so that a stopped run continues.
+
+A job is done if its file has its settings and findings, and if the files that it writes exist.
+This module knows neither Mitsuba nor Dr.Jit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from rich.console import Console
+
+from ..errors import UserError
+from ..io import write_json
+
+#: What a job finds. It must be serializable as JSON.
+Findings = dict[str, Any]
+#: What a job's file holds: `settings`, `machine`, `seconds`, and `findings` or `error`.
+Record = dict[str, Any]
+
+
+class Unfinished(Exception):
+    """A job was stopped before its end. The next call continues it."""
+
+
+@final
+@dataclass(frozen=True)
+class Job:
+    """A unit of work with findings that are kept.
+
+    Args:
+        name: file name of its record, unique within a run.
+        settings: everything that its findings depend on. A job whose settings change is repeated.
+        work: does the job. It raises `UserError` if the job fails, and `Unfinished` if it was
+            stopped.
+        seconds: computing time on the machine of `speed.REFERENCE`; None if it was not measured.
+        waits: seconds that do not depend on the machine, such as a fit of a given duration.
+        files: files that it writes. Without them the job is repeated.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    work: Callable[[], Findings]
+    seconds: float | None = None
+    waits: float = 0.0
+    files: Sequence[Path] = ()
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """How the jobs of a run ended.
+
+    Args:
+        records: of the jobs that are done, by name.
+        failed: errors of the jobs that failed, by name.
+        left: names of the jobs that the next call continues.
+    """
+
+    records: Mapping[str, Record]
+    failed: Mapping[str, UserError]
+    left: Sequence[str]
+
+    @property
+    def findings(self) -> dict[str, Findings]:
+        """Findings of the jobs that are done, by name."""
+        return {name: record["findings"] for name, record in self.records.items()}
+
+
+@final
+@dataclass(frozen=True)
+class JobRunner:
+    """Runs jobs one after the other and keeps a record of each.
+
+    Args:
+        folder: for the records, FOLDER/NAME.json.
+        console: shows progress.
+        machine: describes the machine, for the records.
+        slowness: time that a computation takes here, relative to the machine of the estimates.
+        release: frees memory after each job.
+    """
+
+    folder: Path
+    console: Console
+    machine: Callable[[], Mapping[str, Any]] = dict
+    slowness: Callable[[], float] = lambda: 1.0
+    release: Callable[[], None] = lambda: None
+
+    def record(self, job: Job) -> Record:
+        """What is kept of a job with these settings; empty if there is nothing.
+
+        `findings` is a key of it only if the job is done.
+        """
+        try:
+            record = json.loads(self._file(job).read_text(encoding="utf-8"))
+            if record["settings"] != _as_json(job.settings):
+                return {}
+            if "found" in record:  # written by unbake 0.1.0 and older
+                record["findings"] = record.pop("found")
+            if not all(file.is_file() for file in job.files):
+                record.pop("findings", None)
+            return record
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return {}
+
+    def left(self, jobs: Sequence[Job]) -> list[Job]:
+        """The jobs that are not done."""
+        return [job for job in jobs if "findings" not in self.record(job)]
+
+    def plan(self, jobs: Sequence[Job]) -> str:
+        """How many jobs are left, and how long they take on this machine."""
+        left = self.left(jobs)
+        if not left:
+            return f"all {len(jobs)} jobs are done"
+        done = f"{len(jobs) - len(left)} of {len(jobs)} jobs are done"
+        known = [job for job in left if job.seconds is not None]
+        if not known:
+            return f"{done}; no estimate for the others at this scale"
+        seconds = sum(job.seconds or 0.0 for job in known) * self.slowness()
+        told = f"about {duration(seconds + sum(job.waits for job in known))} on this machine"
+        if len(known) == len(left):
+            return f"{done}, the others take {told}"
+        return f"{done}, {len(known)} of the others take {told}; no estimate for the rest"
+
+    def run(self, jobs: Sequence[Job], *, until: float | None = None) -> Outcome:
+        """Run the jobs that are not done.
+
+        A job that fails or is stopped does not keep the others from running.
+
+        Args:
+            until: value of `time.monotonic()` after which no further job starts.
+
+        Raises:
+            KeyboardInterrupt: SIGINT or SIGTERM arrived. Finished jobs are kept.
+            UserError: a record cannot be written.
+            ValueError: two jobs have the same name.
+        """
+        if len({job.name for job in jobs}) < len(jobs):
+            raise ValueError("two jobs have the same name")
+        failed: dict[str, UserError] = {}
+        with _interrupted_by_sigterm():
+            for job in self.left(jobs):
+                if until is not None and time.monotonic() >= until:
+                    break
+                self.console.rule(job.name, align="left")
+                try:
+                    self._run(job)
+                except UserError as error:
+                    failed[job.name] = error
+                    self.console.print(f"error: {error}", markup=False, soft_wrap=True)
+                except Unfinished:
+                    self.console.print(f"{job.name} is not finished; the same command continues it")
+        records = {job.name: self.record(job) for job in jobs}
+        done = {name: record for name, record in records.items() if "findings" in record}
+        left = [job.name for job in jobs if job.name not in done and job.name not in failed]
+        return Outcome(done, failed, left)
+
+    def _run(self, job: Job) -> None:
+        """Run a job and write its record, which of a stopped one has the time spent so far."""
+        before, start = self.record(job).get("seconds", 0.0), time.perf_counter()
+        record: Record = {"settings": dict(job.settings), "machine": dict(self.machine())}
+        try:
+            record["findings"] = job.work()
+        except UserError as error:
+            record["error"] = str(error)
+            raise
+        finally:
+            record["seconds"] = round(before + time.perf_counter() - start, 2)
+            write_json(self._file(job), record)
+            self.release()
+
+    def _file(self, job: Job) -> Path:
+        return self.folder / f"{job.name}.json"
+
+
+def duration(seconds: float) -> str:
+    """A duration in words."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def digest(settings: Mapping[str, Any]) -> str:
+    """Eight characters that identify settings, for names of folders."""
+    text = json.dumps(settings, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _as_json(settings: Mapping[str, Any]) -> Any:
+    """Settings as they are read back from a file: tuples become lists."""
+    return json.loads(json.dumps(dict(settings)))
+
+
+@contextmanager
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """SIGTERM raises KeyboardInterrupt, as SIGINT does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
