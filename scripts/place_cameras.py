@@ -22,7 +22,8 @@ def main() -> None:
     activate()
     from unbake.acquisition.placement import coverage, place
     from unbake.dataset.camera import write_camera_file
-    from unbake.scene.parse import parse, to_principled
+    from unbake.scene.edit import to_principled
+    from unbake.scene.parse import parse
 
     parsed = parse(args.scene)
     to_principled(parsed)

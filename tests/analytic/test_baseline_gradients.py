@@ -11,7 +11,8 @@ import pytest
 from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
 
 from unbake.fields.texture import material_textures
-from unbake.scene import parse as scenes
+from unbake.scene import edit
+from unbake.scene.parse import parse
 from unbake.transport.path_sample import Requirements, rhs, trace
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
 from unbake.transport.vertex import SceneView
@@ -64,8 +65,8 @@ def principled(albedo, roughness):
 
 def with_bsdf(path, plugin, **properties):
     """A scene all of whose materials are this one."""
-    parsed = scenes.parse(path)
-    scenes.to_principled(parsed)
+    parsed = parse(path)
+    edit.to_principled(parsed)
     for node in parsed.principled_nodes():
         for key in list(node.props.keys()):
             del node.props[key]
@@ -145,7 +146,7 @@ def test_gradient_is_the_derivative_of_the_estimator(held_plugin, built_in, meth
 def test_the_whole_gradient_of_the_furnace(built_in, method, albedo):
     """With paths of up to d vertices, I = Σ ρⁱ for i < d, and ∂I/∂ρ = Σ i ρⁱ⁻¹."""
     materials = StandIn(albedo)
-    parsed = scenes.parse(built_in("furnace"))
+    parsed = parse(built_in("furnace"))
     texture, _ = material_textures(materials)
     for node in parsed.state.nodes:
         if node.props.plugin_name() == "diffuse":

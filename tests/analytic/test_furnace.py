@@ -23,7 +23,7 @@ from unbake.fields.domain import Domain
 from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField
 from unbake.fields.texture import material_textures
-from unbake.scene import parse as scenes
+from unbake.scene.parse import parse
 from unbake.transport.objective import (
     EXTRA,
     METHODS,
@@ -174,7 +174,7 @@ def test_the_residual_of_the_exact_radiance_is_zero_and_of_no_other(built_in, al
 def learnable(built_in):
     """The furnace with Lambertian walls whose albedo is read from a stand-in for the fields."""
     materials = ConstantMaterials(0.5)
-    parsed = scenes.parse(built_in("furnace"))
+    parsed = parse(built_in("furnace"))
     albedo, _ = material_textures(materials)
     for node in parsed.state.nodes:
         if node.props.plugin_name() == "diffuse":

@@ -13,14 +13,15 @@ from unbake.evaluation import lighting
 from unbake.evaluation.lighting import (
     compare_environments,
     environment_scale,
-    recovered_lights,
+    recovered_emitters,
     relight_psnr,
     relit,
     sh_coefficients,
     sh_error,
 )
 from unbake.fields.envmap import latlong
-from unbake.scene import parse as scenes
+from unbake.scene import emitters
+from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
 
 ROWS = 64
@@ -29,7 +30,7 @@ ROWS = 64
 @pytest.fixture(scope="module")
 def sky(built_in):
     """The environment of `still`."""
-    return scenes.environment_latlong(scenes.parse(built_in("still")).instantiate(), ROWS)
+    return emitters.environment_latlong(parse(built_in("still")).instantiate(), ROWS)
 
 
 def picture_of(function):
@@ -161,7 +162,7 @@ def test_latlong_is_the_layout_of_mitsubas_envmap(sky):
 def test_a_scenes_environment_is_its_picture(sky):
     scene = {"type": "scene", "ball": {"type": "sphere"}}
     scene["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(sky)}
-    found = scenes.environment_latlong(mi.load_dict(scene), ROWS)
+    found = emitters.environment_latlong(mi.load_dict(scene), ROWS)
     # Means over pixels, so that only what is curved inside one differs.
     assert np.abs(found - sky).max() < 0.05 * sky.max()
     assert np.abs(found - sky).mean() < 0.005 * sky.mean()
@@ -175,7 +176,7 @@ def test_a_scenes_environment_is_its_picture(sky):
 def test_strengths_stand_beside_the_true_ones(built_in, tmp_path):
     config = dataclasses.replace(TINY_FIT, unknown="emission")
     problem = make_problem(built_in("cornell"), "visible", config, 4.0)
-    (light,) = recovered_lights(problem, tmp_path)
+    (light,) = recovered_emitters(problem, tmp_path)
     assert light.name == "light_shape"
     np.testing.assert_allclose(light.strength, 4, rtol=1e-5)
     assert light.truth is None and light.emission_error is None
@@ -183,12 +184,12 @@ def test_strengths_stand_beside_the_true_ones(built_in, tmp_path):
     (tmp_path / "truth").mkdir()
     known = [{"name": "light_shape", "strength": [4, 4, 2]}, {"name": "other", "strength": None}]
     (tmp_path / "truth" / "emission.json").write_text(json.dumps(known))
-    (light,) = recovered_lights(problem, tmp_path)
+    (light,) = recovered_emitters(problem, tmp_path)
     assert light.truth == [4, 4, 2]
     assert light.emission_error == pytest.approx(2 / 6, rel=1e-5)
 
     materials = make_problem(built_in("cornell"), "visible", TINY_FIT, 4.0)
-    assert recovered_lights(materials, tmp_path) == []
+    assert recovered_emitters(materials, tmp_path) == []
 
 
 def test_every_number_has_a_definition():

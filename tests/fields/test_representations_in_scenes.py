@@ -20,7 +20,8 @@ from unbake.config import BitmapConfig, DenseGridConfig
 from unbake.errors import UserError
 from unbake.fields.materials import make_materials
 from unbake.fields.texture import material_textures, slots_of
-from unbake.scene import parse as scenes
+from unbake.scene import edit
+from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
 from unbake.training.step import TrainingStep, initial_state
 from unbake.transport.operator import attach_albedo, attach_material
@@ -91,13 +92,13 @@ def with_slots(tmp_path):
     """A world of several materials with bitmaps of one texel; its materials have the colours."""
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
-    parsed = scenes.parse(path)
-    scenes.to_principled(parsed)
-    names = scenes.material_names(parsed)
+    parsed = parse(path)
+    edit.to_principled(parsed)
+    names = edit.material_names(parsed)
     config = dataclasses.replace(settings("bitmap"), bitmap=BitmapConfig(albedo=1, roughness=1))
     fields = make_materials(config, names, seed=0)
     each = [material_textures(fields, slot) for slot in range(len(names))]
-    scenes.set_own_textures(parsed, each)
+    edit.set_own_textures(parsed, each)
     scene = parsed.instantiate()
     fields.slots = slots_of(scene)
     colours = {name: 0.2 + 0.15 * i for i, name in enumerate(names)}
@@ -149,9 +150,9 @@ def test_materials_without_a_name_get_one_of_their_own(tmp_path):
     # A name that could be one of those given.
     named = '<bsdf type="diffuse" id="material-1"/>'
     path.write_text(f'<scene version="3.0.0">{named}{3 * bsdf}</scene>')
-    parsed = scenes.parse(path)
-    scenes.to_principled(parsed)
-    names = scenes.material_names(parsed)
+    parsed = parse(path)
+    edit.to_principled(parsed)
+    names = edit.material_names(parsed)
     assert len(set(names)) == 4 and all(names) and "material-1" in names
 
 
@@ -200,9 +201,9 @@ def test_bitmaps_render_as_mitsubas_own(built_in):
     randomised(problem.materials, scale=2)
     problem.materials.stand_alone()
 
-    parsed = scenes.parse(built_in("cornell"))
-    scenes.to_principled(parsed)
-    names = scenes.material_names(parsed)
+    parsed = parse(built_in("cornell"))
+    edit.to_principled(parsed)
+    names = edit.material_names(parsed)
     fields = problem.materials.fields
     stock = []
     for name in names:
@@ -214,7 +215,7 @@ def test_bitmaps_render_as_mitsubas_own(built_in):
                 for a in (albedo, roughness)
             ]
         )
-    scenes.set_own_textures(parsed, stock)
+    edit.set_own_textures(parsed, stock)
     scene = parsed.instantiate()
     assert len(names) >= 3
 

@@ -12,6 +12,7 @@ from unbake.fields.emission import Emission, emission_textures
 from unbake.fields.materials import Material
 from unbake.fields.texture import material_textures
 from unbake.imaging.pictures import write_exr
+from unbake.scene import edit, emitters
 from unbake.scene import parse as scenes
 
 DIFFUSE = '<bsdf type="diffuse"><rgb name="reflectance" value="0.6 0.3 0.1"/></bsdf>'
@@ -81,14 +82,14 @@ def plugins(parsed):
 def test_diffuse_and_rough_plastic_become_principled(wrapper, bsdf, roughness, parse):
     parsed = parse(BALL.format(WRAPPERS[wrapper].format(bsdf)))
     assert not parsed.principled_nodes()
-    assert scenes.to_principled(parsed) == 1
+    assert edit.to_principled(parsed) == 1
     (node,) = parsed.principled_nodes()
     assert set(node.props.keys()) == {"base_color", "roughness"}
     assert np.allclose(node.props["base_color"], [0.6, 0.3, 0.1])
     assert node.props["roughness"] == pytest.approx(roughness)
     assert not {"diffuse", "roughplastic"} & set(plugins(parsed))
     # A second time there is nothing left to do
-    assert scenes.to_principled(parsed) == 0
+    assert edit.to_principled(parsed) == 0
     assert np.isfinite(render(parsed.instantiate(), 2)).all()
 
 
@@ -96,7 +97,7 @@ def test_the_defaults_of_mitsuba_are_kept(parse):
     parsed = parse(
         BALL.format('<bsdf type="diffuse"/>') + BALL.format('<bsdf type="roughplastic"/>')
     )
-    assert scenes.to_principled(parsed) == 2
+    assert edit.to_principled(parsed) == 2
     found = [(n.props["base_color"], n.props["roughness"]) for n in parsed.principled_nodes()]
     assert found == [(0.5, 0.9), (0.5, pytest.approx(math.sqrt(0.1)))]
 
@@ -104,21 +105,21 @@ def test_the_defaults_of_mitsuba_are_kept(parse):
 def test_other_materials_stay(parse):
     others = ["dielectric", "conductor", "roughconductor", "plastic", "principled"]
     parsed = parse("".join(BALL.format(f'<bsdf type="{name}"/>') for name in others))
-    assert scenes.to_principled(parsed) == 0
+    assert edit.to_principled(parsed) == 0
     assert [name for name in plugins(parsed) if name in others] == others
 
 
 def test_one_material_of_two_shapes_is_changed_once(parse):
     shared = DIFFUSE.replace("<bsdf", '<bsdf id="shared"', 1)
     parsed = parse(shared + 2 * BALL.format('<ref id="shared"/>'))
-    assert scenes.to_principled(parsed) == 1
+    assert edit.to_principled(parsed) == 1
     assert len(parsed.instantiate().shapes()) in (1, 2)
 
 
 def test_a_converted_diffuse_scene_looks_much_the_same(parse):
     before = render(parse(BALL.format(DIFFUSE)).instantiate(), 256)
     parsed = parse(BALL.format(DIFFUSE))
-    scenes.to_principled(parsed)
+    edit.to_principled(parsed)
     after = render(parsed.instantiate(), 256)
     assert 0.02 < np.abs(after - before).mean() + 0.02 < 0.08
 
@@ -140,7 +141,7 @@ class Painted:
 
 
 def painted(parsed, albedo, roughness):
-    scenes.set_textures(parsed, *material_textures(Painted(albedo, roughness)))
+    edit.set_textures(parsed, *material_textures(Painted(albedo, roughness)))
     return parsed.instantiate()
 
 
@@ -163,7 +164,7 @@ def test_all_other_parameters_stay(parse):
     extra = "".join(f'<float name="{key}" value="{value}"/>' for key, value in keys.items())
     content = BALL.format(PRINCIPLED.replace("</bsdf>", extra + "</bsdf>"))
     parsed = parse(content)
-    scenes.set_textures(parsed, *material_textures(Painted([0.6, 0.3, 0.1], 0.2)))
+    edit.set_textures(parsed, *material_textures(Painted([0.6, 0.3, 0.1], 0.2)))
     (node,) = parsed.principled_nodes()
     assert {key: pytest.approx(node.props[key]) for key in keys} == keys
     assert np.allclose(
@@ -186,13 +187,13 @@ def test_bitmaps_give_way_to_fields(parse, tmp_path):
 def test_nothing_to_fit_is_an_error(parse):
     parsed = parse(BALL.format('<bsdf type="dielectric"/>'))
     with pytest.raises(UserError, match="scene.xml: no material to fit"):
-        scenes.set_textures(parsed, None, None)
+        edit.set_textures(parsed, None, None)
 
 
 def test_roughness_is_shown_in_place_of_albedo(parse):
     content = '<bsdf type="principled"><float name="roughness" value="0.3"/></bsdf>'
     parsed = parse(BALL.format(content) + BALL.format('<bsdf type="principled"/>'))
-    scenes.show_roughness_as_albedo(parsed)
+    edit.show_roughness_as_albedo(parsed)
     assert [n.props["base_color"] for n in parsed.principled_nodes()] == [pytest.approx(0.3), 0.5]
 
 
@@ -265,10 +266,10 @@ def test_a_missing_scene_is_named(tmp_path):
 
 def test_a_scene_needs_light(parse):
     parsed = parse(BALL.format(DIFFUSE))
-    scenes.require_emitters(parsed.instantiate(), parsed.path)
+    emitters.require_emitters(parsed.instantiate(), parsed.path)
     dark = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
     with pytest.raises(UserError, match="the scene has no light source"):
-        scenes.require_emitters(dark, parsed.path)
+        emitters.require_emitters(dark, parsed.path)
 
 
 def test_a_scene_that_fails_does_not_disturb_the_next_one(parse):
@@ -335,24 +336,24 @@ def constant(*rgb):
 @pytest.mark.parametrize("kind", SKIES)
 def test_an_environment_is_replaced_whatever_it_is(kind, parse_lit):
     parsed = parse_lit(SKIES[kind] + LAMP)
-    scenes.set_environment(parsed, constant(0.1, 0.2, 0.3))
+    edit.set_environment(parsed, constant(0.1, 0.2, 0.3))
     scene = parsed.instantiate()
     assert len(scene.emitters()) == 2  # the lamp stays
     np.testing.assert_allclose(
-        scenes.environment_latlong(scene, 4), np.full((4, 8, 3), [0.1, 0.2, 0.3]), rtol=1e-5
+        emitters.environment_latlong(scene, 4), np.full((4, 8, 3), [0.1, 0.2, 0.3]), rtol=1e-5
     )
 
 
 def test_a_scene_without_environment_has_none_to_fit(parse_lit):
     parsed = parse_lit(LAMP)
     with pytest.raises(UserError, match="scene.xml: the scene has no environment map to fit. Add"):
-        scenes.set_environment(parsed, constant(1, 1, 1))
+        edit.set_environment(parsed, constant(1, 1, 1))
     with pytest.raises(UserError, match="the scene has no environment map"):
-        scenes.environment_latlong(parsed.instantiate(), 4)
+        emitters.environment_latlong(parsed.instantiate(), 4)
 
 
 def test_lights_are_told_by_name_and_strength(parse_lit):
-    found = scenes.lights_of(parse_lit("".join(LIGHTS.values())))
+    found = emitters.named_emitters(parse_lit("".join(LIGHTS.values())))
     assert len(found) == len(LIGHTS)
     told = {light.name: light.strength for light in found}
     assert told == {n: s if s is None else pytest.approx(s) for n, s in LIGHTS}
@@ -360,20 +361,20 @@ def test_lights_are_told_by_name_and_strength(parse_lit):
 
 def test_no_two_lights_have_one_name(parse_lit):
     lights = '<emitter type="point"/>' * 3 + '<emitter type="spot"/>'
-    names = [light.name for light in scenes.lights_of(parse_lit(lights))]
+    names = [light.name for light in emitters.named_emitters(parse_lit(lights))]
     assert names == ["point light 1", "point light 2", "point light 3", "spot light"]
 
 
 def test_a_light_without_an_id_has_the_name_of_its_file(built_in, tmp_path):
     parsed = scenes.parse(built_in("cornell"))
-    assert [light.name for light in scenes.lights_of(parsed)] == ["light_shape"]
+    assert [light.name for light in emitters.named_emitters(parsed)] == ["light_shape"]
     copied = scenes.parse(scenes.write(parsed, tmp_path))
-    assert [light.name for light in scenes.lights_of(copied)] == ["light"]
+    assert [light.name for light in emitters.named_emitters(copied)] == ["light"]
 
 
 def test_every_light_gets_a_texture_of_its_own(parse_lit):
     parsed = parse_lit("".join(LIGHTS.values()))
-    before = scenes.lights_of(parsed)
+    before = emitters.named_emitters(parsed)
 
     def make(count):
         strengths = Emission(count, scale=1.0)
@@ -382,8 +383,8 @@ def test_every_light_gets_a_texture_of_its_own(parse_lit):
         strengths.prepare()
         return emission_textures(strengths)
 
-    assert scenes.set_emission(parsed, make) == before
-    strengths = [light.strength for light in scenes.lights_of(parsed)]
+    assert edit.set_emission(parsed, make) == before
+    strengths = [light.strength for light in emitters.named_emitters(parsed)]
     np.testing.assert_allclose(np.ravel(strengths), np.arange(27) + 1, rtol=1e-5)
     shown = " ".join(str(emitter) for emitter in parsed.instantiate().emitters())
     assert all(f"Strength[{i}]" in shown for i in range(9))
@@ -392,7 +393,7 @@ def test_every_light_gets_a_texture_of_its_own(parse_lit):
 @pytest.mark.parametrize("kind", ["envmap", "sunsky"])
 def test_a_scene_lit_by_its_environment_alone_has_no_light_to_fit(kind, parse_lit):
     parsed = parse_lit(SKIES[kind])
-    assert scenes.lights_of(parsed) == []
+    assert emitters.named_emitters(parsed) == []
     with pytest.raises(UserError, match="scene.xml: the scene has no light to fit: no area") as e:
-        scenes.set_emission(parsed, lambda count: [])
+        edit.set_emission(parsed, lambda count: [])
     assert "--unknown lighting" in str(e.value) and "\n" not in str(e.value)

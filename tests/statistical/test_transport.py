@@ -16,7 +16,8 @@ from support import (
 
 from unbake.dataset.camera import Camera
 from unbake.fields.texture import material_textures
-from unbake.scene import parse as scenes
+from unbake.scene import edit
+from unbake.scene.parse import parse
 from unbake.transport.path_sample import Requirements, lhs, rhs, trace
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.prior import residual
@@ -73,10 +74,10 @@ def test_fields_in_the_place_of_materials(built_in):
     """The values carried to the BSDFs give what the same constants in the scene file give."""
     colour, roughness = (0.7, 0.4, 0.2), 0.3
     materials = ConstantMaterials(mi.Color3f(*colour), roughness)
-    ours, stock = scenes.parse(built_in("cornell")), scenes.parse(built_in("cornell"))
-    scenes.set_textures(ours, *material_textures(materials))
+    ours, stock = parse(built_in("cornell")), parse(built_in("cornell"))
+    edit.set_textures(ours, *material_textures(materials))
     paint = mi.load_dict({"type": "rgb", "value": list(colour)})
-    scenes.set_textures(stock, paint, roughness)
+    edit.set_textures(stock, paint, roughness)
     scene_view = SceneView.of(ours.instantiate(), materials, 8)
     compare(scene_view, stock.instantiate(), built_in_cameras("cornell", 12))
 

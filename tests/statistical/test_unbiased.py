@@ -19,7 +19,8 @@ from support import (
 
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.texture import material_textures
-from unbake.scene import parse as scenes
+from unbake.scene import edit
+from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
 from unbake.training.step import State, TrainingStep
 from unbake.transport.objective import (
@@ -111,8 +112,8 @@ def test_the_value_of_split_halves_is_the_squared_error_of_the_expected_image():
 def room(built_in):
     """The Cornell box with one principled material whose albedo each lane can have its own of."""
     materials = ConstantMaterials(0.5, 0.4)
-    parsed = scenes.parse(built_in("cornell"))
-    scenes.set_textures(parsed, *material_textures(materials))
+    parsed = parse(built_in("cornell"))
+    edit.set_textures(parsed, *material_textures(materials))
     return SceneView.of(parsed.instantiate(), materials, 8)
 
 

@@ -18,9 +18,9 @@ from support import (
 
 from unbake.acquisition.capture import CaptureSettings, capture
 from unbake.config import DenseGridConfig, LightingConfig, from_toml
-from unbake.dataset.lights import true_environment
+from unbake.dataset.lighting import true_environment
 from unbake.errors import UserError
-from unbake.evaluation.lighting import recovered_lights, sh_error
+from unbake.evaluation.lighting import recovered_emitters, sh_error
 from unbake.training.problem import make_problem, training_pixels
 from unbake.training.regularizers import is_anchored
 from unbake.training.schedule import learning_rates
@@ -70,7 +70,7 @@ def fitted(dataset, unknown, *, steps=200, **settings):
 def test_the_strength_of_a_lamp_is_found(photographs, method):
     dataset = photographs("cornell")
     problem, mean = fitted(dataset, "emission", method=method)
-    (light,) = recovered_lights(problem, dataset.folder)
+    (light,) = recovered_emitters(problem, dataset.folder)
     print(light, mean)
     assert light.truth == pytest.approx([13, 10, 6.5])
     assert mean < 0.3  # where it began, far from the truth

@@ -13,7 +13,7 @@ from support import TINY_FIT
 
 from unbake.acquisition.capture import CaptureSettings, capture
 from unbake.config import LightingConfig
-from unbake.dataset.lights import ROWS, true_environment
+from unbake.dataset.lighting import ROWS, true_environment
 from unbake.dataset.views import Dataset
 from unbake.imaging.pictures import tonemap
 from unbake.training.checkpoint import Progress
@@ -94,7 +94,7 @@ def test_materials_alone_are_a_sheet_of_four(cornell, tmp_path):
 def test_lights_are_told_in_a_line_and_have_no_picture(cornell, tmp_path):
     problem, lines = preview(cornell, "emission", tmp_path / "previews")
     assert not (tmp_path / "previews").exists()
-    (name,) = problem.lights
+    (name,) = problem.emitter_names
     assert lines[0]["validation"] == {"emission": {name: pytest.approx([START] * 3)}}
     said = io.StringIO()
     with Monitor(tmp_path / "log.jsonl", Console(file=said, width=200), 100) as monitor:

@@ -18,7 +18,8 @@ from support import (
 
 from unbake.acquisition.capture import CaptureSettings, capture
 from unbake.fields.texture import material_textures
-from unbake.scene import parse as scenes
+from unbake.scene import edit
+from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
 from unbake.transport.objective import pixel_means, squared_error
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
@@ -148,9 +149,9 @@ class Everywhere(ConstantMaterials):
 
 def test_split_halves_and_two_passes_have_one_expectation(built_in):
     materials = Everywhere(0.6, 0.4)
-    parsed = scenes.parse(built_in("cornell"))
-    scenes.to_principled(parsed)
-    scenes.set_textures(parsed, *material_textures(materials))
+    parsed = parse(built_in("cornell"))
+    edit.to_principled(parsed)
+    edit.set_textures(parsed, *material_textures(materials))
     scene = parsed.instantiate()
     spp, integrator = 4, path_replay(3, 3, False)
     cameras = built_in_cameras("cornell", 16)

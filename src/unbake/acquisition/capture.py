@@ -12,12 +12,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..dataset.camera import Camera, frame_name, read_cameras
-from ..dataset.lights import write_lights
+from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..imaging.pictures import write_exr
-from ..scene import parse as scenes
+from ..scene import edit, emitters
+from ..scene.parse import parse, write
 from ..transport.render import parts_of, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
@@ -99,7 +100,7 @@ def _capture(
     sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     albedo, roughness, mask = _truth(path, scene, rays)
-    write_lights(path, folder / "truth")
+    write_true_lighting(path, folder / "truth")
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
         shape = (camera.height, camera.width)
@@ -152,19 +153,19 @@ def _copy_scene(name: str, folder: Path, tell: Callable[[str], None]) -> tuple[P
         if source.suffix != ".xml" and not source.exists():
             known = ", ".join(SCENES)
             raise UserError(f"no such scene: {name!r}", None, f"Give an XML file or one of {known}")
-    parsed = scenes.parse(source)
-    changed = scenes.to_principled(parsed)
+    parsed = parse(source)
+    changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")
     if not parsed.principled_nodes():
         raise UserError(
             "no material to fit: no shape has a principled, diffuse or roughplastic BSDF", source
         )
-    original = scenes.parse(source)
-    scenes.to_principled(original)
+    original = parse(source)
+    edit.to_principled(original)
     scene = original.instantiate()
-    scenes.require_emitters(scene, source)
-    path = scenes.write(parsed, folder)
+    emitters.require_emitters(scene, source)
+    path = write(parsed, folder)
     shutil.rmtree(made, ignore_errors=True)
     return path, scene
 
@@ -232,8 +233,8 @@ def _truth(
     """Albedo, roughness and mask of all pixels."""
     specular = 32  # cut-outs only: what lies behind a mirror is masked out
     images = []
-    parsed = scenes.parse(path)
-    scenes.show_roughness_as_albedo(parsed)
+    parsed = parse(path)
+    edit.show_roughness_as_albedo(parsed)
     for shown in (scene, parsed.instantiate()):
         scene_view = SceneView.of(shown, None, specular)
         images.append(

@@ -105,7 +105,7 @@ def place_room(
     if len(positions) == 0:
         raise UserError("no free space for a camera in the scene", remedy=_REMEDY)
     points = free_space.sample_surface(scene, _POINTS, seed, power=0.5)
-    seen = free_space.sees(scene, positions, points)
+    seen = free_space.visibility(scene, positions, points)
     candidates = _candidates(scene, positions, points, seen, up, fov, seed)
     if len(candidates.eye) < views + held_out:
         raise UserError(f"no room for {views + held_out} cameras in the scene", remedy=_REMEDY)
@@ -184,11 +184,11 @@ def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -
     seen = np.zeros(len(points.position), dtype=bool)
     for camera in cameras:
         framed = np.flatnonzero(~seen & _in_frame(camera, points.position))
-        seen[framed] = free_space.sees(scene, camera.origin[None], _subset(points, framed))[0]
+        seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
     reachable = seen.copy()
     for position in _standpoints(scene):
         hidden = np.flatnonzero(~reachable)
-        reachable[hidden] = free_space.sees(scene, position[None], _subset(points, hidden))[0]
+        reachable[hidden] = free_space.visibility(scene, position[None], _subset(points, hidden))[0]
     return float(seen.sum() / max(reachable.sum(), 1))
 
 
@@ -244,8 +244,12 @@ def _importance(
     light = np.zeros(len(points.position))
     for turn in range(_VIEWERS):
         viewer = positions[np.argmax(seen * rng.random(seen.shape), axis=0)]
-        light += free_space.radiance(scene, viewer, points.position, seed + turn) / _VIEWERS
-    shown = free_space.sees(scene, free_space.sensor_probes(scene, seed)[:32], points).any(axis=0)
+        light += (
+            free_space.outgoing_radiance(scene, viewer, points.position, seed + turn) / _VIEWERS
+        )
+    shown = free_space.visibility(scene, free_space.sensor_probes(scene, seed)[:32], points).any(
+        axis=0
+    )
     shown = shown if shown.any() else seen.any(axis=0)
     usual = np.median(light[shown]) if shown.any() else 0.0
     if usual == 0:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..config import FitConfig
-from ..dataset.lights import ROWS, true_environment
+from ..dataset.lighting import ROWS, true_environment
 from ..dataset.pixels import CameraRays
 from ..dataset.views import View
 from ..imaging.metrics import mean_psnr, psnr
@@ -179,7 +179,7 @@ def _evaluate_light(recovered: Recovered, folder: Path, tell: Callable[[str], No
             found["environment"] = numbers = lighting.compare_environments(map_, truth)
             tell(", ".join(f"environment {k} {v:.3g}" for k, v in numbers.items()))
     if problem.emission is not None:
-        found["emission"] = [asdict(x) for x in lighting.recovered_lights(problem, data)]
+        found["emission"] = [asdict(x) for x in lighting.recovered_emitters(problem, data)]
         for row in found["emission"]:
             error = row["emission_error"]
             off = "" if error is None else f", {100 * error:.2f} % off"

@@ -1,4 +1,4 @@
-"""How good recovered light is: the environment map, what it lights, and the lights' colours."""
+"""Scores of recovered lighting: the environment map, balls relit by it, and emitter strengths."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..dataset.lights import true_emission
+from ..dataset.lighting import true_emission
 from ..imaging.metrics import psnr
 from ..training.problem import Problem
 
-#: Spherical harmonics up to this order are what surfaces that are not mirrors see of the light.
+#: Degree of the spherical harmonics: rougher surfaces than mirrors respond to little beyond it.
 ORDER = 3
 RELIT_HEIGHT = 40
 RELIT_SAMPLES = 256
-#: Below it a norm is that of darkness; errors are relative to no less.
+#: Smallest norm that an error is relative to.
 DARK = 1e-9
 
 DEFINITIONS = {
@@ -34,8 +34,8 @@ DEFINITIONS = {
 
 
 @dataclass(frozen=True)
-class RecoveredLight:
-    """A light whose strength was sought, and how far from the truth it was found."""
+class RecoveredEmitter:
+    """An emitter whose strength was optimized, and its relative error."""
 
     name: str
     strength: list[float]  # linear RGB
@@ -43,8 +43,8 @@ class RecoveredLight:
     emission_error: float | None
 
 
-def recovered_lights(problem: Problem, data: Path) -> list[RecoveredLight]:
-    """The lights' strengths beside the true ones of the data set, where those are known.
+def recovered_emitters(problem: Problem, data: Path) -> list[RecoveredEmitter]:
+    """The emitters' strengths beside the true ones of the data set, where those are known.
 
     Raises:
         UserError: the data set's truth cannot be read.
@@ -52,18 +52,18 @@ def recovered_lights(problem: Problem, data: Path) -> list[RecoveredLight]:
     if problem.emission is None:
         return []
     known, found = true_emission(data), np.array(problem.emission.values).T
-    lights = []
-    for name, strength in zip(problem.lights, found, strict=True):
+    recovered = []
+    for name, strength in zip(problem.emitter_names, found, strict=True):
         truth, error = known.get(name), None
         if truth is not None:
             error = _relative_error(strength, truth)
         true = None if truth is None else truth.tolist()
-        lights.append(RecoveredLight(name, [float(x) for x in strength], true, error))
-    return lights
+        recovered.append(RecoveredEmitter(name, [float(x) for x in strength], true, error))
+    return recovered
 
 
 def compare_environments(found: np.ndarray, truth: np.ndarray) -> dict:
-    """How near a map is to the true one, plainly and after alignment of its scale.
+    """Errors of a map against the true one, as it is and with its scale aligned.
 
     Args:
         found, truth: linear RGB radiance in the layout of `latlong`, shape (h, 2 h, 3).
@@ -80,7 +80,7 @@ def compare_environments(found: np.ndarray, truth: np.ndarray) -> dict:
 
 
 def environment_scale(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Of each channel, the factor that brings the low frequencies of a map nearest to another's."""
+    """Factors (3,), one a channel, that fit a map to the truth: least squares of coefficients."""
     c, true = sh_coefficients(found), sh_coefficients(truth)
     return (c * true).sum(0) / np.maximum((c * c).sum(0), DARK)
 
@@ -114,19 +114,19 @@ def sh_coefficients(image: np.ndarray) -> np.ndarray:
 
 
 def relight_psnr(found: np.ndarray, truth: np.ndarray) -> float:
-    """How alike things look under a map and under the true one; see `DEFINITIONS`."""
+    """PSNR in dB of balls lit by a map and by the true one; see `DEFINITIONS`."""
     true, seen = relit(truth)
     white = max(float(np.percentile(true[seen], 99)), DARK)
     pictures = [np.clip(picture / white, 0, 1) for picture in (relit(found)[0], true)]
-    # Equal pictures have no number; JSON has no infinity.
+    # JSON has no infinity for the PSNR of equal images.
     return min(psnr(*pictures, seen), 120.0)
 
 
 def relit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Three balls under a map, in nothing else: no direction is up.
+    """Render three balls, lit by a map alone.
 
     Returns:
-        Linear RGB, (RELIT_HEIGHT, 3 RELIT_HEIGHT, 3), and where balls are.
+        Linear RGB, shape (RELIT_HEIGHT, 3 RELIT_HEIGHT, 3), and the mask of the balls.
     """
     materials = [
         {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}},
@@ -159,7 +159,7 @@ def _relative_error(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def _solid_angles(rows: int) -> np.ndarray:
-    """Of each texel of a map, (rows, 2 rows); the first and the last row are the poles."""
+    """Solid angles of a map's texels, (rows, 2 rows); the first and the last row are the poles."""
     edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0, 1))
     return np.repeat((edges[:-1] - edges[1:])[:, None] * np.pi / rows, 2 * rows, 1)
 

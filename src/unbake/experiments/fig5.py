@@ -20,7 +20,8 @@ from ..config import DenseGridConfig, FitConfig, PathConfig, PriorName
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..profiling.bench_step import FreshFit, begin_fit
-from ..scene.parse import parse, to_principled, write
+from ..scene.edit import to_principled
+from ..scene.parse import parse, write
 from ..training.memory import peak_bytes
 from ..training.step import lacks_memory
 from .experiment import Experiment, ExperimentContext, ExperimentResult, save_figure

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..dataset.lights import true_environment
+from ..dataset.lighting import true_environment
 from ..imaging.pictures import montage, read_exr, tonemap, write_png
 from .experiment import Experiment, ExperimentContext, ExperimentResult
 from .jobs import Findings, Job

@@ -18,7 +18,8 @@ from ..config import FitConfig, from_toml
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..imaging.pictures import read_exr, tonemap, write_exr, write_png
-from ..scene.parse import ParsedScene, parse, referenced, to_principled, write
+from ..scene.edit import to_principled
+from ..scene.parse import ParsedScene, parse, referenced, write
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
 

@@ -12,7 +12,8 @@ from ..acquisition.placement import coverage
 from ..dataset.camera import read_cameras
 from ..dataset.pixels import CameraRays
 from ..imaging.pictures import montage, tonemap, write_png
-from ..scene.parse import parse, to_principled
+from ..scene.edit import to_principled
+from ..scene.parse import parse
 from ..transport.path_tracer import path_lengths
 from ..transport.render import parts_of, render_radiance
 from ..transport.vertex import SceneView

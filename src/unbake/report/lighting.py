@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from unbake.dataset.lights import true_environment
+from unbake.dataset.lighting import true_environment
 from unbake.report import display
 from unbake.report.runs import Run
 

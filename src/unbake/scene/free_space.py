@@ -1,4 +1,4 @@
-"""Where a camera can stand in a scene and which surfaces it sees from there, by ray tests.
+"""Positions where a camera can stand in a scene, and the visibility of surfaces from them.
 
 Positions, normals and directions are (n, 3) float64 arrays in world space.
 """
@@ -13,13 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Fractions of the scene's diagonal
+# Fractions of the scene's diagonal.
 CLEARANCE = 0.03
 CONTACT = 1e-3
 SMALL_OBJECT = 0.15
 _RAY_OFFSET = 1e-4
 
-# A room may have windows or lack a wall: the open front of a box is a sixth of the directions
+# A room may have windows or lack a wall: the open front of a box takes a sixth of the directions.
 ROOM_ENCLOSURE = 0.75
 
 _DIRECTIONS = 64
@@ -29,18 +29,17 @@ _CHUNK = 1 << 20
 @final
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """First hits of rays: distances (n,) in world units, infinite where nothing was hit, whether
-    the geometric normal faces away from the ray's origin, and whether that side is black."""
+    """First hits of n rays."""
 
-    distance: np.ndarray
-    back: np.ndarray
-    black: np.ndarray
+    distance: np.ndarray  #: (n,) world units, infinite where nothing was hit
+    back: np.ndarray  #: (n,) bool: a back face, by the geometric normal
+    black: np.ndarray  #: (n,) bool: a back face of a one-sided BSDF, which reflects nothing
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on surfaces whose material is sought, (n, 3) each: positions and unit normals."""
+    """Points on surfaces whose material is optimized, (n, 3) each: positions and unit normals."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -54,16 +53,16 @@ def bounds(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def up_axis(scene: mi.Scene) -> np.ndarray:
-    """The scene's up direction (3,): the signed coordinate axis that the first sensor stands on.
+    """The scene's up direction (3,), a signed coordinate axis.
 
-    That is the axis level with the sensor's horizon (perpendicular to its x axis) which is nearest
-    to its y axis; y without a sensor.
+    Of the axes perpendicular to the x axis of the first sensor, the one nearest to its y axis; y
+    without a sensor.
     """
     if not scene.sensors():
         return np.array([0.0, 1.0, 0.0])
     matrix = _matrix(scene.sensors()[0])
-    level = np.abs(matrix[0:3, 0]) < 0.17
-    nearness = np.abs(matrix[0:3, 1]) + level
+    perpendicular = np.abs(matrix[0:3, 0]) < 0.17
+    nearness = np.abs(matrix[0:3, 1]) + perpendicular
     axis = int(np.argmax(nearness))
     up = np.zeros(3)
     up[axis] = math.copysign(1.0, matrix[axis, 1])
@@ -88,61 +87,58 @@ def trace(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> Hits:
     return Hits(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def visible(scene: mi.Scene, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Whether nothing stands between two points, for each pair (n,) bool; glass counts as wall."""
+def unoccluded(scene: mi.Scene, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Whether the segment between two points is free, (n,) bool; glass occludes."""
     offset = _RAY_OFFSET * bounds(scene)[2]
     free = np.empty(len(starts), dtype=bool)
     for i in range(0, len(starts), _CHUNK):
-        start, way = starts[i : i + _CHUNK], (ends - starts)[i : i + _CHUNK]
-        length = np.maximum(np.linalg.norm(way, axis=1), 1e-12)
-        ray = _ray(start, way / length[:, None])
+        start, segment = starts[i : i + _CHUNK], (ends - starts)[i : i + _CHUNK]
+        length = np.maximum(np.linalg.norm(segment, axis=1), 1e-12)
+        ray = _ray(start, segment / length[:, None])
         ray.maxt = mi.Float(np.maximum(length - offset, 0.0).astype(np.float32))
         free[i : i + _CHUNK] = ~np.array(scene.ray_test(ray))
     return free
 
 
-def sees(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) -> np.ndarray:
-    """Which surface points (m) are in plain sight of which positions (n): (n, m) bool.
-
-    A surface may be seen from either side; sides are taken as the position lies.
-    """
+def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) -> np.ndarray:
+    """Visibility of surface points (m) from positions (n), from either side: (n, m) bool."""
     offset = _RAY_OFFSET * bounds(scene)[2]
     result = np.empty((len(positions), len(points.position)), dtype=bool)
     for row, position in enumerate(positions):
-        way = position - points.position
-        side = np.sign(np.einsum("ij,ij->i", way, points.normal))
+        to_position = position - points.position
+        side = np.sign(np.einsum("ij,ij->i", to_position, points.normal))
         start = points.position + (offset * side)[:, None] * points.normal
-        result[row] = visible(scene, start, np.broadcast_to(position, start.shape))
+        result[row] = unoccluded(scene, start, np.broadcast_to(position, start.shape))
     return result
 
 
-def radiance(
+def outgoing_radiance(
     scene: mi.Scene, eyes: np.ndarray, points: np.ndarray, seed: int, depth: int = 6
 ) -> np.ndarray:
-    """A rough estimate of the light that reaches `eyes` from `points`, (n,), linear, channel mean.
+    """Radiance from `points` to `eyes`, (n,), linear, mean of the channels: one path each.
 
-    One path each; the path must start in plain sight of the point.
+    Each point must be visible from its eye.
     """
-    way = points - eyes
-    length = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+    segment = points - eyes
+    length = np.maximum(np.linalg.norm(segment, axis=1, keepdims=True), 1e-12)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, len(eyes))
     integrator = mi.load_dict({"type": "path", "max_depth": depth})
-    ray = mi.RayDifferential3f(_ray(eyes, way / length))
+    ray = mi.RayDifferential3f(_ray(eyes, segment / length))
     colour, _, _ = integrator.sample(scene, sampler, ray)
     return np.array(colour, dtype=np.float64).mean(axis=0)
 
 
 def sample_surface(scene: mi.Scene, count: int, seed: int, power: float = 1.0) -> SurfacePoints:
-    """Points spread evenly over the surfaces whose material is sought.
+    """Random points on the surfaces whose material is optimized.
 
-    Emitters and surfaces that only reflect or refract like a mirror or glass are left out. A shape
-    gets a share of the points in proportion to its area to the given power: 1 spreads them by
-    area, less gives small shapes more.
+    Emitters and surfaces with a purely specular BSDF are left out. The probability of a shape is
+    proportional to its area to the given power: 1 samples uniformly by area, less favours small
+    shapes.
     """
     rng = np.random.default_rng(seed)
-    # Scenes are loaded in parallel, so the order of their shapes changes from run to run
-    order = sorted(range(len(scene.shapes())), key=lambda i: _place(scene.shapes()[i]))
+    # Mitsuba 3.9 loads in parallel: the order of the shapes changes from run to run.
+    order = sorted(range(len(scene.shapes())), key=lambda i: _sort_key(scene.shapes()[i]))
     shapes = [scene.shapes()[i] for i in order]
     share = np.array([_area(shape) for shape in shapes]) ** power
     if share.sum() == 0:
@@ -151,41 +147,41 @@ def sample_surface(scene: mi.Scene, count: int, seed: int, power: float = 1.0) -
     uv = mi.Point2f(rng.random((2, count)).astype(np.float32))
     index = mi.UInt32(np.array(order, dtype=np.uint32)[chosen])
     sampled = dr.gather(mi.ShapePtr, scene.shapes_dr(), index).sample_position(0.0, uv)
-    return SurfacePoints(_rows(sampled.p), _rows(sampled.n))
+    return SurfacePoints(_as_rows(sampled.p), _as_rows(sampled.n))
 
 
 def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
     """Whether positions (n, 3) lie inside an object rather than in a room: (n,) bool.
 
-    Rooms are closed too, and published ones have normals either way, so being enclosed or seeing
-    back faces alone says nothing. A position counts as inside where all of 256 directions hit
-    something, no chain of free lines of sight through other positions leads to the space that the
-    scene's own sensors show, and one of these holds:
+    Rooms are closed as well, and published ones have normals of either orientation, so neither
+    enclosure nor back faces suffice. A position counts as inside if rays in all of 256 directions
+    hit something, no chain of free segments through other positions connects it with the space
+    that the scene's own sensors see, and one of these holds:
 
     - nothing is farther away than 15 % of the scene's diagonal (the inside of a small object);
     - 75 % of the hits are back faces which reflect nothing (one-sided materials);
     - 75 % of the hits are back faces, and the box around the hits fills less than half of the
-      scene's bounding box (a larger object: a room with outward normals would fill it). Not all,
-      since an object that stands on the floor often has no bottom of its own.
+      scene's bounding box (a larger object: a room with outward normals would fill it). 75 %
+      because an object on the floor often has no bottom face.
     """
     result = np.zeros(len(positions), dtype=bool)
     for start in range(0, len(positions), 1024):
-        result[start : start + 1024] = _shut_in(scene, positions[start : start + 1024])
-    seeds = sensor_probes(scene, 0)
-    if result.any() and len(seeds):
-        result &= ~_connected(scene, positions, seeds, 0)
+        result[start : start + 1024] = _enclosed(scene, positions[start : start + 1024])
+    probes = sensor_probes(scene, 0)
+    if result.any() and len(probes):
+        result &= ~_connected(scene, positions, probes, 0)
     return result
 
 
-def _shut_in(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
-    """The part of `inside_geometry` that looks at one position at a time."""
+def _enclosed(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
+    """The tests of `inside_geometry` that need one position only."""
     low, high, diagonal = bounds(scene)
     directions = sphere_directions(256)
     hits = _trace_spheres(scene, positions, directions)
     enclosed = np.isfinite(hits.distance).all(axis=1)
     distance = np.where(np.isfinite(hits.distance), hits.distance, 0.0)
     extent = np.ptp(distance[..., None] * directions, axis=1)
-    # A flat scene has no volume: compare with a box of some thickness
+    # A flat scene has no volume, so its box gets a minimal thickness.
     filled = np.prod(extent / np.maximum(high - low, 1e-6 * diagonal), axis=1)
     small = distance.max(axis=1) < SMALL_OBJECT * diagonal
     black = hits.black.mean(axis=1) >= 0.75
@@ -194,27 +190,29 @@ def _shut_in(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
 
 
 def enclosure(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
-    """The fraction of all directions in which positions (n, 3) meet a surface: (n,) in [0, 1]."""
+    """The fraction of directions from positions (n, 3) that hit a surface: (n,) in [0, 1]."""
     hits = _trace_spheres(scene, positions, sphere_directions(_DIRECTIONS))
     return np.isfinite(hits.distance).mean(axis=1)
 
 
 def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
-    """Positions in the space that the scene's own sensors show, (n, 3): on their view rays between
-    the entry into the scene's bounding box and the first surface."""
+    """Random positions in the space that the scene's own sensors see, (n, 3).
+
+    They lie on camera rays between the scene's bounding box and the first hit.
+    """
     rng = np.random.default_rng(seed)
     low, high, diagonal = bounds(scene)
     probes = [np.empty((0, 3))]
     for sensor in scene.sensors():
         film = mi.Point2f(rng.random((2, 64)).astype(np.float32))
         ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
-        origins, directions = _rows(ray.o), _rows(ray.d)
+        origins, directions = _as_rows(ray.o), _as_rows(ray.d)
         far = trace(scene, origins, directions).distance
         with np.errstate(divide="ignore", invalid="ignore"):
             walls = np.stack([(low - origins) / directions, (high - origins) / directions])
         enter = np.maximum(np.nanmax(walls.min(axis=0), axis=1), 0.0)
         leave = np.minimum(np.nanmin(walls.max(axis=0), axis=1), far)
-        # A sensor that looks at the outside of a wall shows no space
+        # A sensor close to the outside of a wall sees no space.
         usable = leave > enter + CONTACT * diagonal
         depth = enter + (leave - enter) * rng.random(len(far))
         probes.append((origins + depth[:, None] * directions)[usable])
@@ -222,46 +220,46 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
 
 
 def free_positions(scene: mi.Scene, count: int, seed: int) -> np.ndarray:
-    """Up to `count` positions in a room where a camera can stand, spread evenly, (n, 3).
+    """Up to `count` quasi-random positions in a room where a camera can stand, (n, 3).
 
-    Each has surfaces around it (75 % of all directions), is at least 3 % of the scene's diagonal
-    from every surface, and is connected with the space that the scene's own sensors show by a
-    chain of free lines of sight. So the insides of cupboards and the outside of the room are left
-    out. Without a sensor that shows the inside, all space outside objects counts.
+    Each is enclosed by surfaces (75 % of all directions), at least 3 % of the scene's diagonal away
+    from them, and connected with the space that the scene's own sensors see by a chain of free
+    segments. This rules out the insides of cupboards and the outside of the room. Without a sensor
+    inside the room, all space outside objects counts.
     """
     low, high, diagonal = bounds(scene)
-    # Four times as many candidates as asked for: furniture and the space outside take their share
+    # Candidates in furniture or outside are rejected below, hence four times as many.
     candidates = low + (high - low) * _quasi_random(max(4 * count, 4096), seed)
     hits = _trace_spheres(scene, candidates, sphere_directions(_DIRECTIONS))
     free = hits.distance.min(axis=1) > CLEARANCE * diagonal
     free &= np.isfinite(hits.distance).mean(axis=1) >= ROOM_ENCLOSURE
     candidates = candidates[free]
-    seeds = sensor_probes(scene, seed)
-    if len(seeds):
-        return candidates[_connected(scene, candidates, seeds, seed)][:count]
+    probes = sensor_probes(scene, seed)
+    if len(probes):
+        return candidates[_connected(scene, candidates, probes, seed)][:count]
     return candidates[~inside_geometry(scene, candidates)][:count]
 
 
-def _connected(scene: mi.Scene, positions: np.ndarray, seeds: np.ndarray, seed: int) -> np.ndarray:
-    """Which positions a chain of free lines of sight joins with one of the seeds: (n,) bool."""
+def _connected(scene: mi.Scene, positions: np.ndarray, starts: np.ndarray, seed: int) -> np.ndarray:
+    """Whether a chain of free segments connects each position with one of `starts`: (n,) bool."""
     rng = np.random.default_rng(seed)
     reached = np.zeros(len(positions), dtype=bool)
     idle = 0
     while idle < 2 and not reached.all():
-        waiting = np.flatnonzero(~reached)
-        # Not all pairs: whoever a round misses is met from others in the next ones
-        sources = np.concatenate([seeds, positions[reached]])
+        remaining = np.flatnonzero(~reached)
+        # A random subset of all pairs: later rounds find what this one misses.
+        sources = np.concatenate([starts, positions[reached]])
         sources = sources[rng.permutation(len(sources))[:64]]
-        starts = np.repeat(positions[waiting], len(sources), axis=0)
-        lines = visible(scene, starts, np.tile(sources, (len(waiting), 1)))
-        new = waiting[lines.reshape(len(waiting), -1).any(axis=1)]
+        ends = np.repeat(positions[remaining], len(sources), axis=0)
+        free = unoccluded(scene, ends, np.tile(sources, (len(remaining), 1)))
+        new = remaining[free.reshape(len(remaining), -1).any(axis=1)]
         reached[new] = True
         idle = 0 if len(new) else idle + 1
     return reached
 
 
 def _quasi_random(count: int, seed: int) -> np.ndarray:
-    """The R3 sequence: (count, 3) in [0, 1), whose every prefix is spread evenly."""
+    """Points of the R3 low-discrepancy sequence with a random offset, (count, 3) in [0, 1)."""
     golden = 1.2207440846057596
     steps = golden ** -np.arange(1.0, 4.0)
     start = np.random.default_rng(seed).random(3)
@@ -293,7 +291,7 @@ def _ray(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
 
 
-def _rows(vector: mi.Vector3f) -> np.ndarray:
+def _as_rows(vector: mi.Vector3f) -> np.ndarray:
     return np.array(vector, dtype=np.float64).reshape(3, -1).T
 
 
@@ -301,15 +299,15 @@ def _matrix(sensor: mi.Sensor) -> np.ndarray:
     return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
 
 
-def _place(shape: mi.Shape) -> tuple[float, ...]:
-    """What tells shapes of a scene apart however they are ordered: bounding box and area."""
+def _sort_key(shape: mi.Shape) -> tuple[float, ...]:
+    """Bounding box and area: a key that does not depend on the order of a scene's shapes."""
     box = shape.bbox()
     corners = np.concatenate([np.array(box.min).ravel(), np.array(box.max).ravel()])
     return (*corners.tolist(), float(np.asarray(shape.surface_area()).ravel()[0]))
 
 
 def _area(shape: mi.Shape) -> float:
-    """The shape's area, zero where no material is sought on it."""
+    """The shape's area; zero if its material is not optimized."""
     if shape.is_emitter() or shape.bsdf() is None:
         return 0.0
     if not shape.bsdf().flags() & int(mi.BSDFFlags.Smooth):

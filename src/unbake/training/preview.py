@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.lights import ROWS, true_environment
+from ..dataset.lighting import ROWS, true_environment
 from ..dataset.views import Dataset, View
 from ..imaging.pictures import montage, to_bytes, tonemap, write_png
 from .checkpoint import Progress
@@ -50,7 +50,9 @@ class Preview:
             sheets.append([montage([[map_], *self._environment])])
         if self._problem.emission is not None:
             strengths = np.array(self._problem.emission.values).T.tolist()
-            found.append({"emission": dict(zip(self._problem.lights, strengths, strict=True))})
+            found.append(
+                {"emission": dict(zip(self._problem.emitter_names, strengths, strict=True))}
+            )
         if sheets:
             file = self._folder / f"step-{progress.step:06d}.png"
             write_png(file, montage(sheets, gap=0))

@@ -1,4 +1,4 @@
-"""From a data set and settings to what is fitted."""
+"""The problem that a fit solves: a scene with trainable fields in the place of its unknowns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from ..fields.envmap import EnvironmentMap, environment_emitter
 from ..fields.materials import Materials, make_materials
 from ..fields.radiance import RadianceField, make_radiance
 from ..fields.texture import material_textures, slots_of
-from ..scene import parse as scenes
+from ..scene import edit, emitters
+from ..scene.parse import ParsedScene, parse
 from ..transport.objective import METHODS, requirements
 from ..transport.vertex import SceneView
 
@@ -30,16 +31,16 @@ Parameters = Mapping[str, mi.Float | mi.TensorXf]
 
 @dataclass
 class Problem:
-    """A world with unknowns φ in it, and its radiance field if the method has one.
+    """A scene with unknowns φ, and the radiance field if the method has one.
 
-    What is None is known, and as the scene says.
+    A field that is None is not optimized: the scene gives its values.
     """
 
     scene_view: SceneView
     materials: Materials | None
     environment: EnvironmentMap | None
     emission: Emission | None
-    lights: list[str]  #: names of the lights whose strength is unknown
+    emitter_names: list[str]  #: of the emitters whose strength is unknown
     radiance: RadianceField | None
     hide_emitters: bool
     half_precision: bool  #: in products of its networks
@@ -54,7 +55,7 @@ class Problem:
         return named
 
     def assign(self, parameters: Parameters) -> None:
-        """Use these arrays from now on, whatever was derived from others."""
+        """Use these arrays, and derive again what depends on them."""
         if self.materials is not None:
             self.materials.assign(parameters)
         for word, light in self._lighting():
@@ -78,36 +79,36 @@ class Problem:
 
 
 def make_problem(scene: Path, background: str, config: FitConfig, scale: float) -> Problem:
-    """Put fresh fields in the place of what is unknown of a scene.
+    """Replace the unknowns of a scene by untrained fields.
 
     Args:
-        scene: the Mitsuba scene; what it says of the unknowns is ignored.
+        scene: the Mitsuba scene; its own values of the unknowns are ignored.
         background: `visible` or `hidden`.
-        scale: radiance of the untrained radiance field, environment and lights.
+        scale: radiance of the untrained radiance field, environment and emitters.
 
     Raises:
         UserError: the scene cannot be loaded, has no emitter or nothing to fit, or has meshes
             without the texture coordinates that bitmaps need.
     """
-    parsed = scenes.parse(scene)
-    scenes.to_principled(parsed)
+    parsed = parse(scene)
+    edit.to_principled(parsed)
     seeds = np.random.SeedSequence(config.seed).generate_state(2)
     materials = environment = emission = None
-    lights: list[str] = []
+    emitter_names: list[str] = []
     if config.learns_materials:
         materials = _unknown_materials(parsed, config, int(seeds[0]))
     if config.learns_environment:
         environment = EnvironmentMap(config.lighting.resolution, scale=scale)
-        scenes.set_environment(parsed, environment_emitter(environment))
+        edit.set_environment(parsed, environment_emitter(environment))
     if config.unknown == "emission":
-        emission, lights = _unknown_emission(parsed, scale)
+        emission, emitter_names = _unknown_emission(parsed, scale)
     loaded = parsed.instantiate()
-    scenes.require_emitters(loaded, scene)
+    emitters.require_emitters(loaded, scene)
     domain = Domain.of(loaded.bbox())
     if materials is not None:
         materials.domain = domain
         if config.representation == "bitmap":
-            scenes.require_unwrapped(loaded, scene)
+            edit.require_unwrapped(loaded, scene)
             materials.slots = slots_of(loaded)
 
     radiance = None
@@ -119,33 +120,33 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
         materials,
         environment,
         emission,
-        lights,
+        emitter_names,
         radiance,
         background == "hidden",
         config.half_precision,
     )
 
 
-def _unknown_materials(parsed: scenes.ParsedScene, config: FitConfig, seed: int) -> Materials:
-    names = scenes.material_names(parsed)
+def _unknown_materials(parsed: ParsedScene, config: FitConfig, seed: int) -> Materials:
+    names = edit.material_names(parsed)
     materials = make_materials(config, names, seed=seed)
     if config.representation == "bitmap":
         each = [material_textures(materials, slot) for slot in range(len(names))]
-        scenes.set_own_textures(parsed, each)
+        edit.set_own_textures(parsed, each)
     else:
-        scenes.set_textures(parsed, *material_textures(materials))
+        edit.set_textures(parsed, *material_textures(materials))
     return materials
 
 
-def _unknown_emission(parsed: scenes.ParsedScene, scale: float) -> tuple[Emission, list[str]]:
+def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list[str]]:
     made: list[Emission] = []
 
     def textures(count: int) -> list[mi.Texture]:
         made.append(Emission(count, scale=scale))
         return emission_textures(made[0])
 
-    lights = scenes.set_emission(parsed, textures)
-    return made[0], [light.name for light in lights]
+    named = edit.set_emission(parsed, textures)
+    return made[0], [emitter.name for emitter in named]
 
 
 def training_pixels(dataset: Dataset, *, clip_negative: bool) -> PixelSource:

@@ -23,7 +23,7 @@ class SceneView:
         materials: fields that stand in for the unknown materials; None: the scene's own are used.
         max_specular: longest chain of specular interactions followed; longer ones end in black.
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
-        has_lamps: whether any surface of the scene emits light (found by `of`).
+        has_area_emitters: whether any surface of the scene emits light (found by `of`).
     """
 
     scene: mi.Scene

@@ -1,4 +1,4 @@
-"""What the lights of a data set truly are, where it was rendered: files beside its other truth."""
+"""The true lighting of a rendered data set: its environment and the strengths of its emitters."""
 
 from __future__ import annotations
 
@@ -10,45 +10,46 @@ import numpy as np
 from ..errors import UserError
 from ..imaging.pictures import write_exr
 from ..io import array, read_json, text, write_json
-from ..scene import parse as scenes
+from ..scene import emitters
+from ..scene.parse import parse
 from .views import read_image
 
-#: Rows of the picture of a true environment.
+#: Rows of the image of a true environment.
 ROWS = 128
 _AGAIN = "Capture the data set again, or remove the file"
 
 
-def write_lights(scene: Path, folder: Path) -> None:
-    """Write the true lighting of a scene: `environment.exr`, `emission.json`, or what there is.
+def write_true_lighting(scene: Path, folder: Path) -> None:
+    """Write `environment.exr` and `emission.json`, each where the scene has such emitters.
 
     Args:
-        scene: the Mitsuba scene that photographs were rendered from.
+        scene: the Mitsuba scene that the photographs are rendered from.
         folder: `truth` of the data set.
     """
-    parsed = scenes.parse(scene)
-    lights = scenes.lights_of(parsed)
-    if lights:
-        write_json(folder / "emission.json", [asdict(light) for light in lights])
+    parsed = parse(scene)
+    named = emitters.named_emitters(parsed)
+    if named:
+        write_json(folder / "emission.json", [asdict(emitter) for emitter in named])
     loaded = parsed.instantiate()
     if loaded.environment() is not None:
-        picture = scenes.environment_latlong(loaded, ROWS)
+        picture = emitters.environment_latlong(loaded, ROWS)
         write_exr(folder / "environment.exr", np.dstack([picture, np.ones(picture.shape[:2])]))
 
 
 def true_environment(data: Path) -> np.ndarray | None:
-    """The true environment of a data set, in the layout of `latlong`; None where it is not known.
+    """The true environment of a data set, in the layout of `latlong`; None without a file.
 
     Returns:
         Linear RGB radiance, float32, shape (ROWS, 2 ROWS, 3).
 
     Raises:
-        UserError: the file cannot be read, or has another size.
+        UserError: the file cannot be read or has another size.
     """
     file = data / "truth" / "environment.exr"
     if not file.is_file():
         return None
     try:
-        # A map is positive: of pixels below zero, it can only miss what is below.
+        # A recovered map is never negative, so neither is the truth that it is compared with.
         picture = read_image(file, 2 * ROWS, ROWS, clip_negative=True)
     except UserError as error:
         raise UserError(error.what, error.where, _AGAIN) from None
@@ -56,7 +57,7 @@ def true_environment(data: Path) -> np.ndarray | None:
 
 
 def true_emission(data: Path) -> dict[str, np.ndarray]:
-    """The true strength of the lights of a data set by name, linear RGB, where it is known.
+    """True strengths (3,) of a data set's emitters by name, linear RGB; unknown ones left out.
 
     Raises:
         UserError: the file is damaged.
@@ -68,11 +69,11 @@ def true_emission(data: Path) -> dict[str, np.ndarray]:
     if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
         raise UserError("not a list of lights", file, _AGAIN)
     known: dict[str, np.ndarray] = {}
-    for number, light in enumerate(entries):
+    for number, emitter in enumerate(entries):
         where = f"{file}, light {number}"
-        name = text(light, "name", where)
-        if light.get("strength") is not None:
-            known[name] = array(light, "strength", (3,), where)
+        name = text(emitter, "name", where)
+        if emitter.get("strength") is not None:
+            known[name] = array(emitter, "strength", (3,), where)
             if not np.isfinite(known[name]).all():
                 raise UserError(f"the strength of {name!r} is not finite", file, _AGAIN)
     return known

@@ -6,10 +6,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unbake.dataset.lights import ROWS, true_emission, true_environment, write_lights
+from unbake.dataset.lighting import ROWS, true_emission, true_environment, write_true_lighting
 from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
-from unbake.scene import parse as scenes
+from unbake.scene import emitters
+from unbake.scene.parse import parse
 
 
 @pytest.fixture
@@ -25,11 +26,11 @@ def files(folder):
 
 
 def test_an_environment_is_what_directions_see(built_in, truth):
-    write_lights(built_in("still"), truth)
+    write_true_lighting(built_in("still"), truth)
     assert files(truth) == ["environment.exr"]
     picture = true_environment(truth.parent)
     assert picture.shape == (ROWS, 2 * ROWS, 3) and picture.dtype == np.float32
-    expected = scenes.environment_latlong(scenes.parse(built_in("still")).instantiate(), ROWS)
+    expected = emitters.environment_latlong(parse(built_in("still")).instantiate(), ROWS)
     assert expected.std() > 0.1
     np.testing.assert_array_equal(picture, expected)
     assert true_emission(truth.parent) == {}
@@ -44,7 +45,7 @@ def test_an_environment_is_what_directions_see(built_in, truth):
     ],
 )
 def test_the_strength_of_lights_is_that_of_the_scene(name, light, strength, built_in, truth):
-    write_lights(built_in(name), truth)
+    write_true_lighting(built_in(name), truth)
     assert files(truth) == ["emission.json"]
     known = true_emission(truth.parent)
     assert list(known) == [light]
@@ -58,7 +59,7 @@ def test_a_constant_environment_is_both(truth, tmp_path):
         '<scene version="3.0.0"><shape type="sphere"/><emitter type="constant" id="sky">'
         '<rgb name="radiance" value="0.5 1 2"/></emitter></scene>'
     )
-    write_lights(path, truth)
+    write_true_lighting(path, truth)
     assert files(truth) == ["emission.json", "environment.exr"]
     np.testing.assert_allclose(true_environment(tmp_path), np.full((128, 256, 3), [0.5, 1, 2]))
     np.testing.assert_allclose(true_emission(tmp_path)["sky"], [0.5, 1, 2])
@@ -142,7 +143,7 @@ def test_what_is_written_is_plain_json(truth, tmp_path):
         '<scene version="3.0.0"><shape type="sphere"><emitter type="area">'
         '<texture type="checkerboard" name="radiance"/></emitter></shape></scene>'
     )
-    write_lights(path, truth)
+    write_true_lighting(path, truth)
     assert json.loads((truth / "emission.json").read_text()) == [
         {"name": "area light", "strength": None}
     ]
@@ -160,14 +161,14 @@ def test_the_picture_is_what_mitsuba_would_load(truth, tmp_path):
         '<transform name="to_world"><rotate x="1" angle="90"/><rotate z="1" angle="40"/>'
         "</transform></emitter></scene>"
     )
-    write_lights(path, truth)
+    write_true_lighting(path, truth)
     again = {"type": "envmap", "filename": str(truth / "environment.exr")}
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 4000)
     si = mi.SurfaceInteraction3f()
     si.wi = mi.warp.square_to_uniform_sphere(sampler.next_2d())
     found = np.array(mi.load_dict(again).eval(si))
-    true = np.array(scenes.parse(path).instantiate().environment().eval(si))
+    true = np.array(parse(path).instantiate().environment().eval(si))
     assert true.std() > 0.5
     # The picture has sharp edges, which two grids that do not coincide blur.
     assert np.median(np.abs(found - true)) < 0.01

@@ -1,0 +1,149 @@
+"""Edits of a parsed scene: textures and emitters of our own replace those that it has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..errors import UserError
+from ..fields.texture import painted_meshes_without_uv
+from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
+from .parse import ParsedScene, referenced
+
+
+def to_principled(scene: ParsedScene) -> int:
+    """Turn every `diffuse` and rough plastic BSDF into `principled`, as the paper did (Sec. 6).
+
+    Diffuse becomes roughness 0.9; rough plastic keeps its colour, with roughness √α, the perceptual
+    roughness of the same microfacet width.
+
+    Returns:
+        The number of BSDFs changed.
+    """
+    changed = 0
+    for node in scene.state.nodes:
+        props = node.props
+        match props.plugin_name():
+            case "diffuse":
+                colour, roughness = props.get("reflectance", 0.5), 0.9
+            case "roughplastic":
+                colour = props.get("diffuse_reflectance", 0.5)
+                roughness = math.sqrt(props.get("alpha", 0.1))
+            case _:
+                continue
+        for key in list(props.keys()):
+            del props[key]
+        props.set_plugin_name("principled")
+        props["base_color"] = colour
+        props["roughness"] = roughness
+        changed += 1
+    return changed
+
+
+def material_names(scene: ParsedScene) -> list[str]:
+    """Unique names of the `principled` BSDFs, in the order of the nodes.
+
+    Raises:
+        UserError: there is no such BSDF, so nothing could be fitted.
+    """
+    nodes = scene.principled_nodes()
+    if not nodes:
+        raise UserError(
+            "no material to fit: no shape has a principled, diffuse or roughplastic BSDF",
+            where=scene.path,
+        )
+    names: list[str] = []
+    for number, node in enumerate(nodes):
+        name = node.props.id() or f"material-{number}"
+        names.append(name if name not in names else f"{name}-{number}")
+    return names
+
+
+def set_textures(scene: ParsedScene, albedo: object, roughness: object) -> None:
+    """Give every `principled` BSDF these textures; its other parameters keep their values.
+
+    Raises:
+        UserError: there is no such BSDF, so nothing could be fitted.
+    """
+    set_own_textures(scene, [(albedo, roughness)] * len(material_names(scene)))
+
+
+def set_own_textures(scene: ParsedScene, textures: list[tuple[object, object]]) -> None:
+    """Give each `principled` BSDF an albedo and a roughness texture of its own.
+
+    BSDFs with textures of their own are not merged, nor are their shapes.
+    """
+    for node, (albedo, roughness) in zip(scene.principled_nodes(), textures, strict=True):
+        node.props["base_color"] = albedo
+        node.props["roughness"] = roughness
+
+
+def show_roughness_as_albedo(scene: ParsedScene) -> None:
+    """Replace each base colour by the roughness, so that an albedo integrator renders it."""
+    for node in scene.principled_nodes():
+        props = node.props
+        props["base_color"] = props["roughness"] if "roughness" in props else 0.5
+
+
+def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:
+    """Replace the scene's environment, whatever plugin it is.
+
+    Raises:
+        UserError: the scene has no environment.
+    """
+    root = scene.state.root.props
+    for key in root.keys():
+        node = referenced(scene, root[key])
+        if node is not None and node.props.plugin_name() in ENVIRONMENTS:
+            # Under a new name: `transform_merge_meshes` of Mitsuba 3.9 makes up names again that
+            # the parser has used.
+            del root[key]
+            root["unknown environment"] = emitter
+            return
+    raise UserError(
+        "the scene has no environment map to fit",
+        scene.path,
+        "Add one, or fit its lights with --unknown emission",
+    )
+
+
+def set_emission(
+    scene: ParsedScene, make: Callable[[int], Sequence[mi.Texture]]
+) -> list[NamedEmitter]:
+    """Give every emitter of `STRENGTHS` a texture as its strength, also where it had a bitmap.
+
+    Args:
+        make: returns as many textures as it is asked for, each of one colour.
+
+    Returns:
+        The emitters before the edit, in the order of their textures.
+
+    Raises:
+        UserError: the scene has no such emitter.
+    """
+    emitters = named_emitters(scene)
+    if not emitters:
+        raise UserError(
+            "the scene has no light to fit: no area, point, spot or directional one",
+            scene.path,
+            "Add one, or fit its environment map with --unknown lighting",
+        )
+    for i, texture in zip(emitter_nodes(scene), make(len(emitters)), strict=True):
+        props = scene.state.nodes[i].props
+        props[STRENGTHS[props.plugin_name()]] = texture
+    return emitters
+
+
+def require_unwrapped(scene: mi.Scene, path: Path) -> None:
+    """Raise a `UserError` if a mesh with unknown materials has no texture coordinates."""
+    names = painted_meshes_without_uv(scene)
+    if names:
+        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        raise UserError(
+            f"meshes without texture coordinates cannot have bitmaps: {shown}",
+            path,
+            "Use --representation neural or grid, or unwrap the mesh",
+        )
