@@ -241,8 +241,8 @@ def _environment() -> np.ndarray:
     return np.stack([8 * np.exp(-9 * (x - y) ** 2), 4 * y, x], axis=-1)
 
 
-def _seek_light(run: Path, noise: float, unknown: str = "materials+lighting") -> None:
-    """Make a run one that sought the environment map, and say that it found it up to noise."""
+def _optimize_environment(run: Path, noise: float, unknown: str = "materials+lighting") -> None:
+    """Make a run one that optimized the environment map, which it recovered up to noise."""
     map_ = _environment() + noise
     _save(run / "evaluation" / "environment.exr", map_)
     numbers = {"sh_error": noise, "sh_error_aligned": noise / 2}
@@ -251,8 +251,10 @@ def _seek_light(run: Path, noise: float, unknown: str = "materials+lighting") ->
     _edit(run, lambda m: m["definitions"].update(sh_error="|c - c*|", relight_psnr="balls"))
 
 
-def _seek_lamps(run: Path, area_emitters: dict[str, tuple[list[float], float | None]]) -> None:
-    """Make a run one that sought the strength of lights; by name, strength and error."""
+def _optimize_emission(
+    run: Path, area_emitters: dict[str, tuple[list[float], float | None]]
+) -> None:
+    """Make a run one that optimized the strengths of emitters, given with their errors by name."""
     rows = [
         {"name": name, "strength": strength, "emission_error": error,
          "truth": None if error is None else [17, 15.8, 13.8]}
@@ -265,13 +267,13 @@ def _seek_lamps(run: Path, area_emitters: dict[str, tuple[list[float], float | N
 
 def _know_materials(run: Path) -> None:
     """Make a run one whose materials are known: no numbers of them, no pictures."""
-    unsought = {"albedo_psnr": None, "roughness_psnr": None}
-    _seek_light(run, 0.1, "lighting")
+    not_optimized = {"albedo_psnr": None, "roughness_psnr": None}
+    _optimize_environment(run, 0.1, "lighting")
 
     def change(metrics: dict) -> None:
         metrics.update(representation=None)
         for row in (*metrics["per_view"], metrics["heldout"], metrics["train"]):
-            row.update(unsought)
+            row.update(not_optimized)
 
     _edit(run, change)
     for kind in ("albedo", "roughness"):
@@ -284,7 +286,7 @@ def test_a_run_with_known_materials_beside_one_that_seeks_them(made, tmp_path: P
     text = write_report(made[1], tmp_path / "report.html").read_text()
     shown = [alt for alt in _Page(text).images() if "heldout_000" in alt and "Albedo" in alt]
     assert len(shown) == 3 and not any("direct" in alt for alt in shown)
-    assert "known, not sought" in text and "lighting sought" in text
+    assert "known, not optimized" in text and "lighting optimized" in text
     assert "Materials and lighting recovered" in text
 
 
@@ -294,7 +296,7 @@ def test_runs_with_known_materials_show_renderings_alone(made, tmp_path: Path):
     text = write_report(made[1], tmp_path / "report.html").read_text()
     shown = [alt for alt in _Page(text).images() if "heldout_000" in alt]
     assert len(shown) == 5 and all(alt.startswith("Rendering") for alt in shown)
-    assert "Lighting recovered in room" in text and "not sought" not in text
+    assert "Lighting recovered in room" in text and "not optimized" not in text
 
 
 def _section(text: str, name: str) -> str:
@@ -317,8 +319,8 @@ def test_runs_that_know_the_light_have_no_section_on_it(made, tmp_path: Path):
 def test_environment_maps_are_shown_beside_the_truth(made, tmp_path: Path):
     _save(made[0] / "truth" / "environment.exr", _environment(), np.ones((128, 256)))
     third = _make_run(tmp_path / "runs" / "prb", made[0], "prb", 0.05)
-    _seek_light(made[1][0], 0.04)
-    _seek_light(made[1][1], 0.2, "lighting")
+    _optimize_environment(made[1][0], 0.04)
+    _optimize_environment(made[1][1], 0.2, "lighting")
     text = write_report([*made[1], third], tmp_path / "report.html").read_text()
     light = _section(text, "light")
     assert 'href="#light"' in text and "at -2.0 stops" in light and "0.05</span>" in light
@@ -331,7 +333,7 @@ def test_environment_maps_are_shown_beside_the_truth(made, tmp_path: Path):
     assert _cells(light) == [
         [*best, ("n best", "125.00")],
         [("n first", "20.00"), ("n", "10.00"), ("n first", "20.00"), ("n", "25.00")],
-        [("n first soft", "known, not sought")],
+        [("n first soft", "known, not optimized")],
     ]
     assert 'class="number best">SH error 4.00 %' in light and light.count("best") == 5
     assert "|c - c*|" in light and "balls" in light
@@ -341,7 +343,7 @@ def test_environment_maps_are_shown_beside_the_truth(made, tmp_path: Path):
 
 def test_all_maps_have_the_exposure_that_suits_the_truth(made, tmp_path: Path):
     _save(made[0] / "truth" / "environment.exr", _environment(), np.ones((128, 256)))
-    _seek_light(made[1][0], 50.0)
+    _optimize_environment(made[1][0], 50.0)
     light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
     assert "at -2.0 stops" in light
     truth, ours = re.findall(r'data-kind="picture".*?src="(.*?)"', light, re.S)
@@ -351,7 +353,7 @@ def test_all_maps_have_the_exposure_that_suits_the_truth(made, tmp_path: Path):
 
 def test_maps_without_truth_stand_alone(made, tmp_path: Path):
     for run in made[1]:
-        _seek_light(run, 0.05)
+        _optimize_environment(run, 0.05)
         _edit(run, lambda m: m.update(environment=None))
     light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
     assert len(_Page(light).images()) == 2 and "no ground truth" in light
@@ -359,17 +361,28 @@ def test_maps_without_truth_stand_alone(made, tmp_path: Path):
 
 
 def test_lights_are_a_table_of_strengths(made, tmp_path: Path):
-    _seek_lamps(made[1][0], {"lamp": ([17.217773, 15.829334, 13.7], 0.0084), EVIL: ([0, 0, 0], 0)})
-    _seek_lamps(made[1][1], {"lamp": ([170.5, 2.25, 0.001], 9.5), "sun": ([1e5, 2, 3], None)})
+    _optimize_emission(
+        made[1][0], {"lamp": ([17.217773, 15.829334, 13.7], 0.0084), EVIL: ([0, 0, 0], 0)}
+    )
+    _optimize_emission(
+        made[1][1], {"lamp": ([170.5, 2.25, 0.001], 9.5), "sun": ([1e5, 2, 3], None)}
+    )
     third = _make_run(tmp_path / "runs" / "prb", made[0], "prb", 0.05)
     text = write_report([*made[1], third], tmp_path / "report.html").read_text()
     light = _section(text, "light").replace("\N{EN SPACE}", " ")
-    unsought, dash = ("n first soft", "known, not sought"), [("n first", "—"), ("n", "—")]
+    not_optimized, dash = ("n first soft", "known, not optimized"), [("n first", "—"), ("n", "—")]
     truth, ours = ("n first", "17.00 15.80 13.80"), ("n first", "17.22 15.83 13.70")
     assert _cells(light) == [
-        [truth, ours, ("n best", "0.84"), ("n first", "170.5 2.2 0.0"), ("n", "950.00"), unsought],
-        [truth, ("n first", "0.00 0.00 0.00"), ("n", "0.00"), *dash, unsought],
-        [("n first", "—"), *dash, ("n first", "100000 2 3"), ("n", "—"), unsought],
+        [
+            truth,
+            ours,
+            ("n best", "0.84"),
+            ("n first", "170.5 2.2 0.0"),
+            ("n", "950.00"),
+            not_optimized,
+        ],
+        [truth, ("n first", "0.00 0.00 0.00"), ("n", "0.00"), *dash, not_optimized],
+        [("n first", "—"), *dash, ("n first", "100000 2 3"), ("n", "—"), not_optimized],
     ]
     assert "of a colour" in light and _Page(text).images().count("Environment map") == 0
     assert _Page(text).count("script") == 1
@@ -377,7 +390,7 @@ def test_lights_are_a_table_of_strengths(made, tmp_path: Path):
 
 def test_lights_alone_are_the_title_and_leave_out_columns_of_materials(made, tmp_path: Path):
     for run in made[1]:
-        _seek_lamps(run, {"lamp": ([1, 2, 3], 0.1)})
+        _optimize_emission(run, {"lamp": ([1, 2, 3], 0.1)})
     text = write_report(made[1], tmp_path / "report.html").read_text()
     assert "Lights recovered in room" in text and "light recovered" in _words(text)
     numbers = _section(text, "numbers")
@@ -386,7 +399,7 @@ def test_lights_alone_are_the_title_and_leave_out_columns_of_materials(made, tmp
 
 def test_an_aligned_albedo_has_its_column(made, tmp_path: Path):
     aligned = {"albedo_psnr_aligned": 43.21}
-    _seek_light(made[1][0], 0.05)
+    _optimize_environment(made[1][0], 0.05)
     _edit(made[1][0], lambda m: [m[split].update(aligned) for split in ("heldout", "train")])
     _edit(made[1][0], lambda m: m["definitions"].update(albedo_psnr_aligned="after scaling"))
     text = _section(write_report(made[1], tmp_path / "report.html").read_text(), "numbers")
@@ -402,7 +415,7 @@ def test_an_aligned_albedo_has_its_column(made, tmp_path: Path):
 def test_what_failed_is_told_and_cannot_inject_markup(made, tmp_path: Path):
     page = tmp_path / "report.html"
     text = write_report(made[1], page, {"ad-pt": f"out of memory {EVIL}"}).read_text()
-    assert "ad-pt came to nothing: out of memory" in _words(text)
+    assert "ad-pt failed: out of memory" in _words(text)
     assert _Page(text).count("script") == 1
 
 
@@ -463,14 +476,14 @@ def _remove(path: str) -> Callable[[Path, list[Path]], None]:
         ),
         (
             lambda data, runs: (
-                _seek_light(runs[0], 0.1),
+                _optimize_environment(runs[0], 0.1),
                 _save(data / "truth" / "environment.exr", np.zeros((2, 4, 4))),
             ),
             r"truth/environment\.exr",
         ),
         (
             lambda data, runs: (
-                _seek_light(runs[0], 0.1),
+                _optimize_environment(runs[0], 0.1),
                 _save(data / "truth" / "environment.exr", _environment(), np.ones((128, 256))),
                 _save(runs[0] / "evaluation" / "environment.exr", np.zeros((2, 4, 3))),
             ),

@@ -169,7 +169,7 @@ def place_object(
 def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -> float:
     """The fraction of the reachable surface area that at least one camera sees, in [0, 1].
 
-    Surfaces are those whose material is sought (no emitters, no mirrors and glass). Reachable is
+    Surfaces are those whose material is optimized (no emitters, no mirrors and glass). Reachable is
     what a camera sees from some position where one can stand: in a room from 512 positions of its
     free space (`freespace.free_positions`), around an object from 512 positions on the sphere of
     twice its radius, below it as well; what a given camera sees is always reachable. The backs of

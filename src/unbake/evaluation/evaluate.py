@@ -30,7 +30,7 @@ DEFINITIONS = {
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
-    "mask": "pixels all of whose samples see a material that is sought: emitters, mirrors, glass "
+    "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",
 }
 

@@ -1,4 +1,4 @@
-"""What a page says of recovered light: environment maps side by side, and the lights' strengths."""
+"""The page's section on light: environment maps side by side, and the strengths of the lights."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ NUMBERS = {
 
 
 def light_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
-    """The section's contents for the template: `maps` and `lights`, each None where not sought.
+    """The section's contents for the template: `maps` and `lights`, each None where not optimized.
 
     Raises:
         UserError: a map is gone, cannot be read, or has another size than the true one.
     """
-    if not any(run.seeks("environment") or run.seeks("emission") for run in runs):
+    if not any(run.optimizes("environment") or run.optimizes("emission") for run in runs):
         return None
     return {"maps": _maps(runs, data), "lights": _lights(runs)}
 
 
 def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
     """Maps at one exposure, which suits the truth where it is known, and their errors."""
-    if not any(run.seeks("environment") for run in runs):
+    if not any(run.optimizes("environment") for run in runs):
         return None
     truth = true_environment(data)
     found: list[np.ndarray | None] = []
     errors: list[np.ndarray | None] = []
     for run in runs:
-        path = display.evaluated(run, "environment.exr") if run.seeks("environment") else None
+        path = display.evaluated(run, "environment.exr") if run.optimizes("environment") else None
         found.append(None if path is None else display.rgb(path)[0])
         known = path is not None and truth is not None
         errors.append(display.error(found[-1], truth, path) if known else None)
@@ -53,7 +53,7 @@ def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
         {
             "picture": None if map_ is None else display.tonemapped(map_, exposure),
             "error": None if off is None else display.painted(off, scale, np.ones(off.shape, bool)),
-            "empty": "known, not sought",
+            "empty": "known, not optimized",
             "number": f"SH error {low['text']} %" if low["text"] != display.DASH else display.DASH,
             "best": low["best"],
         }
@@ -84,7 +84,7 @@ def _numbers(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
 
 def _lights(runs: list[Run]) -> list[dict[str, Any]] | None:
     """One row a light: its true strength, and each run's with its error."""
-    if not any(run.seeks("emission") for run in runs):
+    if not any(run.optimizes("emission") for run in runs):
         return None
     found = [{row["name"]: row for row in run.metrics.get("emission") or ()} for run in runs]
     rows = []
@@ -93,7 +93,8 @@ def _lights(runs: list[Run]) -> list[dict[str, Any]] | None:
         truth = next((light["truth"] for light in said if light.get("truth")), None)
         errors = [display.number(light.get("emission_error")) for light in said]
         cells = [
-            cell | {"strength": _colour(light.get("strength")), "optimized": run.seeks("emission")}
+            cell
+            | {"strength": _colour(light.get("strength")), "optimized": run.optimizes("emission")}
             for cell, light, run in zip(
                 display.marked(errors, display.percent, min), said, runs, strict=True
             )

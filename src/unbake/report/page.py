@@ -62,11 +62,11 @@ AXES = {"step": "step", "seconds": "training time, seconds"}  # key in the log: 
 
 @final
 @dataclass(frozen=True)
-class Scaling:
-    """How values become colours, the same for every run and view, so that they compare."""
+class Scales:
+    """How values become colours, the same for all runs and views."""
 
-    exposure: float  # stops
-    error: dict[str, float]  # the brightest colour, a quantity
+    exposure: float  #: stops
+    error: dict[str, float]  #: by quantity, the error that has the brightest colour
 
 
 def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | None = None) -> Path:
@@ -80,7 +80,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
     Args:
         runs: run folders, all evaluated on the same data.
         out: the page's file; it appears complete or not at all.
-        failed: further runs that came to nothing, by name: why.
+        failed: further runs that failed: name to reason.
 
     Returns:
         `out`.
@@ -94,12 +94,12 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
     data = data_folder(loaded)
     transforms = read_json(data / "transforms.json", "Give back the data that the run was fit to")
     views = read_views(data, transforms, loaded)
-    scaling = _scaling(loaded, views)
+    scales = _scales(loaded, views)
     groups = [
         {
             "split": split,
             "total": sum(frame.get("split") == split for frame in transforms["frames"]),
-            "views": [_view_block(view, loaded, scaling) for view in views if view.split == split],
+            "views": [_view_block(view, loaded, scales) for view in views if view.split == split],
         }
         for split in SPLITS
     ]
@@ -114,10 +114,10 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             rows=_table(loaded),
             light=light_section(loaded, data),
             optimized=_optimized(loaded),
-            materials=any(run.seeks("albedo") for run in loaded),
+            materials=any(run.optimizes("albedo") for run in loaded),
             failed=failed or {},
             groups=groups,
-            exposure=scaling.exposure,
+            scales=scales,
             longest=display.LONGEST_SIDE,
             magma=pictures.MAGMA,
             chart=charts,
@@ -142,13 +142,13 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
 
 def _recovered(run: Run, view: View, quantity: str) -> Path | None:
     """Where a run's picture of a view lies; None where there is none to be expected."""
-    if not run.view(view.name) or not run.seeks(quantity):
+    if not run.view(view.name) or not run.optimizes(quantity):
         return None
     return display.evaluated(run, f"{view.split}/{view.name}_{quantity}.exr")
 
 
-def _scaling(runs: list[Run], views: list[View]) -> Scaling:
-    """Exposure and error scales that suit all pictures of the page at once."""
+def _scales(runs: list[Run], views: list[View]) -> Scales:
+    """Exposure and error scales from all pictures of the page."""
     light: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
     for view in views:
@@ -161,32 +161,32 @@ def _scaling(runs: list[Run], views: list[View]) -> Scaling:
                 if recovered is not None:
                     error = display.error(display.rgb(recovered)[0], reference, recovered)
                     parts.append(display.sample(error[mask]))
-    scales = {quantity: display.error_scale(errors[quantity]) for quantity in QUANTITIES}
-    return Scaling(display.exposure(light), scales)
+    error_scales = {q: display.error_scale(errors[q]) for q in QUANTITIES}
+    return Scales(display.exposure(light), error_scales)
 
 
-def _view_block(view: View, runs: list[Run], scaling: Scaling) -> dict[str, Any]:
+def _view_block(view: View, runs: list[Run], scales: Scales) -> dict[str, Any]:
     """A view's pictures for the template: a column a quantity, in it truth and runs."""
     height, width = display.rgb(view.truth["render"])[0].shape[:2]
-    quantities = [q for q in QUANTITIES if any(run.seeks(q) for run in runs)]
-    columns = [_column(view, runs, quantity, scaling) for quantity in quantities]
+    quantities = [q for q in QUANTITIES if any(run.optimizes(q) for run in runs)]
+    columns = [_column(view, runs, quantity, scales) for quantity in quantities]
     return {"name": view.name, "width": width, "height": height, "columns": columns}
 
 
-def _column(view: View, runs: list[Run], quantity: str, scaling: Scaling) -> dict[str, Any]:
+def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[str, Any]:
     def paint(linear: np.ndarray) -> str:
         if quantity == "roughness":
             small = pictures.shrink(linear, display.LONGEST_SIDE)
             return pictures.png_data_uri(pictures.to_bytes(small))
-        return display.tonemapped(linear, scaling.exposure if quantity == "render" else 0.0)
+        return display.tonemapped(linear, scales.exposure if quantity == "render" else 0.0)
 
     values = [display.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
-    scale = scaling.error[quantity]
+    scale = scales.error[quantity]
     reference, mask = display.rgb(view.truth[quantity]) if quantity in view.truth else (None, None)
     cells = []
     for run, psnr in zip(runs, display.marked(values, display.decibels), strict=True):
         path = _recovered(run, view, quantity)
-        empty = "not evaluated" if run.seeks(quantity) else "known, not sought"
+        empty = "not evaluated" if run.optimizes(quantity) else "known, not optimized"
         cell: dict[str, Any] = {"picture": None, "error": None, "empty": empty}
         if path is not None:
             image = display.rgb(path)[0]
@@ -203,9 +203,9 @@ def _column(view: View, runs: list[Run], quantity: str, scaling: Scaling) -> dic
 
 
 def _psnrs(runs: list[Run]) -> dict[str, str]:
-    """The PSNRs of the table and their headings: of what was sought, aligned where some run is."""
+    """Keys and headings of the columns: quantities that some run optimized, and aligned albedo."""
     aligned = any("albedo_psnr_aligned" in (run.metrics.get("heldout") or {}) for run in runs)
-    optimized = {key for key in PSNRS if any(run.seeks(key.split("_")[0]) for run in runs)}
+    optimized = {key for key in PSNRS if any(run.optimizes(key.split("_")[0]) for run in runs)}
     return {
         key: name
         for key, name in PSNRS.items()
@@ -240,7 +240,9 @@ def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     details = [(form, "φ", "")] if (form := FORMS.get(said["representation"])) else []
     details.append((FORMS.get(said["radiance"], "no"), "L", "θ"))
     if _unknown(metrics) != "materials":
-        details.append((f"{OPTIMIZED.get(_unknown(metrics), 'something').lower()} sought", "", ""))
+        details.append(
+            (f"{OPTIMIZED.get(_unknown(metrics), 'something').lower()} optimized", "", "")
+        )
     if metrics.get("bounces", 1) != 1:
         details.append((f"{metrics['bounces']} bounces", "", ""))
     if metrics.get("prior", "extra-bounce") != "extra-bounce":
@@ -284,7 +286,7 @@ def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
     told = {k: v for k, v in DEFINED.items() if k in psnrs or k not in PSNRS}
     numbers = [_told(run, told) | _rendering(run) for run in runs]
     light = {
-        kind: [_told(run, words) if run.seeks(kind) else {} for run in runs]
+        kind: [_told(run, words) if run.optimizes(kind) else {} for run in runs]
         for kind, words in LIGHT_DEFINED.items()
     }
     return {part: _grouped(runs, said) for part, said in ({"numbers": numbers} | light).items()}

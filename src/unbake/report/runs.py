@@ -33,7 +33,7 @@ class Run:
     config: dict[str, Any]
     log: list[dict[str, Any]]
 
-    def seeks(self, quantity: str) -> bool:
+    def optimizes(self, quantity: str) -> bool:
         """Whether the run has pictures or numbers of a quantity, rather than knew it."""
         unknown = str(self.metrics.get("unknown", "materials"))
         match quantity:
