@@ -67,6 +67,26 @@ def test_coefficients_are_those_of_known_functions(function, expected):
     np.testing.assert_allclose(c, analytic, atol=4e-3)
 
 
+def test_the_basis_is_orthonormal():
+    """Order by order, m from -l to l: the image of a basis function has one coefficient, 1."""
+    gram = np.array([sh_coefficients(np.dstack([f] * 3))[:, 0] for f in lighting._sh_basis(256)])
+    np.testing.assert_allclose(gram, np.eye(16), atol=3e-4)
+
+
+def test_coefficients_are_those_of_associated_legendre_polynomials():
+    """Numbers of an implementation by the recurrence of P_l^m, without Condon–Shortley phase."""
+    y, x = np.mgrid[0:16, 0:32]
+    channels = [np.exp(-0.05 * ((x - 9) ** 2 + (y - 5) ** 2)), 0.3 + 0.01 * x * y]
+    image = np.stack([*channels, np.sin(0.4 * x) ** 2 * y], axis=-1)
+    first = [
+        0.516730304, 0.594091113, 0.243139564, -0.181094211, -0.189894843, 0.289095598,
+        -0.125114548, -0.088123754, -0.2855309, -0.080407027, -0.091729454, 0.014591554,
+        -0.089659673, -0.00444788, -0.137926828, 0.097786253,
+    ]  # fmt: skip
+    np.testing.assert_allclose(sh_coefficients(image)[:, 0], first, rtol=1e-6)
+    assert sh_error(image, image[::-1]) == pytest.approx(0.782707066366079, rel=1e-12)
+
+
 def test_the_poles_are_the_first_and_the_last_row():
     """A picture of few rows, where half a texel matters."""
     y = np.cos(np.pi * np.arange(9) / 8)[:, None, None] * np.ones((9, 18, 3))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -93,24 +93,10 @@ def sh_error(found: np.ndarray, truth: np.ndarray) -> float:
 def sh_coefficients(image: np.ndarray) -> np.ndarray:
     """Real spherical harmonics coefficients of a map, ((ORDER + 1)², 3), m from -l to l.
 
-    θ and φ are those of the picture, from its top and from its left edge.
+    θ is measured from the image's top, φ from its left edge; no Condon–Shortley phase.
     """
-    rows = len(image)
-    θ = np.pi * np.arange(rows) / (rows - 1)
-    φ = np.pi * (np.arange(2 * rows) + 0.5) / rows
-    weighted = image * _solid_angles(rows)[..., None]
-    basis = []
-    for order in range(ORDER + 1):
-        for m in range(-order, order + 1):
-            k = math.sqrt((2 * order + 1) / (4 * math.pi))
-            k *= math.sqrt(math.factorial(order - abs(m)) / math.factorial(order + abs(m)))
-            around = (
-                np.ones_like(φ)
-                if m == 0
-                else np.sqrt(2) * (np.cos(m * φ) if m > 0 else np.sin(-m * φ))
-            )
-            basis.append(k * np.outer(_legendre(order, abs(m), np.cos(θ)), around))
-    return np.einsum("khw,hwc->kc", np.array(basis), weighted)
+    weighted = image * _solid_angles(len(image))[..., None]
+    return np.einsum("khw,hwc->kc", _sh_basis(len(image)), weighted)
 
 
 def relight_psnr(found: np.ndarray, truth: np.ndarray) -> float:
@@ -164,14 +150,15 @@ def _solid_angles(rows: int) -> np.ndarray:
     return np.repeat((edges[:-1] - edges[1:])[:, None] * np.pi / rows, 2 * rows, 1)
 
 
-def _legendre(order: int, m: int, x: np.ndarray) -> np.ndarray:
-    """Associated Legendre polynomial P_l^m without the Condon–Shortley phase."""
-    p = np.ones_like(x)
-    for i in range(1, m + 1):
-        p = p * (2 * i - 1) * np.sqrt(np.maximum(1 - x * x, 0))
-    if order == m:
-        return p
-    last, p = p, x * (2 * m + 1) * p
-    for n in range(m + 2, order + 1):
-        last, p = p, ((2 * n - 1) * x * p - (n + m - 1) * last) / (n - m)
-    return p
+def _sh_basis(rows: int) -> np.ndarray:
+    """The basis functions at a map's texels, ((ORDER + 1)², rows, 2 rows), float64."""
+    θ, φ = np.meshgrid(
+        np.pi * np.arange(rows) / (rows - 1),
+        np.pi * (np.arange(2 * rows) + 0.5) / rows,
+        indexing="ij",
+    )
+    # `dr.sh_eval` includes the Condon–Shortley phase (-1)^m. Half a turn about z removes it.
+    d = np.stack([-np.sin(θ) * np.cos(φ), -np.sin(θ) * np.sin(φ), np.cos(θ)])
+    basis = dr.sh_eval(dr.float64_array_t(mi.Vector3f)(d.reshape(3, -1)), ORDER)
+    # The constant function comes as a single number.
+    return np.reshape([np.broadcast_to(f, θ.size) for f in basis], (-1, *θ.shape))
