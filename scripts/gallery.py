@@ -6,13 +6,14 @@ Columns: rendering (or photograph), albedo, roughness. Rows: the truth, then the
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
 from unbake import activate
+from unbake.dataset.data_folder import DataFolder
 from unbake.imaging.pictures import montage, read_exr, to_bytes, tonemap, write_png
+from unbake.training.run_folder import RunFolder
 
 
 def row(render: Path, albedo: Path, roughness: Path, zoom: int) -> list[np.ndarray]:
@@ -35,15 +36,13 @@ def main() -> None:
     args = parser.parse_args()
     activate()
     split = args.view.split("_")[0]
-    data = Path(json.loads((args.runs[0] / "evaluation" / "metrics.json").read_text())["data"])
-    name = f"{args.view}.exr"
-    truth = data / "truth"
-    files = [data / "images" / name, truth / "albedo" / name, truth / "roughness" / name]
-    rows = [row(*files, args.zoom)]
-    for run in args.runs:
-        folder = run / "evaluation" / split
-        files = [folder / f"{args.view}_{kind}.exr" for kind in ("render", "albedo", "roughness")]
-        rows.append(row(*files, args.zoom))
+    runs = [RunFolder(path) for path in args.runs]
+    data = DataFolder(runs[0].data(runs[0].metrics()["data"]))
+    truth = [data.truth(quantity, args.view) for quantity in ("albedo", "roughness")]
+    rows = [row(data.image(args.view), *truth, args.zoom)]
+    for run in runs:
+        kinds = ("render", "albedo", "roughness")
+        rows.append(row(*(run.picture(split, args.view, kind) for kind in kinds), args.zoom))
     write_png(args.out, montage(rows))
 
 

@@ -1,5 +1,6 @@
 """Rules of the house that no linter knows."""
 
+import ast
 import re
 
 import pytest
@@ -16,6 +17,45 @@ FORBIDDEN = {
         r"[\"'\s(=](/home/|/root/|/Users/|/work/|/tmp/|/mnt/|[A-Z]:\\\\?Users)"
     ),
 }
+
+RUN, DATA = "training/run_folder.py", "dataset/data_folder.py"
+#: The modules that own them, names of files in any text, and names of folders in paths.
+FILE_NAMES = {
+    "run": (
+        {RUN},
+        r"config\.toml|origin\.json|log\.jsonl|metrics\.json|\.safetensors",
+        r"checkpoints|previews|evaluation",
+    ),
+    "data set": (
+        {DATA},
+        r"transforms\.json|emission\.json|photographs\.npy|foreground\.npy|(^|/)\.cache",
+        r"images|truth|scene|\.cache",
+    ),
+    "environment map": ({RUN, DATA}, r"environment\.exr", r"environment\."),
+}
+
+
+def spelled(tree, files, folders):
+    """Lines of a module that spell a file's name outside of docstrings, or a folder's in a path."""
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = {
+        node.body[0].value
+        for node in ast.walk(tree)
+        if isinstance(node, documented) and node.body and isinstance(node.body[0], ast.Expr)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+            part, pattern = node.right, rf"({folders})(/|$)"
+        elif isinstance(node, ast.Constant) and node not in docstrings:
+            part, pattern = node, files
+        else:
+            continue
+        parts = part.values if isinstance(part, ast.JoinedStr) else [part]
+        for part in parts[:1]:
+            if isinstance(part, ast.Constant) and isinstance(part.value, str):
+                search = re.match if pattern is not files else re.search
+                if search(pattern, part.value):
+                    yield part.lineno
 
 
 def sources(repository):
@@ -59,3 +99,35 @@ def test_source_is_free_of(rule, repository):
 )
 def test_the_rules_catch_what_they_are_for(rule, line, hit):
     assert bool(re.search(FORBIDDEN[rule], line)) is hit
+
+
+@pytest.mark.parametrize("what", FILE_NAMES)
+def test_one_module_names_the_files_of_a_folder(what, repository):
+    owners, *names = FILE_NAMES[what]
+    root = repository / "src" / "unbake"
+    modules = {path.relative_to(root).as_posix(): path for path in root.rglob("*.py")}
+    hits = {
+        module: lines
+        for module, path in modules.items()
+        if (lines := list(spelled(ast.parse(path.read_text("utf-8")), *names)))
+    }
+    assert hits.keys() & owners
+    assert not {module: lines for module, lines in hits.items() if module not in owners}
+
+
+@pytest.mark.parametrize(
+    ("line", "hits"),
+    [
+        ('read(run / "config.toml")', 1),
+        ('raise UserError("no checkpoints; remove previews/ and config.toml")', 1),
+        ('f"{run}/log.jsonl"', 1),
+        ('run / "checkpoints"', 1),
+        ('run / "evaluation/heldout"', 1),
+        ('run / f"previews/{name}"', 1),
+        ('{"evaluation": 1}', 0),
+        ('def f():\n    """Reads config.toml."""', 0),
+    ],
+)
+def test_a_file_name_outside_its_module_is_found(line, hits):
+    _, *names = FILE_NAMES["run"]
+    assert len(list(spelled(ast.parse(line), *names))) == hits

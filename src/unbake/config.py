@@ -367,7 +367,7 @@ def _write_table(table: dict, path: tuple[str, ...], lines: list[str]) -> None:
             _write_table(value, (*path, key), lines)
 
 
-def from_toml(text: str, where: str = "config.toml") -> FitConfig:
+def from_toml(text: str, where: str = "settings") -> FitConfig:
     """Settings from TOML text; keys that are absent keep the value of the named preset.
 
     Raises:

@@ -1,11 +1,14 @@
-"""Files: atomic writes, and typed access to JSON whose mistakes become `UserError`s."""
+"""Files: atomic writes, paths that stay in their folder, and typed access to JSON.
+
+What is wrong with a file becomes a `UserError`.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +16,20 @@ import numpy as np
 
 from .errors import UserError
 
+# ------------------------------------------------------------------------------------------ writing
 
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+
+def write_atomically(
+    path: Path, write: Callable[[Path], object], *, durable: bool = False, what: str = "file"
+) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it to `path`.
+
+    Args:
+        path: the file; its folder is made where there is none.
+        write: is called with the temporary file's path.
+        durable: flush the content to disk before the file takes its name, so that not even a
+            power cut leaves half a file under that name.
+        what: what the file is, for the error message.
 
     Raises:
         UserError: the folder cannot be made or written.
@@ -25,16 +39,84 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
+        if durable:
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
-        raise UserError(f"the file cannot be written ({error})", path) from error
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise UserError(f"the {what} cannot be written ({reason})", path) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
 
 
-def read_json(path: Path) -> Any:
+def remove_unfinished(folder: Path) -> None:
+    """Delete the temporary files that a killed `write_atomically` left in a folder."""
+    for temporary in folder.glob(".*.tmp"):
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, content: str, *, durable: bool = False) -> None:
+    """Write a UTF-8 text file, complete or not at all; arguments as in `write_atomically`."""
+    write_atomically(path, lambda p: p.write_text(content, encoding="utf-8"), durable=durable)
+
+
+def write_json(path: Path, content: Any, *, allow_nan: bool = True, durable: bool = False) -> None:
+    """Write a JSON file, complete or not at all; arguments as in `write_atomically`.
+
+    Raises:
+        UserError: the folder cannot be made or written.
+        ValueError: a number is not finite, and `allow_nan` is False.
+    """
+    write_text(path, json.dumps(content, indent=1, allow_nan=allow_nan) + "\n", durable=durable)
+
+
+# -------------------------------------------------------------------------------------------- paths
+
+
+def inside(folder: Path, name: str, where: str, what: str = "folder") -> Path:
+    """The file of a folder that a text names, relative to the folder, which it must not leave.
+
+    Args:
+        folder: the folder, such as that of a data set.
+        name: from a file that others may have written.
+        where: the file and entry that `name` was found in.
+        what: what the folder is, for the error message.
+
+    Raises:
+        UserError: `name` is not a path, or leads out of the folder.
+    """
+    try:
+        resolved = (folder / name).resolve()
+        contained = resolved.is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):
+        raise UserError(f"{name!r} is not a path", where, "Correct it") from None
+    if not contained:
+        raise UserError(f"{name!r} lies outside the {what}", where, f"Move the file into {folder}")
+    return folder / name
+
+
+def relative(folder: Path, path: Path, what: str = "folder") -> str:
+    """The inverse of `inside`: the path from a folder to a file in it, with forward slashes.
+
+    Raises:
+        UserError: the file lies outside the folder.
+    """
+    resolved, root = path.resolve(), folder.resolve()
+    if not resolved.is_relative_to(root):
+        raise UserError(f"the file lies outside the {what}", path, f"Move it into {folder}")
+    return resolved.relative_to(root).as_posix()
+
+
+# -------------------------------------------------------------------------------------------- JSON
+
+
+def read_json(path: Path, remedy: str | None = None) -> Any:
     """Parse a JSON file.
+
+    Args:
+        remedy: what the user can do where the file is missing or damaged.
 
     Raises:
         UserError: the file is missing, unreadable, or not JSON.
@@ -42,20 +124,46 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError("the file does not exist", path, "Check the path") from None
+        raise UserError("the file does not exist", path, remedy or "Check the path") from None
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise UserError(f"the file is not readable JSON ({reason})", path, "Repair it") from None
+        said = f"the file is not readable JSON ({reason})"
+        raise UserError(said, path, remedy or "Repair it") from None
 
 
-def write_json(path: Path, content: Any, *, allow_nan: bool = True) -> None:
-    """Write a JSON file, complete or not at all.
+def read_object(path: Path, remedy: str | None = None) -> dict[str, Any]:
+    """Parse a JSON file that holds an object; arguments as in `read_json`.
 
     Raises:
-        UserError: the folder cannot be made or written.
+        UserError: the file is missing, unreadable, not JSON, or holds something else.
     """
-    described = json.dumps(content, indent=1, allow_nan=allow_nan) + "\n"
-    write_atomically(path, lambda file: file.write_text(described, encoding="utf-8"))
+    content = read_json(path, remedy)
+    if not isinstance(content, dict):
+        raise UserError("the file does not hold a JSON object", path, remedy or "Repair it")
+    return content
+
+
+def check_format(keys: Mapping[str, Any], newest: int, where: object) -> int:
+    """The format of a file's content: its "format", 1 where it names none.
+
+    Args:
+        keys: the file's content.
+        newest: the newest format that can be read.
+        where: the file.
+
+    Raises:
+        UserError: the format is newer, or not a positive whole number.
+    """
+    version = keys.get("format", 1)
+    if type(version) is not int or version < 1:
+        raise UserError(f"'format' is {version!r}, not a positive whole number", where, "Repair it")
+    if version > newest:
+        raise UserError(
+            f"was written by a newer unbake (format {version}; this one reads up to {newest})",
+            where,
+            "Update unbake",
+        )
+    return version
 
 
 def number(keys: dict[str, Any], key: str, where: str) -> float:

@@ -26,7 +26,7 @@ def files(folder):
 
 
 def test_an_environment_is_what_directions_see(built_in, truth):
-    write_true_lighting(built_in("still"), truth)
+    write_true_lighting(built_in("still"), truth.parent)
     assert files(truth) == ["environment.exr"]
     picture = true_environment(truth.parent)
     assert picture.shape == (ROWS, 2 * ROWS, 3) and picture.dtype == np.float32
@@ -45,7 +45,7 @@ def test_an_environment_is_what_directions_see(built_in, truth):
     ],
 )
 def test_the_strength_of_lights_is_that_of_the_scene(name, light, strength, built_in, truth):
-    write_true_lighting(built_in(name), truth)
+    write_true_lighting(built_in(name), truth.parent)
     assert files(truth) == ["emission.json"]
     known = true_emission(truth.parent)
     assert list(known) == [light]
@@ -59,7 +59,7 @@ def test_a_constant_environment_is_both(truth, tmp_path):
         '<scene version="3.0.0"><shape type="sphere"/><emitter type="constant" id="sky">'
         '<rgb name="radiance" value="0.5 1 2"/></emitter></scene>'
     )
-    write_true_lighting(path, truth)
+    write_true_lighting(path, truth.parent)
     assert files(truth) == ["emission.json", "environment.exr"]
     np.testing.assert_allclose(true_environment(tmp_path), np.full((128, 256, 3), [0.5, 1, 2]))
     np.testing.assert_allclose(true_emission(tmp_path)["sky"], [0.5, 1, 2])
@@ -143,7 +143,7 @@ def test_what_is_written_is_plain_json(truth, tmp_path):
         '<scene version="3.0.0"><shape type="sphere"><emitter type="area">'
         '<texture type="checkerboard" name="radiance"/></emitter></shape></scene>'
     )
-    write_true_lighting(path, truth)
+    write_true_lighting(path, truth.parent)
     assert json.loads((truth / "emission.json").read_text()) == [
         {"name": "area light", "strength": None}
     ]
@@ -161,7 +161,7 @@ def test_the_picture_is_what_mitsuba_would_load(truth, tmp_path):
         '<transform name="to_world"><rotate x="1" angle="90"/><rotate z="1" angle="40"/>'
         "</transform></emitter></scene>"
     )
-    write_true_lighting(path, truth)
+    write_true_lighting(path, truth.parent)
     again = {"type": "envmap", "filename": str(truth / "environment.exr")}
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 4000)

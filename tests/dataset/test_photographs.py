@@ -109,13 +109,13 @@ def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch,
         mi.Bitmap(np.full((HEIGHT, WIDTH, 4), 0.5, np.float32)).write(str(image))
         os.utime(image, ns=(1, 1))
     elif change == "interrupted":
-        (made.folder / module.CACHE / "key.json").unlink()
+        (made.folder / ".cache" / "key.json").unlink()
     elif change == "damaged key":
-        (made.folder / module.CACHE / "key.json").write_text("{")
+        (made.folder / ".cache" / "key.json").write_text("{")
     elif change == "odd key":
-        (made.folder / module.CACHE / "key.json").write_text("[]")
+        (made.folder / ".cache" / "key.json").write_text("[]")
     elif change == "cut table":
-        os.truncate(made.folder / module.CACHE / "photographs.npy", 40)
+        os.truncate(made.folder / ".cache" / "photographs.npy", 40)
     read = []
     decode = module.read_image
     monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))

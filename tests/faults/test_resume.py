@@ -19,7 +19,7 @@ from safetensors.numpy import load_file
 from unbake import cli
 from unbake.config import read_toml
 from unbake.imaging.pictures import read_exr, write_exr
-from unbake.training.monitor import forget_after
+from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
 
 
@@ -43,7 +43,7 @@ def started(cornell, tiny, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "unbake", "fit", cornell, "--out", run, "--settings", settings,
          "--method", "direct", "--seconds", "3600"],
-        env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])},
+        env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     while len(list((run / "checkpoints").glob("*.safetensors"))) < 3:
@@ -260,9 +260,9 @@ def test_a_log_forgets_what_lies_after_a_step(tmp_path):
     log = tmp_path / "log.jsonl"
     lines = ['{"step": 20}', '{"step": 40}', '{"step": 40, "validation": {}}', '{"step": 60}']
     log.write_text("\n".join([*lines, '{"step": 8']))
-    forget_after(log, 40)
+    RunFolder(tmp_path).forget_after(40)
     assert log.read_text().splitlines() == lines[:3]
-    forget_after(log, 0)
+    RunFolder(tmp_path).forget_after(0)
     assert log.read_text() == ""
-    forget_after(tmp_path / "new.jsonl", 0)
-    assert (tmp_path / "new.jsonl").read_text() == ""
+    RunFolder(tmp_path / "new").forget_after(0)
+    assert (tmp_path / "new" / "log.jsonl").read_text() == ""

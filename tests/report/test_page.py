@@ -19,6 +19,10 @@ from unbake.report.page import write_report
 
 SIZE = (24, 32)
 TRAINING, HELDOUT = 6, 2
+CAMERA = {
+    "w": SIZE[1], "h": SIZE[0], "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0,
+    "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+}  # fmt: skip
 EVIL = '<script>alert("1")<'
 
 
@@ -48,7 +52,9 @@ def _make_data(folder: Path, prefix: str = "", known: bool = True) -> Path:
         _save(folder / "images" / f"{name}.exr", truth["render"], np.ones(SIZE))
         for kind in ("albedo", "roughness") if known else ():
             _save(folder / "truth" / kind / f"{name}.exr", truth[kind], truth["mask"])
-        frames.append({"file_path": f"images/{name}.exr", "split": split})
+        frames.append(CAMERA | {"file_path": f"images/{name}.exr", "split": split})
+    (folder / "scene").mkdir()
+    (folder / "scene" / "scene.xml").write_text("<scene version='3.0.0'/>")
     transforms = {
         "scene": "scene/scene.xml",
         "background": "visible",
@@ -426,6 +432,11 @@ def _edit(run: Path, change: Callable[[dict], object]) -> None:
     path.write_text(json.dumps(metrics))
 
 
+def _edit_data(data: Path, **changes: object) -> None:
+    path = data / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
 def _remove(path: str) -> Callable[[Path, list[Path]], None]:
     def change(data: Path, runs: list[Path]) -> None:
         (data.parent / path).unlink()
@@ -440,8 +451,8 @@ def _remove(path: str) -> Callable[[Path, list[Path]], None]:
         (_remove("runs/ours/config.toml"), r"config\.toml"),
         (_remove("runs/ours/log.jsonl"), r"log\.jsonl"),
         (_remove("runs/ours/evaluation/heldout/heldout_001_albedo.exr"), r"heldout_001_albedo"),
-        (_remove("room/images/heldout_001.exr"), r"heldout_001\.exr.*no such picture"),
-        (_remove("room/transforms.json"), r"transforms\.json"),
+        (_remove("room/images/heldout_001.exr"), r"heldout_001\.exr.*the image does not exist"),
+        (_remove("room/transforms.json"), r"room: no transforms\.json"),
         (lambda data, runs: data.rename(data.with_name("moved")), "data .* gone .*room"),
         (lambda data, runs: _edit(runs[1], lambda m: m.update(data="/")), "other data"),
         (lambda data, runs: _edit(runs[1], lambda m: m.pop("per_view")), "`per_view`"),
@@ -460,15 +471,11 @@ def _remove(path: str) -> Callable[[Path, list[Path]], None]:
             "line 1 is not JSON",
         ),
         (
-            lambda data, runs: (data / "transforms.json").write_text(
-                '{"frames": [{"file_path": "../../x.exr"}]}'
-            ),
-            "does not lie inside",
+            lambda data, runs: _edit_data(data, frames=[{"file_path": "../../x.exr"}]),
+            "lies outside the data folder",
         ),
-        (
-            lambda data, runs: (data / "transforms.json").write_text('{"frames": [1]}'),
-            "`frames`",
-        ),
+        (lambda data, runs: _edit_data(data, frames=[1]), "frame 0: the frame is not an object"),
+        (lambda data, runs: _edit_data(data, frames={}), "'frames' is not a list"),
         (lambda data, runs: _edit(runs[0], lambda m: m["per_view"].append({})), "has no name"),
         (
             lambda data, runs: _edit(runs[0], lambda m: m.update(unknown="lighting")),

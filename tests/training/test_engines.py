@@ -11,6 +11,7 @@ from support import TINY_FIT, built_in_cameras, grey_photographs
 from unbake.fields.network import Network, can_record_layout
 from unbake.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from unbake.training.problem import make_problem
+from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep, initial_state
 
 RATES = {"albedo": 2e-3, "roughness": 2e-3, "radiance": 5e-3}
@@ -111,8 +112,8 @@ def test_a_checkpoint_keeps_the_scale(built_in, tmp_path):
     step, state = start(built_in, "half")
     for i in range(3):
         step(state, i, RATES)
-    save_checkpoint(tmp_path, state, Progress(3, 1.0, 384))
+    save_checkpoint(RunFolder(tmp_path), state, Progress(3, 1.0, 384))
     _, again = start(built_in, "half")
     assert float(again.scale[0]) != float(state.scale[0])
-    load_checkpoint(tmp_path, again)
+    load_checkpoint(RunFolder(tmp_path), again)
     assert float(again.scale[0]) == float(state.scale[0])

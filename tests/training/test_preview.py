@@ -20,6 +20,7 @@ from unbake.training.checkpoint import Progress
 from unbake.training.monitor import Monitor
 from unbake.training.preview import Preview
 from unbake.training.problem import make_problem
+from unbake.training.run_folder import RunFolder
 
 SIZE, GAP = 16, 2
 START = 0.2  # radiance of the untrained light
@@ -40,12 +41,12 @@ def preview(data, unknown, folder):
     config = dataclasses.replace(TINY_FIT, unknown=unknown, lighting=LightingConfig(resolution=8))
     dataset = Dataset.load(data)
     problem = make_problem(dataset.scene, dataset.background, config, START)
-    return problem, Preview(problem, dataset, folder).show(AFTER)
+    return problem, Preview(problem, dataset, RunFolder(folder)).show(AFTER)
 
 
 def picture(folder):
     """The one picture of the folder, (H, W, 3) uint8."""
-    (file,) = folder.iterdir()
+    (file,) = (folder / "previews").iterdir()
     assert file.name == "step-000040.png"
     return np.array(mi.Bitmap(str(file)))
 
@@ -92,7 +93,7 @@ def test_materials_alone_are_a_sheet_of_four(cornell, tmp_path):
 
 
 def test_lights_are_told_in_a_line_and_have_no_picture(cornell, tmp_path):
-    problem, lines = preview(cornell, "emission", tmp_path / "previews")
+    problem, lines = preview(cornell, "emission", tmp_path)
     assert not (tmp_path / "previews").exists()
     (name,) = problem.emitter_names
     assert lines[0]["validation"] == {"emission": {name: pytest.approx([START] * 3)}}

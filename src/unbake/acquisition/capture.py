@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..dataset.camera import Camera, frame_name, read_cameras
+from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
@@ -68,7 +69,7 @@ def capture(
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        dataset = _capture(scene, partial, settings, cameras, tell)
+        dataset = _capture(scene, DataFolder(partial), settings, cameras, tell)
         dataset.save(partial)
         partial.rename(out)
     except OSError as error:
@@ -80,12 +81,12 @@ def capture(
 
 def _capture(
     name: str,
-    folder: Path,
+    data: DataFolder,
     settings: CaptureSettings,
     camera_file: Path | None,
     tell: Callable[[str], None],
 ) -> Dataset:
-    path, scene = _copy_scene(name, folder / "scene", tell)
+    path, scene = _copy_scene(name, data.scene, tell)
     posed = _cameras(name, scene, settings, camera_file)
     counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
     seen = coverage(scene, [c for split, c in posed if split == "train"])
@@ -100,21 +101,21 @@ def _capture(
     sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     albedo, roughness, mask = _truth(path, scene, rays)
-    write_true_lighting(path, folder / "truth")
+    write_true_lighting(path, data.path)
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
         shape = (camera.height, camera.width)
         part = slice(first, first + camera.width * camera.height)
         first = part.stop
-        file = frame_name(split, number[split]) + ".exr"
+        view_name = frame_name(split, number[split])
         number[split] += 1
         view = View(
-            name=file.removesuffix(".exr"),
+            name=view_name,
             split=split,
             camera=camera,
-            image=folder / "images" / file,
-            albedo=folder / "truth" / "albedo" / file,
-            roughness=folder / "truth" / "roughness" / file,
+            image=data.image(view_name),
+            albedo=data.truth("albedo", view_name),
+            roughness=data.truth("roughness", view_name),
         )
         grey = np.repeat(roughness[part, None], 3, 1)
         write_exr(view.image, _rgba(rgb[part], alpha[part], shape))
@@ -122,7 +123,7 @@ def _capture(
         write_exr(view.roughness, _rgba(grey, mask[part], shape))
         views.append(view)
     return Dataset(
-        folder=folder,
+        folder=data.path,
         scene=path,
         background="visible" if room else "hidden",
         views=tuple(views),

@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from .. import backend, config, experiments
+from .. import backend, experiments
 from ..errors import UserError
+from ..training.run_folder import RunFolder
 from .options import (
     Count,
     Data,
@@ -189,9 +190,9 @@ def fit(
     }
     if resume:
         exclude("resume", start | other)
-        if not (out / "config.toml").is_file():
-            raise UserError("there is no run to resume in this folder", out, "Leave out --resume")
-        chosen = config.read_toml(out / "config.toml")
+        folder = RunFolder(out)
+        folder.require_resumable()
+        chosen = folder.settings()
     else:
         chosen = chosen_settings(preset, settings)
     chosen = overridden(chosen, length | other)
@@ -243,7 +244,7 @@ def evaluate(
         values = {k: v for k, v in metrics[split].items() if k != "views"}
         shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in values.items())
         _say(f"{split} ({metrics[split]['views']} views): {shown}")
-    _say(f"wrote {run / 'evaluation'}; next: unbake report {run} --out report.html")
+    _say(f"wrote {RunFolder(run).evaluation}; next: unbake report {run} --out report.html")
 
 
 def report(runs: Positional[Runs], /, out: Path) -> None:

@@ -12,7 +12,7 @@ import drjit as dr
 from rich.console import Console
 from rich.table import Table
 
-from ..config import FitConfig, read_toml
+from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..evaluation.convergence import milliseconds_per_step, score_curve, time_to_quality
@@ -20,10 +20,9 @@ from ..evaluation.evaluate import EvaluationSettings, description, evaluate
 from ..io import write_json
 from ..machine import machine
 from ..report.page import write_report
-from ..report.runs import read_json, read_log
 from ..training.checkpoint import Progress
 from ..training.loop import fit
-from ..training.recovered import read_origin
+from ..training.run_folder import RunFolder
 from .method_variant import MethodVariant
 
 DEFINITIONS = {
@@ -84,16 +83,17 @@ def compare(
         raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
     Dataset.load(data)
     for name, settings in chosen.items():
-        _check_kept(out / name, settings, data)
+        _check_kept(RunFolder(out / name), settings, data)
 
     rows: dict[str, dict[str, Any]] = {}
     errors: list[UserError] = []
     for name, settings in chosen.items():
         console.rule(name, align="left")
         try:
-            progress = _fitted(data, out / name, settings, clip_negative, console)
-            metrics = _evaluated(out / name, progress, evaluation, console)
-            rows[name] = description(settings) | _numbers(out / name, metrics)
+            run = RunFolder(out / name)
+            progress = _fitted(data, run, settings, clip_negative, console)
+            metrics = _evaluated(run, progress, evaluation, console)
+            rows[name] = description(settings) | _numbers(run, metrics)
         except UserError as error:
             errors.append(error)
             rows[name] = description(settings) | {"error": str(error)}
@@ -122,23 +122,27 @@ def compare(
     return result
 
 
-def _check_kept(run: Path, settings: FitConfig, data: Path) -> None:
+def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:
     """Refuse a run of other settings or data: it would be compared as if it were this one."""
-    if not (run / "config.toml").is_file():
+    if not run.exists:
         return
-    stored = vars(read_toml(run / "config.toml"))
+    stored = vars(run.settings())
     other = ", ".join(key for key, value in vars(settings).items() if stored[key] != value)
     if other:
-        raise UserError(f"the run in this folder differs in {other}", run, "Give another --out")
-    if Path(read_origin(run).data) != data.resolve():
-        raise UserError("the run in this folder has other data", run, "Give another --out")
+        raise UserError(
+            f"the run in this folder differs in {other}", run.path, "Give another --out"
+        )
+    if run.data(run.origin().data).resolve() != data.resolve():
+        raise UserError("the run in this folder has other data", run.path, "Give another --out")
 
 
 def _fitted(
-    data: Path, run: Path, settings: FitConfig, clip_negative: bool, console: Console
+    data: Path, run: RunFolder, settings: FitConfig, clip_negative: bool, console: Console
 ) -> Progress:
-    begun = (run / "config.toml").is_file()
-    progress = fit(data, run, settings, resume=begun, clip_negative=clip_negative, console=console)
+    resume, path = run.exists, run.path
+    progress = fit(
+        data, path, settings, resume=resume, clip_negative=clip_negative, console=console
+    )
     done, total = progress.step, settings.steps
     if settings.seconds:
         done, total = progress.seconds, settings.seconds
@@ -149,21 +153,20 @@ def _fitted(
 
 
 def _evaluated(
-    run: Path, progress: Progress, settings: EvaluationSettings, console: Console
+    run: RunFolder, progress: Progress, settings: EvaluationSettings, console: Console
 ) -> dict[str, Any]:
     """The run's metrics: those it has, if they are of this state and these settings."""
-    file = run / "evaluation" / "metrics.json"
-    if file.is_file():
-        metrics = read_json(file, "Remove it")
+    if run.metrics_file.is_file():
+        metrics = run.metrics()
         render = {"spp": settings.spp, "max_depth": settings.max_depth}
         same = metrics.get("steps") == progress.step and metrics.get("render") == render
         if same and NUMBERS <= metrics.keys():
             return metrics
-    return evaluate(run, settings, tell=lambda line: console.print(line, soft_wrap=True))
+    return evaluate(run.path, settings, tell=lambda line: console.print(line, soft_wrap=True))
 
 
-def _numbers(run: Path, metrics: dict[str, Any]) -> dict[str, Any]:
-    log = read_log(run / "log.jsonl")
+def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:
+    log = run.log()
     each = milliseconds_per_step(log)
     steps, samples, seconds = (metrics[key] for key in ("steps", "samples", "seconds"))
     return {

@@ -12,8 +12,9 @@ from typing import Any, final
 import mitsuba as mi
 import numpy as np
 
+from unbake.dataset.data_folder import TRANSFORMS
 from unbake.errors import UserError
-from unbake.io import array, integer, number, read_json
+from unbake.io import array, integer, number, read_json, write_text
 
 SPLITS = ("train", "heldout")
 
@@ -24,7 +25,7 @@ _RIGID_TOLERANCE = 1e-3
 _SQUARE_TOLERANCE = 1e-4
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_NO_CAMERA_FILE = "A camera file holds a list 'cameras', or the 'frames' of a transforms.json"
+_NO_CAMERA_FILE = f"A camera file holds a list 'cameras', or the 'frames' of a {TRANSFORMS}"
 
 
 @final
@@ -249,8 +250,7 @@ def write_camera_file(path: Path, cameras: Sequence[tuple[str, LookAt]]) -> None
         }
         counts[split] += 1
         lines.append("  " + json.dumps(entry))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text('{"cameras": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
+    write_text(path, '{"cameras": [\n' + ",\n".join(lines) + "\n]}\n")
 
 
 def read_cameras(path: Path, width: int, height: int) -> list[tuple[str, Camera]]:

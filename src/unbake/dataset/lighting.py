@@ -12,6 +12,7 @@ from ..imaging.pictures import write_exr
 from ..io import array, read_json, text, write_json
 from ..scene import emitters
 from ..scene.parse import parse
+from .data_folder import DataFolder
 from .views import read_image
 
 #: Rows of the image of a true environment.
@@ -19,21 +20,21 @@ ROWS = 128
 _AGAIN = "Capture the data set again, or remove the file"
 
 
-def write_true_lighting(scene: Path, folder: Path) -> None:
-    """Write `environment.exr` and `emission.json`, each where the scene has such emitters.
+def write_true_lighting(scene: Path, data: Path) -> None:
+    """Write the true environment map and the true strengths, each where the scene has such emitters.
 
     Args:
         scene: the Mitsuba scene that the photographs are rendered from.
-        folder: `truth` of the data set.
+        data: the data set's folder.
     """
-    parsed = parse(scene)
+    folder, parsed = DataFolder(data), parse(scene)
     named = emitters.named_emitters(parsed)
     if named:
-        write_json(folder / "emission.json", [asdict(emitter) for emitter in named])
+        write_json(folder.emission_file, [asdict(emitter) for emitter in named])
     loaded = parsed.instantiate()
     if loaded.environment() is not None:
         picture = emitters.environment_latlong(loaded, ROWS)
-        write_exr(folder / "environment.exr", np.dstack([picture, np.ones(picture.shape[:2])]))
+        write_exr(folder.environment_file, np.dstack([picture, np.ones(picture.shape[:2])]))
 
 
 def true_environment(data: Path) -> np.ndarray | None:
@@ -45,7 +46,7 @@ def true_environment(data: Path) -> np.ndarray | None:
     Raises:
         UserError: the file cannot be read or has another size.
     """
-    file = data / "truth" / "environment.exr"
+    file = DataFolder(data).environment_file
     if not file.is_file():
         return None
     try:
@@ -62,7 +63,7 @@ def true_emission(data: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file is damaged.
     """
-    file = data / "truth" / "emission.json"
+    file = DataFolder(data).emission_file
     if not file.is_file():
         return {}
     entries = read_json(file)

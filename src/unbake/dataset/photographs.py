@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,15 +11,14 @@ from typing import final
 import numpy as np
 
 from ..errors import UserError
-from ..io import write_json
+from ..io import read_object, write_json
 from .camera import Camera
+from .data_folder import DataFolder
 from .views import Dataset, View, read_image
 
 #: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
 #: set's folder, of which the system keeps in memory what it has room for.
 IN_MEMORY = 512 << 20
-#: The folder of that file, in the data set's.
-CACHE = ".cache"
 #: Linear RGB, and the same of the photograph blurred.
 _COLUMNS = 6
 
@@ -132,46 +130,46 @@ def _cached(
     dataset: Dataset, views: Sequence[View], count: int, clip_negative: bool, hidden: bool
 ) -> Photographs:
     """Photographs in a file that is made where it is missing, or made from other images."""
-    folder = dataset.folder / CACHE
+    data = DataFolder(dataset.folder)
     key = {
         "images": [[str(v.image), v.image.stat().st_mtime_ns] for v in views if v.image.is_file()],
         "pixels": count,
         "clip_negative": clip_negative,
         "foreground_only": hidden,
     }
-    found = _open_cache(folder, key)
+    found = _open_cache(data, key)
     if found is None:
         try:
-            _write_cache(folder, views, key)
+            _write_cache(data, views, key)
         except OSError as error:
             raise UserError(
                 f"the decoded photographs cannot be written ({error.strerror})",
-                folder,
+                data.cache,
                 f"They take {4 * _COLUMNS * count / 1e9:.1f} GB. Make room, or the folder writable",
             ) from None
-        found = _open_cache(folder, key)
+        found = _open_cache(data, key)
     return found
 
 
-def _open_cache(folder: Path, key: dict) -> Photographs | None:
+def _open_cache(data: DataFolder, key: dict) -> Photographs | None:
     """What is in the files, if they are whole and of these photographs."""
     try:
-        stored = json.loads((folder / "key.json").read_text(encoding="utf-8"))
+        stored = read_object(data.cache_key)
         if stored != {"key": key, "mean": stored["mean"]}:
             return None
-        table, chosen = np.load(folder / "photographs.npy", mmap_mode="r"), None
+        table, chosen = np.load(data.cached_photographs, mmap_mode="r"), None
         if key["foreground_only"]:
-            chosen = np.load(folder / "foreground.npy", mmap_mode="r")
-    except (OSError, ValueError, KeyError, TypeError):
+            chosen = np.load(data.cached_foreground, mmap_mode="r")
+    except (UserError, OSError, ValueError, KeyError):
         return None
     return Photographs(table, chosen, stored["mean"])
 
 
-def _write_cache(folder: Path, views: Sequence[View], key: dict) -> None:
-    folder.mkdir(exist_ok=True)
+def _write_cache(data: DataFolder, views: Sequence[View], key: dict) -> None:
+    data.cache.mkdir(exist_ok=True)
     # The key is written last: without it the rest is taken for unfinished.
-    (folder / "key.json").unlink(missing_ok=True)
-    path = folder / "photographs.npy"
+    data.cache_key.unlink(missing_ok=True)
+    path = data.cached_photographs
     table = np.lib.format.open_memmap(path, "w+", np.float32, (key["pixels"], _COLUMNS))
     try:
         _reserve(path)
@@ -181,8 +179,8 @@ def _write_cache(folder: Path, views: Sequence[View], key: dict) -> None:
     made = _fill(table, _decoded(views, key["clip_negative"]), key["foreground_only"])
     table.flush()
     if made.chosen is not None:
-        np.save(folder / "foreground.npy", made.chosen)
-    write_json(folder / "key.json", {"key": key, "mean": made.mean})
+        np.save(data.cached_foreground, made.chosen)
+    write_json(data.cache_key, {"key": key, "mean": made.mean})
 
 
 def _reserve(path: Path) -> None:

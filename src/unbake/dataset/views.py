@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import struct
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +13,11 @@ import mitsuba as mi
 import numpy as np
 
 from unbake.dataset.camera import Camera, camera_from_frame, read_split
+from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.errors import UserError
-from unbake.io import read_json, text
+from unbake.io import text
 from unbake.scene import free_space
 
-TRANSFORMS = "transforms.json"
 BACKGROUNDS = ("visible", "hidden")
 
 _HDR_SUFFIXES = (".exr", ".hdr", ".pfm", ".rgbe")
@@ -28,8 +25,7 @@ _LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".webp", ".gif", ".tif
 _HEAD = 1 << 16  # bytes of a file that are read to know its size
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _NEED_HDR = "Give linear HDR images (OpenEXR); tone-mapped 8-bit images hold no radiance"
-_MAKE_DATA = "Render a data set from a scene with `unbake capture SCENE --out DATA`"
-_REPLACE = "Write the image again, or remove its frame from transforms.json"
+_REPLACE = f"Write the image again, or remove its frame from {TRANSFORMS}"
 
 
 @final
@@ -96,26 +92,17 @@ class Dataset:
                 or an image is not HDR or of another size than its frame says. It names the file
                 and the remedy.
         """
-        folder = Path(folder)
-        file = folder / TRANSFORMS
-        if folder.is_file():
-            raise UserError("is a file, not a data folder", folder, _MAKE_DATA)
-        if not folder.is_dir():
-            raise UserError("the data folder does not exist", folder, "Check the path")
-        if not file.is_file():
-            raise UserError(f"no {TRANSFORMS} in the folder", folder, "Is this a data folder?")
-        top = read_json(file)
-        if not isinstance(top, dict):
-            raise UserError("the file does not hold a JSON object", file, "Repair it")
-        scene = _inside(folder, text(top, "scene", str(file)), f"{file}: 'scene'")
+        data = DataFolder(Path(folder))
+        top, file = data.read_transforms(), data.transforms_file
+        scene = data.inside(text(top, "scene", str(file)), f"{file}: 'scene'")
         if not scene.is_file():
             raise UserError("the scene file does not exist", scene, f"Set 'scene' in {file}")
-        views = _read_views(folder, file, top)
+        views = _read_views(data, file, top)
         for view in views:
             for image in (view.image, view.albedo, view.roughness):
                 if image is not None:
                     _check_header(image, view.camera.width, view.camera.height)
-        return cls(folder, scene, _background(top, file), views, *_provenance(top, file))
+        return cls(data.path, scene, _background(top, file), views, *_provenance(top, file))
 
     def save(self, folder: Path) -> None:
         """Write `transforms.json` into a folder, atomically; images are not touched.
@@ -126,29 +113,15 @@ class Dataset:
         Raises:
             UserError: a file lies outside the folder.
         """
-        folder = Path(folder)
+        data = DataFolder(Path(folder))
         content = {
-            "scene": _relative(folder, self.scene),
+            "scene": data.relative(self.scene),
             "background": self.background,
             "render": self.render,
             "coverage": self.coverage,
-            "frames": [_frame(folder, view) for view in self.views],
+            "frames": [_frame(data, view) for view in self.views],
         }
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=folder, prefix=".transforms-", delete=False
-        ) as file:
-            try:
-                json.dump(content, file, indent=1, allow_nan=False)
-                file.write("\n")
-                file.flush()
-                os.fsync(file.fileno())
-                # Temporary files are private to their owner, a data set is not
-                os.chmod(file.name, 0o644)
-                os.replace(file.name, folder / TRANSFORMS)
-            except BaseException:
-                os.unlink(file.name)
-                raise
+        data.write_transforms(content)
 
 
 def read_image(path: Path, width: int, height: int, clip_negative: bool = False) -> np.ndarray:
@@ -200,7 +173,7 @@ def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
     return named
 
 
-def _read_views(folder: Path, file: Path, top: dict[str, Any]) -> tuple[View, ...]:
+def _read_views(data: DataFolder, file: Path, top: dict[str, Any]) -> tuple[View, ...]:
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError("'frames' is not a list of frames", file, "Each view is one frame")
@@ -209,7 +182,7 @@ def _read_views(folder: Path, file: Path, top: dict[str, Any]) -> tuple[View, ..
         where = f"{file}: frame {index}"
         if not isinstance(frame, dict):
             raise UserError("the frame is not an object", where, "Each view is one frame")
-        view = _read_view(folder, frame, top, where)
+        view = _read_view(data, frame, top, where)
         if view.name in names:
             raise UserError(f"two frames are named {view.name!r}", where, "Rename one image")
         names.add(view.name)
@@ -219,13 +192,12 @@ def _read_views(folder: Path, file: Path, top: dict[str, Any]) -> tuple[View, ..
     return tuple(views)
 
 
-def _read_view(folder: Path, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
-    image = _inside(folder, text(frame, "file_path", where), f"{where}: 'file_path'")
+def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
+    image = data.inside(text(frame, "file_path", where), f"{where}: 'file_path'")
     where = f"{where} ({image.name})"
     split = read_split(frame, where)
     camera = camera_from_frame(frame, top, where)
-    truth = folder / "truth"
-    albedo, roughness = (truth / kind / f"{image.stem}.exr" for kind in ("albedo", "roughness"))
+    albedo, roughness = (data.truth(kind, image.stem) for kind in ("albedo", "roughness"))
     return View(
         image.stem,
         split,
@@ -296,31 +268,10 @@ def _exr_size(head: bytes) -> tuple[int, int] | None:
     return right - left + 1, bottom - top + 1
 
 
-def _inside(folder: Path, name: str, where: str) -> Path:
-    """A path of the data set, relative to its folder, which it must not leave."""
-    try:
-        resolved = (folder / name).resolve()
-        inside = resolved.is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError):
-        raise UserError(f"{name!r} is not a path", where, "Correct it") from None
-    if not inside:
-        raise UserError(
-            f"{name!r} lies outside the data folder", where, f"Move the file into {folder}"
-        )
-    return folder / name
-
-
-def _relative(folder: Path, path: Path) -> str:
-    resolved, root = path.resolve(), folder.resolve()
-    if not resolved.is_relative_to(root):
-        raise UserError("the file lies outside the data folder", path, f"Move it into {folder}")
-    return resolved.relative_to(root).as_posix()
-
-
-def _frame(folder: Path, view: View) -> dict[str, Any]:
+def _frame(data: DataFolder, view: View) -> dict[str, Any]:
     camera = view.camera
     return {
-        "file_path": _relative(folder, view.image),
+        "file_path": data.relative(view.image),
         "split": view.split,
         "w": camera.width,
         "h": camera.height,

@@ -15,8 +15,8 @@ from ..dataset.pixels import CameraRays
 from ..dataset.views import View
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import montage, to_bytes, tonemap, write_exr, write_png
-from ..io import write_json
 from ..training.recovered import Recovered, load_run
+from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.validation import GroundTruth, MaterialBuffers, finite, read_view
 from ..transport.objective import METHODS, requirements
 from ..transport.render import render_radiance
@@ -66,7 +66,7 @@ def evaluate(
         tell: called with lines of progress.
 
     Returns:
-        What it writes to `evaluation/metrics.json`; pictures go beside it.
+        What it writes to the run's metrics file; pictures go beside it.
 
     Raises:
         UserError: the run or its data set cannot be read.
@@ -74,22 +74,22 @@ def evaluate(
     Paper: Sec. 6, Fig. 6.
     """
     settings = settings or EvaluationSettings()
-    recovered = load_run(run)
+    recovered, folder = load_run(run), RunFolder(run)
     dataset = recovered.dataset
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
     views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
     rows, materials = [], []
     for view in views:
-        folder = run / "evaluation" / view.split
         row, seen, truth = _evaluate_view(recovered, view, folder, settings)
         rows.append(row)
         materials.append((seen, truth))
         values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in row if k.endswith("_psnr"))
         tell(f"{view.name}: {', '.join(values)}")
-    light = _evaluate_light(recovered, run / "evaluation", tell)
+    light = _evaluate_light(recovered, folder, tell)
     if recovered.config.unknown == "materials+lighting":
         light["albedo_scale"] = _align_albedo(rows, materials)
-    metrics = description(recovered.config) | {
+    metrics = {"format": METRICS_FORMAT} | description(recovered.config)
+    metrics |= {
         "steps": recovered.progress.step,
         "samples": recovered.progress.samples,
         "seconds": round(recovered.progress.seconds, 2),
@@ -101,7 +101,7 @@ def evaluate(
         "data": str(dataset.folder),
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
     }
-    write_json(run / "evaluation" / "metrics.json", metrics)
+    folder.write_metrics(metrics)
     return metrics
 
 
@@ -124,7 +124,7 @@ def description(config: FitConfig) -> dict:
 
 
 def _evaluate_view(
-    recovered: Recovered, view: View, folder: Path, settings: EvaluationSettings
+    recovered: Recovered, view: View, folder: RunFolder, settings: EvaluationSettings
 ) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
     problem, camera = recovered.problem, view.camera
     rays = CameraRays.of([camera])
@@ -153,8 +153,8 @@ def _evaluate_view(
         pictures["albedo"] = seen.albedo, tonemap(seen.albedo)
         pictures["roughness"] = grey, to_bytes(grey)
     for name, (linear, shown) in pictures.items():
-        write_exr(folder / f"{view.name}_{name}.exr", np.dstack([linear, alpha]))
-        write_png(folder / f"{view.name}_{name}.png", shown)
+        write_exr(folder.picture(view.split, view.name, name), np.dstack([linear, alpha]))
+        write_png(folder.picture(view.split, view.name, name, ".png"), shown)
 
     row = {"name": view.name, "split": view.split} | dict.fromkeys(METRICS)
     if mask.any():
@@ -164,16 +164,16 @@ def _evaluate_view(
     return row, seen, truth
 
 
-def _evaluate_light(recovered: Recovered, folder: Path, tell: Callable[[str], None]) -> dict:
+def _evaluate_light(recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]) -> dict:
     """Numbers and pictures of recovered light; nothing where light was known."""
     problem, data = recovered.problem, recovered.dataset.folder
     found: dict[str, Any] = {}
     if problem.environment is not None:
         map_ = problem.environment.to_latlong(ROWS)
         truth = true_environment(data)
-        write_exr(folder / "environment.exr", map_)
+        write_exr(folder.environment(), map_)
         shown = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
-        write_png(folder / "environment.png", montage(shown))
+        write_png(folder.environment(".png"), montage(shown))
         found["environment"] = None
         if truth is not None:
             found["environment"] = numbers = lighting.compare_environments(map_, truth)

@@ -16,7 +16,7 @@ import drjit as dr
 from rich.console import Console
 
 from ..errors import UserError
-from ..io import write_atomically, write_json
+from ..io import write_atomically, write_json, write_text
 from ..machine import machine
 from . import Scale
 from .jobs import Findings, Job, JobRunner, Record
@@ -164,11 +164,7 @@ def _write(
         "rows": [dict(row) for row in result.rows],
     }
     write_json(folder / "data.json", data)
-    _write_text(folder / "data.csv", csv_text(result.rows))
-    _write_text(folder / "table.md", result.tables.rstrip() + "\n")
+    write_text(folder / "data.csv", csv_text(result.rows))
+    write_text(folder / "table.md", result.tables.rstrip() + "\n")
     if result.draw is not None:
         result.draw(folder / "figure.png")
-
-
-def _write_text(path: Path, text: str) -> None:
-    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))

@@ -51,9 +51,9 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
 def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
     """The maps that were found, and a view lit by them; the truth on the right."""
     view = scene_fits.heldout(context)[VIEW]
-    folders = [scene_fits.evaluation(context, method) for method in ABLATION.values()]
-    maps = [read_exr(folder / "environment.exr") for folder in folders]
-    renderings = [folder / view.split / f"{view.name}_render.exr" for folder in folders]
+    runs = [scene_fits.run(context, method) for method in ABLATION.values()]
+    maps = [read_exr(run.environment()) for run in runs]
+    renderings = [run.picture(view.split, view.name, "render") for run in runs]
     truth = true_environment(scene_fits.scene.data(context))
     photograph = read_exr(view.image)
     images = [

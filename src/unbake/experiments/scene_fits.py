@@ -19,8 +19,8 @@ from ..errors import UserError
 from ..evaluation.evaluate import EvaluationSettings
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import block_means, montage, read_exr, to_bytes, tonemap
-from ..io import read_json
 from ..report.display import rgb
+from ..training.run_folder import RunFolder
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
 from .scenes import PaperScene
@@ -108,14 +108,14 @@ class SceneFits:
         for method, row in result["methods"].items():
             if "error" in row:
                 raise UserError(f"{method} failed: {row['error']}")
-            metrics = read_json(out / method / "evaluation" / "metrics.json")
+            metrics = self.run(context, method).metrics()
             found[method] = {k: row[k] for k in (*kept, "environment") if k in row}
             found[method]["per_view"] = metrics["per_view"]
         return found
 
-    def evaluation(self, context: ExperimentContext, method: str) -> Path:
-        """The folder of a method's final renderings."""
-        return self.runs(context) / method / "evaluation"
+    def run(self, context: ExperimentContext, method: str) -> RunFolder:
+        """The run of a method."""
+        return RunFolder(self.runs(context) / method)
 
     def heldout(self, context: ExperimentContext) -> Sequence[View]:
         """The held-out views."""
@@ -138,7 +138,7 @@ class SceneFits:
         """
         rows, size = [], context.pick(1, 4, 4)
         for view, known in zip(self.heldout(context), row["per_view"], strict=True):
-            file = self.evaluation(context, method) / view.split / f"{view.name}_render.exr"
+            file = self.run(context, method).picture(view.split, view.name, "render")
             photograph, found = read_exr(view.image), read_exr(file)[..., :3]
             scale = exposure(photograph)
             images = [block_means(p[..., :3], size) * scale for p in (found, photograph)]
@@ -163,8 +163,8 @@ class SceneFits:
             scale = exposure(read_exr(view.image))
             truth = {"render": view.image, "albedo": view.albedo, "roughness": view.roughness}
             for what in SHOWN:
-                file = f"{view.split}/{view.name}_{what}.exr"
-                found = [self.evaluation(context, method) / file for method in self.methods]
+                runs = (self.run(context, method) for method in self.methods)
+                found = [run.picture(view.split, view.name, what) for run in runs]
                 factor = scale if what == "render" else 1.0
                 sheet.append([_cell(path, what, factor, view) for path in (*found, truth[what])])
         return montage(sheet)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..acquisition.capture import CaptureSettings, capture
 from ..config import FitConfig, from_toml
+from ..dataset.data_folder import DataFolder
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..imaging.pictures import read_exr, tonemap, write_exr, write_png
@@ -222,7 +223,7 @@ class PaperScene:
             self.described(context),
             work,
             context.pick(seconds, seconds, None),
-            files=[folder / "transforms.json"],
+            files=[DataFolder(folder).transforms_file],
         )
 
 

@@ -55,14 +55,12 @@ def marked(
 # ----------------------------------------------------------------------------------------- pictures
 
 
-def evaluated(run: Run, file: str) -> Path:
+def evaluated(run: Run, picture: Path) -> Path:
     """A picture that the run's evaluation left; UserError where it is gone."""
-    path = run.path / "evaluation" / file
-    if not path.is_file():
-        raise UserError(
-            "an evaluated picture is gone", path, f"Run `unbake evaluate {run.path}` again"
-        )
-    return path
+    if not picture.is_file():
+        again = f"{run.folder.evaluate_again} again"
+        raise UserError("an evaluated picture is gone", picture, again)
+    return picture
 
 
 def rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:

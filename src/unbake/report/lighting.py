@@ -40,7 +40,8 @@ def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
     found: list[np.ndarray | None] = []
     errors: list[np.ndarray | None] = []
     for run in runs:
-        path = display.evaluated(run, "environment.exr") if run.optimizes("environment") else None
+        optimized = run.optimizes("environment")
+        path = display.evaluated(run, run.folder.environment()) if optimized else None
         found.append(None if path is None else display.rgb(path)[0])
         known = path is not None and truth is not None
         errors.append(display.error(found[-1], truth, path) if known else None)

@@ -10,13 +10,14 @@ from typing import Any, final
 import jinja2
 import numpy as np
 
+from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.convergence import score_curve, time_to_quality
 from unbake.imaging import pictures
-from unbake.io import write_atomically
+from unbake.io import write_text
 from unbake.report import charts, display
 from unbake.report.lighting import light_section
-from unbake.report.runs import Run, View, data_folder, labels, read_json, read_run, read_views
+from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 SPLITS = ("heldout", "train")
@@ -75,7 +76,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
     The page holds its pictures, styles and script itself and loads nothing from anywhere.
     Pictures of renderings and albedo are linear RGB seen through the sRGB curve; roughness is shown
     without a curve. Larger pictures than 640 pixels are averaged down; PSNRs are those of
-    `evaluation/metrics.json`, from full resolution.
+    the evaluation, from full resolution.
 
     Args:
         runs: run folders, all evaluated on the same data.
@@ -92,13 +93,13 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
         raise UserError("a report needs at least one run")
     loaded = [read_run(path, label) for path, label in labels(runs)]
     data = data_folder(loaded)
-    transforms = read_json(data / "transforms.json", "Give back the data that the run was fit to")
-    views = read_views(data, transforms, loaded)
+    dataset = Dataset.load(data)
+    views = read_views(dataset, loaded)
     scales = _scales(loaded, views)
     groups = [
         {
             "split": split,
-            "total": sum(frame.get("split") == split for frame in transforms["frames"]),
+            "total": sum(view.split == split for view in dataset.views),
             "views": [_view_block(view, loaded, scales) for view in views if view.split == split],
         }
         for split in SPLITS
@@ -108,7 +109,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
         .from_string(TEMPLATE.read_text(encoding="utf-8"))
         .render(
             scene=data.name,
-            transforms=transforms,
+            dataset=dataset,
             runs=loaded,
             psnrs=_psnrs(loaded).values(),
             rows=_table(loaded),
@@ -133,7 +134,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
         )
     )
     out = Path(out)
-    write_atomically(out, lambda path: path.write_text(page, encoding="utf-8"))
+    write_text(out, page)
     return out
 
 
@@ -144,7 +145,7 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
     """Where a run's picture of a view lies; None where there is none to be expected."""
     if not run.view(view.name) or not run.optimizes(quantity):
         return None
-    return display.evaluated(run, f"{view.split}/{view.name}_{quantity}.exr")
+    return display.evaluated(run, run.folder.picture(view.split, view.name, quantity))
 
 
 def _scales(runs: list[Run], views: list[View]) -> Scales:

@@ -7,9 +7,7 @@ counts.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +20,11 @@ from safetensors.numpy import save
 
 from ..errors import UserError
 from ..fields.network import from_numpy
+from ..io import write_atomically
+from .run_folder import RunFolder
 from .step import State
 
 FORMAT = "unbake-checkpoint-1"
-#: Checkpoints kept in a run folder.
-KEEP = 3
 
 
 @dataclass
@@ -38,7 +36,7 @@ class Progress:
     samples: int = 0
 
 
-def save_checkpoint(folder: Path, state: State, progress: Progress) -> Path:
+def save_checkpoint(run: RunFolder, state: State, progress: Progress) -> Path:
     """Write a checkpoint and delete all but the newest few.
 
     Raises:
@@ -61,33 +59,19 @@ def save_checkpoint(folder: Path, state: State, progress: Progress) -> Path:
         "samples": str(progress.samples),
     }
     metadata["crc"] = str(_checksum(arrays, metadata))
-    path = folder / f"step-{progress.step:07d}.safetensors"
-    partial = path.with_suffix(".partial")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with open(partial, "wb") as file:
-            file.write(save(arrays, metadata))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise UserError(f"the checkpoint cannot be written ({error.strerror})", path) from None
-    # A fit that was killed while it wrote leaves its half behind.
-    leftover = folder.glob("step-*.partial")
-    for old in [*sorted(folder.glob("step-*.safetensors"))[:-KEEP], *leftover]:
-        old.unlink(missing_ok=True)
+    path, content = run.checkpoint(progress.step), save(arrays, metadata)
+    write_atomically(path, lambda p: p.write_bytes(content), durable=True, what="checkpoint")
+    run.tidy_checkpoints()
     return path
 
 
-def load_checkpoint(folder: Path, state: State) -> Progress | None:
+def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
     """Put the newest readable checkpoint into the state; None if none was written yet.
 
     Raises:
         UserError: the checkpoint belongs to other settings, or all checkpoints are damaged.
     """
-    written = sorted(folder.glob("step-*.safetensors"), reverse=True)
+    written = run.written_checkpoints()
     for path in written:
         try:
             with safe_open(path, "numpy") as file:
@@ -101,7 +85,7 @@ def load_checkpoint(folder: Path, state: State) -> Progress | None:
         _restore(state, arrays, path)
         return Progress(int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"]))
     if written:
-        raise UserError("no checkpoint in this folder can be read", folder, "Fit again")
+        raise UserError("no checkpoint in this folder can be read", run.checkpoints, "Fit again")
     return None
 
 

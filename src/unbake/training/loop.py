@@ -14,15 +14,14 @@ import drjit as dr
 import mitsuba as mi
 from rich.console import Console
 
-from ..config import FitConfig, read_toml, to_toml
+from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
-from ..io import write_atomically
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
-from .monitor import Monitor, forget_after, memory_mb
+from .monitor import Monitor, memory_mb
 from .preview import Preview
 from .problem import camera_warnings, make_problem, training_pixels
-from .recovered import Origin, read_origin, write_origin
+from .run_folder import Origin, RunFolder
 from .schedule import learning_rates
 from .step import TrainingStep, initial_state
 from .validation import Score
@@ -64,13 +63,17 @@ def fit(
     Paper: Sec. 4, 5.4.
     """
     console = console or Console()
-    config = _resumed_config(run, config) if resume else _refuse_second_run(run, config)
+    folder = RunFolder(run)
+    if resume:
+        config = _resumed_config(folder, config)
+    else:
+        folder.require_new()
     dataset = Dataset.load(data)
-    clip_negative = clip_negative or (resume and read_origin(run).clip_negative)
+    clip_negative = clip_negative or (resume and folder.origin().clip_negative)
     pixels = training_pixels(dataset, clip_negative=clip_negative)
     mean_radiance = pixels.photographs.mean
     if resume:
-        _require_same_photographs(run, data, mean_radiance)
+        _require_same_photographs(folder, data, mean_radiance)
     problem = make_problem(dataset.scene, dataset.background, config, mean_radiance)
     for warning in camera_warnings(dataset, problem.scene_view.scene):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
@@ -78,22 +81,23 @@ def fit(
     state = initial_state(problem)
     progress = Progress()
     if resume:
-        progress = load_checkpoint(run / "checkpoints", state) or progress
+        progress = load_checkpoint(folder, state) or progress
         console.print(f"going on after step {progress.step}", highlight=False)
     step = TrainingStep(problem, pixels, config)
-    preview = Preview(problem, dataset, run / "previews")
+    preview = Preview(problem, dataset, folder)
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
     step.require_memory(state)
     # Here all input is known to be good, and the folder is made.
-    _write_settings(run, config, Origin(str(data.resolve()), mean_radiance, clip_negative))
-    forget_after(run / "log.jsonl", progress.step)
+    folder.write_origin(Origin(str(data.resolve()), mean_radiance, clip_negative))
+    folder.write_settings(config)
+    folder.forget_after(progress.step)
 
     total = config.seconds or config.steps
     saved_at = shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
     skipped = 0
-    with Monitor(run / "log.jsonl", console, total) as monitor, _stop_on_interrupt() as stop:
+    with Monitor(folder.log_file, console, total) as monitor, _stop_on_interrupt() as stop:
         if score is not None and not progress.step:
             monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
         clock = time.perf_counter() - progress.seconds
@@ -134,7 +138,7 @@ def fit(
                     remedy="Lower learning_rate, or look for extreme pixels in the images",
                 )
             if last or progress.seconds - saved_at >= config.checkpoint_seconds:
-                save_checkpoint(run / "checkpoints", state, progress)
+                save_checkpoint(folder, state, progress)
                 saved_at = progress.seconds
             if last or progress.seconds - shown_at >= config.preview_seconds:
                 state.publish(problem)
@@ -173,37 +177,18 @@ def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: floa
     return entry
 
 
-def _refuse_second_run(run: Path, config: FitConfig) -> FitConfig:
-    """The settings as they are; an error rather than two runs mixed in one folder."""
-    if (run / "config.toml").exists():
-        raise UserError(
-            "there is a run in this folder already",
-            where=run,
-            remedy="Go on with --resume, or give another --out",
-        )
-    return config
-
-
-def _write_settings(run: Path, config: FitConfig, origin: Origin) -> None:
-    write_origin(run, origin)
-    text = to_toml(config)
-    write_atomically(run / "config.toml", lambda path: path.write_text(text, encoding="utf-8"))
-
-
-def _resumed_config(run: Path, config: FitConfig) -> FitConfig:
+def _resumed_config(run: RunFolder, config: FitConfig) -> FitConfig:
     """The settings a run was started with, but for how long it should go on."""
-    if not (run / "config.toml").is_file():
-        raise UserError("there is no run to resume in this folder", run, "Leave out --resume")
-    stored = read_toml(run / "config.toml")
-    return dataclasses.replace(stored, steps=config.steps, seconds=config.seconds)
+    run.require_resumable()
+    return dataclasses.replace(run.settings(), steps=config.steps, seconds=config.seconds)
 
 
-def _require_same_photographs(run: Path, data: Path, mean_radiance: float) -> None:
+def _require_same_photographs(run: RunFolder, data: Path, mean_radiance: float) -> None:
     """A data set may have moved; another one would ruin what was learned without a word."""
-    origin = read_origin(run)
+    origin = run.origin()
     if not math.isclose(origin.mean_radiance, mean_radiance, rel_tol=1e-4):
         raise UserError(
-            f"these are not the photographs that the run {run} was started with",
+            f"these are not the photographs that the run {run.path} was started with",
             where=data,
             remedy=f"Give {origin.data}, or start another run",
         )

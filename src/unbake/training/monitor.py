@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
-from ..io import write_atomically
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
@@ -28,23 +27,8 @@ def memory_mb() -> float:
         return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def forget_after(log: Path, step: int) -> None:
-    """Drop the lines of a log that lie after a step, and what a killed fit left half-written.
-
-    A resumed fit takes those steps again.
-    """
-    kept = []
-    for line in log.read_text(encoding="utf-8").splitlines() if log.is_file() else ():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line + "\n")
-        except (ValueError, KeyError, TypeError):
-            continue
-    write_atomically(log, lambda path: path.write_text("".join(kept), encoding="utf-8"))
-
-
 class Monitor:
-    """Shows progress and appends to `log.jsonl`; a context manager.
+    """Shows progress and appends to the log; a context manager.
 
     A bar with loss terms, samples/s, time left and memory on a terminal, plain lines elsewhere.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from ..dataset.views import Dataset, View
 from ..imaging.pictures import montage, to_bytes, tonemap, write_png
 from .checkpoint import Progress
 from .problem import Problem
+from .run_folder import RunFolder
 from .validation import SAMPLES, GroundTruth, MaterialBuffers
 
 
@@ -23,9 +23,9 @@ class Preview:
         UserError: a truth image of that view, or of the environment, cannot be read.
     """
 
-    def __init__(self, problem: Problem, dataset: Dataset, folder: Path) -> None:
+    def __init__(self, problem: Problem, dataset: Dataset, run: RunFolder) -> None:
         self._problem = problem
-        self._folder = folder
+        self._run = run
         self._view: View = (dataset.heldout or dataset.train)[0]
         self._truth = None if problem.materials is None else GroundTruth.of(self._view)
         known = None if problem.environment is None else true_environment(dataset.folder)
@@ -34,8 +34,8 @@ class Preview:
     def show(self, progress: Progress) -> list[dict]:
         """Show what the fields say now.
 
-        Albedo and roughness, and the environment map, go to `step-NNNNNN.png`, above the truth
-        where that is known. Lights have no picture.
+        Albedo and roughness, and the environment map, go to one picture, above the truth where
+        that is known. Lights have no picture.
 
         Returns:
             Lines for the log: materials against the truth, and the strength of lights.
@@ -54,8 +54,7 @@ class Preview:
                 {"emission": dict(zip(self._problem.emitter_names, strengths, strict=True))}
             )
         if sheets:
-            file = self._folder / f"step-{progress.step:06d}.png"
-            write_png(file, montage(sheets, gap=0))
+            write_png(self._run.preview(progress.step), montage(sheets, gap=0))
         return [{**asdict(progress), "validation": values} for values in found]
 
     def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
+from ..dataset.data_folder import TRANSFORMS
 from ..dataset.photographs import Photographs
 from ..dataset.pixels import CameraRays, PixelSource
 from ..dataset.views import Dataset, check_cameras
@@ -158,7 +159,7 @@ def training_pixels(dataset: Dataset, *, clip_negative: bool) -> PixelSource:
     views = dataset.train
     if not views:
         raise UserError(
-            "no training view", dataset.folder, 'Give frames of transforms.json "split": "train"'
+            "no training view", dataset.folder, f'Give frames of {TRANSFORMS} "split": "train"'
         )
     photographs = Photographs.load(dataset, clip_negative)
     if not photographs.count:

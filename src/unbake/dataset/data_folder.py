@@ -1,0 +1,138 @@
+"""The folder of a data set: where its files lie, and what is read from and written to them.
+
+    DATA/
+      transforms.json                  cameras and images, in the layout of nerfstudio
+      scene/                           the Mitsuba scene and its files
+      images/VIEW.exr                  photographs
+      truth/QUANTITY/VIEW.exr          true materials; a quantity that is not known has no folder
+      truth/environment.exr            the true environment map
+      truth/emission.json              the true strengths of lights
+      .cache/                          decoded photographs; can be deleted
+
+`transforms.json` says where photographs and scene lie, so that those of another program may lie
+elsewhere in the folder. No other module names these files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from ..errors import UserError
+from ..io import check_format, inside, read_object, relative, write_json
+
+#: The file that makes a folder a data set.
+TRANSFORMS = "transforms.json"
+#: The newest format of that file that can be read, and the one that is written.
+FORMAT = 1
+
+_MAKE_DATA = "Render a data set from a scene with `unbake capture SCENE --out DATA`"
+_KIND = "data folder"
+
+
+@final
+@dataclass(frozen=True)
+class DataFolder:
+    """The files of a data set.
+
+    Args:
+        path: the folder; it need not exist yet.
+    """
+
+    path: Path
+
+    @property
+    def transforms_file(self) -> Path:
+        """Cameras and images."""
+        return self.path / TRANSFORMS
+
+    @property
+    def scene(self) -> Path:
+        """The folder of the scene, where the data set was captured."""
+        return self.path / "scene"
+
+    def image(self, view: str) -> Path:
+        """The photograph of a view, where the data set was captured."""
+        return self.path / "images" / f"{view}.exr"
+
+    def truth(self, quantity: str, view: str) -> Path:
+        """The true picture of a quantity, such as "albedo", in a view."""
+        return self.path / "truth" / quantity / f"{view}.exr"
+
+    @property
+    def environment_file(self) -> Path:
+        """The true environment map."""
+        return self.path / "truth" / "environment.exr"
+
+    @property
+    def emission_file(self) -> Path:
+        """The true strengths of lights."""
+        return self.path / "truth" / "emission.json"
+
+    @property
+    def cache(self) -> Path:
+        """The folder of decoded photographs."""
+        return self.path / ".cache"
+
+    @property
+    def cache_key(self) -> Path:
+        """What the cache was made from; it is written last."""
+        return self.cache / "key.json"
+
+    @property
+    def cached_photographs(self) -> Path:
+        """The pixels of all photographs."""
+        return self.cache / "photographs.npy"
+
+    @property
+    def cached_foreground(self) -> Path:
+        """The numbers of the pixels that see the scene."""
+        return self.cache / "foreground.npy"
+
+    def inside(self, name: str, where: str) -> Path:
+        """The file that `transforms.json` names; it must lie in the folder.
+
+        Args:
+            where: the entry that names it, for error messages.
+
+        Raises:
+            UserError: `name` is not a path, or leads out of the folder.
+        """
+        return inside(self.path, name, where, _KIND)
+
+    def relative(self, file: Path) -> str:
+        """How `transforms.json` names a file of the folder.
+
+        Raises:
+            UserError: the file lies outside the folder.
+        """
+        return relative(self.path, file, _KIND)
+
+    def read_transforms(self) -> dict[str, Any]:
+        """The content of `transforms.json`, as it stands in the file.
+
+        Raises:
+            UserError: there is no data set, or the file is damaged or of a newer version.
+        """
+        if self.path.is_file():
+            raise UserError("is a file, not a data folder", self.path, _MAKE_DATA)
+        if not self.path.is_dir():
+            raise UserError("the data folder does not exist", self.path, "Check the path")
+        file = self.transforms_file
+        if not file.is_file():
+            raise UserError(f"no {TRANSFORMS} in the folder", self.path, "Is this a data folder?")
+        content = read_object(file)
+        check_format(content, FORMAT, file)
+        return content
+
+    def write_transforms(self, content: Mapping[str, Any]) -> None:
+        """Write `transforms.json`, complete or not at all, and flushed to disk.
+
+        Raises:
+            UserError: the folder cannot be written.
+            ValueError: a number is not finite.
+        """
+        described = {"format": FORMAT, **content}
+        write_json(self.transforms_file, described, allow_nan=False, durable=True)
