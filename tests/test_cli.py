@@ -16,7 +16,7 @@ from unbake import cli
 from unbake.config import preset, read_toml
 from unbake.imaging.pictures import read_exr
 
-SOURCE = str(Path(cli.__file__).parents[1])
+SOURCE = str(Path(cli.__file__).parents[2])
 COMMANDS = ("capture", "fit", "evaluate", "report", "compare", "bench", "reproduce", "doctor")
 PSNRS = ("render_psnr", "albedo_psnr", "roughness_psnr")
 

@@ -21,7 +21,7 @@ _AGAIN = "Capture the data set again, or remove the file"
 
 
 def write_true_lighting(scene: Path, data: Path) -> None:
-    """Write the true environment map and the true strengths, each where the scene has such emitters.
+    """Write the true environment map and strengths, each where the scene has such emitters.
 
     Args:
         scene: the Mitsuba scene that the photographs are rendered from.
