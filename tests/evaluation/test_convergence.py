@@ -1,5 +1,7 @@
 """What logs tell: time of a step, score curves, time to quality."""
 
+import runpy
+
 import pytest
 
 from unbake.evaluation.convergence import (
@@ -65,3 +67,14 @@ def test_every_run_sets_a_target_for_all():
     assert [(t.run, t.albedo_psnr) for t in targets] == [("fast", 20), ("slow", 15)]
     assert targets[0].seconds == {"fast": 4, "slow": None, "none": None}
     assert targets[1].seconds == {"fast": 2, "slow": 10, "none": None}
+
+
+def test_the_table_of_benchmarks_and_the_comparison_agree_on_the_time_to_quality(repository):
+    table = runpy.run_path(str(repository / "benchmarks" / "tables.py"))["time_to_quality"]
+    noisy = curve((0, 10), (10, 21), (20, 19), (30, 23), (40, 22))
+    runs = {"methods": {"ours": {"score": noisy}}}
+    end = {"methods": {"prb": {"score": curve((0, 10), (90, 20))}}}
+    assert time_to_quality({"prb": curve((90, 20)), "ours": noisy})[0].seconds["ours"] == 22.5
+    assert "| `prb` | 90 s | 20.00 dB | 22 s | 4 |" in table(end, runs)
+    end["methods"]["prb"]["score"] = curve((90, 22.5))
+    assert "not in this run" in table(end, runs)
