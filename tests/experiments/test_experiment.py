@@ -4,6 +4,7 @@ import dataclasses
 import json
 import tarfile
 from functools import partial
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
@@ -20,9 +21,11 @@ from unbake.experiments.experiment import (
 )
 from unbake.experiments.fig4 import agreement, published_tables, smoothed
 from unbake.experiments.jobs import Job
-from unbake.experiments.scene_fits import at_equal_samples
+from unbake.experiments.scene_fits import SceneFits, at_equal_samples
 from unbake.experiments.scenes import SCENES, STAIRCASE
 from unbake.experiments.tables import markdown
+from unbake.imaging.pictures import write_exr
+from unbake.training.run_folder import RunFolder
 
 
 @pytest.fixture(autouse=True)
@@ -215,3 +218,15 @@ def test_published_gradients_are_those_of_the_paper():
 
 def test_every_experiment_goes_by_its_name():
     assert [load(name).name for name in get_args(Name)] == list(get_args(Name))
+
+
+def test_a_rendering_of_another_size_than_the_photograph_is_named(tmp_path, monkeypatch):
+    run = RunFolder(tmp_path / "ours")
+    view = SimpleNamespace(name="a", split="heldout", image=tmp_path / "a.exr")
+    write_exr(view.image, np.ones((8, 8, 4)))
+    write_exr(run.picture("heldout", "a", "render"), np.ones((4, 8, 4)))
+    monkeypatch.setattr(SceneFits, "heldout", lambda *_: [view])
+    monkeypatch.setattr(SceneFits, "run", lambda *_: run)
+    fits = SceneFits(STAIRCASE, ["ours"], None, spp=1)
+    with pytest.raises(UserError, match=r"a_render\.exr: the picture has 8 x 4 pixels"):
+        fits.qualities(context(tmp_path), "ours", {"per_view": [{}]})

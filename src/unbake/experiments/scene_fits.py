@@ -19,7 +19,7 @@ from ..errors import UserError
 from ..evaluation.evaluate import EvaluationSettings
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import block_means, montage, read_exr, to_bytes, tonemap
-from ..report.display import rgb
+from ..report.display import require_same_size, rgb
 from ..training.run_folder import RunFolder
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
@@ -140,6 +140,7 @@ class SceneFits:
         for view, known in zip(self.heldout(context), row["per_view"], strict=True):
             file = self.run(context, method).picture(view.split, view.name, "render")
             photograph, found = read_exr(view.image), read_exr(file)[..., :3]
+            require_same_size(found, photograph, file)
             scale = exposure(photograph)
             images = [block_means(p[..., :3], size) * scale for p in (found, photograph)]
             images = [np.clip(image, 0, 1) for image in images]

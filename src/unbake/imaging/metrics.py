@@ -26,20 +26,21 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
         dB; `inf` where the two agree exactly.
 
     Raises:
-        UserError: the shapes differ, no pixel counts, or a pixel that counts is not finite.
+        UserError: a pixel that counts is not finite, as after a fit that diverged.
+        ValueError: the shapes differ, or no pixel counts.
 
     Source: PSNR as reported in Paper: Sec. 6, Fig. 6.
     """
     image, reference = np.asarray(image), np.asarray(reference)
     if image.shape != reference.shape or image.ndim not in (2, 3):
-        raise UserError(
-            f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}",
-            remedy="Both must be (H, W) or (H, W, C) with equal sizes",
+        raise ValueError(
+            f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}: "
+            "both must be (H, W) or (H, W, C) of equal size"
         )
     if mask is not None:
         image, reference = _select(image, mask), _select(reference, mask)
     if image.size == 0:
-        raise UserError("no pixel to compare: the mask is empty")
+        raise ValueError("no pixel to compare: the mask is empty")
     finite = np.isfinite(image) & np.isfinite(reference)
     if not finite.all():
         bad = int(np.count_nonzero(~finite))
@@ -66,9 +67,8 @@ def _select(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The (N,) or (N, C) pixels that count."""
     mask = np.asarray(mask)
     if mask.dtype != np.bool_ or mask.shape != picture.shape[:2]:
-        raise UserError(
-            f"a {mask.dtype} mask of shape {mask.shape} does not fit a picture "
-            f"of {picture.shape[0]} x {picture.shape[1]} pixels",
-            remedy="A mask is (H, W) and boolean",
+        raise ValueError(
+            f"a {mask.dtype} mask of shape {mask.shape} does not fit a picture of shape "
+            f"{picture.shape}: a mask is (H, W) and boolean"
         )
     return picture[mask]

@@ -53,7 +53,8 @@ def write_exr(path: Path, array: np.ndarray) -> None:
     The file appears complete or not at all, and its folder is made where there is none.
 
     Raises:
-        UserError: the shape is none of these, or the folder cannot be written.
+        UserError: the folder cannot be written.
+        ValueError: the shape is none of these.
     """
     array = np.asarray(array)
     _check_shape(array, channels=(1, 3, 4))
@@ -65,7 +66,8 @@ def write_png(path: Path, array: np.ndarray) -> None:
     """Write (H, W) or (H, W, C) uint8 sRGB values as PNG, complete or not at all; C is 1, 3 or 4.
 
     Raises:
-        UserError: the array is not such a picture, or the folder cannot be written.
+        UserError: the folder cannot be written.
+        ValueError: the array is not such a picture.
     """
     data = _png(array)
     write_atomically(path, lambda p: p.write_bytes(data))
@@ -103,10 +105,10 @@ def absolute_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """|image − reference| averaged over channels: (H, W, C) twice to (H, W), linear.
 
     Raises:
-        UserError: the shapes differ.
+        ValueError: the shapes differ.
     """
     if image.shape != reference.shape:
-        raise UserError(
+        raise ValueError(
             f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}"
         )
     with np.errstate(invalid="ignore"):  # inf − inf is shown as not finite, not warned about
@@ -123,9 +125,12 @@ def false_colour(values: np.ndarray, scale: float, mask: np.ndarray | None = Non
 
     Returns:
         (H, W, 3) uint8 sRGB.
+
+    Raises:
+        ValueError: `scale` is not positive.
     """
     if not scale > 0:
-        raise UserError(f"the scale of a false-colour picture must be positive, not {scale}")
+        raise ValueError(f"the scale of a false-colour picture must be positive, not {scale}")
     finite = np.isfinite(values)
     position = _unit(np.where(finite, values, 0) / scale) * (len(MAGMA) - 1)
     stops = np.array(MAGMA, dtype=np.float32)
@@ -150,7 +155,7 @@ def error_picture(
         mask: (H, W) bool; mid grey where False.
 
     Raises:
-        UserError: the shapes differ or `scale` is not positive.
+        ValueError: the shapes differ or `scale` is not positive.
     """
     return false_colour(absolute_error(image, reference), scale, mask)
 
@@ -183,11 +188,11 @@ def montage(rows: Sequence[Sequence[np.ndarray]], gap: int = 2, paper: int = 255
         paper: grey level of gaps and empty places.
 
     Raises:
-        UserError: there is no picture, or one is not (H, W, 3) uint8.
+        ValueError: there is no picture, or one is not (H, W, 3) uint8.
     """
     cells = [cell for row in rows for cell in row]
     if not cells:
-        raise UserError("a montage needs at least one picture")
+        raise ValueError("a montage needs at least one picture")
     for cell in cells:
         _check_bytes(cell, channels=(3,))
     count = max(len(row) for row in rows)
@@ -216,11 +221,11 @@ def _unit(values: np.ndarray) -> np.ndarray:
 
 def _check_bytes(array: np.ndarray, channels: tuple[int, ...]) -> None:
     if array.dtype != np.uint8:
-        raise UserError(f"an 8-bit picture is needed, not one of {array.dtype}")
+        raise ValueError(f"an 8-bit picture is needed, not one of {array.dtype}")
     _check_shape(array, channels)
 
 
 def _check_shape(array: np.ndarray, channels: tuple[int, ...]) -> None:
     flat = array.ndim == 2 and 1 in channels
     if array.size == 0 or not (flat or (array.ndim == 3 and array.shape[2] in channels)):
-        raise UserError(f"an array of shape {array.shape} is not a picture")
+        raise ValueError(f"an array of shape {array.shape} is not a picture")

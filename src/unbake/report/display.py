@@ -74,14 +74,23 @@ def rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def error(image: np.ndarray, reference: np.ndarray, path: Path) -> np.ndarray:
     """`absolute_error` of a picture, (H, W); UserError where its size is not the reference's."""
-    if image.shape != reference.shape:
+    require_same_size(image, reference, path)
+    return pictures.absolute_error(image, reference)
+
+
+def require_same_size(image: np.ndarray, reference: np.ndarray, path: Path) -> None:
+    """Refuse a picture read from a file that does not have the size of its ground truth.
+
+    Raises:
+        UserError: the sizes differ.
+    """
+    if image.shape[:2] != reference.shape[:2]:
         raise UserError(
             f"the picture has {image.shape[1]} x {image.shape[0]} pixels, "
             f"its ground truth {reference.shape[1]} x {reference.shape[0]}",
             path,
             "Evaluate the run again",
         )
-    return pictures.absolute_error(image, reference)
 
 
 def tonemapped(linear: np.ndarray, exposure: float) -> str:
