@@ -31,7 +31,7 @@ demo: setup ## capture, fit, evaluate and report a small room into demo/ (FRESH=
 	@FRESH="$(FRESH)" bash scripts/demo.sh
 
 bench: setup ## where the time of a step goes here, into benchmarks/results (STAIRCASE=data adds it)
-	@bash benchmarks/run.sh machine
+	@$(BIN)/python benchmarks/run.py machine --again
 
 clean: ## remove the demo, builds and caches
 	rm -rf demo build dist src/*.egg-info .pytest_cache .ruff_cache .import_linter_cache

@@ -1,45 +1,46 @@
-"""The tables of docs/comparison.md, from benchmarks/results: python tables.py"""
+"""The tables of docs/comparison.md and docs/performance.md: python tables.py [RESULTS]"""
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
+from summary import phases_of, read, roofline_of  # noqa: E402
+
 from unbake.evaluation.convergence import seconds_to  # noqa: E402
+from unbake.experiments.tables import markdown  # noqa: E402
 
 RESULTS = Path(__file__).parent / "results"
 
 
-def main() -> None:
-    """Print every table whose numbers are there."""
+def main(folder: Path = RESULTS) -> None:
+    """Print every table whose numbers are in a folder of results."""
     for title, names, table in TABLES:
-        found = [read(name) for name in names]
-        if all(found):
-            print(f"{title}\n\n{table(*found)}\n")
-
-
-def read(name: str) -> dict | None:
-    """The numbers of one file of results."""
-    file = RESULTS / f"{name}.json"
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+        files = [folder / f"{name}.json" for name in names]
+        if all(file.is_file() for file in files):
+            print(f"{title}\n\n{table(*map(read, files))}\n")
+    for file in sorted(folder.glob("*.json")):
+        result = read(file)
+        if isinstance(result.get("steps"), list):
+            print(f"Where the time of a step goes, ms, {file.stem}\n\n{phases(result)}\n")
 
 
 def steps(demo: dict, staircase: dict) -> str:
-    """Milliseconds of a step, and in the second column as multiples of ours."""
+    """Milliseconds of a step, and as multiples of the step of ours."""
     rows = []
     for a, b in zip(demo["rows"], staircase["rows"], strict=True):
-        name = f"`{a['method']}` | {a['representation']} | {a['estimator'].replace('-', ' ')}"
+        name = (f"`{a['method']}`", a["representation"], a["estimator"].replace("-", " "))
         cells = [
             cell
             for row, table in ((a, demo), (b, staircase))
             for cell in (f"{row['milliseconds_per_step']:.0f} ms", f"{ratio(row, table):.2f}")
         ]
-        rows.append([name, *cells])
-    return markdown("method | materials | estimator | demo | / ours | STAIRCASE | / ours", rows)
+        rows.append([*name, *cells])
+    titles = ["method", "materials", "estimator", "demo", "/ ours", "STAIRCASE", "/ ours"]
+    return markdown(titles, rows)
 
 
 def ratio(row: dict, table: dict) -> float:
@@ -59,7 +60,7 @@ def quality(result: dict) -> str:
         psnr = [f"{row[f'{k}_psnr']:.1f}" for k in ("albedo", "roughness", "render")]
         told = f"`{name}`", str(row["steps"]), f"{row['milliseconds_per_step']:.0f}"
         rows.append([*told, *psnr])
-    return markdown("run | steps | ms a step | albedo | roughness | rendering", rows)
+    return markdown(["run", "steps", "ms a step", "albedo", "roughness", "rendering"], rows)
 
 
 def time_to_quality(end: dict, runs: dict) -> str:
@@ -72,10 +73,28 @@ def time_to_quality(end: dict, runs: dict) -> str:
         told += ["not in this run", ""]
     else:
         told += [f"{seconds:.0f} s", f"{last['seconds'] / seconds:.0f}"]
-    return markdown("method | ends after | with albedo | `ours` has it after | times", [told])
+    titles = ["method", "ends after", "with albedo", "`ours` has it after", "times"]
+    return markdown(titles, [told])
 
 
-def scene_fits(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
+def phases(result: dict) -> str:
+    """Milliseconds of the phases of the steps of a machine, and of the roofline."""
+    names = dict.fromkeys(name for step in result["steps"] for name in phases_of(step))
+    rows = []
+    for name in names:
+        times = [phases_of(step).get(name, {}).get("milliseconds") for step in result["steps"]]
+        rows.append([name, *("" if time is None else f"{time:.1f}" for time in times)])
+    rows.append(
+        ["whole step", *(f"{step['milliseconds_per_step']:.1f}" for step in result["steps"])]
+    )
+    least = [roofline_of(step) for step in result["steps"]]
+    rows.append(
+        ["roofline", *("" if r is None else f"{r['milliseconds']['all']:.1f}" for r in least)]
+    )
+    return markdown(["", *(f"`{s['method']}`, {s['data']}" for s in result["steps"])], rows)
+
+
+def spreads(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
     """Mean and spread over seeds; a column is its title, key, factor and digits."""
 
     def table(result: dict) -> str:
@@ -83,7 +102,7 @@ def scene_fits(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
             [f"`{name}`", *(spread(row, key, by, digits) for _, key, by, digits in columns)]
             for name, row in result["methods"].items()
         ]
-        return markdown(" | ".join(["run", *(title for title, *_ in columns)]), rows)
+        return markdown(["run", *(title for title, *_ in columns)], rows)
 
     return table
 
@@ -95,12 +114,6 @@ def spread(row: dict, key: str, factor: float, digits: int) -> str:
     text = f"{factor * row[key]:.{digits}f}"
     deviation = row.get(f"{key}_sd")
     return text if deviation is None else f"{text} ± {factor * deviation:.{digits}f}"
-
-
-def markdown(head: str, rows: Iterable[list[str]]) -> str:
-    """A table of Markdown."""
-    rule = "|".join("---" for _ in head.split("|"))
-    return "\n".join([f"| {head} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in rows)])
 
 
 PSNR = (
@@ -129,18 +142,18 @@ TABLES = (
     ("Equal samples, demo", ("equal-demo",), quality),
     ("Time to quality, demo", ("long-demo", "rivals-demo"), time_to_quality),
     ("Time to quality, STAIRCASE", ("long-staircase", "rivals-staircase"), time_to_quality),
-    ("Ablation, materials", ("ablation-materials",), scene_fits(*PSNR)),
-    ("Ablation, lighting", ("ablation-lighting",), scene_fits(*LIGHT)),
+    ("Ablation, materials", ("ablation-materials",), spreads(*PSNR)),
+    ("Ablation, lighting", ("ablation-lighting",), spreads(*LIGHT)),
     *(
-        (f"still, {unknown}", (f"still-{unknown}",), scene_fits(*BOTH))
+        (f"still, {unknown}", (f"still-{unknown}",), spreads(*BOTH))
         for unknown in ("materials", "lighting", "materials+lighting")
     ),
-    ("Emission", ("emission",), scene_fits(("error, %", "emission_error", 100, 2))),
+    ("Emission", ("emission",), spreads(("error, %", "emission_error", 100, 2))),
     *(
-        (f"Six views, {name}", (f"sparse-{name}",), scene_fits(*PSNR))
+        (f"Six views, {name}", (f"sparse-{name}",), spreads(*PSNR))
         for name in ("none", "smooth", "tied", "both")
     ),
 )
 
 if __name__ == "__main__":
-    main()
+    main(*map(Path, sys.argv[1:2]))

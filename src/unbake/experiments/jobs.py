@@ -116,6 +116,11 @@ class JobRunner:
         """The jobs that are not done."""
         return [job for job in jobs if "findings" not in self.record(job)]
 
+    def forget(self, jobs: Sequence[Job]) -> None:
+        """Remove the records of jobs, so that they run again."""
+        for job in jobs:
+            self._file(job).unlink(missing_ok=True)
+
     def plan(self, jobs: Sequence[Job]) -> str:
         """How many jobs are left, and how long they take on this machine."""
         left = self.left(jobs)

@@ -23,6 +23,8 @@ from ..scene.edit import to_principled
 from ..scene.parse import ParsedScene, parse, referenced, write
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
+from .scales import SMOKE
+from .speed import capture_seconds
 
 _CAMERAS = Path(__file__).parent / "cameras"
 
@@ -50,29 +52,6 @@ preview_seconds = 600.0
 levels = 8
 [roughness.grid]
 levels = 5
-"""
-_SMOKE = """
-pixels = 64
-spp = 4
-preview_seconds = 600.0
-[albedo]
-width = 8
-hidden = 1
-[albedo.grid]
-levels = 2
-table_log2 = 8
-[roughness]
-width = 8
-hidden = 1
-[roughness.grid]
-levels = 2
-table_log2 = 8
-[radiance]
-width = 8
-hidden = 1
-[radiance.grid]
-levels = 2
-table_log2 = 8
 """
 
 
@@ -162,7 +141,7 @@ class PaperScene:
         """The settings of fits, apart from method and length."""
         match context.scale:
             case "smoke":
-                return from_toml(_SMOKE)
+                return from_toml(SMOKE)
             case "cpu":
                 return from_toml(_ROOM if self.room else _OBJECT)
         pixels, spp = (16384, 16) if self.folder == "staircase" else (4096, 64)
@@ -217,7 +196,7 @@ class PaperScene:
             return {"train": len(dataset.train), "heldout": len(dataset.heldout)}
 
         samples = (self.views + 6) * shots.resolution**2 * shots.spp
-        seconds = 1.0 if folder.exists() else 5 + samples / 600_000
+        seconds = 1.0 if folder.exists() else capture_seconds(samples)
         return Job(
             f"{self.folder}-data",
             self.described(context),

@@ -23,3 +23,8 @@ def slowness() -> float:
         dr.sync_thread()
         seconds.append(time.perf_counter() - start)
     return statistics.median(seconds[1:]) / REFERENCE
+
+
+def capture_seconds(samples: int) -> float:
+    """Time to render a data set of so many camera samples on the reference machine."""
+    return 5 + samples / 600_000

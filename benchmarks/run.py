@@ -1,0 +1,457 @@
+"""Every comparison of docs/comparison.md, and the machine's numbers of docs/performance.md.
+
+    python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
+
+Jobs: machine steps rivals long ablation lighting emission sparse (default: all; hours). STAIRCASE
+takes part where --staircase, or STAIRCASE of the environment, names its data set
+(docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
+that the same command continues what was stopped. Results go to --results; `python
+benchmarks/tables.py` prints them as tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+SRC = str(ROOT / "src")
+# The code of this checkout, here and in the commands that jobs run.
+sys.path.insert(0, SRC)
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+
+from rich.console import Console  # noqa: E402
+from summary import machine_results, read, summary  # noqa: E402
+
+from unbake.errors import UserError  # noqa: E402
+from unbake.experiments.commands import (  # noqa: E402
+    call_settings,
+    end_of_call,
+    main,
+    run_jobs,
+    unbake,
+)
+from unbake.experiments.jobs import Findings, Job, JobRunner, digest  # noqa: E402
+from unbake.experiments.scales import SMOKE  # noqa: E402
+from unbake.io import write_atomically, write_json  # noqa: E402
+
+RESULTS = ROOT / "benchmarks" / "results"
+STAIRCASE = "staircase"
+
+# ---------------------------------------------------------------------------------------- The jobs
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A data set of a built-in scene, as `unbake capture` renders it."""
+
+    scene: str
+    views: int = 24
+    held_out: int = 4
+    resolution: int = 128
+    spp: int = 100
+
+    @property
+    def samples(self) -> int:
+        """Camera samples of all photographs."""
+        return (self.views + self.held_out) * self.resolution**2 * self.spp
+
+
+DATA = {
+    "demo": Capture("demo"),
+    "still": Capture("still", views=25, spp=400),
+    "few": Capture("demo", views=6),
+}
+
+
+@dataclass(frozen=True)
+class Compare:
+    """`unbake compare` of methods, summarized over seeds in a file of results.
+
+    Args:
+        job: the job that it belongs to.
+        data: a key of `DATA`, or STAIRCASE.
+        methods: as `unbake compare` reads them.
+        steps: length of each fit; 0 if `seconds` is given.
+        seconds: length of each fit.
+        seeds: each is a comparison of its own.
+        options: further options of `unbake compare`.
+        settings: TOML file of settings, relative to `benchmarks`.
+    """
+
+    job: str
+    data: str
+    methods: Sequence[str]
+    steps: int = 0
+    seconds: int = 0
+    seeds: Sequence[int] = (0,)
+    options: Sequence[object] = ()
+    settings: str | None = None
+
+
+@dataclass(frozen=True)
+class Steps:
+    """`unbake bench methods`: the step times of methods side by side."""
+
+    job: str
+    data: str
+    methods: Sequence[str]
+    settings: str | None = None
+
+
+@dataclass(frozen=True)
+class Machine:
+    """`unbake bench step` of several methods and data sets, in the file of this machine.
+
+    Args:
+        cases: methods, data, settings and number of steps of each.
+    """
+
+    job: str
+    cases: Sequence[tuple[str, str, str | None, int]]
+
+
+NO_SCORES = ("--score-seconds", 0)
+COARSE_RENDERING = ("--evaluate-spp", 16)
+ABLATION = (
+    "direct", "with-prior", "with-stop-gradient", "with-second-bounce", "ours", "no-prior",
+)  # fmt: skip
+STEP_METHODS = (
+    "ours", "direct", "no-prior", "ad-pt", "ad-pt:neural:split-halves", "prb",
+    "prb:neural:split-halves", "ours:bitmap", "prb:bitmap", "prb:bitmap:split-halves", "ours:grid",
+    "prb:grid", "prb:grid:split-halves",
+)  # fmt: skip
+RIVALS = (
+    "ours", "prb", "prb:neural:split-halves", "prb:bitmap", "ad-pt:neural:split-halves", "direct",
+    "no-prior",
+)  # fmt: skip
+ROOM_RIVALS = ("ours", "prb", "ad-pt:neural:split-halves", "direct", "no-prior")
+ROOM = {"data": STAIRCASE, "settings": "staircase.toml"}
+
+#: By the name of the file of results; that of `machine` is named after the machine.
+BENCHMARKS: dict[str, Compare | Steps | Machine] = {
+    "machine": Machine(
+        "machine",
+        (
+            ("ours", "demo", None, 100),
+            ("ours:bitmap", "demo", None, 100),
+            ("no-prior", "demo", None, 100),
+            ("direct", "demo", None, 100),
+            ("prb", "demo", None, 100),
+            ("ours", STAIRCASE, "staircase.toml", 40),
+        ),
+    ),
+    "methods-demo": Steps("steps", "demo", STEP_METHODS),
+    "methods-staircase": Steps("steps", methods=STEP_METHODS, **ROOM),
+    # Equal time, and equal samples.
+    "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=90),
+    "equal-demo": Compare("rivals", "demo", ("ours", "prb"), steps=2400),
+    "rivals-staircase": Compare(
+        "rivals", methods=ROOM_RIVALS, seconds=180, options=COARSE_RENDERING, **ROOM
+    ),
+    # What PRB has after 20 minutes; `rivals` shows when ours has it.
+    "long-demo": Compare("long", "demo", ("prb",), seconds=1200),
+    "long-staircase": Compare(
+        "long", methods=("prb",), seconds=1200, options=COARSE_RENDERING, **ROOM
+    ),
+    "ablation-materials": Compare(
+        "ablation", "demo", ABLATION, steps=2400, seeds=(0, 1, 2), options=NO_SCORES
+    ),
+    "ablation-lighting": Compare(
+        "ablation", "still", ABLATION, steps=1200, seeds=(0, 1, 2),
+        options=(*NO_SCORES, "--unknown", "lighting"),
+    ),
+    # Materials and lighting, alone and together.
+    **{
+        f"still-{unknown}": Compare(
+            "lighting", "still", ("ours",), steps=2400,
+            options=(*NO_SCORES, "--unknown", unknown),
+        )
+        for unknown in ("materials", "lighting", "materials+lighting")
+    },
+    "emission": Compare(
+        "emission", "demo", ("ours",), steps=2400, options=(*NO_SCORES, "--unknown", "emission")
+    ),
+    # Six views, with and without regularization.
+    **{
+        f"sparse-{name}": Compare(
+            "sparse", "few", ("ours",), steps=2400, options=NO_SCORES,
+            settings=f"sparse/{name}.toml",
+        )
+        for name in ("none", "smooth", "tied", "both")
+    },
+}  # fmt: skip
+JOBS = tuple(dict.fromkeys(benchmark.job for benchmark in BENCHMARKS.values()))
+
+
+def at_smoke_scale(benchmark: Compare | Steps | Machine) -> Compare | Steps | Machine:
+    """The same in seconds: two methods, few steps."""
+    match benchmark:
+        case Machine():
+            return replace(benchmark, cases=[(*case[:3], 10) for case in benchmark.cases[::5]])
+        case Steps():
+            return replace(benchmark, methods=benchmark.methods[:2])
+    return replace(
+        benchmark,
+        methods=benchmark.methods[:2],
+        steps=4,
+        seconds=0,
+        seeds=benchmark.seeds[:2],
+        options=(*benchmark.options, "--evaluate-spp", 2),
+    )
+
+
+# -------------------------------------------------------------------------------- How they are run
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where the files of the benchmarks are, and how large they are.
+
+    Args:
+        out: folder of data sets, runs and records of jobs.
+        results: folder of the files of results.
+        staircase: data set of STAIRCASE; None leaves it out.
+    """
+
+    scale: str
+    out: Path
+    results: Path
+    staircase: Path | None
+    until: float | None = None
+    console: Console = field(default_factory=lambda: Console(highlight=False))
+
+    @property
+    def work(self) -> Path:
+        """The folder of a scale."""
+        return self.out / self.scale
+
+    def has(self, data: str) -> bool:
+        """Whether a data set can be used."""
+        return data != STAIRCASE or self.staircase is not None
+
+    def data(self, name: str) -> Path:
+        """The folder of a data set. Other settings have another one."""
+        if name == STAIRCASE:
+            assert self.staircase is not None
+            return self.staircase
+        return self.work / "data" / digest(vars(self._capture(name))) / name
+
+    def settings(self, name: str | None) -> tuple[list[object], str]:
+        """Options that choose settings, and the text of their file."""
+        if self.scale == "smoke":
+            return ["--settings", self.work / "smoke.toml"], SMOKE
+        if name is None:
+            return [], ""
+        file = ROOT / "benchmarks" / name
+        return ["--settings", file], file.read_text(encoding="utf-8")
+
+    def capture(self, name: str) -> list[Job]:
+        """The job that renders a data set, if it is not a given one."""
+        if name == STAIRCASE:
+            return []
+        shots, folder = self._capture(name), self.data(name)
+
+        def work() -> Findings:
+            if not folder.exists():
+                sizes = ("--views", shots.views, "--held-out", shots.held_out)
+                sizes += ("--resolution", shots.resolution, "--spp", shots.spp)
+                unbake("capture", shots.scene, "--out", folder, *sizes)
+            return {}
+
+        seconds = 5 + shots.samples / 600_000
+        return [Job(f"data-{name}", vars(shots), work, seconds, files=[folder / "transforms.json"])]
+
+    def _capture(self, name: str) -> Capture:
+        if self.scale == "smoke":
+            return Capture(DATA[name].scene, views=2, held_out=1, resolution=16, spp=4)
+        return DATA[name]
+
+    def command(
+        self,
+        name: str,
+        words: Sequence[object],
+        file: Path,
+        data: str,
+        settings: str | None,
+        seconds: float | None,
+        waits: float = 0.0,
+    ) -> Job:
+        """A job that is a command of `unbake` which writes a file."""
+        options, text = self.settings(settings)
+        command = partial(unbake, *words, *options, until=self.until)
+        described = {"words": [str(word) for word in words], "settings": text}
+        described["data"] = str(self.data(data))
+        return Job(name, described, lambda: command() or {}, seconds, waits, [file])
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The jobs of a benchmark, and what is made of their files."""
+
+    jobs: list[Job]
+    write: Callable[[], Path]
+
+
+def plan_machine(bench: Bench, benchmark: Machine) -> Planned:
+    """Where the time of a step goes."""
+    jobs, files = [], []
+    for method, data, settings, steps in benchmark.cases:
+        if not bench.has(data):
+            continue
+        label = f"step-{data}-{method.replace(':', '-')}"
+        files.append(bench.work / "steps" / f"{label}.json")
+        words = ["bench", "step", "--data", bench.data(data), "--methods", method]
+        words += ["--steps", steps, "--out", files[-1]]
+        jobs += bench.capture(data)
+        jobs.append(bench.command(label, words, files[-1], data, settings, 25.0))
+
+    def write() -> Path:
+        name, result = machine_results(files)
+        write_json(bench.results / f"{name}.json", result)
+        return bench.results / f"{name}.json"
+
+    return Planned(jobs, write)
+
+
+def plan_steps(bench: Bench, name: str, benchmark: Steps) -> Planned:
+    """Step times of methods, side by side."""
+    file = bench.work / "steps" / f"{name}.json"
+    words = ["bench", "methods", "--data", bench.data(benchmark.data)]
+    words += ["--methods", *benchmark.methods, "--steps", steps_of(bench), "--out", file]
+    job = bench.command(
+        name, words, file, benchmark.data, benchmark.settings, 25.0 * len(benchmark.methods)
+    )
+
+    def write() -> Path:
+        write_json(bench.results / f"{name}.json", read(file))
+        return bench.results / f"{name}.json"
+
+    return Planned([*bench.capture(benchmark.data), job], write)
+
+
+def steps_of(bench: Bench) -> int:
+    """Steps to take the median of."""
+    return 10 if bench.scale == "smoke" else 100
+
+
+def plan_compare(bench: Bench, name: str, benchmark: Compare) -> Planned:
+    """Fits of methods, a job for each seed."""
+    folders = [bench.work / "runs" / f"{name}-{seed}" for seed in benchmark.seeds]
+    length = ["--seconds", benchmark.seconds] if benchmark.seconds else ["--steps", benchmark.steps]
+    jobs = bench.capture(benchmark.data)
+    for seed, folder in zip(benchmark.seeds, folders, strict=True):
+        words = ["compare", bench.data(benchmark.data), "--methods", *benchmark.methods]
+        words += [*length, *benchmark.options, "--seed", seed, "--out", folder]
+        jobs.append(
+            bench.command(
+                folder.name,
+                words,
+                folder / "compare.json",
+                benchmark.data,
+                benchmark.settings,
+                fit_seconds(bench, name, benchmark),
+                benchmark.seconds * len(benchmark.methods),
+            )
+        )
+
+    def write() -> Path:
+        write_json(bench.results / f"{name}.json", summary(folders))
+        return bench.results / f"{name}.json"
+
+    return Planned(jobs, write)
+
+
+def fit_seconds(bench: Bench, name: str, benchmark: Compare) -> float | None:
+    """Computing time of a comparison, from the committed results of the reference machine."""
+    if bench.scale == "smoke":
+        return 5.0 * len(benchmark.methods)
+    other = 30.0 * len(benchmark.methods)  # compiling, and the final renderings
+    if benchmark.seconds:
+        return other
+    file = RESULTS / f"{name}.json"
+    if not file.is_file():
+        return None
+    rows: dict[str, Any] = read(file)["methods"]
+    return other + sum(row.get("seconds", 0.0) for row in rows.values())
+
+
+def planned(bench: Bench, names: Sequence[str]) -> list[Planned]:
+    """The benchmarks of jobs, in the order in which the jobs are named."""
+    plans = []
+    for job in names:
+        for name, benchmark in BENCHMARKS.items():
+            if benchmark.job != job:
+                continue
+            if bench.scale == "smoke":
+                benchmark = at_smoke_scale(benchmark)
+            match benchmark:
+                case Machine():
+                    plans.append(plan_machine(bench, benchmark))
+                case _ if not bench.has(benchmark.data):
+                    print(f"STAIRCASE is not set: {name} is left out", flush=True)
+                case Steps():
+                    plans.append(plan_steps(bench, name, benchmark))
+                case Compare():
+                    plans.append(plan_compare(bench, name, benchmark))
+    return plans
+
+
+def slowness() -> float:
+    """Time that computing takes here, relative to the machine of the estimates."""
+    from unbake import activate
+
+    activate()
+    from unbake.experiments import speed
+
+    return speed.slowness()
+
+
+def run() -> int:
+    """Run the jobs that are named on the command line, and write results."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    staircase = os.environ.get("STAIRCASE") or None
+    parser.add_argument("jobs", metavar="JOB", nargs="*", help=f"of: {' '.join(JOBS)}")
+    parser.add_argument("--scale", choices=("smoke", "cpu"), default="cpu", help="smoke: seconds")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "bench")
+    parser.add_argument("--results", type=Path, help="default: benchmarks/results; smoke: in --out")
+    parser.add_argument("--staircase", type=Path, default=staircase, help="its data set")
+    call_settings(parser)
+    args = parser.parse_args()
+    unknown = [job for job in args.jobs if job not in JOBS]
+    if unknown:
+        raise UserError(f"no job named {unknown[0]!r}", remedy=f"There are {', '.join(JOBS)}")
+    # Numbers at smoke scale mean nothing: they must not replace the committed ones.
+    own = args.out / "smoke" / "results" if args.scale == "smoke" else RESULTS
+    until = end_of_call(args)
+    bench = Bench(args.scale, args.out, args.results or own, args.staircase, until)
+    plans = planned(bench, args.jobs or JOBS)
+    jobs = {job.name: job for plan in plans for job in plan.jobs}
+    runner = JobRunner(bench.work / "jobs", bench.console, slowness=slowness)
+    if args.scale == "smoke" and not args.plan:
+        file = bench.work / "smoke.toml"
+        write_atomically(file, lambda path: path.write_text(SMOKE, encoding="utf-8"))
+    outcome = run_jobs(runner, list(jobs.values()), args, until)
+    if outcome is None:
+        return 0
+    for plan in plans:
+        # A comparison with a method that failed has the numbers of the others.
+        if all(job.name not in outcome.left and _written(job) for job in plan.jobs):
+            print(f"wrote {plan.write()}", flush=True)
+    return 1 if outcome.failed else 0
+
+
+def _written(job: Job) -> bool:
+    return all(file.is_file() for file in job.files)
+
+
+if __name__ == "__main__":
+    main(run)

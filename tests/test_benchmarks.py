@@ -1,0 +1,127 @@
+"""The benchmarks run to their end at smoke scale, continue, and become tables."""
+
+import json
+import os
+import runpy
+import subprocess
+import sys
+
+import pytest
+
+
+def call(repository, script, *words, staircase=""):
+    done = subprocess.run(
+        [sys.executable, str(repository / "benchmarks" / script), *map(str, words)],
+        env={**os.environ, "STAIRCASE": str(staircase), "MINUTES": ""},
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    return done
+
+
+def read(file):
+    return json.loads(file.read_text())
+
+
+@pytest.mark.slow
+def test_jobs_of_every_kind_run_to_their_end_and_once(repository, cornell, tmp_path):
+    words = ("machine", "steps", "emission", "--scale", "smoke", "--out", tmp_path)
+    done = call(repository, "run.py", *words, staircase=cornell)
+    assert done.returncode == 0, done.stderr[-3000:]
+    results = tmp_path / "smoke" / "results"
+    names = {file.stem for file in results.iterdir()}
+    (machine,) = names - {"methods-demo", "methods-staircase", "emission"}
+    assert len(names) == 4
+    steps = read(results / f"{machine}.json")
+    assert [step["data"] for step in steps["steps"]] == ["demo", "cornell"]
+    assert steps["machine"]["cores"] >= 1 and "machine" not in steps["steps"][0]
+    for name in ("methods-demo", "methods-staircase"):
+        rows = read(results / f"{name}.json")["rows"]
+        assert [row["method"] for row in rows] == ["ours", "direct"]
+        assert all(row["milliseconds_per_step"] > 0 for row in rows)
+    emission = read(results / "emission.json")
+    assert emission["unknown"] == "emission" and emission["seeds"] == [0]
+    assert emission["methods"]["ours"]["steps"] == 4
+    assert emission["methods"]["ours"]["emission_error"] > 0
+
+    tables = call(repository, "tables.py", results).stdout
+    assert "Emission" in tables and "Time of a step" in tables and "gradients" in tables
+
+    record = tmp_path / "smoke" / "jobs" / "step-demo-ours.json"
+    record.unlink()
+    before = {file: file.stat().st_mtime_ns for file in record.parent.iterdir()}
+    again = call(repository, "run.py", *words, staircase=cornell)
+    assert again.returncode == 0 and "5 of 6 jobs are done" in again.stdout, again.stdout
+    assert record.is_file()
+    assert before == {file: file.stat().st_mtime_ns for file in before}
+
+
+def test_a_plan_tells_what_is_left_and_what_is_left_out(repository, tmp_path):
+    done = call(repository, "run.py", "long", "--plan", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "0 of 2 jobs are done, the others take about" in done.stdout
+    assert "data-demo" in done.stdout and "long-demo-0" in done.stdout
+    assert "STAIRCASE is not set: long-staircase is left out" in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_job_that_does_not_exist_is_named(repository, tmp_path):
+    done = call(repository, "run.py", "ladder", "--out", tmp_path)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "no job named 'ladder'. There are machine, steps, rivals" in done.stderr
+
+
+@pytest.fixture
+def benchmarks(repository, monkeypatch):
+    """Functions of a script of `benchmarks`: `benchmarks("summary")["summary"]`."""
+    monkeypatch.syspath_prepend(str(repository / "benchmarks"))
+    return lambda name: runpy.run_path(str(repository / "benchmarks" / f"{name}.py"))
+
+
+def comparison(folder, seed, psnr, error=None):
+    """What `unbake compare` writes, reduced to what is read of it."""
+    length = {"steps": 5, "samples": 10, "seconds": 1.0, "milliseconds_per_step": 2.0}
+    fields = {"representation": "neural", "radiance": "neural"}
+    heldout = {"views": 4, "albedo_psnr": psnr, "roughness_psnr": None}
+    row = length | fields | {"heldout": heldout, "score": [{"step": 0}]}
+    row |= {"environment": {"sh_error": 0.5}, "emission": [{"emission_error": psnr / 10}]}
+    methods = {"ours": row, "prb": row if error is None else {"error": error}}
+    settings = {"unknown": "materials", "seed": seed}
+    content = {"machine": {}, "settings": settings, "methods": methods, "time_to_quality": []}
+    folder.mkdir()
+    (folder / "compare.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_seeds_become_mean_and_spread(benchmarks, tmp_path):
+    summary = benchmarks("summary")["summary"]
+    folders = [comparison(tmp_path / f"{seed}", seed, 20.0 + seed) for seed in (0, 2)]
+    both = summary(folders)
+    assert both["seeds"] == [0, 2] and both["views"] == 4
+    ours = both["methods"]["ours"]
+    assert ours["albedo_psnr"] == 21.0 and ours["albedo_psnr_sd"] == pytest.approx(2**0.5)
+    assert ours["sh_error"] == 0.5 and ours["emission_error"] == pytest.approx(2.1)
+    assert "roughness_psnr" not in ours and "score" not in ours
+    one = summary(folders[:1])["methods"]["ours"]
+    assert "albedo_psnr_sd" not in one and one["score"] == [{"step": 0}]
+    failed = summary([*folders, comparison(tmp_path / "3", 3, 1.0, error="no memory")])
+    assert failed["methods"]["prb"] == {"error": "no memory"}
+
+
+def test_files_of_steps_become_one_of_the_machine(benchmarks, tmp_path):
+    machine = {"processor": "Some (TM) CPU", "cores": 2, "variant": "llvm_ad_rgb"}
+    files = [tmp_path / name for name in ("a.json", "b.json")]
+    for file in files:
+        file.write_text(json.dumps({"machine": machine, "data": file.stem}))
+    name, result = benchmarks("summary")["machine_results"](files)
+    assert name == "some-tm-cpu-2-cores-llvm"
+    assert result == {"machine": machine, "steps": [{"data": "a"}, {"data": "b"}]}
+
+
+def test_committed_results_of_every_benchmark_are_read(repository, benchmarks):
+    """Those of older versions too, whose steps have other keys."""
+    tables = call(repository, "tables.py").stdout
+    assert tables.count("| ---") >= 19 and "| gradients |" in tables and "| roofline |" in tables
+    names = {file.stem for file in (repository / "benchmarks" / "results").glob("*.json")}
+    assert benchmarks("run")["BENCHMARKS"].keys() - names == {"machine"}
