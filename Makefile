@@ -1,11 +1,12 @@
 # One command a job; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-slow demo bench clean distclean
+.PHONY: help setup lint test test-slow demo bench clean distclean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-complete
 PYTEST := $(BIN)/python -m pytest
+FORMATTED := src tests benchmarks scripts
 
 help: ## list these jobs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -16,11 +17,19 @@ $(STAMP): pyproject.toml scripts/setup.sh
 	@bash scripts/setup.sh
 	@touch $(STAMP)
 
-# All checks run even where one fails, the tests last.
+# All checks run even where one fails.
+lint: setup ## format, lint, layers and types, without running anything
+	@status=0; \
+	$(BIN)/ruff format --check --quiet $(FORMATTED) || status=1; \
+	$(BIN)/ruff check . || status=1; \
+	$(BIN)/lint-imports || status=1; \
+	$(BIN)/pyright --pythonpath $(BIN)/python || status=1; \
+	exit $$status
+
+# The tests run last, also where a linter fails.
 test: setup ## linters and the tests that take seconds
 	@status=0; \
-	$(BIN)/python -m ruff check . || status=1; \
-	$(BIN)/lint-imports || status=1; \
+	$(MAKE) --no-print-directory lint || status=1; \
 	$(PYTEST) -m "not slow and not gpu" $(ARGS) || status=1; \
 	exit $$status
 

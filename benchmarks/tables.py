@@ -1,4 +1,4 @@
-"""The tables of docs/comparison.md and docs/performance.md: python tables.py [RESULTS]"""
+"""Prints the tables of docs/comparison.md and docs/performance.md: `python tables.py [RESULTS]`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
-from summary import phases_of, read, roofline_of  # noqa: E402
+from summary import phases_of, read, roofline_of
 
-from unbake.evaluation.convergence import seconds_to  # noqa: E402
-from unbake.experiments.tables import markdown  # noqa: E402
+from unbake.evaluation.convergence import seconds_to
+from unbake.experiments.tables import markdown
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -28,6 +28,7 @@ def row(render: Path, albedo: Path, roughness: Path, zoom: int) -> list[np.ndarr
 
 
 def main() -> None:
+    """Write the picture that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--view", default="heldout_000")

@@ -12,6 +12,7 @@ from unbake import activate
 
 
 def main() -> None:
+    """Write a camera file for the scene that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--views", type=int, required=True)

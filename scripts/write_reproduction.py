@@ -87,6 +87,7 @@ def page(kept: Path = KEPT) -> str:
 
 
 def main() -> None:
+    """Write the page and its figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", type=Path, help="folder that `unbake reproduce` wrote")
     parser.add_argument("--scenes", type=Path, default=Path("scenes"), help="unpacked scenes")

@@ -80,14 +80,14 @@ def test_environment_chooses_the_variant():
 
 
 def test_unknown_variant_is_refused_with_the_choices():
-    with pytest.raises(UserError, match="unknown variant 'llvm_rgb'.*cuda_ad_rgb, llvm_ad_rgb"):
+    with pytest.raises(UserError, match=r"unknown variant 'llvm_rgb'.*cuda_ad_rgb, llvm_ad_rgb"):
         backend.activate("llvm_rgb")
     run = run_python(ACTIVATE, UNBAKE_VARIANT="llvm_rgb")
     assert "refused: UNBAKE_VARIANT: unknown variant" in run.stdout
 
 
 def test_cuda_without_a_driver_is_refused(without_gpu):
-    with pytest.raises(UserError, match="no NVIDIA driver.*or use llvm_ad_rgb"):
+    with pytest.raises(UserError, match=r"no NVIDIA driver.*or use llvm_ad_rgb"):
         backend.activate("cuda_ad_rgb")
 
 

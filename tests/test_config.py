@@ -125,7 +125,7 @@ def test_a_file_that_is_no_text_or_missing_is_named(tmp_path):
     with pytest.raises(UserError, match=r"a.toml: cannot be read \(No such file"):
         read_toml(file)
     file.write_bytes(b"steps = 1 # \xff")
-    with pytest.raises(UserError, match="a.toml: is not UTF-8 text. Save it as UTF-8"):
+    with pytest.raises(UserError, match=r"a.toml: is not UTF-8 text. Save it as UTF-8"):
         read_toml(file)
     with pytest.raises(UserError, match="cannot be read"):
         read_toml(tmp_path)

@@ -231,9 +231,9 @@ def _load_llvm(path: str) -> Llvm | None:
     if library is None:
         return None
     if hasattr(library, "LLVMGetVersion"):
-        parts = [ctypes.c_uint() for _ in range(3)]
-        library.LLVMGetVersion(*map(ctypes.byref, parts))
-        return Llvm(path, tuple(part.value for part in parts))
+        major, minor, patch = ctypes.c_uint(), ctypes.c_uint(), ctypes.c_uint()
+        library.LLVMGetVersion(*map(ctypes.byref, (major, minor, patch)))
+        return Llvm(path, (major.value, minor.value, patch.value))
     # LLVM 15 and older state their version through this C++ symbol alone; Dr.Jit asks it too.
     symbol = "_ZN4llvm16LTOCodeGenerator16getVersionStringEv"
     if not hasattr(library, symbol):
@@ -241,7 +241,7 @@ def _load_llvm(path: str) -> Llvm | None:
     stated = getattr(library, symbol)
     stated.restype = ctypes.c_char_p
     numbers = [int(n) for n in re.findall(r"\d+", stated().decode())] + [0, 0, 0]
-    return Llvm(path, tuple(numbers[:3]))
+    return Llvm(path, (numbers[0], numbers[1], numbers[2]))
 
 
 def _newest_installed() -> Llvm | None:

@@ -9,9 +9,13 @@ from __future__ import annotations
 import json
 import sys
 import time
+from typing import TYPE_CHECKING
 
 from unbake import backend
 from unbake.errors import UserError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 def main() -> int:
@@ -64,7 +68,7 @@ def _check_rays() -> None:
     _agree("the distance along a ray", np.array(hits.t), np.array([2.0, 2.0, np.inf]))
 
 
-def _agree(name: str, got: object, expected: object) -> None:
+def _agree(name: str, got: ArrayLike, expected: ArrayLike) -> None:
     import numpy as np
 
     if not np.allclose(got, expected, rtol=1e-3, atol=1e-4):

@@ -99,7 +99,7 @@ def test_damaged_strengths_are_told_in_one_line(content, message, truth):
 
 def test_strengths_that_are_no_text_are_told_in_one_line(truth):
     (truth / "emission.json").write_bytes(b"\xff\xfe\x00[")
-    with pytest.raises(UserError, match="emission.json: the file is not readable JSON"):
+    with pytest.raises(UserError, match=r"emission.json: the file is not readable JSON"):
         true_emission(truth.parent)
 
 
@@ -125,7 +125,7 @@ def not_finite(file):
 @pytest.mark.parametrize("damage", [broken, short, small, not_finite])
 def test_a_damaged_environment_is_told_in_one_line(damage, truth):
     damage(truth / "environment.exr")
-    with pytest.raises(UserError, match="environment.exr: .*Capture the data set again") as error:
+    with pytest.raises(UserError, match=r"environment.exr: .*Capture the data set again") as error:
         true_environment(truth.parent)
     assert "\n" not in str(error.value)
 

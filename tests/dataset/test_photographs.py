@@ -138,7 +138,7 @@ def test_no_room_for_the_file_is_told_in_one_line(dataset, on_disk, monkeypatch)
 
     made = dataset()
     monkeypatch.setattr(module.os, "posix_fallocate", full)
-    with pytest.raises(UserError, match="cannot be written .No space left") as caught:
+    with pytest.raises(UserError, match=r"cannot be written .No space left") as caught:
         Photographs.load(made, False)
     assert "Make room" in caught.value.remedy
     assert not list(made.folder.glob("**/photographs.npy"))

@@ -27,7 +27,7 @@ def cameras():
                 view.cy - 0.2 * index,
                 width,
                 height,
-            )  # fmt: skip
+            )
         )
     return views
 

@@ -68,8 +68,7 @@ def refused_pixels(folder, message, clip_negative=False):
     """Headers are good, so that only reading the pixels tells."""
     views = Dataset.load(folder).views
     with pytest.raises(UserError, match=message) as caught:
-        for view in views:
-            pixels_of(view, clip_negative)
+        _ = [pixels_of(view, clip_negative) for view in views]
     assert caught.value.where and caught.value.remedy
     return caught.value
 
@@ -95,7 +94,7 @@ def test_saving_leaves_one_file_and_replaces_it_whole(folder):
     data.save(folder)
     assert (folder / "transforms.json").read_bytes() == before
     broken = Dataset(folder, data.scene, "hidden", data.views, {"spp": float("nan")}, None)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="JSON"):
         broken.save(folder)
     assert (folder / "transforms.json").read_bytes() == before
     assert sorted(p.name for p in folder.iterdir()) == [

@@ -113,7 +113,7 @@ def test_a_job_that_fails_does_not_keep_others_from_being_done(tmp_path):
 
     jobs = [Job("first", {}, fail, 1.0), *squares(done).jobs(None)]
     failing = Experiment("squares", "", lambda _: jobs, squares(done).result)
-    with pytest.raises(UserError, match="squares, first: no luck. Try again"):
+    with pytest.raises(UserError, match=r"squares, first: no luck. Try again"):
         reproduce(failing, context(tmp_path))
     assert done == [2, 3] and not (tmp_path / "squares").exists()
 
@@ -133,7 +133,7 @@ def test_a_plan_does_nothing(tmp_path):
 
 
 def test_scenes_that_are_not_there_are_named(tmp_path):
-    with pytest.raises(UserError, match="'staircase'.*--scenes"):
+    with pytest.raises(UserError, match=r"'staircase'.*--scenes"):
         STAIRCASE.capture(context(tmp_path))
     lego = next(scene for scene in SCENES if scene.name == "LEGO")
     (tmp_path / "lego").mkdir()
@@ -150,7 +150,7 @@ def test_archives_that_are_damaged_are_named(tmp_path, damage):
     if damage != "other folder":
         content = archive.read_bytes()
         archive.write_bytes(b"nothing" if damage == "no archive" else content[: len(content) // 2])
-    with pytest.raises(UserError, match="staircase.tar.xz.*cannot be unpacked"):
+    with pytest.raises(UserError, match=r"staircase.tar.xz.*cannot be unpacked"):
         STAIRCASE.unpacked(context(tmp_path))
     assert not list((tmp_path / "work" / "published").iterdir())
 

@@ -153,7 +153,7 @@ def test_only_damaged_checkpoints_are_an_error(tmp_path):
 
 def test_a_checkpoint_of_other_settings_is_an_error(tmp_path):
     path = save_checkpoint(RunFolder(tmp_path), make_state(width=3), Progress(1))
-    with pytest.raises(UserError, match="does not fit the settings: phi.weights") as caught:
+    with pytest.raises(UserError, match=r"does not fit the settings: phi.weights") as caught:
         load_checkpoint(RunFolder(tmp_path), make_state(width=4))
     assert caught.value.where == str(path) and "Resume with the settings" in caught.value.remedy
     without = dataclasses.replace(make_state(width=3), theta=None)

@@ -186,7 +186,7 @@ def test_bitmaps_give_way_to_fields(parse, tmp_path):
 
 def test_nothing_to_fit_is_an_error(parse):
     parsed = parse(BALL.format('<bsdf type="dielectric"/>'))
-    with pytest.raises(UserError, match="scene.xml: no material to fit"):
+    with pytest.raises(UserError, match=r"scene.xml: no material to fit"):
         edit.set_textures(parsed, None, None)
 
 
@@ -260,7 +260,7 @@ def test_a_missing_file_is_named_with_its_line(name, with_files):
 
 
 def test_a_missing_scene_is_named(tmp_path):
-    with pytest.raises(UserError, match="none.xml: no such scene file"):
+    with pytest.raises(UserError, match=r"none.xml: no such scene file"):
         scenes.parse(tmp_path / "none.xml")
 
 
@@ -346,7 +346,7 @@ def test_an_environment_is_replaced_whatever_it_is(kind, parse_lit):
 
 def test_a_scene_without_environment_has_none_to_fit(parse_lit):
     parsed = parse_lit(LAMP)
-    with pytest.raises(UserError, match="scene.xml: the scene has no environment map to fit. Add"):
+    with pytest.raises(UserError, match=r"scene.xml: the scene has no environment map to fit. Add"):
         edit.set_environment(parsed, constant(1, 1, 1))
     with pytest.raises(UserError, match="the scene has no environment map"):
         emitters.environment_latlong(parsed.instantiate(), 4)
@@ -394,6 +394,6 @@ def test_every_light_gets_a_texture_of_its_own(parse_lit):
 def test_a_scene_lit_by_its_environment_alone_has_no_light_to_fit(kind, parse_lit):
     parsed = parse_lit(SKIES[kind])
     assert emitters.named_emitters(parsed) == []
-    with pytest.raises(UserError, match="scene.xml: the scene has no light to fit: no area") as e:
+    with pytest.raises(UserError, match=r"scene.xml: the scene has no light to fit: no area") as e:
         edit.set_emission(parsed, lambda count: [])
     assert "--unknown lighting" in str(e.value) and "\n" not in str(e.value)

@@ -325,7 +325,7 @@ def test_bounces_that_would_not_fit_are_refused(bounces, unbake, tmp_path):
     assert outcome.status == 2 and not run.exists()
     assert outcome.err.startswith("error: --bounces: must be 1 to 16")
     assert outcome.err.count("\n") == 1
-    with pytest.raises(UserError, match="here.toml: bounces: must be 1 to 16"):
+    with pytest.raises(UserError, match=r"here.toml: bounces: must be 1 to 16"):
         from_toml(f"bounces = {bounces}", "here.toml")
 
 

@@ -188,7 +188,7 @@ def test_dr_jit_running_out_of_memory_is_told_in_one_line(built_in, monkeypatch)
         raise RuntimeError("jit_malloc(): out of memory! Could not allocate 8 bytes")
 
     monkeypatch.setattr(step_module, "path_radiance", fails)
-    with pytest.raises(UserError, match="no memory for a step of 128 paths. Lower --batch"):
+    with pytest.raises(UserError, match=r"no memory for a step of 128 paths. Lower --batch"):
         step(state, 0, rates(0))
 
 
@@ -352,8 +352,10 @@ def test_two_runs_with_one_thread_are_equal_bit_by_bit(built_in):
 
 
 def test_an_abandoned_fit_does_not_disturb_the_next_one(built_in):
-    """Its scene and its recording are garbage in cycles: freed while the next one is recorded, they
-    would end the process. The collector runs at the worst of moments, if it is let.
+    """Its scene and its recording are garbage in cycles.
+
+    Freed while the next one is recorded, they would end the process. The collector runs at the
+    worst of moments, if it is let.
     """
     script = """
 gc.disable()

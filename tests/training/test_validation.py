@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_scoring_is_not_part_of_the_training_time(cornell, tiny, tmp_path, monke
     # Between the last steps nothing is compiled any more.
     log = [line for line in lines(tmp_path / "run") if "score" in line]
     assert log[-1]["seconds"] == pytest.approx(progress.seconds, abs=1e-6)
-    assert min(b["seconds"] - a["seconds"] for a, b in zip(log, log[1:], strict=False)) < 0.4
+    assert min(b["seconds"] - a["seconds"] for a, b in pairwise(log)) < 0.4
 
 
 def test_a_truth_that_cannot_be_read_is_named_before_anything_is_written(cornell, tiny, tmp_path):

@@ -82,7 +82,7 @@ def test_paths_leave_nothing_behind(neural):
     problem, _ = neural
     interaction = mi.PreliminaryIntersection3f.compute_surface_interaction
     assert problem.materials.carried
-    with pytest.raises(ZeroDivisionError), materials_along_paths(problem.materials):
+    with pytest.raises(ZeroDivisionError), materials_along_paths(problem.materials):  # noqa: PT012
         assert problem.materials.carried
         raise ZeroDivisionError
     assert problem.materials.carried

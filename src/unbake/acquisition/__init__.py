@@ -1,0 +1,1 @@
+"""Renders data sets: built-in scenes, placed cameras, photographs with their true materials."""

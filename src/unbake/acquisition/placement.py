@@ -36,8 +36,15 @@ _REMEDY = "Give a camera file instead"
 @final
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """Possible views: eyes (n, 3), forward directions (n, 3) and typical depths (n,), and how much
-    of what is to know about each surface point a view tells, (n, points) float32 in [0, 1]."""
+    """Possible views.
+
+    Args:
+        eye: positions, (n, 3).
+        forward: directions, (n, 3).
+        depth: typical depths, (n,).
+        value: how much of what is to know about each surface point a view tells, (n, points)
+            float32 in [0, 1].
+    """
 
     eye: np.ndarray
     forward: np.ndarray

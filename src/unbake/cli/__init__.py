@@ -6,7 +6,7 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -411,7 +411,7 @@ def _say(line: str) -> None:
     print(line, flush=True)
 
 
-def _fail(message: str) -> None:
+def _fail(message: str) -> NoReturn:
     """Tell what is wrong, on one line whatever the width of the terminal, and exit."""
     line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
     Console(stderr=True).print(line, soft_wrap=True)

@@ -78,5 +78,6 @@ def exclude(option: str, others: dict[str, object]) -> None:
 
 
 def require(name: str, value: int, least: int) -> None:
+    """Raise UserError where an option is smaller than `least`."""
     if value < least:
         raise UserError(f"must be {least} or more, not {value}", where=f"--{name}")

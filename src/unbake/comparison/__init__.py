@@ -1,0 +1,1 @@
+"""Methods side by side: their quality over time, and their step times."""

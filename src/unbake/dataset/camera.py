@@ -76,9 +76,9 @@ class Camera:
     @classmethod
     def look_at(
         cls,
-        origin: Sequence[float],
-        target: Sequence[float],
-        up: Sequence[float],
+        origin: Sequence[float] | np.ndarray,
+        target: Sequence[float] | np.ndarray,
+        up: Sequence[float] | np.ndarray,
         fov_degrees: float,
         width: int,
         height: int,
@@ -237,7 +237,7 @@ def frame_name(split: str, index: int) -> str:
 
 def write_camera_file(path: Path, cameras: Sequence[tuple[str, LookAt]]) -> None:
     """Write (split, placement) pairs as a camera file: JSON, one camera a line, world units."""
-    counts = dict.fromkeys(SPLITS, 0)
+    counts: dict[str, int] = dict.fromkeys(SPLITS, 0)
     lines = []
     for split, placed in cameras:
         entry = {

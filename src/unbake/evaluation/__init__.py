@@ -1,0 +1,1 @@
+"""Path traced renderings of what was recovered, and its errors against the truth."""

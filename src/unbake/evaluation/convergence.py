@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
@@ -31,7 +32,7 @@ def milliseconds_per_step(log: Log) -> float | None:
     at = {r["step"]: r["seconds"] for r in log if _timed(r)}
     marks = sorted(at.items())
     spent, steps = [], []
-    for (first, start), (last, end) in zip(marks, marks[1:], strict=False):
+    for (first, start), (last, end) in pairwise(marks):
         if first >= WARM_UP:
             spent.append(1e3 * (end - start) / (last - first))
             steps.append(last - first)

@@ -103,9 +103,9 @@ def relight_psnr(found: np.ndarray, truth: np.ndarray) -> float:
     """PSNR in dB of balls lit by a map and by the true one; see `DEFINITIONS`."""
     true, seen = relit(truth)
     white = max(float(np.percentile(true[seen], 99)), DARK)
-    pictures = [np.clip(picture / white, 0, 1) for picture in (relit(found)[0], true)]
+    ours, theirs = (np.clip(picture / white, 0, 1) for picture in (relit(found)[0], true))
     # JSON has no infinity for the PSNR of equal images.
-    return min(psnr(*pictures, seen), 120.0)
+    return min(psnr(ours, theirs, seen), 120.0)
 
 
 def relit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

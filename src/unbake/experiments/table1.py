@@ -117,8 +117,14 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
             | {"published_steps": scene.steps}
         )
     table = markdown(
-        ["scene", "path length", "the paper", "views", "the paper", "held out", "surface seen"]
-        + [
+        [
+            "scene",
+            "path length",
+            "the paper",
+            "views",
+            "the paper",
+            "held out",
+            "surface seen",
             "pixels a view",
             "spp a step",
             "the paper",

@@ -9,6 +9,7 @@ layers on LLVM. The *fused* engine does narrow ones in one kernel, with gradient
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Literal
 
 import drjit as dr
@@ -60,7 +61,7 @@ class Network:
 
         sizes = [self.inputs, *[config.width] * config.hidden, outputs]
         self.layers: list[tuple[mi.TensorXf, mi.TensorXf]] = []
-        for layer, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
             bound = math.sqrt(6 / fan_in) * (0.1 if layer == config.hidden else 1)
             weights = from_numpy(mi.Float, rng.uniform(-bound, bound, fan_out * fan_in))
             weights = mi.TensorXf(weights, (fan_out, fan_in))

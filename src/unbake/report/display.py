@@ -23,11 +23,13 @@ Choice = Callable[[Iterable[float]], float]  # max or min
 
 def number(value: object) -> float | None:
     """A number that can be shown, or None for null and not-a-number."""
-    good = isinstance(value, int | float) and not math.isnan(value)
-    return float(value) if good else None
+    if not isinstance(value, int | float) or math.isnan(value):
+        return None
+    return float(value)
 
 
 def decibels(value: float | None) -> str:
+    """A PSNR with two digits, and a dash for None."""
     if value is None:
         return DASH
     text = "∞" if math.isinf(value) else f"{abs(value):.2f}"
@@ -35,6 +37,7 @@ def decibels(value: float | None) -> str:
 
 
 def percent(value: float | None) -> str:
+    """A fraction in percent with two digits, without the sign; a dash for None."""
     return DASH if value is None else f"{100 * value:.2f}"
 
 

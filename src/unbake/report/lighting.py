@@ -42,9 +42,13 @@ def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
     for run in runs:
         optimized = run.optimizes("environment")
         path = display.evaluated(run, run.folder.environment()) if optimized else None
-        found.append(None if path is None else display.rgb(path)[0])
-        known = path is not None and truth is not None
-        errors.append(display.error(found[-1], truth, path) if known else None)
+        if path is None:
+            found.append(None)
+            errors.append(None)
+            continue
+        map_ = display.rgb(path)[0]
+        found.append(map_)
+        errors.append(None if truth is None else display.error(map_, truth, path))
     lit = [map_ for map_ in found if map_ is not None] if truth is None else [truth]
     exposure = display.exposure([display.sample(map_.mean(axis=2)) for map_ in lit])
     scale = display.error_scale([[display.sample(e)] for e in errors if e is not None])
@@ -106,8 +110,9 @@ def _lights(runs: list[Run]) -> list[dict[str, Any]] | None:
 
 def _colour(strength: object) -> str:
     """Linear RGB with four digits of its largest channel."""
-    values = [display.number(x) for x in strength] if isinstance(strength, list) else []
-    if len(values) != 3 or None in values:
+    said = [display.number(x) for x in strength] if isinstance(strength, list) else []
+    values = [x for x in said if x is not None]
+    if len(said) != 3 or len(values) != 3:
         return display.DASH
     largest = max(abs(x) for x in values)
     digits = 3 - math.floor(math.log10(largest)) if 0 < largest < math.inf else 2

@@ -1,0 +1,1 @@
+"""Mitsuba scenes: read, edited, and the space in them that is free."""

@@ -85,7 +85,7 @@ def show_roughness_as_albedo(scene: ParsedScene) -> None:
     """Replace each base colour by the roughness, so that an albedo integrator renders it."""
     for node in scene.principled_nodes():
         props = node.props
-        props["base_color"] = props["roughness"] if "roughness" in props else 0.5
+        props["base_color"] = props.get("roughness", 0.5)
 
 
 def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:
@@ -95,7 +95,7 @@ def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:
         UserError: the scene has no environment.
     """
     root = scene.state.root.props
-    for key in root.keys():
+    for key in list(root):
         node = referenced(scene, root[key])
         if node is not None and node.props.plugin_name() in ENVIRONMENTS:
             # Under a new name: `transform_merge_meshes` of Mitsuba 3.9 makes up names again that

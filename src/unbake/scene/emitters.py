@@ -77,7 +77,7 @@ def _names(scene: ParsedScene, emitters: list[int]) -> list[str]:
     """A unique name for each of these nodes."""
     nodes, shapes = scene.state.nodes, {}
     for shape in (n for n in nodes if n.type == mi.ObjectType.Shape):
-        for key in shape.props.keys():
+        for key in list(shape.props):
             if is_reference(shape.props[key]):
                 # `mi.parser.write_file` of Mitsuba 3.9 drops ids that nothing refers to.
                 file = str(shape.props.get("filename", ""))

@@ -29,7 +29,7 @@ _CHUNK = 1 << 20
 @final
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """First hits of n rays."""
+    """First hits of rays."""
 
     distance: np.ndarray  #: (n,) world units, infinite where nothing was hit
     back: np.ndarray  #: (n,) bool: a back face, by the geometric normal
@@ -196,9 +196,9 @@ def enclosure(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
 
 
 def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
-    """Random positions in the space that the scene's own sensors see, (n, 3).
+    """Positions in the space that the scene's own sensors show, (n, 3).
 
-    They lie on camera rays between the scene's bounding box and the first hit.
+    They lie on view rays between the entry into the scene's bounding box and the first surface.
     """
     rng = np.random.default_rng(seed)
     low, high, diagonal = bounds(scene)

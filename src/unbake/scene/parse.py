@@ -116,7 +116,7 @@ def _resolve_files(scene: ParsedScene) -> None:
     """Make file names absolute: Mitsuba would look for them in the working directory."""
     folder = scene.path.parent.resolve()
     for node in scene.state.nodes:
-        for key in node.props.keys():
+        for key in list(node.props):
             value = node.props[key]
             if not isinstance(value, str):
                 continue
@@ -130,7 +130,7 @@ def _resolve_files(scene: ParsedScene) -> None:
 
 def _require_finite(scene: ParsedScene) -> None:
     for node in scene.state.nodes:
-        for key in node.props.keys():
+        for key in list(node.props):
             if not _is_finite(node.props[key]):
                 raise UserError(
                     f"{node.props.plugin_name()}.{key} has a number that is not finite",

@@ -1,0 +1,1 @@
+"""Optimization: from a data set and settings to recovered fields."""

@@ -38,7 +38,7 @@ class PathSample:
     learned: PathSample | None = None  # the samples that L_θ learns of; None: all of these
 
     def vertex(self, number: int) -> Vertex:
-        """x₁, x₂, …"""
+        """Vertex x₁, x₂, … of the path."""
         return self.x1 if number == 1 else self.bounces[number - 2].next
 
     def place(self, number: int, vertex: Vertex) -> None:

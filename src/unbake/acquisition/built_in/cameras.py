@@ -7,7 +7,7 @@ from typing import TypedDict
 
 import numpy as np
 
-Vec3 = Sequence[float]
+Vec3 = Sequence[float] | np.ndarray
 UP = (0.0, 0.0, 1.0)
 
 

@@ -196,5 +196,7 @@ def cameras(views: int, held_out: int) -> list[Camera]:
 
 def _place(placed: tuple, index: int, extra: int, split: str) -> Camera:
     if index < len(placed):
-        return camera(*placed[index], FOV, split)
-    return camera(*scattered(extra, FREE, ((0, 0, 0), (WIDTH, DEPTH, HEIGHT))), FOV, split)
+        origin, target = placed[index]
+    else:
+        origin, target = scattered(extra, FREE, ((0, 0, 0), (WIDTH, DEPTH, HEIGHT)))
+    return camera(origin, target, FOV, split)

@@ -139,7 +139,7 @@ def spines(colour: Colour, roughness: float) -> Maps:
 
 def banded(first: Colour, second: Colour, smooth: float, rough: float) -> Maps:
     """Level bands on a turned object; (u, v) in [0, 1]."""
-    x, y = grid(1.0, 1.0, 64)
+    _, y = grid(1.0, 1.0, 64)
     amount = stripes(y, 0.4)
     return tint(amount, first, second), mix(amount, smooth, rough)
 

@@ -10,7 +10,7 @@ from typing import final
 import mitsuba as mi
 import numpy as np
 
-Vec3 = Sequence[float]
+Vec3 = Sequence[float] | np.ndarray
 
 
 @final
@@ -41,7 +41,7 @@ class Mesh:
         params["vertex_positions"] = np.ravel(self.positions).astype(np.float32)
         params["vertex_texcoords"] = np.ravel(self.uv).astype(np.float32)
         params["faces"] = np.ravel(self.faces).astype(np.uint32)
-        if smooth:
+        if self.normals is not None:
             params["vertex_normals"] = np.ravel(self.normals).astype(np.float32)
         params.update()
         mesh.write_ply(str(path))
@@ -65,11 +65,11 @@ def quad(corner: Vec3, u: Vec3, v: Vec3, *, overlap: float = 0.0, unit_uv: bool 
     UVs are metres along `u` and `v` from `corner`, or [0, 1] with `unit_uv`. `overlap` lets the
     quad stick out at every side by that many metres, so that walls leave no slit between them.
     """
-    corner, u, v = (np.asarray(a, dtype=np.float64) for a in (corner, u, v))
+    origin, u, v = (np.asarray(a, dtype=np.float64) for a in (corner, u, v))
     lengths = np.array([np.linalg.norm(u), np.linalg.norm(v)])
     ends = np.stack([-overlap / lengths, 1 + overlap / lengths], axis=1)
     st = np.array([[ends[0, i], ends[1, j]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
-    positions = corner + st[:, :1] * u + st[:, 1:] * v
+    positions = origin + st[:, :1] * u + st[:, 1:] * v
     uv = st if unit_uv else st * lengths
     return Mesh(positions, uv, np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -80,15 +80,15 @@ def box(low: Vec3, high: Vec3, *, omit: Sequence[str] = (), unit_uv: bool = Fals
     Faces that rest on other surfaces are left out so that no surface is there which nobody sees.
     UVs are metres from the lower corner of each face, or [0, 1] with `unit_uv`.
     """
-    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    x, y, z = np.diag(high - low)
+    corner = np.asarray(low, dtype=np.float64)
+    x, y, z = np.diag(np.asarray(high, dtype=np.float64) - corner)
     sides = {
-        "-x": (low + y, -y, z),
-        "+x": (low + x, y, z),
-        "-y": (low, x, z),
-        "+y": (low + x + y, -x, z),
-        "-z": (low + y, x, -y),
-        "+z": (low + z, x, y),
+        "-x": (corner + y, -y, z),
+        "+x": (corner + x, y, z),
+        "-y": (corner, x, z),
+        "+y": (corner + x + y, -x, z),
+        "-z": (corner + y, x, -y),
+        "+z": (corner + z, x, y),
     }
     return merge(*(quad(*side, unit_uv=unit_uv) for n, side in sides.items() if n not in omit))
 

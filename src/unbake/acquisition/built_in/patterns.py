@@ -21,7 +21,8 @@ def grid(
     columns, rows = max(8, round(width * per_metre)), max(8, round(height * per_metre))
     x = (np.arange(columns) + 0.5) / columns * width + origin[0]
     y = (np.arange(rows) + 0.5) / rows * height + origin[1]
-    return np.broadcast_arrays(x[None, :], y[:, None])
+    x, y = np.broadcast_arrays(x[None, :], y[:, None])
+    return x, y
 
 
 def mix(amount: np.ndarray, first: np.ndarray | float, second: np.ndarray | float) -> np.ndarray:

@@ -1,0 +1,6 @@
+# The backport of tomllib that Python 3.10 needs; newer interpreters do not have it installed.
+from typing import Any
+
+class TOMLDecodeError(ValueError): ...
+
+def loads(s: str, /) -> dict[str, Any]: ...
