@@ -18,6 +18,7 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
 from unbake.transport.operator import attach_material, bounce
+from unbake.transport.path_sample import Requirements
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.vertex import find_vertex
 
@@ -137,6 +138,13 @@ def enable_gradients(problem):
     problem.materials.assign(φ)
     problem.radiance.assign(θ)
     return φ, θ
+
+
+def pieces(bounces: int, residuals: int) -> Requirements:
+    """What k bounces, so many residuals and the LHS loss read; left-hand sides are attached."""
+    left, right = range(1, max(residuals, 1) + 1), range(2, residuals + 2)
+    attached = frozenset(left)
+    return Requirements(bounces, residuals, attached, frozenset(right) - attached)
 
 
 # ------------------------------------------------------------------------- stand-ins for fields

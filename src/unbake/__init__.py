@@ -51,12 +51,16 @@ if TYPE_CHECKING:
     from .training.problem import training_pixels as training_pixels
     from .training.recovered import load_run as load_run
     from .training.schedule import learning_rates as learning_rates
-    from .training.step import State as State
+    from .training.state import State as State
+    from .training.state import initial_state as initial_state
     from .training.step import TrainingStep as TrainingStep
-    from .training.step import initial_state as initial_state
-    from .transport.objective import METHODS as METHODS
-    from .transport.objective import Attached as Attached
-    from .transport.objective import RelativeL2 as RelativeL2
+    from .transport.loss import RelativeL2 as RelativeL2
+    from .transport.loss import pixel_means as pixel_means
+    from .transport.loss import squared_error as squared_error
+    from .transport.methods import METHODS as METHODS
+    from .transport.methods import Attached as Attached
+    from .transport.methods import Method as Method
+    from .transport.methods import register_method as register_method
     from .transport.objective import objective as objective
     from .transport.objective import requirements as requirements
     from .transport.path_sample import PathSample as PathSample
@@ -65,7 +69,16 @@ if TYPE_CHECKING:
     from .transport.path_sample import rhs as rhs
     from .transport.path_sample import trace as trace
     from .transport.path_tracer import path_traced as path_traced
+    from .transport.prior import residual as residual
+    from .transport.prior import residual_norm as residual_norm
     from .transport.render import render_radiance as render_radiance
+    from .transport.samplers import PathSampler as PathSampler
+    from .transport.samplers import SamplerContext as SamplerContext
+    from .transport.samplers import register_sampler as register_sampler
+    from .transport.terms import TERMS as TERMS
+    from .transport.terms import Term as Term
+    from .transport.terms import TermInputs as TermInputs
+    from .transport.terms import register_term as register_term
     from .transport.vertex import SceneView as SceneView
     from .transport.vertex import Vertex as Vertex
 
@@ -91,21 +104,27 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "fields.materials": ("Material", "Materials"),
     "fields.radiance": ("RadianceField",),
     # Light transport and the objective.
-    "transport.objective": ("METHODS", "Attached", "RelativeL2", "objective", "requirements"),
+    "transport.loss": ("RelativeL2", "pixel_means", "squared_error"),
+    "transport.methods": ("METHODS", "Attached", "Method", "register_method"),
+    "transport.objective": ("objective", "requirements"),
     "transport.path_sample": ("PathSample", "Requirements", "lhs", "rhs", "trace"),
     "transport.path_tracer": ("path_traced",),
+    "transport.prior": ("residual", "residual_norm"),
     "transport.render": ("render_radiance",),
+    "transport.samplers": ("PathSampler", "SamplerContext", "register_sampler"),
+    "transport.terms": ("TERMS", "Term", "TermInputs", "register_term"),
     "transport.vertex": ("SceneView", "Vertex"),
     # The parts of a training loop.
     "training.checkpoint": ("Progress", "load_checkpoint", "save_checkpoint"),
     "training.problem": ("Problem", "make_problem", "training_pixels"),
     "training.schedule": ("learning_rates",),
-    "training.step": ("State", "TrainingStep", "initial_state"),
+    "training.state": ("State", "initial_state"),
+    "training.step": ("TrainingStep",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 # Modules above that are imported without Mitsuba.
-_PURE = frozenset({"backend", "config", "errors"})
+_PURE = frozenset({"backend", "config", "errors", "transport.methods"})
 
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

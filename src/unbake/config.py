@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from .errors import UserError
+from .transport.methods import METHODS, Method
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -25,18 +26,6 @@ else:
 
 Estimator = Literal["auto", "split-halves", "two-pass"]
 Reference = Literal["smoothed", "photograph"]
-#: The last three are the steps of the ablation (Fig. 7, 8) between `direct` and `ours`, in order.
-MethodName = Literal[
-    "ours",
-    "no-prior",
-    "direct",
-    "ad-pt",
-    "prb",
-    "with-prior",
-    "with-stop-gradient",
-    "with-second-bounce",
-]
-PathMethodName = Literal["ad-pt", "prb"]
 PriorName = Literal["one-bounce", "extra-bounce"]
 Unknown = Literal["materials", "lighting", "materials+lighting", "emission"]
 Representation = Literal["neural", "grid", "bitmap"]
@@ -188,7 +177,7 @@ class FitConfig:
 
     preset: PresetName = "cpu"
     unknown: Unknown = "materials"
-    method: MethodName = "ours"
+    method: str = "ours"  #: see `transport/methods.py`
     bounces: int = 1  #: differentiable bounces before L_θ is asked (Sec. 6.3); `ours` only
     prior: PriorName = "extra-bounce"  #: where the residual is taken (Sec. 4.2); `ours` only
     representation: Representation = "neural"  #: of the materials (Sec. 5.1, Fig. 5, Sec. 8)
@@ -247,7 +236,8 @@ class FitConfig:
             f"1 to {MOST_BOUNCES} (every bounce is kept in memory; prb follows longer paths)",
             self.bounces,
         )
-        if self.method != "ours":
+        _check(self.method in METHODS, "method", f"one of {', '.join(METHODS)}", self.method)
+        if not METHODS[self.method].takes_options:
             _check(self.bounces == 1, "bounces", f"1 for the method {self.method}", self.bounces)
             only = f"extra-bounce for the method {self.method}"
             _check(self.prior == "extra-bounce", "prior", only, self.prior)
@@ -271,7 +261,13 @@ class FitConfig:
     @property
     def follows_paths(self) -> bool:
         """Whether the method follows paths to their end, and has no radiance field."""
-        return self.method in typing.get_args(PathMethodName)
+        return METHODS[self.method].follows_paths
+
+    @property
+    def chosen_method(self) -> Method:
+        """The method, with its residuals where `prior` says."""
+        method = METHODS[self.method]
+        return method.without_extra_bounce() if self.prior == "one-bounce" else method
 
     @property
     def learns_materials(self) -> bool:

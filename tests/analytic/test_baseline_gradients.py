@@ -81,7 +81,7 @@ def path_traced(method, scene, materials, sampler, ray, rr_depth=DEPTH, depth=DE
     if method == "ad-pt":
         scene_view, requirements = (
             SceneView.of(scene, materials, 8),
-            Requirements(depth - 1, 0, False),
+            Requirements(depth - 1),
         )
         sample = trace(scene_view, None, ray, sampler, requirements, hide_emitters=False)
         return rhs(sample, mi.Color3f(0), depth - 1)

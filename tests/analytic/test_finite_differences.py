@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
+from support import ConstantMaterials, built_in_cameras, pieces, pixel_rays, seeded
 
 from unbake.fields.texture import material_textures
-from unbake.transport.path_sample import Requirements, rhs, trace
+from unbake.transport.path_sample import rhs, trace
 from unbake.transport.vertex import SceneView
 
 ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
@@ -99,7 +99,7 @@ def objective(scene_view):
         field,
         ray,
         seeded(2, dr.width(ray)),
-        Requirements(1, 1, lhs=True),
+        pieces(1, 1),
         hide_emitters=False,
     )
     weights = np.random.default_rng(3).uniform(0.5, 1.5, (3, dr.width(ray) // SPP))

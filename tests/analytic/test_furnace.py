@@ -13,6 +13,7 @@ from support import (
     ConstantMaterials,
     ConstantRadiance,
     built_in_cameras,
+    pieces,
     pixel_rays,
     seeded,
 )
@@ -24,17 +25,10 @@ from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField
 from unbake.fields.texture import material_textures
 from unbake.scene.parse import parse
-from unbake.transport.objective import (
-    EXTRA,
-    METHODS,
-    PHOTOMETRIC,
-    PRIOR,
-    Attached,
-    RelativeL2,
-    objective,
-    requirements,
-)
-from unbake.transport.path_sample import Requirements, lhs, rhs, trace
+from unbake.transport.loss import RelativeL2
+from unbake.transport.methods import EXTRA, METHODS, PHOTOMETRIC, PRIOR, Attached
+from unbake.transport.objective import objective, requirements
+from unbake.transport.path_sample import lhs, rhs, trace
 from unbake.transport.prior import residual
 from unbake.transport.vertex import SceneView
 
@@ -62,10 +56,10 @@ def train(scene_view, field, terms, steps, rate, final_rate):
             field,
             ray,
             sampler,
-            Requirements(1, 2, lhs=True),
+            pieces(1, 2),
             hide_emitters=False,
         )
-        value = sum(objective(terms, sample, black, 2, loss).values())
+        value = sum(objective(terms, sample, black, loss).values())
         dr.backward(value)
         adam.step(eval=False)
         dr.eval(adam, value)
@@ -90,7 +84,7 @@ def pictures(scene_view, field, spp):
         field,
         ray,
         seeded(5, dr.width(ray)),
-        Requirements(1, 1, lhs=True),
+        pieces(1, 1),
         hide_emitters=False,
     )
     both = lhs(sample, sample.radiance[0]), rhs(sample, sample.radiance[1])
@@ -145,7 +139,7 @@ def exact_sample(scene, albedo, factor=1.0, lanes_spp=64):
         field,
         ray,
         seeded(4, dr.width(ray)),
-        Requirements(1, 2, lhs=True),
+        pieces(1, 2),
         hide_emitters=False,
     )
 
@@ -190,7 +184,7 @@ def test_the_gradient_with_k_live_bounces_is_the_closed_form(learnable, albedo, 
     materials.albedo = mi.Color3f(albedo)
     dr.enable_grad(materials.albedo)
     ray = pixel_rays(built_in_cameras("furnace", 16, views=8), 64, seed=5)
-    cache, wanted = ConstantRadiance(albedo / (1 - albedo)), Requirements(bounces, 1, lhs=True)
+    cache, wanted = ConstantRadiance(albedo / (1 - albedo)), pieces(bounces, 1)
     sample = trace(learnable, cache, ray, seeded(6, dr.width(ray)), wanted, hide_emitters=False)
     image = rhs(sample, sample.radiance[bounces], bounces)
     value = np.array(dr.mean(dr.detach(image), axis=1)).ravel()
@@ -213,7 +207,7 @@ def test_more_live_bounces_come_nearer_to_the_true_gradient(learnable):
     for bounces in (1, 4):
         materials.albedo = mi.Color3f(albedo)
         dr.enable_grad(materials.albedo)
-        row = METHODS["ours"]
+        row = METHODS["ours"].terms
         field = ConstantRadiance(albedo / (1 - albedo))
         sampler = seeded(6, dr.width(ray))
         sample = trace(
@@ -221,7 +215,7 @@ def test_more_live_bounces_come_nearer_to_the_true_gradient(learnable):
         )
         target = dr.full(mi.Color3f, 4.0, dr.width(ray) // 16)
         loss = RelativeL2(0.01)
-        terms = objective(row, sample, target, 16, loss, bounces=bounces)
+        terms = objective(row, sample, target, loss, bounces=bounces)
         dr.backward(terms[PHOTOMETRIC])
         found.append(float(dr.sum(dr.grad(materials.albedo))[0]))
     closed = [sum(i * 0.8 ** (i - 1) for i in range(1, k)) + 5 * k * 0.8 ** (k - 1) for k in (1, 4)]

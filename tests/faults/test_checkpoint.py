@@ -11,7 +11,7 @@ import pytest
 from unbake.errors import UserError
 from unbake.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from unbake.training.run_folder import KEEP, RunFolder
-from unbake.training.step import State
+from unbake.training.state import State
 
 
 def make_state(seed=0, width=3):

@@ -23,7 +23,8 @@ from unbake.fields.texture import material_textures, slots_of
 from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
-from unbake.training.step import TrainingStep, initial_state
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 from unbake.transport.operator import attach_albedo, attach_material
 from unbake.transport.vertex import SceneView, find_vertex
 

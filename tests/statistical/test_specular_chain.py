@@ -6,13 +6,14 @@ import pytest
 from support import (
     PathTracedRadiance,
     assert_same_expectation,
+    pieces,
     pixel_rays,
     seeded,
     stock_path,
 )
 
 from unbake.dataset.camera import Camera
-from unbake.transport.path_sample import Requirements, lhs, rhs, trace
+from unbake.transport.path_sample import lhs, rhs, trace
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.vertex import SceneView, find_vertex
 
@@ -111,7 +112,7 @@ def test_both_sides_with_an_exact_cache_are_the_image_of_path(name):
     truth = stock_path(scene, ray, 5, max_depth=64)
     cache, requirements = (
         PathTracedRadiance(scene_view, 6, 16),
-        Requirements(bounces=1, residuals=1, lhs=True),
+        pieces(1, 1),
     )
     sample = trace(
         scene_view, cache, ray, seeded(7, dr.width(ray)), requirements, hide_emitters=False
@@ -184,8 +185,6 @@ def test_a_lane_in_black_stays_black_in_both_images():
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, 8), 0, 0), dr.normalize(mi.Vector3f(1, 0, 1)))
     scene_view = SceneView.of(scene, None, 4)
     cache = PathTracedRadiance(scene_view, 1, 4)
-    sample = trace(
-        scene_view, cache, ray, seeded(2, 8), Requirements(1, 2, lhs=True), hide_emitters=False
-    )
+    sample = trace(scene_view, cache, ray, seeded(2, 8), pieces(1, 2), hide_emitters=False)
     assert dr.all(lhs(sample, sample.radiance[0]) == 0, axis=None)
     assert dr.all(rhs(sample, sample.radiance[1]) == 0, axis=None)

@@ -9,6 +9,7 @@ from support import (
     PathTracedRadiance,
     assert_same_expectation,
     built_in_cameras,
+    pieces,
     pixel_rays,
     seeded,
     stock_path,
@@ -18,7 +19,7 @@ from unbake.dataset.camera import Camera
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
-from unbake.transport.path_sample import Requirements, lhs, rhs, trace
+from unbake.transport.path_sample import lhs, rhs, trace
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.prior import residual
 from unbake.transport.vertex import SceneView
@@ -40,7 +41,7 @@ def compare(
     truth = stock_path(stock, ray, 3, max_depth=STOCK_DEPTH, hide_emitters=hide_emitters)
     # The series brings its own random numbers, from another seed.
     cache = PathTracedRadiance(ours, 4, DEPTH)
-    requirements = Requirements(bounces=1, residuals=1, lhs=True)
+    requirements = pieces(1, 1)
     sample = trace(
         ours, cache, ray, seeded(5, dr.width(ray)), requirements, hide_emitters=hide_emitters
     )
@@ -92,7 +93,7 @@ def test_the_residuals_of_the_exact_radiance_vanish(built_in):
         cache,
         ray,
         seeded(9, dr.width(ray)),
-        Requirements(1, 2, lhs=True),
+        pieces(1, 2),
         hide_emitters=False,
     )
     first = residual(sample, 1, sample.radiance[0], sample.radiance[1])

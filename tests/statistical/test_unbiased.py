@@ -9,29 +9,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import (
-    TINY_FIT,
-    ConstantMaterials,
-    ConstantRadiance,
-    built_in_cameras,
-    seeded,
-)
+from support import TINY_FIT, ConstantMaterials, ConstantRadiance, built_in_cameras, pieces, seeded
 
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
-from unbake.training.step import State, TrainingStep
-from unbake.transport.objective import (
-    PHOTOMETRIC,
-    Attached,
-    RelativeL2,
-    objective,
-    pixel_means,
-    squared_error,
-)
-from unbake.transport.path_sample import Requirements, rhs, trace
+from unbake.training.state import State
+from unbake.training.step import TrainingStep
+from unbake.transport.loss import RelativeL2, pixel_means, squared_error
+from unbake.transport.methods import PHOTOMETRIC, Attached
+from unbake.transport.objective import objective
+from unbake.transport.path_sample import rhs, trace
 from unbake.transport.vertex import SceneView
 
 
@@ -125,7 +115,7 @@ def one_pixel(room, lanes, seed):
     albedo = room.materials.albedo = dr.full(mi.Color3f, 0.5, lanes)
     dr.enable_grad(albedo)
     return albedo, trace(
-        room, ConstantRadiance(0.3), ray, sampler, Requirements(1, 1, lhs=True), hide_emitters=False
+        room, ConstantRadiance(0.3), ray, sampler, pieces(1, 1), hide_emitters=False
     )
 
 
@@ -164,7 +154,7 @@ def test_the_gradient_of_a_real_pixel_is_unbiased(room):
         loss = RelativeL2(epsilon)
         if estimator is None:
             row = {PHOTOMETRIC: Attached(scene=True)}
-            value = objective(row, sample, photographs, spp, loss, primal)[PHOTOMETRIC]
+            value = objective(row, sample, photographs, loss, primal)[PHOTOMETRIC]
         else:
             weight = loss.weight(photographs)
             value = estimator(rhs(sample, sample.radiance[1]), photographs, spp, weight)

@@ -12,7 +12,8 @@ from unbake.fields.network import Network, can_record_layout
 from unbake.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from unbake.training.problem import make_problem
 from unbake.training.run_folder import RunFolder
-from unbake.training.step import TrainingStep, initial_state
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 
 RATES = {"albedo": 2e-3, "roughness": 2e-3, "radiance": 5e-3}
 

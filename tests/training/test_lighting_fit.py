@@ -24,8 +24,10 @@ from unbake.evaluation.lighting import recovered_emitters, sh_error
 from unbake.training.problem import make_problem, training_pixels
 from unbake.training.regularizers import is_anchored
 from unbake.training.schedule import learning_rates
-from unbake.training.step import TrainingStep, initial_state
-from unbake.transport.objective import METHODS, requirements
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
+from unbake.transport.methods import METHODS
+from unbake.transport.objective import requirements
 from unbake.transport.path_sample import rhs, trace
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
 
@@ -123,7 +125,7 @@ def radiance(problem, method, ray, seed):
         replay = path_replay(DEPTH, DEPTH, hide_emitters=problem.hide_emitters)
         with materials_along_paths(scene_view.materials):
             return path_radiance(replay, scene_view.scene, sampler, ray, problem.read_by_scene())
-    wanted = requirements(METHODS["ad-pt"], DEPTH - 1)
+    wanted = requirements(METHODS["ad-pt"].terms, DEPTH - 1)
     sample = trace(scene_view, None, ray, sampler, wanted, hide_emitters=problem.hide_emitters)
     return rhs(sample, sample.radiance[DEPTH - 1], DEPTH - 1)
 

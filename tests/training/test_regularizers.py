@@ -12,7 +12,8 @@ from unbake.config import LightingConfig, RegularizationConfig
 from unbake.fields.materials import Material
 from unbake.training.problem import make_problem
 from unbake.training.regularizers import is_anchored, regularization_terms
-from unbake.training.step import TrainingStep, initial_state
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 from unbake.transport.regularizers import (
     albedo_ties_roughness,
     mean_albedo_deviation,

@@ -8,7 +8,7 @@ from support import TINY_FIT
 from unbake.config import BitmapConfig, DenseGridConfig, FitConfig, LightingConfig
 from unbake.training.problem import make_problem
 from unbake.training.schedule import learning_rates
-from unbake.training.step import initial_state
+from unbake.training.state import initial_state
 
 STEADY = FitConfig(
     learning_rate=0.2,

@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
 
-import unbake.training.step as step_module
+import unbake.training.memory as memory_module
+import unbake.transport.samplers as samplers_module
 from unbake.config import PathConfig
 from unbake.dataset.pixels import PixelSource
 from unbake.errors import UserError
 from unbake.training.memory import peak_bytes
 from unbake.training.monitor import memory_mb
 from unbake.training.problem import make_problem
-from unbake.training.step import TrainingStep, initial_state
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 
 
 def start(built_in, config=TINY_FIT, pixels=None):
@@ -146,7 +148,7 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
     config = dataclasses.replace(TINY_FIT, method="ad-pt", pixels=2048, **SHORT)
     step, state = start(built_in, config)
     before = parameters(state)
-    monkeypatch.setattr(step_module, "free_bytes", lambda: 100_000)
+    monkeypatch.setattr(memory_module, "free_bytes", lambda: 100_000)
     with pytest.raises(UserError) as error:
         step(state, 0, rates(0))
     message = str(error.value)
@@ -162,7 +164,7 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
     assert all((before[name] == after[name]).all() for name in before)
     assert all(not np.array(dr.grad(v)).any() for v in state.phi.values())
     for free in (None, 10**12):
-        monkeypatch.setattr(step_module, "free_bytes", lambda free=free: free)
+        monkeypatch.setattr(memory_module, "free_bytes", lambda free=free: free)
         step, state = start(built_in, config)
         assert np.isfinite(float(step(state, 0, rates(0))["photometric"][0]))
 
@@ -170,7 +172,7 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
 def test_the_estimate_of_memory_is_what_a_step_then_takes(built_in):
     config = dataclasses.replace(TINY_FIT, method="ad-pt", pixels=32768, **SHORT)
     step, state = start(built_in, config)
-    estimate = step._bytes_needed(state)
+    estimate = step.bytes_needed(state)
     if estimate is None:
         pytest.skip("nobody tells here how much memory was taken")
     state.set_learning_rates(rates(0))
@@ -187,7 +189,7 @@ def test_dr_jit_running_out_of_memory_is_told_in_one_line(built_in, monkeypatch)
     def fails(*arguments):
         raise RuntimeError("jit_malloc(): out of memory! Could not allocate 8 bytes")
 
-    monkeypatch.setattr(step_module, "path_radiance", fails)
+    monkeypatch.setattr(samplers_module, "path_radiance", fails)
     with pytest.raises(UserError, match=r"no memory for a step of 128 paths. Lower --batch"):
         step(state, 0, rates(0))
 
@@ -198,7 +200,7 @@ def test_dr_jit_running_out_of_memory_is_told_in_one_line(built_in, monkeypatch)
 def test_a_gradient_that_is_not_finite_is_dropped_and_no_other(built_in, monkeypatch):
     step, state = start(built_in)
     name = next(k for k in state.phi if k.endswith("1.bias"))  # of the first network's outputs
-    objective, broken = step_module.objective, [True]
+    objective, broken = samplers_module.objective, [True]
 
     def with_broken_entry(*arguments):
         terms = objective(*arguments)
@@ -210,7 +212,7 @@ def test_a_gradient_that_is_not_finite_is_dropped_and_no_other(built_in, monkeyp
             terms["broken"] = dr.sum(dr.select(first, root, 0))
         return terms
 
-    monkeypatch.setattr(step_module, "objective", with_broken_entry)
+    monkeypatch.setattr(samplers_module, "objective", with_broken_entry)
 
     def move(i):
         before = parameters(state)
@@ -314,9 +316,10 @@ from unbake import backend
 backend.activate()
 import drjit as dr, numpy as np
 from support import TINY_FIT, built_in_cameras, grey_photographs
-from unbake.training import step as step_module
+from unbake.transport import samplers as samplers_module
 from unbake.training.problem import make_problem
-from unbake.training.step import TrainingStep, initial_state
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 
 def fit(steps):
     problem = make_problem(Path(sys.argv[1]), "visible", TINY_FIT, 0.2)
@@ -361,14 +364,14 @@ def test_an_abandoned_fit_does_not_disturb_the_next_one(built_in):
 gc.disable()
 fit(4)
 gc.disable()
-objective = step_module.objective
+objective = samplers_module.objective
 
 def collecting(*arguments):
     if gc.isenabled():
         gc.collect()
     return objective(*arguments)
 
-step_module.objective = collecting
+samplers_module.objective = collecting
 fit(4)
 print("done")
 """

@@ -21,7 +21,7 @@ from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
-from unbake.transport.objective import pixel_means, squared_error
+from unbake.transport.loss import pixel_means, squared_error
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
 
 DEPTH = 4

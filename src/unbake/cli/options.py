@@ -26,7 +26,7 @@ Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
 Preset = Annotated[
     config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
 ]
-Method = Annotated[config.MethodName | None, arg(metavar="METHOD", help_behavior_hint="")]
+Method = Annotated[str | None, arg(metavar="METHOD", help_behavior_hint="")]
 Unknown = Annotated[config.Unknown | None, arg(metavar="WHAT", help_behavior_hint="")]
 Prior = Annotated[
     config.PriorName | None, arg(metavar="{one-bounce,extra-bounce}", help_behavior_hint="")

@@ -17,7 +17,7 @@ from ..errors import UserError
 from ..evaluation.evaluate import description
 from ..io import write_json
 from ..machine import machine
-from ..profiling.bench_step import begin_fit
+from ..training.fresh_fit import begin_fit
 from ..training.schedule import learning_rates
 from .method_variant import MethodVariant
 

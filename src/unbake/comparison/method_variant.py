@@ -6,8 +6,9 @@ import typing
 from dataclasses import dataclass, replace
 from typing import final
 
-from ..config import Estimator, FitConfig, MethodName, Representation
+from ..config import Estimator, FitConfig, Representation
 from ..errors import UserError
+from ..transport.methods import METHODS
 
 
 @final
@@ -15,7 +16,7 @@ from ..errors import UserError
 class MethodVariant:
     """A method, how it represents materials, and its estimator; None: as shared settings say."""
 
-    method: MethodName
+    method: str
     representation: Representation | None = None
     estimator: Estimator | None = None
 
@@ -26,15 +27,18 @@ class MethodVariant:
         Raises:
             UserError: there is no such method, representation or estimator.
         """
-        choices = {"method": MethodName, "representation": Representation, "estimator": Estimator}
+        choices = {
+            "method": tuple(METHODS),
+            "representation": typing.get_args(Representation),
+            "estimator": typing.get_args(Estimator),
+        }
         words = text.split(":")
         if len(words) > len(choices):
             raise UserError(f"{text!r} has too many parts", "--methods", "METHOD:REPRESENTATION")
         said: dict[str, typing.Any] = dict(zip(choices, words, strict=False))
         for what, word in said.items():
-            known = typing.get_args(choices[what])
-            if word not in known:
-                remedy = f"There are {', '.join(known)}"
+            if word not in choices[what]:
+                remedy = f"There are {', '.join(choices[what])}"
                 raise UserError(f"no {what} named {word!r}", "--methods", remedy)
         return MethodVariant(**said)
 
@@ -44,8 +48,9 @@ class MethodVariant:
         return "-".join(filter(None, (self.method, self.representation, self.estimator)))
 
     def settings(self, shared: FitConfig) -> FitConfig:
-        """The shared settings with this method; what `ours` alone knows goes for the others."""
-        own = replace(shared, bounces=1, prior="extra-bounce") if self.method != "ours" else shared
+        """The shared settings with this method, without the options that it does not take."""
+        takes_options = METHODS[self.method].takes_options
+        own = shared if takes_options else replace(shared, bounces=1, prior="extra-bounce")
         representation = self.representation or shared.representation
         estimator = self.estimator or shared.estimator
         return replace(own, method=self.method, representation=representation, estimator=estimator)

@@ -18,7 +18,7 @@ from ..imaging.pictures import montage, to_bytes, tonemap, write_exr, write_png
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.validation import GroundTruth, MaterialBuffers, finite, read_view
-from ..transport.objective import METHODS, requirements
+from ..transport.objective import requirements
 from ..transport.render import render_radiance
 from . import lighting
 
@@ -111,7 +111,7 @@ def description(config: FitConfig) -> dict:
     `representation` is that of the materials (φ), None where they are known, `radiance` that of
     L_θ, None where the method has no radiance field.
     """
-    cached = requirements(METHODS[config.method]).radiance
+    cached = requirements(config.chosen_method.terms).radiance
     return {
         "unknown": config.unknown,
         "method": config.method,

@@ -19,11 +19,11 @@ from ..comparison.method_variant import MethodVariant
 from ..config import DenseGridConfig, FitConfig, PathConfig, PriorName
 from ..dataset.views import Dataset
 from ..errors import UserError
-from ..profiling.bench_step import FreshFit, begin_fit
 from ..scene.edit import to_principled
 from ..scene.parse import parse, write
-from ..training.memory import peak_bytes
-from ..training.step import lacks_memory
+from ..training.fresh_fit import FreshFit, begin_fit
+from ..training.memory import lacks_memory, peak_bytes
+from ..transport.methods import METHODS
 from .experiment import Experiment, ExperimentContext, ExperimentResult, save_figure
 from .jobs import Findings, Job, digest
 from .table2 import PUBLISHED as PATHS
@@ -96,7 +96,7 @@ def _measure(
             if "error" in row:
                 continue
             config = MethodVariant.of(curve.variant).settings(shared)
-            if config.method == "ours":
+            if METHODS[config.method].takes_options:
                 config = replace(config, prior=curve.prior)
             try:
                 with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, curve.symbolic):

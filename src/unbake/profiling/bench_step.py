@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -22,10 +21,11 @@ from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from ..io import write_json
 from ..machine import machine
+from ..training.fresh_fit import begin_fit
 from ..training.monitor import memory_mb
-from ..training.problem import Problem, make_problem, training_pixels
 from ..training.schedule import learning_rates
-from ..training.step import State, TrainingStep, initial_state
+from ..training.state import State
+from ..training.step import TrainingStep
 from .phases import Phases, kernel_history, milliseconds
 from .roofline import roofline
 
@@ -33,24 +33,6 @@ from .roofline import roofline
 WARM_UP = 20
 #: Steps that are taken apart, to take the median of.
 APART = 7
-
-
-@dataclass(frozen=True)
-class FreshFit:
-    """A fit before its first step."""
-
-    problem: Problem
-    pixels: PixelSource
-    step: TrainingStep
-    state: State
-
-
-def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
-    """A fit of a data set that writes nothing."""
-    pixels = training_pixels(dataset, clip_negative=False)
-    mean = pixels.photographs.mean
-    problem = make_problem(dataset.scene, dataset.background, config, mean)
-    return FreshFit(problem, pixels, TrainingStep(problem, pixels, config), initial_state(problem))
 
 
 @contextmanager

@@ -10,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..dataset.pixels import PixelBatch
-from ..training import step as steps
-from ..transport import operator, path_sample
+from ..transport import operator, path_sample, samplers
 
 #: What is done outside of all calls below counts as this.
 OPTIMISER = "optimiser"
@@ -25,8 +24,8 @@ _CALLS = (
     (path_sample, "attach_albedo", "material nets"),
     (path_sample, "bounce", "BSDFs and lights"),
     (path_sample, "reflected_radiance", "radiance net"),
-    (steps, "path_radiance", "paths"),
-    (steps, "objective", "losses"),
+    (samplers, "path_radiance", "paths"),
+    (samplers, "objective", "losses"),
     (dr, "backward", "gradients"),
 )
 

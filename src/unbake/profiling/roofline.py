@@ -15,9 +15,9 @@ from ..fields.grid import DenseGrid
 from ..fields.materials import Volume
 from ..fields.network import Network
 from ..training.problem import Problem
-from ..training.step import State
-from ..transport.objective import METHODS, requirements
-from ..transport.path_sample import Requirements, where_radiance_is_learned
+from ..training.state import State
+from ..transport.objective import requirements
+from ..transport.path_sample import Requirements
 from .phases import kernel_history, milliseconds
 
 #: A parameter, its gradient and both moments of Adam: read, and all but the gradient written.
@@ -87,8 +87,7 @@ def roofline(problem: Problem, pixels: PixelSource, state: State, config: FitCon
 
 
 def _work(problem: Problem, state: State, config: FitConfig) -> Work:
-    terms = METHODS["ours, one-bounce" if config.prior == "one-bounce" else config.method]
-    wanted = requirements(terms, config.bounces)
+    wanted = requirements(config.chosen_method.terms, config.bounces)
     arrays = [a for _, adam in state.optimizers() for a in adam.values()]
     adam = Work(0, 0, 4 * _ADAM_FLOATS * sum(dr.width(a) for a in arrays))
     work = adam + _of_the_image(problem, wanted).times(config.samples_per_step)
@@ -106,7 +105,7 @@ def _of_the_image(problem: Problem, wanted: Requirements) -> Work:
     for _ in range(wanted.bounces):
         work += _materials(problem, gradient=True)
     if wanted.radiance:
-        work += _albedo(problem) + _radiance(problem, gradient=False)
+        work += _albedo(problem) + _radiance(problem, gradient=wanted.image_attached)
     return work
 
 
@@ -114,16 +113,17 @@ def _of_learning(problem: Problem, wanted: Requirements, *, all_samples: bool) -
     """What comes in addition where L_θ learns of the sample."""
     bounces = max(0, wanted.residuals - wanted.bounces)
     work = Work(2 * bounces, 0, 0)
-    for _ in range(bounces):
-        work += _materials(problem, gradient=False)
-    learned, constant = where_radiance_is_learned(wanted)
+    for number in range(wanted.bounces + 1, wanted.residuals + 1):
+        work += _materials(problem, gradient=number in wanted.differentiable)
+    learned, constant = wanted.attached, wanted.constant
     for number in learned | constant:
         work += _radiance(problem, gradient=number in learned)
     if not all_samples:
         return work + _albedo(problem) if bounces else work
     # Where learning needs what the image asks at its end, it is asked once for both.
     shared = wanted.bounces + 1 in learned | constant
-    return work + _radiance(problem, gradient=False).times(-1) if shared else work
+    image = _radiance(problem, gradient=wanted.image_attached)
+    return work + image.times(-1) if shared else work
 
 
 def _materials(problem: Problem, *, gradient: bool) -> Work:

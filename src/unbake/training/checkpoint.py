@@ -22,7 +22,7 @@ from ..errors import UserError
 from ..fields.network import from_numpy
 from ..io import write_atomically
 from .run_folder import RunFolder
-from .step import State
+from .state import State
 
 FORMAT = "unbake-checkpoint-1"
 

@@ -23,7 +23,8 @@ from .preview import Preview
 from .problem import camera_warnings, make_problem, training_pixels
 from .run_folder import Origin, RunFolder
 from .schedule import learning_rates
-from .step import TrainingStep, initial_state
+from .state import initial_state
+from .step import TrainingStep
 from .validation import Score
 
 #: Steps between readings of the loss; reading waits for the machine.

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..backend import CUDA_VARIANT
+from ..errors import UserError
 
 _PROCESS = Path("/proc/self")
 #: Where control groups, as containers are, state their limit and what is used of it.
@@ -67,3 +68,50 @@ def free_bytes() -> int | None:
 def _status(key: str) -> int:
     lines = (_PROCESS / "status").read_text().splitlines()
     return 1024 * int(next(x for x in lines if x.startswith(key + ":")).split()[1])
+
+
+#: Paths of the smaller one of two batches that tell how much memory a batch takes.
+_PROBED_PATHS = 4096
+#: What helps where paths do not fit the memory.
+SMALLER = "Lower --batch or --spp or path.max_depth, or use --method prb"
+
+
+def lacks_memory(error: BaseException | None) -> bool:
+    """Whether an error comes from Dr.Jit running out of memory, also while it records."""
+    while error is not None and "out of memory" not in str(error):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def forecast_bytes(probe: Callable[[int], None], pixels: int, spp: int) -> float | None:
+    """What a batch will need, judged by two smaller ones; None where memory cannot be measured.
+
+    Args:
+        probe: computes a batch of so many pixels, and drops what comes of it.
+        pixels: of the batch.
+        spp: samples a pixel.
+    """
+    few = max(1, min(pixels // 4, _PROBED_PATHS // spp))
+    probe(few)  # compiles, which takes memory as well
+    fewer, more = (peak_bytes(lambda n=n: probe(n)) for n in (few, 2 * few))
+    if fewer is None or more is None:
+        return None
+    return more + max(0, more - fewer) * (pixels / few - 2)
+
+
+def require_memory(need: float | None, method: str, paths: int) -> None:
+    """Raise an error if a step would need more memory than there is, rather than be killed.
+
+    Args:
+        need: bytes; None: not known, and taken for little.
+        method: what to call the step by.
+        paths: of the step.
+
+    Raises:
+        UserError: it would.
+    """
+    free = free_bytes()
+    if need is not None and free is not None and need > free:
+        what = f"{method} needs about {need / 1e9:.1f} GB of memory for a step of"
+        what += f" {paths} paths, {free / 1e9:.1f} GB are free"
+        raise UserError(what, None, SMALLER)

@@ -24,7 +24,7 @@ from ..fields.radiance import RadianceField, make_radiance
 from ..fields.texture import material_textures, slots_of
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
-from ..transport.objective import METHODS, requirements
+from ..transport.objective import requirements
 from ..transport.vertex import SceneView
 
 Parameters = Mapping[str, mi.Float | mi.TensorXf]
@@ -113,7 +113,7 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
             materials.slots = slots_of(loaded)
 
     radiance = None
-    if requirements(METHODS[config.method]).radiance:
+    if requirements(config.chosen_method.terms).radiance:
         radiance = make_radiance(config, domain, scale=scale, seed=int(seeds[1]))
     scene_view = SceneView.of(loaded, materials, config.transport.max_specular)
     return Problem(

@@ -11,7 +11,7 @@ from ..errors import UserError
 from .checkpoint import Progress, load_checkpoint
 from .problem import Problem, make_problem
 from .run_folder import RunFolder
-from .step import initial_state
+from .state import initial_state
 
 
 @dataclass

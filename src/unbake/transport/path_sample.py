@@ -28,13 +28,13 @@ Piece = TypeVar("Piece")
 class PathSample:
     """One camera sample a lane: x₁, bounces from x₁, x₂, …, and L_θ at those vertices.
 
-    The first bounces pass gradients to φ, the radiance at the first vertices to θ: those that
-    `Requirements` asked for.
+    Some bounces pass gradients to φ, and some of the radiance to θ: those that `Requirements` asks
+    for.
     """
 
     x1: Vertex
     bounces: list[Bounce]  # from x₁, x₂, …; the next vertex of each is where the next one starts
-    radiance: list[mi.Color3f]  # L_θ at x₁, x₂, …; zero where nobody needs it
+    radiance: list[mi.Color3f]  # L_θ at x₁, x₂, …; zero where no term reads it
     learned: PathSample | None = None  # the samples that L_θ learns of; None: all of these
 
     def vertex(self, number: int) -> Vertex:
@@ -51,16 +51,23 @@ class PathSample:
 
 @dataclass(frozen=True)
 class Requirements:
-    """Which pieces of a path sample a method uses; the others are not computed."""
+    """Which pieces of a path sample a method uses, and which of them pass gradients.
+
+    Vertices are given by number: 1 is x₁. What is not listed is not computed. See
+    `objective.requirements`, which makes one from a method's terms.
+    """
 
     bounces: int  #: k, of the image: differentiable
-    residuals: int  #: number of first vertices where the residual is taken: 0, 1 or 2
-    lhs: bool  #: whether the radiance field is seen directly
+    residuals: int = 0  #: bounces of the samples that L_θ learns of
+    attached: frozenset[int] = frozenset()  #: where these ask L_θ, with gradients to θ
+    constant: frozenset[int] = frozenset()  #: where these ask L_θ without gradients
+    image_attached: bool = False  #: whether L_θ at the image's end passes gradients to θ
+    differentiable: frozenset[int] = frozenset()  #: where bounces pass gradients to φ, beyond k
 
     @property
     def radiance(self) -> bool:
         """Whether there is a radiance field."""
-        return self.lhs or self.residuals > 0
+        return bool(self.attached or self.constant or self.image_attached)
 
 
 @dataclass
@@ -91,7 +98,7 @@ def trace(
     Materials are evaluated once a vertex, and L_θ once where the image and residuals both need it.
 
     Args:
-        some: the samples that L_θ learns of; None: all.
+        subset: the samples that L_θ learns of; None: all.
 
     Paper: Sec. 4.2, 6.3, Fig. 2.
     """
@@ -111,15 +118,17 @@ def trace(
     for paths in (sample, learned):
         paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
     if requirements.radiance:
-        with_gradients, without = where_radiance_is_learned(requirements)
-        _look_up(radiance, learned, with_gradients)
+        attached, constant = set(requirements.attached), set(requirements.constant)
         last = {requirements.bounces + 1}  # where the image ends
-        with dr.suspend_grad():
-            if learned is sample:
-                without |= last - with_gradients
-            else:
+        if learned is sample:  # the image shares the look-ups
+            attached |= last if requirements.image_attached else set()
+            constant = (constant | last) - attached
+        _look_up(radiance, learned, attached)
+        if learned is not sample:
+            with dr.suspend_grad(when=not requirements.image_attached):
                 _look_up(radiance, sample, last)
-            _look_up(radiance, learned, without)
+        with dr.suspend_grad():
+            _look_up(radiance, learned, constant)
     return sample
 
 
@@ -132,7 +141,8 @@ def _prolong(
 ) -> None:
     """Add bounces to a path until it has so many."""
     for number in range(len(sample.bounces) + 1, bounces + 1):
-        with dr.suspend_grad(when=number > requirements.bounces):
+        passes = number <= requirements.bounces or number in requirements.differentiable
+        with dr.suspend_grad(when=not passes):
             x = attach_material(scene_view, sample.vertex(number))
             sample.place(number, x)
             sample.bounces.append(bounce(scene_view, x, sampler))
@@ -151,15 +161,6 @@ def _gather(piece: Piece, subset: SampleSubset) -> Piece:
         return dr.gather(type(piece), piece, subset.lanes)
     parts = {f.name: _gather(getattr(piece, f.name), subset) for f in dataclasses.fields(piece)}
     return dataclasses.replace(piece, **parts)
-
-
-def where_radiance_is_learned(requirements: Requirements) -> tuple[set[int], set[int]]:
-    """Numbers of the vertices whose L_θ learning needs: with gradients to θ, and without.
-
-    A residual at xᵢ compares L(xᵢ) with L(xᵢ₊₁).
-    """
-    learned = set(range(1, requirements.residuals + 1)) | ({1} if requirements.lhs else set())
-    return learned, {i + 1 for i in range(1, requirements.residuals + 1)} - learned
 
 
 def _look_up(radiance: RadianceField, sample: PathSample, numbers: set[int]) -> None:
@@ -185,7 +186,10 @@ def reflected_radiance(radiance: RadianceField, *vertices: Vertex) -> list[mi.Co
     parts, offset = [], 0
     for x in v:
         lanes = dr.arange(mi.UInt32, offset, offset + dr.width(x.valid))
-        parts.append(dr.gather(mi.Color3f, together, lanes))
+        # Dr.Jit 1.5 loses gradients now and then where several kernels add to a small array on
+        # LLVM (those of L_θ at x₁ and at x₂ were a third too small in one step of ten), unless it
+        # is told that no two lanes meet.
+        parts.append(dr.gather(mi.Color3f, together, lanes, mode=dr.ReduceMode.NoConflicts))
         offset += dr.width(x.valid)
     return parts
 

@@ -1,0 +1,150 @@
+"""Methods: THE table of which term of the objective trains what (Sec. 4.1).
+
+Pure Python, so that settings and the command line can read it without Mitsuba. A method of your own
+is a `Method` given to `register_method`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+from ..errors import UserError
+
+
+@dataclass(frozen=True)
+class Attached:
+    """Which edges of a term pass gradients."""
+
+    scene: bool = False  #: materials at the vertices where light scatters, and lights, to φ
+    lhs: bool = False  #: L_θ on the left-hand side, to θ
+    rhs: bool = False  #: L_θ on the right-hand side, to θ
+
+
+#: Names of the terms that `terms.py` defines.
+PHOTOMETRIC, PRIOR, EXTRA, LHS = "photometric", "prior", "prior_extra", "lhs"
+#: Names of the samplers that `samplers.py` defines.
+BOUNCES, PATH_REPLAY = "bounces", "path-replay"
+
+
+@dataclass(frozen=True)
+class Method:
+    """What is minimised, what trains what, and how light is followed.
+
+    Args:
+        name: of settings, the command line and folders: letters, digits, `-`, `_` and `.`.
+        title: one line for people.
+        terms: what each term trains, by the term's name; a term that is absent is not part of the
+            method.
+        sampler: name of the path sampler (`samplers.py`).
+        follows_paths: whether paths are followed to their end, `path.max_depth`. All light is then
+            in the image, and there is no radiance field.
+        takes_options: whether the settings `bounces` and `prior` change it.
+    """
+
+    name: str
+    title: str
+    terms: Mapping[str, Attached]
+    sampler: str = BOUNCES
+    follows_paths: bool = False
+    takes_options: bool = False
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"\w[\w.-]*", self.name):
+            raise ValueError(f"{self.name!r} cannot be a method's name")
+        if not self.terms:
+            raise ValueError(f"the method {self.name} has no terms")
+        for term, attached in self.terms.items():
+            if attached == Attached():
+                raise ValueError(f"{term} trains nothing in the method {self.name}")
+            if self.follows_paths and (attached.lhs or attached.rhs):
+                raise ValueError(f"{self.name} follows paths to their end: it has no L_θ to train")
+        object.__setattr__(self, "terms", MappingProxyType(dict(self.terms)))
+
+    def without_extra_bounce(self) -> Method:
+        """The same method with the residual at x₁ alone.
+
+        Paper: Sec. 4.2.
+        """
+        return replace(self, terms={t: a for t, a in self.terms.items() if t != EXTRA})
+
+
+_METHODS: dict[str, Method] = {}
+#: All methods by name.
+METHODS: Mapping[str, Method] = MappingProxyType(_METHODS)
+
+
+def register_method(method: Method) -> Method:
+    """Add a method to the table; settings and commands know its name from then on.
+
+    Its terms and sampler need not be registered yet: they are looked up when a fit begins.
+
+    Raises:
+        ValueError: there is another method of this name.
+    """
+    if METHODS.get(method.name, method) != method:
+        raise ValueError(f"there is another method named {method.name}")
+    _METHODS[method.name] = method
+    return method
+
+
+def method_named(name: str) -> Method:
+    """The method of this name.
+
+    Raises:
+        UserError: there is none.
+    """
+    if name not in METHODS:
+        raise UserError(f"no method named {name!r}", remedy=f"There are {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+_SCENE, _LHS = Attached(scene=True), Attached(lhs=True)
+
+# Photometric: Eq. 5 with Eq. 12. Prior: Eq. 10. Extra: the same at x₂. LHS: Eq. 14.
+for _method in (
+    Method(
+        "ours",
+        "radiometric prior at two vertices and LHS loss",
+        {PHOTOMETRIC: _SCENE, PRIOR: _LHS, EXTRA: _LHS, LHS: _LHS},
+        takes_options=True,
+    ),
+    Method(
+        "no-prior",
+        "ours, the radiance field learned from photographs alone",
+        {PHOTOMETRIC: _SCENE, LHS: _LHS},
+    ),
+    Method("direct", "direct illumination only", {PHOTOMETRIC: _SCENE}),
+    Method(
+        "ad-pt",
+        "path tracing, differentiated with all paths in memory",
+        {PHOTOMETRIC: _SCENE},
+        follows_paths=True,
+    ),
+    Method(
+        "prb",
+        "path replay backpropagation, Mitsuba's",
+        {PHOTOMETRIC: _SCENE},
+        sampler=PATH_REPLAY,
+        follows_paths=True,
+    ),
+    # The ablation of Fig. 7 and 8, from `direct` to `ours`, each with one thing more.
+    Method(
+        "with-prior",
+        "direct, and a prior that trains the materials too",
+        {PHOTOMETRIC: _SCENE, PRIOR: Attached(scene=True, lhs=True)},
+    ),
+    Method(
+        "with-stop-gradient",
+        "with-prior, whose prior trains the radiance field alone",
+        {PHOTOMETRIC: _SCENE, PRIOR: _LHS},
+    ),
+    Method(
+        "with-second-bounce",
+        "with-stop-gradient, with the residual at x2 as well",
+        {PHOTOMETRIC: _SCENE, PRIOR: _LHS, EXTRA: _LHS},
+    ),
+):
+    register_method(_method)

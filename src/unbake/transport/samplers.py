@@ -1,0 +1,222 @@
+"""How a method follows light: path samplers, which give the pixels of a step and its loss terms.
+
+A sampler of your own is a factory given to `register_sampler`, and named by a `Method`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Protocol
+
+import mitsuba as mi
+
+from ..errors import UserError
+from ..fields.network import Network, can_record_layout
+from ..fields.radiance import RadianceField
+from .loss import RelativeL2, squared_error
+from .methods import BOUNCES, PATH_REPLAY, PHOTOMETRIC, Method
+from .objective import objective, requirements
+from .path_sample import PathSample, SampleSubset, rhs, trace
+from .prb import materials_along_paths, path_radiance, path_replay
+from .vertex import SceneView
+
+#: What the scene's textures and emitters look into, by name.
+Arrays = Mapping[str, mi.Float | mi.TensorXf]
+
+
+@dataclass(frozen=True)
+class SamplerContext:
+    """What a sampler works on.
+
+    Args:
+        method: whose terms it computes.
+        scene_view: the scene, with fields in the place of unknown materials.
+        radiance: L_θ; None where no term asks for it.
+        hide_emitters: whether cameras see neither environment nor area emitters.
+        spp: camera samples a pixel.
+        bounces: k, after which the image takes L_θ.
+        max_depth: longest path in bounces, plus one, of methods that follow paths to their end.
+        rr_depth: bounces of these before Russian roulette.
+        read_by_scene: gives the present arrays that the scene's textures and emitters read.
+    """
+
+    method: Method
+    scene_view: SceneView
+    radiance: RadianceField | None
+    hide_emitters: bool
+    spp: int
+    bounces: int
+    max_depth: int
+    rr_depth: int
+    read_by_scene: Callable[[], Arrays]
+
+
+class PathSampler(Protocol):
+    """What a training step asks of a sampler.
+
+    `scene` is always the handle to use: a frozen function brings its own. `ray` has `spp`
+    consecutive lanes a pixel, and `sampler` is seeded for as many.
+    """
+
+    #: Whether all paths are kept in memory, so that a step may need more than there is.
+    keeps_paths: bool
+    #: Whether `dr.freeze` can record a step.
+    can_be_recorded: bool
+
+    def prepared(self) -> AbstractContextManager:
+        """A context that all else happens in, backpropagation too."""
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Linear RGB radiance of camera samples."""
+
+    def terms(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        target: mi.Color3f,
+        sampler: mi.Sampler,
+        subset: SampleSubset | None,
+        loss: RelativeL2,
+        primal: mi.Color3f | None,
+    ) -> dict[str, mi.Float]:
+        """The terms of the objective; see `objective`.
+
+        Args:
+            target: the photographs' pixels, linear RGB, one lane a pixel.
+            subset: the samples that L_θ learns of; None: all.
+        """
+
+
+class BounceSampler:
+    """A few bounces, then L_θ: the method of the paper and its ablations.
+
+    Also `ad-pt`: many bounces, all kept in memory, and nothing after them. (Mitsuba's `path` would
+    do, but asks textures, and so fields, inside virtual calls and several times a vertex: a step
+    took 8 to 60 times as long. Without a loop there is no Russian roulette either, which would save
+    nothing where all lanes wait for the longest path.)
+    """
+
+    can_be_recorded = True
+
+    def __init__(self, context: SamplerContext) -> None:
+        self._context = context
+        self.keeps_paths = context.method.follows_paths
+        self._bounces = context.max_depth - 1 if self.keeps_paths else context.bounces
+        self._requirements = requirements(context.method.terms, self._bounces)
+
+    def prepared(self) -> AbstractContextManager:
+        """Nothing is needed."""
+        return nullcontext()
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Radiance of camera samples."""
+        sample = self._trace(scene, ray, sampler, None)
+        return rhs(sample, sample.radiance[self._bounces], self._bounces)
+
+    def terms(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        target: mi.Color3f,
+        sampler: mi.Sampler,
+        subset: SampleSubset | None,
+        loss: RelativeL2,
+        primal: mi.Color3f | None,
+    ) -> dict[str, mi.Float]:
+        """The terms of the objective."""
+        sample = self._trace(scene, ray, sampler, subset)
+        return objective(self._context.method.terms, sample, target, loss, primal, self._bounces)
+
+    def _trace(
+        self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler, subset: SampleSubset | None
+    ) -> PathSample:
+        c = self._context
+        return trace(
+            c.scene_view.with_scene(scene),
+            c.radiance,
+            ray,
+            sampler,
+            self._requirements,
+            hide_emitters=c.hide_emitters,
+            subset=subset,
+        )
+
+
+class PathReplaySampler:
+    """Paths to their end, by Mitsuba's `prb`.
+
+    Raises:
+        UserError: the method has terms that are not of the image alone.
+    """
+
+    keeps_paths = False
+
+    def __init__(self, context: SamplerContext) -> None:
+        self._context, method = context, context.method
+        if list(method.terms) != [PHOTOMETRIC]:
+            what = f"the method {method.name} has other terms than {PHOTOMETRIC}"
+            raise UserError(what, None, f"The sampler {method.sampler} gives the image alone")
+        requirements(method.terms)
+        self._integrator = path_replay(context.max_depth, context.rr_depth, context.hide_emitters)
+        materials = context.scene_view.materials
+        fields = [] if materials is None else materials.fields.values()
+        # Inside Mitsuba's loop, networks are cooperative vectors.
+        networks = any(isinstance(getattr(f, "function", f), Network) for f in fields)
+        self.can_be_recorded = not networks or can_record_layout()
+
+    def prepared(self) -> AbstractContextManager:
+        """Paths find the fields' materials."""
+        return materials_along_paths(self._context.scene_view.materials)
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Radiance of camera samples."""
+        arrays = self._context.read_by_scene()
+        return path_radiance(self._integrator, scene, sampler, ray, arrays)
+
+    def terms(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        target: mi.Color3f,
+        sampler: mi.Sampler,
+        subset: SampleSubset | None,
+        loss: RelativeL2,
+        primal: mi.Color3f | None,
+    ) -> dict[str, mi.Float]:
+        """The terms of the objective: the photometric one."""
+        image = self.image(scene, ray, sampler)
+        weight = loss.weight(target)
+        return {PHOTOMETRIC: squared_error(image, target, self._context.spp, weight, primal)}
+
+
+SamplerFactory = Callable[[SamplerContext], PathSampler]
+
+_SAMPLERS: dict[str, SamplerFactory] = {BOUNCES: BounceSampler, PATH_REPLAY: PathReplaySampler}
+#: All samplers by name.
+SAMPLERS: Mapping[str, SamplerFactory] = MappingProxyType(_SAMPLERS)
+
+
+def register_sampler(name: str, factory: SamplerFactory) -> None:
+    """Add a sampler to the table; methods may name it from then on.
+
+    Raises:
+        ValueError: there is another sampler of this name.
+    """
+    if SAMPLERS.get(name, factory) is not factory:
+        raise ValueError(f"there is another sampler named {name}")
+    _SAMPLERS[name] = factory
+
+
+def make_sampler(context: SamplerContext) -> PathSampler:
+    """The sampler that a method names.
+
+    Raises:
+        UserError: there is no such sampler, or it cannot serve the method's terms.
+    """
+    name = context.method.sampler
+    if name not in SAMPLERS:
+        raise UserError(f"no sampler named {name!r}", remedy=f"There are {', '.join(SAMPLERS)}")
+    return SAMPLERS[name](context)

@@ -1,0 +1,158 @@
+"""The terms of the objective: what each reads of a path sample, and its value.
+
+A term of your own is a `Term` given to `register_term`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import UserError
+from .loss import RelativeL2, squared_error
+from .methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, Attached
+from .path_sample import PathSample, lhs, rhs
+from .prior import residual, residual_norm
+
+
+@dataclass(frozen=True)
+class TermInputs:
+    """What the value of a term is made of; what the method does not attach is a constant.
+
+    Args:
+        sample: path samples, as many consecutive lanes for each pixel.
+        lhs: L_θ at x₁, x₂, … on left-hand sides, linear RGB; zero where no term reads it.
+        rhs: the same on right-hand sides.
+        target: the photographs' pixels, linear RGB, one lane a pixel.
+        loss: what errors are relative to.
+        primal: an independent, detached estimate of the same pixels for the two-pass estimator;
+            None: the split-halves estimator. For terms of the image alone.
+        bounces: k, after which the image takes L_θ.
+    """
+
+    sample: PathSample
+    lhs: list[mi.Color3f]
+    rhs: list[mi.Color3f]
+    target: mi.Color3f
+    loss: RelativeL2
+    primal: mi.Color3f | None
+    bounces: int
+
+    @property
+    def spp(self) -> int:
+        """Lanes of the path samples a pixel."""
+        return dr.width(self.sample.x1.valid) // dr.width(self.target)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of the objective.
+
+    Vertices are given by number: 1 is x₁. Only what a term says here is computed for it, and only
+    that can be attached.
+
+    Args:
+        name: of methods' tables and of the log.
+        value: the term's value, one lane; smaller is better.
+        scene: vertices at which it reads how light scatters.
+        lhs: vertices at which it reads L_θ for a left-hand side.
+        rhs: vertices at which it reads L_θ for a right-hand side.
+        of_image: whether it reads the image: all camera samples, of k bounces and L_θ at the vertex
+            after those. All other terms read the samples that L_θ learns of.
+    """
+
+    name: str
+    value: Callable[[TermInputs], mi.Float]
+    scene: tuple[int, ...] = ()
+    lhs: tuple[int, ...] = ()
+    rhs: tuple[int, ...] = ()
+    of_image: bool = False
+
+    def __post_init__(self) -> None:
+        if self.of_image and (self.scene or self.lhs or self.rhs):
+            raise ValueError(f"{self.name}: a term of the image has no vertices of its own")
+        if min((*self.scene, *self.lhs, *self.rhs, 1)) < 1:
+            raise ValueError(f"{self.name}: vertices are numbered from 1")
+
+    def check(self, attached: Attached) -> None:
+        """Refuse edges that the term does not have: they would train nothing.
+
+        Raises:
+            UserError: there is one.
+        """
+        for flag in ("scene", "lhs", "rhs"):
+            has = flag != "lhs" if self.of_image else getattr(self, flag)
+            if getattr(attached, flag) and not has:
+                raise UserError(f"the term {self.name} has no {flag} that could be attached")
+
+
+_TERMS: dict[str, Term] = {}
+#: All terms by name.
+TERMS: Mapping[str, Term] = MappingProxyType(_TERMS)
+
+
+def register_term(term: Term) -> Term:
+    """Add a term to the table; methods may name it from then on.
+
+    Raises:
+        ValueError: there is another term of this name.
+    """
+    if TERMS.get(term.name, term) != term:
+        raise ValueError(f"there is another term named {term.name}")
+    _TERMS[term.name] = term
+    return term
+
+
+def term_named(name: str) -> Term:
+    """The term of this name.
+
+    Raises:
+        UserError: there is none.
+    """
+    if name not in TERMS:
+        raise UserError(f"no term named {name!r}", remedy=f"There are {', '.join(TERMS)}")
+    return TERMS[name]
+
+
+def photometric(x: TermInputs) -> mi.Float:
+    """The squared error of the image.
+
+    Paper: Eq. 5, Eq. 12.
+    """
+    pixels = rhs(x.sample, x.rhs[x.bounces], x.bounces)
+    return squared_error(pixels, x.target, x.spp, x.loss.weight(x.target), x.primal)
+
+
+def prior(x: TermInputs) -> mi.Float:
+    """The residual at x₁.
+
+    Paper: Eq. 10.
+    """
+    return residual_norm(residual(x.sample, 1, x.lhs[0], x.rhs[1]), x.lhs[0], x.loss.epsilon)
+
+
+def prior_extra(x: TermInputs) -> mi.Float:
+    """The residual at x₂.
+
+    Paper: Eq. 10, Sec. 4.2.
+    """
+    return residual_norm(residual(x.sample, 2, x.lhs[1], x.rhs[2]), x.lhs[1], x.loss.epsilon)
+
+
+def lhs_loss(x: TermInputs) -> mi.Float:
+    """The squared error of the radiance field seen directly.
+
+    Paper: Eq. 14, Sec. 4.3.
+    """
+    pixels = lhs(x.sample, x.lhs[0])
+    return squared_error(pixels, x.target, x.spp, x.loss.weight(x.target))
+
+
+register_term(Term(PHOTOMETRIC, photometric, of_image=True))
+register_term(Term(PRIOR, prior, scene=(1,), lhs=(1,), rhs=(2,)))
+register_term(Term(EXTRA, prior_extra, scene=(2,), lhs=(2,), rhs=(3,)))
+register_term(Term(LHS, lhs_loss, lhs=(1,)))
