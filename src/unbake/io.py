@@ -109,7 +109,27 @@ def relative(folder: Path, path: Path, what: str = "folder") -> str:
     return resolved.relative_to(root).as_posix()
 
 
-# -------------------------------------------------------------------------------------------- JSON
+# ------------------------------------------------------------------------------------ text and JSON
+
+
+def read_text(path: Path, remedy: str | None = None) -> str:
+    """The content of a UTF-8 text file.
+
+    Args:
+        remedy: what the user can do where the file cannot be read.
+
+    Raises:
+        UserError: the file is missing, unreadable, or not UTF-8.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise UserError("the file does not exist", path, remedy or "Check the path") from None
+    except OSError as error:
+        said = f"the file cannot be read ({error.strerror})"
+        raise UserError(said, path, remedy or "Check the path") from None
+    except UnicodeDecodeError:
+        raise UserError("the file is not UTF-8 text", path, remedy or "Repair it") from None
 
 
 def read_json(path: Path, remedy: str | None = None) -> Any:

@@ -18,6 +18,7 @@ from safetensors.numpy import load_file
 
 from unbake import cli
 from unbake.config import read_toml
+from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
@@ -266,3 +267,12 @@ def test_a_log_forgets_what_lies_after_a_step(tmp_path):
     assert log.read_text() == ""
     RunFolder(tmp_path / "new").forget_after(0)
     assert (tmp_path / "new" / "log.jsonl").read_text() == ""
+
+
+def test_a_log_that_is_no_text_is_named_and_forgotten_where_a_fit_goes_on(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_file.write_bytes(b'{"step": 1}\n\xff\xfe\n{"step": 2}\n')
+    with pytest.raises(UserError, match=r"log\.jsonl: the file is not UTF-8 text"):
+        run.log()
+    run.forget_after(2)
+    assert run.log() == [{"step": 1}, {"step": 2}]

@@ -20,11 +20,13 @@ from safetensors.numpy import save
 
 from ..errors import UserError
 from ..fields.network import from_numpy
-from ..io import write_atomically
+from ..io import check_format, write_atomically
 from .run_folder import RunFolder
 from .state import State
 
-FORMAT = "unbake-checkpoint-1"
+#: The newest format that can be read, and the one that is written.
+FORMAT = 1
+_NAME = "unbake-checkpoint-"
 
 
 @dataclass
@@ -53,7 +55,7 @@ def save_checkpoint(run: RunFolder, state: State, progress: Progress) -> Path:
     if state.scale is not None:
         arrays["scale"] = np.array(state.scale)
     metadata = {
-        "format": FORMAT,
+        "format": f"{_NAME}{FORMAT}",
         "step": str(progress.step),
         "seconds": repr(progress.seconds),
         "samples": str(progress.samples),
@@ -69,7 +71,8 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
     """Put the newest readable checkpoint into the state; None if none was written yet.
 
     Raises:
-        UserError: the checkpoint belongs to other settings, or all checkpoints are damaged.
+        UserError: the checkpoint belongs to other settings or was written by a newer version, or
+            all checkpoints are damaged.
     """
     written = run.written_checkpoints()
     for path in written:
@@ -80,8 +83,10 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
         except (SafetensorError, OSError, ValueError, TypeError, MemoryError):
             continue
         crc = metadata.pop("crc", None)
-        if metadata.get("format") != FORMAT or crc != str(_checksum(arrays, metadata)):
+        version = metadata.get("format", "").removeprefix(_NAME)
+        if crc != str(_checksum(arrays, metadata)) or not version.isdecimal():
             continue
+        check_format({"format": int(version)}, FORMAT, path)
         _restore(state, arrays, path)
         return Progress(int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"]))
     if written:

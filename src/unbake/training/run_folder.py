@@ -24,7 +24,7 @@ from typing import Any, final
 
 from ..config import FitConfig, read_toml, to_toml
 from ..errors import UserError
-from ..io import check_format, read_object, remove_unfinished, write_json, write_text
+from ..io import check_format, read_object, read_text, remove_unfinished, write_json, write_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -36,6 +36,7 @@ ORIGIN_FORMAT = 1
 METRICS_FORMAT = 1
 #: Checkpoints kept in a run folder.
 KEEP = 3
+_GIVE_RUN = "Give the folder of a run"
 
 
 @final
@@ -148,10 +149,10 @@ class RunFolder:
             UserError: the file is missing or is not TOML.
         """
         try:
-            return tomllib.loads(self.config_file.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            what = f"the settings cannot be read ({error})"
-            raise UserError(what, self.config_file, "Give the folder of a run") from error
+            return tomllib.loads(read_text(self.config_file, _GIVE_RUN))
+        except tomllib.TOMLDecodeError as error:
+            what = f"the settings are not valid TOML ({error})"
+            raise UserError(what, self.config_file, _GIVE_RUN) from None
 
     def write_settings(self, config: FitConfig) -> None:
         """Write the settings; from then on there is a run in this folder."""
@@ -193,8 +194,8 @@ class RunFolder:
         """
         file = self.log_file
         if not file.is_file():
-            raise UserError("the run has no log", file, "Give the folder of a run")
-        texts = [text for text in file.read_text(encoding="utf-8").splitlines() if text.strip()]
+            raise UserError("the run has no log", file, _GIVE_RUN)
+        texts = [text for text in read_text(file).splitlines() if text.strip()]
         lines = []
         for number, text in enumerate(texts, start=1):
             try:
@@ -210,7 +211,8 @@ class RunFolder:
         A resumed fit takes those steps again.
         """
         log, kept = self.log_file, []
-        for line in log.read_text(encoding="utf-8").splitlines() if log.is_file() else ():
+        lines = log.read_bytes().splitlines() if log.is_file() else ()
+        for line in (line.decode("utf-8", "replace") for line in lines):
             try:
                 if json.loads(line)["step"] <= step:
                     kept.append(line + "\n")

@@ -1,0 +1,117 @@
+"""Files: whole or not at all, inside their folder, and of a known format."""
+
+import errno
+import json
+import os
+
+import pytest
+
+from unbake.errors import UserError
+from unbake.io import (
+    check_format,
+    inside,
+    read_object,
+    read_text,
+    relative,
+    remove_unfinished,
+    write_atomically,
+    write_json,
+    write_text,
+)
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_a_durable_file_is_on_the_disk_before_it_has_its_name(durable, tmp_path, monkeypatch):
+    file, seen = tmp_path / "new" / "a.json", []
+    sync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda number: seen.append(file.exists()) or sync(number))
+    write_json(file, {"a": [1, 2]}, durable=durable)
+    assert seen == ([False] if durable else [])
+    assert json.loads(file.read_text()) == {"a": [1, 2]}
+    assert [p.name for p in file.parent.iterdir()] == ["a.json"]
+
+
+def test_a_full_disk_leaves_the_old_file_and_is_told_in_short(tmp_path, monkeypatch):
+    file = tmp_path / "a.txt"
+    write_text(file, "old")
+
+    def full(number):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError) as caught:
+        write_text(file, "new", durable=True)
+    assert str(caught.value) == f"{file}: the file cannot be written (No space left on device)"
+    assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
+
+
+def test_numbers_that_json_lacks_leave_no_file(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "a.json", float("nan"), allow_nan=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+    keep = [tmp_path / name for name in ("a.txt", "b.tmp", ".hidden")]
+    for file in keep:
+        file.write_text("mine")
+    temporary = []
+
+    def die(path):
+        path.write_text("half")
+        temporary.append(path)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "a.txt", die)
+    assert not temporary[0].exists()
+    temporary[0].write_text("half")
+    remove_unfinished(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(keep)
+    remove_unfinished(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["../b", "a/../../b", "/etc/passwd", "link/b"])
+def test_a_path_may_not_leave_its_folder(name, tmp_path):
+    folder = tmp_path / "data"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path)
+    with pytest.raises(UserError, match=r"a\.json: frame 3: .* lies outside the folder"):
+        inside(folder, name, "a.json: frame 3")
+    with pytest.raises(UserError, match="lies outside the data set"):
+        relative(folder, folder / name, "data set")
+
+
+def test_a_path_inside_is_relative_and_back(tmp_path):
+    assert inside(tmp_path, "a/../b/c.exr", "here") == tmp_path / "a/../b/c.exr"
+    assert relative(tmp_path, tmp_path / "a" / ".." / "b" / "c.exr") == "b/c.exr"
+    with pytest.raises(UserError, match="is not a path"):
+        inside(tmp_path, "a\0b", "here")
+
+
+def test_what_is_not_text_or_no_object_is_named(tmp_path):
+    file = tmp_path / "a.json"
+    with pytest.raises(UserError, match=r"a\.json: the file does not exist. Make it"):
+        read_object(file, "Make it")
+    with pytest.raises(UserError, match=r"a\.json: the file does not exist. Check the path"):
+        read_text(file)
+    file.write_text("[1]")
+    with pytest.raises(UserError, match=r"a\.json: the file does not hold a JSON object"):
+        read_object(file)
+    file.write_bytes(b"\xff{}")
+    with pytest.raises(UserError, match=r"a\.json: the file is not UTF-8 text"):
+        read_text(file)
+    with pytest.raises(UserError, match=r"a\.json: the file is not readable JSON"):
+        read_object(file)
+    with pytest.raises(UserError, match=r"cannot be read .Is a directory"):
+        read_text(tmp_path)
+
+
+def test_a_format_is_the_first_unless_it_says_another():
+    assert check_format({}, 1, "here") == 1
+    assert check_format({"format": 2}, 3, "here") == 2
+    with pytest.raises(UserError) as caught:
+        check_format({"format": 4}, 3, "here")
+    assert str(caught.value) == (
+        "here: was written by a newer unbake (format 4; this one reads up to 3). Update unbake"
+    )
