@@ -69,7 +69,10 @@ def test_every_run_sets_a_target_for_all():
     assert targets[1].seconds == {"fast": 2, "slow": 10, "none": None}
 
 
-def test_the_table_of_benchmarks_and_the_comparison_agree_on_the_time_to_quality(repository):
+def test_the_table_of_benchmarks_and_the_comparison_agree_on_the_time_to_quality(
+    repository, monkeypatch
+):
+    monkeypatch.syspath_prepend(repository / "benchmarks")
     table = runpy.run_path(str(repository / "benchmarks" / "tables.py"))["time_to_quality"]
     noisy = curve((0, 10), (10, 21), (20, 19), (30, 23), (40, 22))
     runs = {"methods": {"ours": {"score": noisy}}}
