@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .config import read_toml as read_toml
     from .config import to_toml as to_toml
     from .dataset.camera import Camera as Camera
+    from .dataset.data_folder import DataFolder as DataFolder
     from .dataset.pixels import CameraRays as CameraRays
     from .dataset.pixels import PixelBatch as PixelBatch
     from .dataset.pixels import PixelSource as PixelSource
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
     from .training.problem import make_problem as make_problem
     from .training.problem import training_pixels as training_pixels
     from .training.recovered import load_run as load_run
+    from .training.run_folder import Origin as Origin
+    from .training.run_folder import RunFolder as RunFolder
     from .training.schedule import learning_rates as learning_rates
     from .training.state import State as State
     from .training.state import initial_state as initial_state
@@ -97,6 +100,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "report.page": ("write_report",),
     # Data sets.
     "dataset.camera": ("Camera",),
+    "dataset.data_folder": ("DataFolder",),
     "dataset.pixels": ("CameraRays", "PixelBatch", "PixelSource", "RayBatch"),
     "dataset.views": ("Dataset", "View"),
     # Unknowns: fields on surfaces.
@@ -117,6 +121,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     # The parts of a training loop.
     "training.checkpoint": ("Progress", "load_checkpoint", "save_checkpoint"),
     "training.problem": ("Problem", "make_problem", "training_pixels"),
+    "training.run_folder": ("Origin", "RunFolder"),
     "training.schedule": ("learning_rates",),
     "training.state": ("State", "initial_state"),
     "training.step": ("TrainingStep",),

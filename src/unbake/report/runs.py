@@ -49,7 +49,7 @@ class Run:
 @final
 @dataclass(frozen=True)
 class View:
-    """One posed picture of the data; `truth` lacks the quantities nobody knows."""
+    """One posed image of the data set; `truth` holds the quantities that have ground truth."""
 
     name: str
     split: str
@@ -121,7 +121,7 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
     """Every evaluated held-out view, then at most four training views, evenly spaced.
 
     Raises:
-        UserError: a view was evaluated that the data lacks.
+        UserError: an evaluated view is missing from the data set.
     """
     evaluated = {row["name"] for run in runs for row in run.metrics["per_view"]}
     unknown = evaluated - {view.name for view in dataset.views}
@@ -131,10 +131,8 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
             dataset.folder,
             f"{runs[0].folder.evaluate_again} again",
         )
-    heldout, training = (
-        [_view(view) for view in views if view.name in evaluated]
-        for views in (dataset.heldout, dataset.train)
-    )
+    heldout = [_view(view) for view in dataset.heldout if view.name in evaluated]
+    training = [_view(view) for view in dataset.train if view.name in evaluated]
     if len(training) > TRAINING_VIEWS:
         chosen = np.linspace(0, len(training) - 1, TRAINING_VIEWS).round().astype(int)
         training = [training[i] for i in chosen]
