@@ -35,7 +35,7 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
         assert f"{row['milliseconds_per_step']:.1f}" in done.out
 
 
-PARTS = {"batch", "ray tracing", "BSDFs and lights", "losses", "gradients", "optimiser"}
+PHASES = {"batch", "ray tracing", "BSDFs and lights", "losses", "gradients", "optimiser"}
 
 
 def test_a_method_that_fails_does_not_keep_others_from_being_measured(
@@ -72,21 +72,21 @@ def test_one_method_is_taken_apart(unbake, cornell, tiny, tmp_path, method, more
     assert done.status == 0, done.err
     result = json.loads(out.read_text())
     assert result["method"] == method and result["compiled"] == 0 and result["launches"] > 0
-    parts = result["parts"]
-    wanted = PARTS | more if method != "prb" else more | {"batch", "gradients", "optimiser"}
-    assert wanted <= parts.keys()
-    assert all(row["launches"] > 0 and row["milliseconds"] > 0 for row in parts.values())
+    phases = result["phases"]
+    wanted = PHASES | more if method != "prb" else more | {"batch", "gradients", "optimiser"}
+    assert wanted <= phases.keys()
+    assert all(row["launches"] > 0 and row["milliseconds"] > 0 for row in phases.values())
     assert result["milliseconds_in_kernels"] > 0 and result["milliseconds_in_python"] > 0
     assert f"{result['milliseconds_per_step']:.1f} ms a step" in done.out
     assert result["memory_mb"]["peak"] >= result["memory_mb"]["now"] > 0
-    assert (result["floor"] is None) == (method == "prb")
+    assert (result["roofline"] is None) == (method == "prb")
 
 
-def test_the_floor_counts_what_a_step_must_do(unbake, cornell, tiny, tmp_path):
+def test_the_roofline_counts_what_a_step_must_do(unbake, cornell, tiny, tmp_path):
     out = tmp_path / "step.json"
     assert bench(unbake, "step", cornell, tiny, out, "ours").status == 0
     result = json.loads(out.read_text())
-    work, rates, roofline = (result["floor"][k] for k in ("work", "rates", "milliseconds"))
+    work, rates, roofline = (result["roofline"][k] for k in ("work", "rates", "milliseconds"))
     samples, learned = 64 * 4, 64 * 2
     # From the camera and at x1 one to a light and one by the BSDF; at x2 where L learns of it.
     assert work["rays"] == 3 * samples + 2 * learned

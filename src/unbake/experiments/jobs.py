@@ -142,7 +142,8 @@ class JobRunner:
         A job that fails or is stopped does not keep the others from running.
 
         Args:
-            until: value of `time.monotonic()` after which no further job starts.
+            until: value of `time.monotonic()` after which no further job starts. One always does,
+                so that calls come to an end.
 
         Raises:
             KeyboardInterrupt: SIGINT or SIGTERM arrived. Finished jobs are kept.
@@ -153,8 +154,8 @@ class JobRunner:
             raise ValueError("two jobs have the same name")
         failed: dict[str, UserError] = {}
         with _interrupted_by_sigterm():
-            for job in self.left(jobs):
-                if until is not None and time.monotonic() >= until:
+            for number, job in enumerate(self.left(jobs)):
+                if number and until is not None and time.monotonic() >= until:
                     break
                 self.console.rule(job.name, align="left")
                 try:

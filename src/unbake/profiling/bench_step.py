@@ -74,9 +74,9 @@ def bench_step(
     result = {"machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(fit.step, fit.state, config, steps)
-    result["parts"] = _taken_apart(fit.step, fit.state)
+    result["phases"] = _taken_apart(fit.step, fit.state)
     result["memory_mb"] = _memory(fit.pixels, fit.state)
-    result["floor"] = roofline(fit.problem, fit.pixels, fit.state, config)
+    result["roofline"] = roofline(fit.problem, fit.pixels, fit.state, config)
     _print(result, console)
     if out is not None:
         write_json(out, result)
@@ -119,13 +119,13 @@ def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -
 
 
 def _taken_apart(step: TrainingStep, state: State) -> dict:
-    """Milliseconds and launches of each part of a step, medians over steps traced anew."""
+    """Milliseconds and launches of each phase of a step: medians over steps traced anew."""
     recorded = []
     for i in range(APART + 1):
-        parts = Phases()
-        with parts.recorded():
+        phases = Phases()
+        with phases.recorded():
             step.unfrozen(state, i)
-        recorded.append(parts.kernels)
+        recorded.append(phases.kernels)
     return {
         name: {
             "milliseconds": statistics.median(milliseconds(one[name]) for one in recorded[1:]),
@@ -174,20 +174,20 @@ def _print(result: dict, console: Console) -> None:
         f"{result['compiled']} compiled, {result['milliseconds_in_python']:.1f} ms in Python "
         f"({result['milliseconds_in_python'] / wall:.0%}); traced {result['recordings']} times"
     )
-    table = Table("the step taken apart", "launches", "ms", "of it products", "share")
-    total = sum(row["milliseconds"] for row in result["parts"].values())
-    for name, row in sorted(result["parts"].items(), key=lambda item: -item[1]["milliseconds"]):
+    table = Table("phase", "launches", "ms", "of it products", "share")
+    total = sum(row["milliseconds"] for row in result["phases"].values())
+    for name, row in sorted(result["phases"].items(), key=lambda item: -item[1]["milliseconds"]):
         ms = row["milliseconds"]
         cells = f"{ms:.2f}", f"{row['products']:.2f}", f"{ms / total:.0%}"
         table.add_row(name, str(row["launches"]), *cells)
     console.print(table)
     memory = result["memory_mb"]
     console.print("memory, MB: " + ", ".join(f"{name} {mb:.0f}" for name, mb in memory.items()))
-    least = result["floor"]
+    least = result["roofline"]
     if least is not None:
         ms = least["milliseconds"]
         console.print(
-            f"floor {ms['all']:.1f} ms (rays {ms['rays']:.1f}, products "
+            f"roofline {ms['all']:.1f} ms (rays {ms['rays']:.1f}, products "
             f"{ms['multiply_adds']:.1f}, bytes {ms['bytes']:.1f}); the step takes "
             f"{wall / ms['all']:.1f} times as long"
         )
