@@ -29,6 +29,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PY
 from rich.console import Console  # noqa: E402
 from summary import machine_results, read, summary  # noqa: E402
 
+from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 from unbake.experiments.commands import (  # noqa: E402
     call_settings,
@@ -266,7 +267,8 @@ class Bench:
             return {}
 
         seconds = 5 + shots.samples / 600_000
-        return [Job(f"data-{name}", vars(shots), work, seconds, files=[folder / "transforms.json"])]
+        files = [DataFolder(folder).transforms_file]
+        return [Job(f"data-{name}", vars(shots), work, seconds, files=files)]
 
     def _capture(self, name: str) -> Capture:
         if self.scale == "smoke":

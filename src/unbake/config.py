@@ -374,6 +374,9 @@ def from_toml(text: str, where: str = "settings") -> FitConfig:
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"not valid TOML ({error})", where=where) from None
     try:
+        # Version 0.1 spelled it the British way.
+        if "regularisation" in table:
+            table["regularization"] = table.pop("regularisation")
         name = _typed(table.get("preset", "cpu"), PresetName, "preset")
         return _update(preset(name), table, ())
     except UserError as error:
