@@ -38,7 +38,7 @@ def context(folder, **others) -> ExperimentContext:
     return ExperimentContext("smoke", folder, folder, Console(quiet=True), **others)
 
 
-def squares(done: list, numbers=(2, 3), offset=0, files=(), plots=False) -> Experiment:
+def squares(done: list, numbers=(2, 3), offset=0, files=()) -> Experiment:
     """An experiment that notes what it does."""
 
     def work(number):
@@ -55,7 +55,7 @@ def squares(done: list, numbers=(2, 3), offset=0, files=(), plots=False) -> Expe
         rows = [{"job": name} | f for name, f in findings.items()]
         return ExperimentResult(rows, markdown(["a", "b"], [[1, None]]))
 
-    return Experiment("squares", "Squares", jobs, result, plots)
+    return Experiment("squares", "Squares", jobs, result)
 
 
 def test_jobs_that_are_done_are_not_done_again(tmp_path):
@@ -116,14 +116,6 @@ def test_a_job_that_fails_does_not_keep_others_from_being_done(tmp_path):
     with pytest.raises(UserError, match=r"squares, first: no luck. Try again"):
         reproduce(failing, context(tmp_path))
     assert done == [2, 3] and not (tmp_path / "squares").exists()
-
-
-def test_figures_that_cannot_be_drawn_are_not_begun(tmp_path, monkeypatch):
-    done = []
-    monkeypatch.setattr(experiment, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match="matplotlib"):
-        reproduce(squares(done, plots=True), context(tmp_path))
-    assert not done
 
 
 def test_a_plan_does_nothing(tmp_path):

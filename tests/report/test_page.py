@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -140,6 +144,8 @@ def test_the_page_shows_every_view_run_and_number(made, tmp_path: Path):
     assert "4 of 6 views, evenly spaced" in text
     assert text.index("heldout_000") < text.index("train_000")
     assert page.count("svg") == 4 + 6
+    assert "<title>Photometric loss over training time, seconds</title>" in text
+    assert re.findall(r"<g><title>(\w+)</title>", text).count("ours") == 4 + 6
     assert "40.00" in text and "20.00" in text and "1.64\N{NO-BREAK SPACE}M" in text
     assert '<td class="n best first">40.00</td>' in text
     assert "10 log10(1/MSE)" in text
@@ -517,38 +523,104 @@ def test_what_is_missing_is_named(made, tmp_path: Path, change, said: str):
 # ------------------------------------------------------------------------------------------- curves
 
 
+def _drawn(figure) -> tuple[list, list]:
+    """The curves and the bands of a chart."""
+    (axes,) = figure.axes
+    curves = [line for line in axes.lines if (line.get_gid() or "").startswith("run-")]
+    return curves, list(axes.collections)
+
+
 def test_a_resumed_log_draws_each_step_once_and_in_order():
     log = [{"step": s, "v": v} for s, v in ((0, 1.0), (10, 2.0), (5, 3.0), (10, 4.0))]
     log += [{"step": 11, "v": math.nan}, {"step": 12}, {"step": 13, "v": None}]
-    drawn = charts.chart([log], "step", "step", lambda r: r.get("v"), False)
-    assert drawn is not None
-    points = re.findall(r"([\d.]+) ([\d.]+)", drawn.lines[0].path)
-    across = [float(x) for x, _ in points]
-    assert len(points) == 3 and across == sorted(across) and not drawn.lines[0].band
+    figure = charts.chart([log], "step", "step", lambda r: r.get("v"), False)
+    assert figure is not None
+    (curve,), bands = _drawn(figure)
+    assert curve.get_xydata().tolist() == [[0, 1], [5, 3], [10, 4]] and not bands
 
 
 def test_many_points_are_summarised_with_a_band_inside_the_chart():
     rng = np.random.default_rng(0)
     log = [{"step": s, "v": float(v)} for s, v in enumerate(rng.lognormal(0, 2, 5000))]
-    drawn = charts.chart([log, []], "step", "step", lambda r: r["v"], True)
-    assert drawn is not None and len(drawn.lines) == 1
-    line = drawn.lines[0]
-    assert line.path.count("L") == charts.BINS - 1
-    heights = [float(y) for _, y in re.findall(r"([\d.]+) ([\d.]+)", line.path + line.band)]
-    assert charts.TOP <= min(heights) and max(heights) <= charts.BOTTOM
-    assert len(drawn.y_ticks) > 1
+    figure = charts.chart([log, []], "step", "step", lambda r: r["v"], True)
+    assert figure is not None
+    (curve,), (band,) = _drawn(figure)
+    x, y = curve.get_xydata().T
+    assert len(x) == charts.BINS
+    # Of a log-normal distribution with σ = 2: the median, the 10th and the 90th percentile.
+    np.testing.assert_allclose(np.log(y), 0, atol=1.2)
+    np.testing.assert_allclose(np.log(y).mean(), 0, atol=0.1)
+    edges = np.log(band.get_paths()[0].vertices[:, 1])
+    assert np.mean(edges[edges < 0]) == pytest.approx(-2.56, abs=0.2)
+    assert np.mean(edges[edges > 0]) == pytest.approx(2.56, abs=0.2)
+    (axes,) = figure.axes
+    (left, right), (low, high) = axes.get_xlim(), np.log(axes.get_ylim())
+    assert left <= x.min() and x.max() <= right
+    assert low <= edges.min() and edges.max() <= high and high - low < 1.2 * np.ptp(edges)
+    assert axes.get_yscale() == "log" and len(_ticks(axes.yaxis)) > 1
+
+
+def _ticks(axis) -> list[str]:
+    """The labels of an axis that are seen."""
+    low, high = axis.get_view_interval()
+    places = zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True)
+    return [label.get_text() for at, label in places if low <= at <= high]
 
 
 @pytest.mark.parametrize("logarithmic", [False, True])
 @pytest.mark.parametrize("values", [[5.0], [2.0, 2.0], [1e-9, 1e9], [0.3, 0.31], [1234567.0, 2.0]])
 def test_axes_have_ticks_for_any_range(values: list[float], logarithmic: bool):
     log = [{"step": i, "v": v} for i, v in enumerate(values)]
-    drawn = charts.chart([log], "step", "step", lambda r: r["v"], logarithmic)
-    assert drawn is not None
-    for ticks in (drawn.x_ticks, drawn.y_ticks):
+    figure = charts.chart([log], "step", "step", lambda r: r["v"], logarithmic)
+    assert figure is not None
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    for ticks in (_ticks(axes.xaxis), _ticks(axes.yaxis)):
         assert 2 <= len(ticks) <= 14
-        assert len({tick.label for tick in ticks}) == len(ticks)
+        assert len(set(ticks)) == len(ticks) and all(ticks)
 
 
 def test_a_term_that_no_run_has_draws_no_chart():
     assert charts.chart([[{"step": 1, "v": 0.0}]], "step", "step", lambda r: r["v"], True) is None
+
+
+def test_an_embedded_chart_takes_colours_and_fonts_from_the_page():
+    """Ten runs: eight colours of the legend, then the same ones dashed. Names are no markup."""
+    logs = [[{"step": s, "v": 1.5 + run + s} for s in range(200)] for run in range(10)]
+    figure = charts.chart(logs, "step", "step", lambda r: r["v"], True)
+    names = [f"{EVIL}{run}" for run in range(10)]
+    svg = charts.inline_svg(figure, "Loss over step", names)
+    assert svg == charts.inline_svg(figure, "Loss over step", names)
+    root = ElementTree.fromstring(svg)
+    assert root.tag == "svg" and root.find("title").text == "Loss over step"
+    told = {
+        group.find("title").text: group for group in root.iter("g") if len(group.findall("title"))
+    }
+    assert list(told) == names
+    for run, name in enumerate(names):
+        style = told[name].find("path").get("style")
+        assert f"stroke: var(--c{run % 8})" in style and ("dasharray" in style) == (run >= 8)
+    assert {t.text for t in root.iter("text")} >= {"step", "0", "50", "10", "100"}
+    assert not re.search("#[0-9a-f]{6}|font|url|://|<style|<metadata", svg)
+
+
+def test_charts_do_not_follow_the_matplotlib_configuration_of_a_user():
+    import matplotlib
+
+    log = [{"step": s, "v": s} for s in range(9)]
+    texts = []
+    for changes in ({}, {"axes.facecolor": "red", "lines.linewidth": 9, "svg.fonttype": "path"}):
+        with matplotlib.rc_context(changes):
+            figure = charts.chart([log], "step", "step", lambda r: r["v"], False)
+            texts.append(charts.inline_svg(figure, "t", ["a"]))
+            assert not changes or matplotlib.rcParams["lines.linewidth"] == 9
+    assert texts[0] == texts[1]
+
+
+def test_matplotlib_is_imported_by_drawing_alone():
+    code = "import sys, unbake.cli, unbake.report.page; print('matplotlib' in sys.modules)"
+    source = {"PYTHONPATH": str(Path(charts.__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | source, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["False"]

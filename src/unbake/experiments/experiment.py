@@ -8,7 +8,6 @@ import shutil
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, final
 
@@ -88,14 +87,12 @@ class Experiment:
         jobs: makes its jobs, in the order in which they run. Raises `UserError` if scenes are
             missing.
         result: makes the result from the findings of the jobs, by name.
-        plots: whether its figure needs matplotlib.
     """
 
     name: str
     title: str
     jobs: Callable[[ExperimentContext], list[Job]]
     result: Callable[[ExperimentContext, Mapping[str, Findings]], ExperimentResult]
-    plots: bool = False
 
 
 def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool = False) -> None:
@@ -111,8 +108,6 @@ def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool 
         OSError: the folder cannot be made.
         KeyboardInterrupt: SIGINT or SIGTERM arrived. The same call continues.
     """
-    if experiment.plots and find_spec("matplotlib") is None:
-        raise UserError("figures need matplotlib", remedy="pip install 'unbake[plots]'")
     jobs = experiment.jobs(context)
     runner = JobRunner(
         context.work / experiment.name, context.console, machine, slowness, _release_memory

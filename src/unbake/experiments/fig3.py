@@ -127,6 +127,4 @@ def _draw(path: Path, rows: list[dict]) -> None:
     save_figure(figure, path)
 
 
-EXPERIMENT = Experiment(
-    "fig3", "Time of a step, scene by scene (Fig. 3)", _jobs, _result, plots=True
-)
+EXPERIMENT = Experiment("fig3", "Time of a step, scene by scene (Fig. 3)", _jobs, _result)

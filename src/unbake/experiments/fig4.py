@@ -347,6 +347,4 @@ def _draw(path: Path, tables: Mapping, theirs: Mapping) -> None:
     save_figure(figure, path)
 
 
-EXPERIMENT = Experiment(
-    "fig4", "Gradients of a roughness in STAIRCASE (Fig. 4)", _jobs, _result, plots=True
-)
+EXPERIMENT = Experiment("fig4", "Gradients of a roughness in STAIRCASE (Fig. 4)", _jobs, _result)

@@ -237,6 +237,4 @@ def _draw(path: Path, rows: list[dict]) -> None:
     save_figure(figure, path)
 
 
-EXPERIMENT = Experiment(
-    "fig5", "A step in the cube as paths get longer (Fig. 5)", _jobs, _result, plots=True
-)
+EXPERIMENT = Experiment("fig5", "A step in the cube as paths get longer (Fig. 5)", _jobs, _result)

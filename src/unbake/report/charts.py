@@ -1,55 +1,63 @@
-"""Small charts of a run's log: what to draw, in the coordinates of an SVG picture."""
+"""Charts of a run's log: matplotlib figures, and the SVG of them that a page holds.
+
+matplotlib is imported by the functions that draw: its import takes longer than `unbake --help`.
+"""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
+from xml.etree import ElementTree
 
 import numpy as np
 
-WIDTH, HEIGHT = 400, 250
-LEFT, RIGHT, TOP, BOTTOM = 50, 388, 10, 212  # the plotting area inside it
+if TYPE_CHECKING:
+    from matplotlib.axis import YAxis
+    from matplotlib.figure import Figure
+
+#: CSS variables of the page and their colours in light mode, which are those of the figures.
+COLOURS = {
+    "soft": "#615e58", "hair": "#ebe8e1",
+    "c0": "#1f62b0", "c1": "#c8500f", "c2": "#12806a", "c3": "#8f3aa8",
+    "c4": "#96700a", "c5": "#4f5b6b", "c6": "#c01c4a", "c7": "#557a12",
+}  # fmt: skip
 BINS = 120  # more points than this are summarised, one point a bin
-TICKS = 6  # wanted on a linear axis
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_RUNS = 8  # colours of runs; further runs have the same ones and dashed curves
+_SIZE = (400, 250)  # pixels
+_EDGES = {"left": 50 / 400, "right": 388 / 400, "bottom": 38 / 250, "top": 240 / 250}
+_TICKS = 6  # wanted on a linear axis
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_STYLE = {
+    "axes.edgecolor": COLOURS["soft"],
+    "axes.axisbelow": True,
+    "axes.spines.left": False,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.labelcolor": COLOURS["soft"],
+    "font.size": 12,
+    "grid.color": COLOURS["hair"],
+    "grid.linewidth": 1,
+    "lines.linewidth": 1.7,
+    "lines.markersize": 5.2,
+    "xtick.color": COLOURS["soft"],
+    "ytick.color": COLOURS["soft"],
+    "ytick.major.size": 0,
+    "ytick.minor.size": 0,
+    # Text stays text, in the font of the page.
+    "svg.fonttype": "none",
+}
+
+Record = dict[str, Any]
 
 
 @final
 @dataclass(frozen=True)
-class Tick:
-    """A labelled place on an axis, in SVG units."""
-
-    at: float
-    label: str
-
-
-@final
-@dataclass(frozen=True)
-class Line:
-    """One run's curve: an SVG path, a band around it (empty where nothing was summarised)."""
-
-    run: int
-    path: str
-    band: str
-    end: tuple[float, float]
-
-
-@final
-@dataclass(frozen=True)
-class Chart:
-    """Axes and curves of one quantity for all runs."""
-
-    x_title: str
-    x_ticks: list[Tick]
-    y_ticks: list[Tick]
-    lines: list[Line]
-
-
-@final
-@dataclass(frozen=True)
-class _Series:
+class _Curve:
     """Points of one run, with a lower and an upper edge where several were summarised."""
 
     run: int
@@ -59,17 +67,14 @@ class _Series:
     high: np.ndarray | None
 
 
-Record = dict[str, Any]
-
-
 def chart(
     logs: Sequence[list[Record]],
     x_key: str,
     x_title: str,
     y_of: Callable[[Record], object],
     logarithmic: bool,
-) -> Chart | None:
-    """Lay out one quantity of several logs over steps or seconds.
+) -> Figure | None:
+    """Draw one quantity of several logs over steps or seconds.
 
     More than 120 points of a run are summarised in equal intervals of x: the line is their mean
     (geometric on a logarithmic axis), the band reaches from their 10th to their 90th percentile.
@@ -82,46 +87,57 @@ def chart(
         logarithmic: whether y is logarithmic; values that are not positive are then left out.
 
     Returns:
-        None where no run has a value.
+        A figure whose curves have the group ids `run-0`, `run-1`, …; None where no run has a value.
     """
-    series = []
+    curves = []
     for run, log in enumerate(logs):
         x, y = _points(log, x_key, y_of, logarithmic)
         if len(x):
-            series.append(_summarise(run, x, y))
-    if not series:
-        return None
-    x_low = min(0.0, min(float(s.x.min()) for s in series))
-    x_high = max(float(s.x.max()) for s in series)
-    x_high = x_high if x_high > x_low else x_low + 1
-    y_low, y_high = _padded(
-        min(float(s.y.min()) for s in series), max(float(s.y.max()) for s in series)
-    )
+            curves.append(_summarise(run, x, y, logarithmic))
+    return _draw(curves, x_title, logarithmic) if curves else None
 
-    def place(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        across = LEFT + (x - x_low) / (x_high - x_low) * (RIGHT - LEFT)
-        up = BOTTOM - np.clip((y - y_low) / (y_high - y_low), 0, 1) * (BOTTOM - TOP)
-        return across, up
 
-    x_values = _round_values(x_low, x_high, TICKS)
-    x_at = place(np.array(x_values), np.zeros(len(x_values)))[0]
-    y_marks = _decades(y_low, y_high) if logarithmic else _plain(y_low, y_high)
-    y_at = place(np.zeros(len(y_marks)), np.array([value for value, _ in y_marks]))[1]
-    return Chart(
-        x_title,
-        [
-            Tick(round(float(at), 1), _short(value))
-            for value, at in zip(x_values, x_at, strict=True)
-        ],
-        [Tick(round(float(at), 1), text) for (_, text), at in zip(y_marks, y_at, strict=True)],
-        [_line(s, place) for s in series],
-    )
+def inline_svg(figure: Figure, title: str, labels: Sequence[str]) -> str:
+    """A figure as an `<svg>` element for the page, the same for the same figure.
+
+    Colours become the page's CSS variables, so that they follow its light and dark mode, and fonts
+    are left to the page.
+
+    Args:
+        figure: from `chart`.
+        title: names the chart to screen readers, and makes ids unique on the page.
+        labels: names of the runs, told where the mouse is on a curve.
+    """
+    file = io.StringIO()
+    with _style({"svg.hashsalt": title}):
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(file, format="svg", transparent=True, metadata=nothing)
+    root = ElementTree.fromstring(file.getvalue())
+    for element in root.iter():
+        _for_html(element)
+    for parent in list(root.iter()):
+        for child in list(parent):
+            # A style element would hold for the whole page.
+            if child.tag in ("metadata", "style"):
+                parent.remove(child)
+    for element in root.iter():
+        run = re.fullmatch(r"run-(\d+)", element.get("id", ""))
+        if run:
+            name = ElementTree.Element("title")
+            name.text = labels[int(run[1])]
+            element.insert(0, name)
+    _without_unused_ids(root)
+    root.attrib = {"viewBox": root.get("viewBox", ""), "role": "img", "aria-label": title}
+    name = ElementTree.Element("title")
+    name.text = title
+    root.insert(0, name)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _points(
     log: list[Record], x_key: str, y_of: Callable[[Record], object], logarithmic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finite points in the order of x (y as log10 where asked for).
+    """Finite points in the order of x.
 
     A run that went on from a checkpoint repeats steps: the last record of an x counts.
     """
@@ -131,79 +147,85 @@ def _points(
         if not (isinstance(x, int | float) and isinstance(y, int | float)):
             continue
         if math.isfinite(x) and math.isfinite(y) and (y > 0 or not logarithmic):
-            points[float(x)] = math.log10(y) if logarithmic else float(y)
+            points[float(x)] = float(y)
     ordered = sorted(points.items())
     return np.array([x for x, _ in ordered]), np.array([y for _, y in ordered])
 
 
-def _summarise(run: int, x: np.ndarray, y: np.ndarray) -> _Series:
+def _summarise(run: int, x: np.ndarray, y: np.ndarray, logarithmic: bool) -> _Curve:
     if len(x) <= BINS:
-        return _Series(run, x, y, None, None)
+        return _Curve(run, x, y, None, None)
     edges = np.linspace(x[0], x[-1], BINS + 1)
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
     groups = [index == i for i in np.unique(index)]
-    low, high = np.array([np.percentile(y[group], (10, 90)) for group in groups]).T
-    return _Series(
-        run,
-        np.array([x[group].mean() for group in groups]),
-        np.array([y[group].mean() for group in groups]),
-        low,
-        high,
-    )
+    scaled = np.log(y) if logarithmic else y
+    rows = [(scaled[g].mean(), *np.percentile(scaled[g], (10, 90))) for g in groups]
+    mean, low, high = np.exp(rows).T if logarithmic else np.array(rows).T
+    return _Curve(run, np.array([x[g].mean() for g in groups]), mean, low, high)
 
 
-def _line(
-    series: _Series, place: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-) -> Line:
-    x, y = place(series.x, series.y)
-    band = ""
-    if series.low is not None and series.high is not None:
-        upper, lower = place(series.x, series.high)[1], place(series.x, series.low)[1]
-        band = _path(np.concatenate([x, x[::-1]]), np.concatenate([upper, lower[::-1]])) + "Z"
-    return Line(series.run, _path(x, y), band, (round(float(x[-1]), 1), round(float(y[-1]), 1)))
+def _draw(curves: list[_Curve], x_title: str, logarithmic: bool) -> Figure:
+    with _style({}):
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+        # One unit of the SVG is a 72nd of an inch to matplotlib and a pixel to the page.
+        figure = Figure(figsize=(_SIZE[0] / 72, _SIZE[1] / 72), dpi=72)
+        axes = figure.add_axes(_axes_rectangle())
+        for curve in curves:
+            colour = COLOURS[f"c{curve.run % _RUNS}"]
+            # Nothing lies outside the axes, and clip paths are references by url.
+            if curve.low is not None and curve.high is not None:
+                band = {"color": colour, "alpha": 0.14, "linewidth": 0, "clip_on": False}
+                axes.fill_between(curve.x, curve.low, curve.high, **band)
+            dashes = "--" if curve.run >= _RUNS else "-"
+            (line,) = axes.plot(curve.x, curve.y, dashes, color=colour, clip_on=False)
+            line.set(marker="o", markevery=[len(curve.x) - 1], gid=f"run-{curve.run}")
+            line.set(solid_joinstyle="round", solid_capstyle="round", markeredgewidth=0)
+        first = min(0.0, min(float(c.x.min()) for c in curves))
+        last = max(float(c.x.max()) for c in curves)
+        axes.set_xlim(first, last if last > first else first + 1)
+        axes.set_xlabel(x_title)
+        axes.xaxis.set_major_locator(MaxNLocator(_TICKS, steps=[1, 2, 5, 10]))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+        axes.grid(axis="y", clip_on=False)
+        axes.margins(y=0.05)
+        axes.autoscale(axis="y")
+        if logarithmic:
+            axes.set_yscale("log")
+            _decades(axes.yaxis)
+        else:
+            axes.yaxis.set_major_locator(MaxNLocator(_TICKS, steps=[1, 2, 5, 10]))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    return figure
 
 
-def _path(x: np.ndarray, y: np.ndarray) -> str:
-    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+def _axes_rectangle() -> tuple[float, float, float, float]:
+    e = _EDGES
+    return e["left"], e["bottom"], e["right"] - e["left"], e["top"] - e["bottom"]
 
 
-def _padded(low: float, high: float) -> tuple[float, float]:
-    margin = 0.05 * (high - low) if high > low else 0.5
-    return low - margin, high + margin
+def _decades(axis: YAxis) -> None:
+    """Ticks of a logarithmic axis: powers of ten, and 2 and 5 times them where few fit."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+    low, high = np.log10(axis.get_view_interval())
+    if high - low > 2:
+        axis.set_major_locator(LogLocator(numticks=8))
+    elif high - low > 0.7:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    else:
+        axis.set_major_locator(MaxNLocator(_TICKS, steps=[1, 2, 5, 10]))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _power(value)))
 
 
-def _round_values(low: float, high: float, about: int) -> list[float]:
-    """Multiples of 1, 2 or 5 times 10^n between low and high, some `about` of them."""
-    rough = (high - low) / about
-    decade = 10.0 ** math.floor(math.log10(rough))
-    step = next(m * decade for m in (1, 2, 5, 10) if m * decade >= rough * (1 - 1e-9))
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return [round(i * step, 12) for i in range(first, last + 1)]
-
-
-def _plain(low: float, high: float) -> list[tuple[float, str]]:
-    return [(value, _short(value)) for value in _round_values(low, high, TICKS)]
-
-
-def _decades(low: float, high: float) -> list[tuple[float, str]]:
-    """Ticks of a log10 axis: powers of ten, and 2 and 5 times them where few fit."""
-    span = high - low
-    factors = (1,) if span > 2 else (1, 2, 5) if span > 0.7 else (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)
-    every = max(1, math.ceil(span / 6))
-    marks = []
-    for exponent in range(math.floor(low), math.ceil(high) + 1):
-        for factor in factors:
-            at = exponent + math.log10(factor)
-            if low <= at <= high and exponent % every == 0:
-                marks.append((at, _power(factor, exponent)))
-    return marks if len(marks) > 1 else [(at, _short(10**at)) for at in (low, high)]
-
-
-def _power(factor: float, exponent: int) -> str:
-    if -3 <= exponent <= 3:
-        return f"{factor * 10.0**exponent:g}"
-    power = "10" + str(exponent).translate(SUPERSCRIPTS)
-    return power if factor == 1 else f"{factor:g}·{power}"
+def _power(value: float) -> str:
+    if 1e-3 <= value < 1e4:
+        return f"{value:g}"
+    factor, exponent = f"{value:e}".split("e")
+    power = "10" + str(int(exponent)).translate(_SUPERSCRIPTS)
+    return power if float(factor) == 1 else f"{float(factor):g}·{power}"
 
 
 def _short(value: float) -> str:
@@ -211,3 +233,36 @@ def _short(value: float) -> str:
         return f"{value / 1e6:g} M"
     text = f"{value:g}" if abs(value) < 1e4 else f"{value:,.0f}".replace(",", "\u202f")
     return text.replace("-", "−")
+
+
+@contextmanager
+def _style(more: dict[str, Any]) -> Iterator[None]:
+    """Draw with the defaults of matplotlib and our style, whatever a user's matplotlibrc says."""
+    from matplotlib import style
+
+    with style.context(["default", _STYLE | more], after_reset=True):
+        yield
+
+
+def _for_html(element: ElementTree.Element) -> None:
+    """Drop namespaces, fonts, white space and digits; colours become CSS variables."""
+    element.tag = element.tag.rpartition("}")[2]
+    element.attrib = {key.rpartition("}")[2]: v for key, v in element.attrib.items()}
+    if "style" in element.attrib:
+        style = "; ".join(s for s in element.attrib["style"].split("; ") if "font" not in s)
+        for variable, colour in COLOURS.items():
+            style = style.replace(colour, f"var(--{variable})")
+        element.set("style", style)
+    for key in {"d", "x", "y"} & set(element.attrib):
+        coordinates = re.sub(r"\d+\.\d+", lambda m: f"{float(m[0]):.2f}", element.attrib[key])
+        element.set(key, coordinates.strip().replace("  ", " "))
+    element.tail = None
+    if element.tag != "text":
+        element.text = None
+
+
+def _without_unused_ids(root: ElementTree.Element) -> None:
+    used = {element.get("href", "")[1:] for element in root.iter()}
+    for element in root.iter():
+        if element.get("id") not in used:
+            element.attrib.pop("id", None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, final
 
@@ -121,7 +122,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             scales=scales,
             longest=display.LONGEST_SIDE,
             magma=pictures.MAGMA,
-            chart=charts,
+            charts=charts,
             losses=_loss_charts(loaded),
             scores=_score_charts(loaded),
             race=_race(loaded),
@@ -336,23 +337,35 @@ def _setting(value: object) -> str:
 
 
 def _loss_charts(runs: list[Run]) -> list[dict[str, Any]]:
-    logs = [run.log for run in runs]
-    return [
-        {"title": title, "unit": "relative L2, no unit", "chart": drawn}
-        for x_key, x_title in AXES.items()
-        for key, title in LOSSES.items()
-        if (drawn := charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), True))
-    ]
+    return _charts(
+        runs, [run.log for run in runs], LOSSES, "relative L2, no unit", logarithmic=True
+    )
 
 
 def _score_charts(runs: list[Run]) -> list[dict[str, Any]]:
     logs = [score_curve(run.log) for run in runs]
-    return [
-        {"title": title, "unit": "dB", "chart": drawn}
-        for x_key, x_title in reversed(AXES.items())
-        for key, title in SCORES.items()
-        if (drawn := charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), False))
-    ]
+    return _charts(runs, logs, SCORES, "dB", axes=("seconds", "step"))
+
+
+def _charts(
+    runs: list[Run],
+    logs: list[list[dict[str, Any]]],
+    titles: Mapping[str, str],
+    unit: str,
+    *,
+    axes: Sequence[str] = tuple(AXES),
+    logarithmic: bool = False,
+) -> list[dict[str, Any]]:
+    """A panel for each x axis and each key of `titles` that some log has."""
+    labels = [run.label for run in runs]
+    panels = []
+    for x_key, (key, title) in product(axes, titles.items()):
+        x_title = AXES[x_key]
+        figure = charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), logarithmic)
+        if figure is not None:
+            svg = charts.inline_svg(figure, f"{title} over {x_title}", labels)
+            panels.append({"title": title, "unit": unit, "svg": svg})
+    return panels
 
 
 def _race(runs: list[Run]) -> list[dict[str, Any]]:
@@ -383,12 +396,7 @@ def _validation_charts(runs: list[Run]) -> list[dict[str, Any]]:
     logs = _validations(runs)
     if all(score_curve(run.log) for run, log in zip(runs, logs, strict=True) if log):
         return []
-    return [
-        {"title": title, "unit": "dB", "chart": drawn}
-        for x_key, x_title in AXES.items()
-        for key, title in VALIDATION.items()
-        if (drawn := charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), False))
-    ]
+    return _charts(runs, logs, VALIDATION, "dB")
 
 
 def _validations(runs: list[Run]) -> list[list[dict[str, Any]]]:
