@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+import psutil
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -171,10 +172,7 @@ def _resources() -> tuple[Row, ...]:
 
 
 def _memory() -> Row:
-    try:
-        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return Row("memory", "unknown")
+    total = psutil.virtual_memory().total
     enough = total > 2 * _GIB
     remedy = "" if enough else "Use a smaller batch"
     return Row("memory", f"{total / _GIB:.1f} GiB", enough, remedy)

@@ -18,8 +18,7 @@ import unbake.transport.samplers as samplers_module
 from unbake.config import PathConfig
 from unbake.dataset.pixels import PixelSource
 from unbake.errors import UserError
-from unbake.training.memory import peak_bytes
-from unbake.training.monitor import memory_mb
+from unbake.training.memory import memory_mb, peak_bytes
 from unbake.training.problem import make_problem
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep

@@ -22,7 +22,7 @@ from ..dataset.views import Dataset
 from ..io import write_json
 from ..machine import machine
 from ..training.fresh_fit import begin_fit
-from ..training.monitor import memory_mb
+from ..training.memory import memory_mb
 from ..training.schedule import learning_rates
 from ..training.state import State
 from ..training.step import TrainingStep
@@ -143,6 +143,7 @@ def _memory(pixels: PixelSource, state: State) -> dict:
         name: 3 * 4 * sum(dr.width(a) for a in adam.values()) for name, adam in state.optimizers()
     }
     owned["photographs"] = pixels.photographs.bytes
+    # psutil 7 has no peak of a process.
     unit = 1 if sys.platform == "darwin" else 1024
     now = memory_mb()
     peak = max(now, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6)

@@ -18,7 +18,8 @@ from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
-from .monitor import Monitor, memory_mb
+from .memory import memory_mb
+from .monitor import Monitor
 from .preview import Preview
 from .problem import camera_warnings, make_problem, training_pixels
 from .run_folder import Origin, RunFolder

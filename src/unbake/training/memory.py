@@ -1,4 +1,4 @@
-"""How much memory this process needs for something, and how much it may still have (Linux)."""
+"""Memory that a step takes, and memory that this process can still have."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import psutil
 
 from ..backend import CUDA_VARIANT
 from ..errors import UserError
 
 _PROCESS = Path("/proc/self")
-#: Where control groups, as containers are, state their limit and what is used of it.
+#: Limit and use of a control group, such as a container: psutil 7 knows those of the machine only.
 _LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
@@ -21,23 +22,23 @@ _LIMITS = (
 
 
 def peak_bytes(work: Callable[[], None]) -> int | None:
-    """By how much memory rises at most while `work` runs; None where nobody can tell.
+    """How far memory rises at most while `work` runs; None where it cannot be measured.
 
-    On a CPU this is resident memory, on a GPU what Dr.Jit has allocated there.
+    On a CPU this is resident memory (Linux only), on a GPU what Dr.Jit has allocated there.
     """
     dr.sync_thread()
     dr.flush_malloc_cache()
     if mi.variant() == CUDA_VARIANT:
         return _peak_on_device(work)
     try:
-        # What was freed goes back to the system, or `work` would take it up unseen.
+        # Freed memory goes back to the system, else `work` would reuse it unmeasured.
         ctypes.CDLL(None).malloc_trim(0)
-        # Written to, this file makes the present size the peak again.
+        # psutil 7 can neither reset nor read the peak of a process. Writing 5 resets it.
         (_PROCESS / "clear_refs").write_text("5")
-        before = _status("VmRSS")
+        before = _peak_resident()
         work()
         dr.sync_thread()
-        return max(0, _status("VmHWM") - before)
+        return max(0, _peak_resident() - before)
     except (OSError, AttributeError, ValueError, StopIteration):
         return None
 
@@ -50,12 +51,16 @@ def _peak_on_device(work: Callable[[], None]) -> int:
     return max(0, dr.detail.malloc_watermark(dr.JitBackend.CUDA) - before)
 
 
+def memory_mb() -> float:
+    """Resident memory of this process now, in MB."""
+    return psutil.Process().memory_info().rss / 1e6
+
+
 def free_bytes() -> int | None:
-    """Memory that this process could still take; None where nobody can tell."""
+    """Memory that this process can still take, within its control group; None without /proc."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = 1024 * int(next(x for x in lines if x.startswith("MemAvailable:")).split()[1])
-    except (OSError, ValueError, StopIteration):
+        free = psutil.virtual_memory().available
+    except OSError:
         return None
     for limit, used in _LIMITS:
         try:
@@ -65,9 +70,9 @@ def free_bytes() -> int | None:
     return max(0, free)
 
 
-def _status(key: str) -> int:
+def _peak_resident() -> int:
     lines = (_PROCESS / "status").read_text().splitlines()
-    return 1024 * int(next(x for x in lines if x.startswith(key + ":")).split()[1])
+    return 1024 * int(next(x for x in lines if x.startswith("VmHWM:")).split()[1])
 
 
 #: Paths of the smaller one of two batches that tell how much memory a batch takes.

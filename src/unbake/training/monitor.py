@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
-import sys
 from pathlib import Path
 from typing import IO
 
@@ -15,16 +13,6 @@ from ..errors import UserError
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
-
-
-def memory_mb() -> float:
-    """Resident memory of this process now, in MB."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * resource.getpagesize() / 1e6
-    except OSError:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
 class Monitor:
