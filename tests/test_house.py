@@ -99,6 +99,8 @@ def test_one_module_names_the_files_of_a_folder(what, repository):
     owners, *names = FILE_NAMES[what]
     root = repository / "src" / "unbake"
     modules = {path.relative_to(root).as_posix(): path for path in root.rglob("*.py")}
+    for folder in ("benchmarks", "scripts"):
+        modules |= {f"{folder}/{path.name}": path for path in (repository / folder).glob("*.py")}
     hits = {
         module: lines
         for module, path in modules.items()
