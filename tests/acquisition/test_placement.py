@@ -12,7 +12,7 @@ from unbake.dataset.views import check_cameras
 from unbake.errors import UserError
 from unbake.scene import free_space
 
-MATTE = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+MATTE = {"type": "twosided", "bsdf": {"type": "principled", "roughness": 0.9}}
 SIDES = [([0, 1, 0], angle) for angle in (0, 90, 180, 270)]
 SIDES += [([1, 0, 0], angle) for angle in (90, 270)]
 
@@ -54,7 +54,7 @@ def room():
         **walls(),
         cupboard=box((0.5, -0.5, 0.5), 0.49),
         on_emitter=on_emitter((-0.3, 0.85, -0.3)),
-        outside={"type": "sphere", "center": [2.5, 0, 0], "radius": 0.2},
+        outside={"type": "sphere", "center": [2.5, 0, 0], "radius": 0.2, "bsdf": MATTE},
         sensor=sensor((-0.6, 0, -0.6), (0, 0, 0)),
     )
 
@@ -187,7 +187,7 @@ def test_coverage_is_the_fraction_of_area_in_sight():
     assert seen(axes[4]) == pytest.approx(1 / 6, abs=0.02)
     assert seen(axes[4], axes[4]) == seen(axes[4])
     assert seen(*axes) == pytest.approx(1.0, abs=2e-3)
-    ball = scene(ball={"type": "sphere"})
+    ball = scene(ball={"type": "sphere", "bsdf": MATTE})
     far = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 60.0, 8, 8)
     assert coverage(ball, [far], 5000) == pytest.approx((1 - 1 / 4) / 2, abs=0.02)
 

@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.optimized import has_optimized_material
+
 # Fractions of the scene's diagonal.
 CLEARANCE = 0.03
 CONTACT = 1e-3
@@ -132,7 +134,7 @@ def outgoing_radiance(
 def sample_surface(scene: mi.Scene, count: int, seed: int, power: float = 1.0) -> SurfacePoints:
     """Random points on the surfaces whose material is optimized.
 
-    Emitters and surfaces with a purely specular BSDF are left out. The probability of a shape is
+    All other surfaces are left out: see `transport/optimized.py`. The probability of a shape is
     proportional to its area to the given power: 1 samples uniformly by area, less favours small
     shapes.
     """
@@ -308,8 +310,6 @@ def _sort_key(shape: mi.Shape) -> tuple[float, ...]:
 
 def _area(shape: mi.Shape) -> float:
     """The shape's area; zero if its material is not optimized."""
-    if shape.is_emitter() or shape.bsdf() is None:
-        return 0.0
-    if not shape.bsdf().flags() & int(mi.BSDFFlags.Smooth):
+    if not has_optimized_material(shape):
         return 0.0
     return float(np.asarray(shape.surface_area()).ravel()[0])

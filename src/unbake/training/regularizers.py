@@ -6,8 +6,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..config import FitConfig
-from ..fields.materials import registry_number
-from ..fields.texture import slots_of
 from ..transport.regularizers import (
     albedo_ties_roughness,
     mean_albedo_deviation,
@@ -30,7 +28,7 @@ def regularization_terms(
         return {}
     scene_view, everywhere = problem.scene_view.with_scene(scene), mi.Bool(True)
     vertex = find_vertex(scene_view, ray, everywhere, sampler, hide_emitters=problem.hide_emitters)
-    valid = vertex.valid & _is_optimized(scene, vertex.si.shape)
+    valid = vertex.valid & scene_view.is_optimized(vertex.si.shape)
     here = materials.evaluate(vertex.si, valid)
     dr.eval(here.albedo, here.roughness)
     terms: dict[str, mi.Float] = {}
@@ -55,10 +53,3 @@ def is_anchored(problem: Problem, config: FitConfig) -> bool:
     both = problem.materials is not None and problem.environment is not None
     alone = len(problem.scene_view.scene.emitters()) == 1
     return both and alone and problem.hide_emitters and config.lighting.anchor > 0
-
-
-def _is_optimized(scene: mi.Scene, shape: mi.ShapePtr) -> mi.Bool:
-    """Whether shapes are of an unknown material, not of a known one such as metal."""
-    # Each shape is asked once, while this is recorded.
-    optimized = slots_of(scene).keys()
-    return dr.dispatch(shape, lambda s: mi.Bool(registry_number(s) in optimized))

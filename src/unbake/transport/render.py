@@ -58,20 +58,17 @@ def render_materials(
 
     Returns:
         Albedo (pixels, 3), linear RGB; roughness (pixels,), perceptual; and coverage (pixels,), the
-        fraction of samples that see a material which is sought: not an emitter, a mirror or glass,
-        nor background. Materials are means over those samples, zero where there are none.
+        fraction of samples that see a material that is optimized: not an emitter, nor any other
+        BSDF, nor background. Materials are means over those samples, zero where there are none.
     """
     albedo = np.zeros((pixels, 3), np.float32)
     roughness, coverage = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
     sampler = mi.load_dict({"type": "independent"})
-    optimized = _optimized(scene_view.scene)
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
         sampler.seed(dr.opaque(mi.UInt32, part_seed), dr.width(ray))
         with dr.suspend_grad():
             v = attach_material(scene_view, find_vertex(scene_view, ray, mi.Bool(True), sampler))
-            shape = dr.reinterpret_array(mi.UInt32, v.si.shape)
-            counted = v.valid & v.direct_view
-            counted &= dr.gather(mi.Bool, optimized, shape, counted)
+            counted = v.valid & v.direct_view & scene_view.is_optimized(v.si.shape)
             rough = v.si.dn_dv.x if scene_view.materials is not None else mi.Float(0)
             weighted = [dr.select(counted, x, 0) for x in (*v.albedo, rough, mi.Float(1))]
             dr.eval(weighted)
@@ -101,16 +98,3 @@ def parts_of(
 
 def _pixel_means(samples: mi.Float, spp: int) -> np.ndarray:
     return np.array(dr.block_sum(samples, spp)) / spp
-
-
-def _optimized(scene: mi.Scene) -> mi.Bool:
-    """For each shape, by its number in Dr.Jit's registry, whether its material is sought."""
-    # Shapes of groups, which rays meet through instances, are not among `scene.shapes()`.
-    shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
-    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in shapes]
-    table = np.zeros(max(numbers) + 1, bool)
-    for number, shape in zip(numbers, shapes, strict=True):
-        # The printed form names the BSDF inside wrappers, which Mitsuba gives no other access to.
-        principled = shape.bsdf() is not None and "Principled BSDF" in str(shape.bsdf())
-        table[number] = principled and shape.emitter() is None
-    return mi.Bool(table)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, fields, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..fields.materials import Materials
+from ..fields.materials import Materials, registry_number
+from .optimized import optimized_shapes
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class SceneView:
         max_specular: longest chain of specular interactions followed; longer ones end in black.
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
         has_area_emitters: whether any surface of the scene emits light (found by `of`).
+        optimized: numbers of the shapes whose material is optimized (found by `of`).
     """
 
     scene: mi.Scene
@@ -31,18 +33,26 @@ class SceneView:
     max_specular: int
     has_chains: bool
     has_area_emitters: bool
+    optimized: frozenset[int]
 
     @staticmethod
     def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> SceneView:
-        """The world of a scene; looks at every BSDF once."""
+        """The view of a scene; looks at every BSDF once."""
         flags = [int(shape.bsdf().flags()) for shape in scene.shapes() if shape.bsdf() is not None]
         chains = any(not f & int(mi.BSDFFlags.Smooth) or f & int(mi.BSDFFlags.Null) for f in flags)
         area_emitters = any(shape.emitter() is not None for shape in scene.shapes())
-        return SceneView(scene, materials, max_specular, chains, area_emitters)
+        optimized = optimized_shapes(scene)
+        return SceneView(scene, materials, max_specular, chains, area_emitters, optimized)
 
     def with_scene(self, scene: mi.Scene) -> SceneView:
-        """The same world around this handle of its scene (frozen functions bring their own)."""
+        """The same around this handle of the scene (frozen functions bring their own)."""
         return replace(self, scene=scene)
+
+    def is_optimized(self, shape: mi.ShapePtr) -> mi.Bool:
+        """Whether the material of shapes is optimized; not where there is no shape."""
+        # Each shape is asked once, while this is traced. (A table would be an array that comes
+        # from outside of a frozen function.)
+        return dr.dispatch(shape, lambda s: mi.Bool(registry_number(s) in self.optimized))
 
 
 @dataclass

@@ -1,0 +1,28 @@
+"""Which surfaces have a material that is optimized, or could be: THE definition of it."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..fields.materials import registry_number
+
+
+def has_optimized_material(shape: mi.Shape) -> bool:
+    """Whether a shape's BSDF is `principled`, or holds one, and the shape emits no light.
+
+    BSDFs that hold others are `twosided`, `mask`, `bumpmap`, `normalmap` and `blendbsdf`. Diffuse
+    and rough plastic count only once `scene.edit.to_principled` has changed them.
+    """
+    bsdf = shape.bsdf()
+    if bsdf is None or shape.is_emitter():
+        return False
+    return any(node.class_name() == "Principled" for node in mi.traverse(bsdf).hierarchy)
+
+
+def optimized_shapes(scene: mi.Scene) -> frozenset[int]:
+    """The shapes of optimized material, by their numbers in Dr.Jit's registry.
+
+    Shapes of groups, which rays meet through instances, are among them.
+    """
+    shapes = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape))
+    return frozenset(registry_number(shape) for shape in shapes if has_optimized_material(shape))
