@@ -1,4 +1,8 @@
-"""Collects the parts of a built-in scene and writes them as a self-contained Mitsuba scene."""
+"""Writes the parts of a built-in scene as a self-contained Mitsuba scene.
+
+The XML is our own because `mi.parser.write_file` of Mitsuba 3.9.1 loses the ids of shapes and
+emitters: it writes ids only of nodes that others refer to. Emitters are known by those ids.
+"""
 
 from __future__ import annotations
 
