@@ -25,7 +25,7 @@ from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
 from .placement import coverage, is_room, place
 
-#: Samples a pixel of the truth images, which have no noise but at edges.
+#: Samples a pixel of the truth images, which are noisy at edges only.
 TRUTH_SAMPLES = 16
 
 
@@ -33,11 +33,11 @@ TRUTH_SAMPLES = 16
 class CaptureSettings:
     """How a data set is rendered."""
 
-    views: int = 24  #: training views, where no camera file is given
-    held_out: int = 4  #: held-out views, where no camera file is given
-    resolution: int = 128  #: width and height in pixels, where the cameras do not say
+    views: int = 24  #: training views, without a camera file
+    held_out: int = 4  #: held-out views, without a camera file
+    resolution: int = 128  #: width and height in pixels, unless the camera file has its own
     spp: int = 100  #: camera samples a pixel, stratified
-    max_depth: int = 64  #: path length limit; too short a limit looks like darker materials
+    max_depth: int = 64  #: longest path; paths cut short would be fitted as darker materials
     rr_depth: int = 8  #: bounces before Russian roulette
     seed: int = 0
 
@@ -50,7 +50,7 @@ def capture(
     cameras: Path | None = None,
     tell: Callable[[str], None] = print,
 ) -> Dataset:
-    """Render a scene from many cameras, and what its materials truly are.
+    """Render a scene from many cameras, with its true materials and lighting.
 
     Args:
         scene: a Mitsuba XML file, or the name of a built-in scene.
@@ -96,8 +96,8 @@ def _capture(
     )
     room = is_room(scene)
     rays = CameraRays.of([c for _, c in posed])
-    # Stratified samples: a third less variance than independent ones at the same cost. Their number
-    # is rounded up to a grid.
+    # Stratified samples have a third less variance than independent ones at the same cost. The
+    # sampler rounds their number up to a grid.
     sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     albedo, roughness, mask = _truth(path, scene, rays)
@@ -141,9 +141,9 @@ def _capture(
 
 
 def _copy_scene(name: str, folder: Path, tell: Callable[[str], None]) -> tuple[Path, mi.Scene]:
-    """Write the scene, with every opaque BSDF as `principled`, and its files into the folder.
+    """Write the scene and its files into the folder, opaque BSDFs turned into `principled`.
 
-    The scene itself is made from the original, so that errors name the user's file and line.
+    The scene that is returned comes from the original, so that errors name the user's file.
     """
     folder.mkdir(parents=True)
     made = folder.with_name("made")
@@ -232,7 +232,7 @@ def _truth(
     path: Path, scene: mi.Scene, rays: CameraRays
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Albedo, roughness and mask of all pixels."""
-    specular = 32  # cut-outs only: what lies behind a mirror is masked out
+    specular = 32  # for cut-outs (null interactions): pixels behind mirrors are masked out
     images = []
     parsed = parse(path)
     edit.show_roughness_as_albedo(parsed)

@@ -1,4 +1,4 @@
-"""Where to put cameras so that they cover a scene: all over a room, or around an object.
+"""Automatic placement of cameras that cover a scene: all over a room, or around an object.
 
 The paper places the cameras of its rooms by hand "to cover the entire scene" and samples those of
 its objects on the hemisphere around them. Paper: Sec. 6.
@@ -18,7 +18,7 @@ from unbake.dataset.camera import Camera, LookAt
 from unbake.errors import UserError
 from unbake.scene import free_space
 
-# Enough that neighbouring candidates differ by less than a photographer's adjustments
+# Sampling of candidate views: positions and surface points, directions and rays of each view.
 _POSITIONS = 240
 _POINTS = 3000
 _AZIMUTHS = 12
@@ -27,7 +27,7 @@ _GRID = 8
 _VIEWERS = 16
 _OVEREXPOSED = 30.0
 
-# A surface seen once squarely and from near leaves a third of its value to further views
+# One close view at normal incidence takes two thirds of a surface's value, 1 - exp(-1.1).
 _VALUE = 1.1
 _FREE_POSITIONS = 512
 _REMEDY = "Give a camera file instead"
@@ -41,9 +41,8 @@ class _Candidates:
     Args:
         eye: positions, (n, 3).
         forward: directions, (n, 3).
-        depth: typical depths, (n,).
-        value: how much of what is to know about each surface point a view tells, (n, points)
-            float32 in [0, 1].
+        depth: median depths, (n,).
+        value: what a view is worth for each surface point, (n, points) float32 in [0, 1].
     """
 
     eye: np.ndarray
@@ -58,11 +57,10 @@ class _Candidates:
 
 
 def is_room(scene: mi.Scene) -> bool:
-    """Whether the scene surrounds its cameras (a room) rather than being surrounded (an object).
+    """Whether the scene encloses its cameras (a room) or they stand around it (an object).
 
-    True where surfaces take up 75 % of all directions, on average over the space that the scene's
-    sensors show between its bounding box and its surfaces; without sensors, over the part of the
-    bounding box outside closed objects.
+    A room has surfaces in 75 % of all directions, on average over the space that the scene's
+    sensors see; without sensors, over the part of the bounding box outside closed objects.
     """
     probes = free_space.sensor_probes(scene, 0)
     if not scene.sensors():
@@ -75,7 +73,7 @@ def is_room(scene: mi.Scene) -> bool:
 
 
 def place(scene: mi.Scene, views: int, held_out: int, *, seed: int = 0) -> list[tuple[str, LookAt]]:
-    """Cameras as `place_room` or `place_object` finds them, whichever the scene is."""
+    """Cameras of `place_room` or `place_object`, by `is_room`."""
     placed = place_room if is_room(scene) else place_object
     return placed(scene, views, held_out, seed=seed)
 
@@ -85,12 +83,12 @@ def place_room(
 ) -> list[tuple[str, LookAt]]:
     """Cameras inside a room that together cover its surfaces.
 
-    Candidates stand in free space (see `freespace.free_positions`) and look all around, up and
-    down; those with their nose on something are dropped. Training views are chosen one after the
-    other by what they add: a surface counts the more, the more squarely and the nearer it is seen,
-    and each view of it leaves less for the next ones. Surfaces far darker or brighter than what
-    the scene's sensors show count down to a quarter, small shapes more than their area. Held-out
-    views look, from elsewhere, at surfaces that training views see.
+    Candidates stand in free space (`free_space.free_positions`) and look all around, up and down;
+    those too close to a surface are dropped. Training views are chosen greedily: a surface point
+    counts by the cosine of its angle and by pixels per area, and less with each view that already
+    sees it. Points far darker or brighter than what the scene's sensors see have down to a quarter
+    of the weight; small shapes have more than their area. Held-out views see, from other positions,
+    surfaces that training views see.
 
     Args:
         scene: the room.
@@ -129,9 +127,9 @@ def place_object(
 ) -> list[tuple[str, LookAt]]:
     """Cameras on the upper hemisphere around an object, looking at its centre.
 
-    Positions are spread evenly; the held-out ones lie in between the training ones, evenly from
-    the horizon to the top. All have one distance, at which the object just fits into all (square)
-    images. A ground plane, flat and level and larger than all the rest, is no part of the object.
+    Positions form a Fibonacci spiral, from which held-out views are taken at regular intervals.
+    All have the same distance, at which the object just fits into the square images. A level
+    ground plane that is larger than everything else does not count as part of the object.
 
     Args:
         scene: the object.
@@ -153,7 +151,7 @@ def place_object(
     low, high = _object_box(scene, up)
     centre, radius = _sphere(low, high)
     count = views + held_out
-    # The horizon itself and the pole show least and upset the up direction
+    # Views from the horizon show least; at the pole the up direction is degenerate.
     height = 0.08 + 0.87 * (np.arange(count) + 0.5) / count
     turn = 2 * math.pi * np.random.default_rng(seed).random()
     angle = turn + np.arange(count) * math.pi * (3 - math.sqrt(5))
@@ -176,16 +174,15 @@ def place_object(
 def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -> float:
     """The fraction of the reachable surface area that at least one camera sees, in [0, 1].
 
-    Surfaces are those whose material is optimized (no emitters, no mirrors and glass). Reachable is
-    what a camera sees from some position where one can stand: in a room from 512 positions of its
-    free space (`freespace.free_positions`), around an object from 512 positions on the sphere of
-    twice its radius, below it as well; what a given camera sees is always reachable. The backs of
-    walls and the insides of furniture are not.
+    Only surfaces whose material is optimized count (no emitters, mirrors or glass). A point is
+    reachable if a given camera sees it, or one of 512 other positions: in a room, positions in free
+    space (`free_space.free_positions`); around an object, positions on the sphere of twice its
+    radius, including below it. Backs of walls and insides of furniture are not reachable.
 
     Args:
         scene: the scene.
         cameras: the training views.
-        samples: number of surface points tested, spread by area.
+        samples: number of surface points tested, uniform by area.
     """
     points = free_space.sample_surface(scene, samples, 1)
     seen = np.zeros(len(points.position), dtype=bool)
@@ -208,11 +205,11 @@ def _candidates(
     fov: float,
     seed: int,
 ) -> _Candidates:
-    """All views from all positions that show surfaces from a decent distance."""
+    """Views in all directions from all positions, without those too close to a surface."""
     eyes, forwards = _all_views(positions, up, np.random.default_rng(seed))
     half = math.tan(math.radians(fov) / 2)
     depths = _view_depths(scene, eyes, forwards, up, half)
-    # No interpolation: between a wall and nothing there is no depth
+    # No interpolation: rays that leave the scene have infinite depth.
     near, median = np.quantile(depths, (0.1, 0.5), axis=1, method="lower")
     usual = np.median(median[np.isfinite(median)]) if np.isfinite(median).any() else 0.0
     kept = np.flatnonzero(np.isfinite(median) & (median > 0.5 * usual) & (near > 0.25 * usual))
@@ -227,11 +224,11 @@ def _candidates(
     return _Candidates(eyes[kept], forwards[kept], median[kept], value)
 
 
-def _framed(way: np.ndarray, forwards: np.ndarray, up: np.ndarray, half: float) -> np.ndarray:
-    """Which points, (m, 3) from the eye, lie in square images along n directions: (n, m) bool."""
+def _framed(offsets: np.ndarray, forwards: np.ndarray, up: np.ndarray, half: float) -> np.ndarray:
+    """Whether points at offsets (m, 3) from the eye lie in n square images: (n, m) bool."""
     axes = np.stack([*_axes(forwards, up), half * forwards])
-    # Threads of a matrix product cost more than these three terms
-    x, y, reach = np.einsum("ani,mi->anm", axes.astype(np.float32), way.astype(np.float32))
+    # einsum: starting the threads of a BLAS product takes longer than this sum of three terms.
+    x, y, reach = np.einsum("ani,mi->anm", axes.astype(np.float32), offsets.astype(np.float32))
     return (np.abs(x) < reach) & (np.abs(y) < reach)
 
 
@@ -242,10 +239,10 @@ def _importance(
     seen: np.ndarray,
     seed: int,
 ) -> np.ndarray:
-    """How much surface points count by the light that leaves them, (n,) in [0.25, 1].
+    """Weights of surface points by their outgoing radiance, (n,) in [0.25, 1].
 
-    Full weight goes to what lies within the exposure of the scene's own sensors. An image of a dark
-    corner is mostly noise, and a lamp room behind a door must not outweigh the room itself.
+    Points that the scene's own sensors expose well have full weight. Images of dark corners are
+    mostly noise, and a bright adjoining room must not outweigh the room itself.
     """
     rng = np.random.default_rng(seed)
     light = np.zeros(len(points.position))
@@ -266,18 +263,18 @@ def _importance(
 
 
 def _worth(eye: np.ndarray, points: free_space.SurfacePoints, usual: float) -> np.ndarray:
-    """What a view tells about the points it shows, by angle and by pixels per area, in [0, 1]."""
-    way = eye - points.position
-    distance = np.linalg.norm(way, axis=1)
-    cosine = np.abs(np.einsum("ij,ij->i", way, points.normal)) / distance
-    told = cosine * np.minimum(1.0, (1.5 * usual / distance) ** 2)
-    return (1 - np.exp(-_VALUE * told)).astype(np.float32)
+    """What an unobstructed view of points is worth, by angle and pixels per area, in [0, 1]."""
+    to_eye = eye - points.position
+    distance = np.linalg.norm(to_eye, axis=1)
+    cosine = np.abs(np.einsum("ij,ij->i", to_eye, points.normal)) / distance
+    resolution = cosine * np.minimum(1.0, (1.5 * usual / distance) ** 2)
+    return (1 - np.exp(-_VALUE * resolution)).astype(np.float32)
 
 
 def _greedy(
     candidates: _Candidates, count: int, weight: np.ndarray, taken: list[int], diagonal: float
 ) -> list[int]:
-    """The views that add most, one after the other, keeping away from `taken` and each other."""
+    """Greedy choice of the views that add most value, different from `taken` and each other."""
     remaining = weight.astype(np.float32)
     novelty = np.ones(len(candidates.eye))
     for view in taken:
@@ -293,7 +290,7 @@ def _greedy(
 
 
 def _difference(candidates: _Candidates, view: int, diagonal: float) -> np.ndarray:
-    """How different all candidates are from one of them: 0 (the same view) to 1, (n,)."""
+    """Difference of all candidates from one of them, from 0 (the same view) to 1, (n,)."""
     away = np.linalg.norm(candidates.eye - candidates.eye[view], axis=1) / (0.12 * diagonal)
     aligned = np.clip(candidates.forward @ candidates.forward[view], 0.0, 1.0)
     return 1 - np.exp(-(away**2)) * aligned**2
@@ -337,7 +334,7 @@ def _axes(forwards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _in_frame(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) project into the image, (n,) bool; occlusion is not considered."""
+    """Whether points (n, 3) project into the image, without regard to occlusion: (n,) bool."""
     local = (points - camera.origin) @ camera.to_world[:3, :3]
     depth = -local[:, 2]
     front = depth > 0
@@ -355,7 +352,7 @@ def _standpoints(scene: mi.Scene) -> np.ndarray:
 
 
 def _object_box(scene: mi.Scene, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (3,) of the object, its ground plane left out."""
+    """Lower and upper corner (3,) of the scene without its ground plane."""
     boxes = []
     for shape in scene.shapes():
         box = shape.bbox()
@@ -383,7 +380,7 @@ def _sphere(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
 def _fitting_distance(
     points: np.ndarray, radius: float, outward: np.ndarray, up: np.ndarray, fov: float
 ) -> float:
-    """How far from the centre cameras must be to show all points (m, 3) and leave a margin."""
+    """The distance from the centre at which all points (m, 3) fit into all images with a margin."""
     if len(points) == 0:
         return radius / math.sin(math.radians(fov) / 2)
     right, above = _axes(-outward, up)

@@ -1,4 +1,4 @@
-"""How fast runs are, and how soon they are good: read from their logs."""
+"""Step times and time to quality of runs, from their logs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-#: The first steps trace and compile; intervals of the log that begin before are no measurement.
+#: The first steps trace and compile; intervals of the log that begin before are left out.
 WARM_UP = 4
 SCORES = ("albedo_psnr", "roughness_psnr")
 
@@ -20,15 +20,15 @@ Log = Sequence[Mapping[str, Any]]
 @final
 @dataclass(frozen=True)
 class Target:
-    """A quality, the run that ended with it, and when each run had it for good."""
+    """A score, and the time from which each run stays at or above it."""
 
-    run: str
-    albedo_psnr: float  # dB, the run's last score on all held-out views
-    seconds: dict[str, float | None]  # of training; None: never
+    run: str  #: the run whose last score this is
+    albedo_psnr: float  #: dB, over all held-out views
+    seconds: dict[str, float | None]  #: of training by run; None: never
 
 
 def milliseconds_per_step(log: Log) -> float | None:
-    """Median time of a step after warm-up, in ms; None where a log is too short to tell."""
+    """Median time of a step after warm-up, in ms; None if the log is too short."""
     at = {r["step"]: r["seconds"] for r in log if _timed(r)}
     marks = sorted(at.items())
     spent, steps = [], []
@@ -36,7 +36,7 @@ def milliseconds_per_step(log: Log) -> float | None:
         if first >= WARM_UP:
             spent.append(1e3 * (end - start) / (last - first))
             steps.append(last - first)
-    # Intervals of the log differ in length: the median is over steps.
+    # The median is over steps: intervals of the log differ in length.
     return float(np.median(np.repeat(spent, steps))) if spent else None
 
 
@@ -50,10 +50,9 @@ def score_curve(log: Log) -> list[dict[str, float | None]]:
 
 
 def seconds_to(curve: Sequence[Mapping[str, Any]], target: float) -> float | None:
-    """When a score curve reached a target for good: from then on it never falls below it.
+    """The time from which a score curve stays at or above a target: its last upward crossing.
 
-    Between two scores the curve is a straight line. A curve that crosses the target in its noise
-    counts from the last crossing.
+    Scores are interpolated linearly.
 
     Args:
         curve: as `score_curve` gives it.
@@ -73,10 +72,10 @@ def seconds_to(curve: Sequence[Mapping[str, Any]], target: float) -> float | Non
 
 
 def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Target]:
-    """For each run's last score, when each run reached it for good.
+    """A target for the last score of each run.
 
     Args:
-        curves: score curve of each run, by name; a run without scores sets no target.
+        curves: score curve of each run by name; a run without scores sets no target.
     """
     ends = {name: points[-1][1] for name, c in curves.items() if (points := _points(c))}
     return [

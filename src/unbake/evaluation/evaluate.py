@@ -1,4 +1,4 @@
-"""How good a run is: its materials and its renderings against the photographs and the truth."""
+"""Evaluation of a run: its renderings and materials against photographs and ground truth."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class EvaluationSettings:
     """How the recovered scene is rendered."""
 
     spp: int = 64  #: camera samples a pixel
-    max_depth: int = 48  #: bounces, plus one; specular ones are not counted
+    max_depth: int = 48  #: longest path: bounces, plus one; specular ones are not counted
     rr_depth: int = 5  #: bounces before Russian roulette
     train_views: int = 4  #: training views to render; all held-out views are rendered
     material_spp: int = 16  #: camera samples a pixel of the albedo and roughness pictures
-    clip_negative: bool = False  #: take negative pixels as zero; also where the fit did
+    clip_negative: bool = False  #: clip negative pixels of photographs, as always if the fit did
 
 
 def evaluate(
@@ -56,9 +56,9 @@ def evaluate(
     *,
     tell: Callable[[str], None] = print,
 ) -> dict:
-    """Render a run's views with the recovered materials and compare.
+    """Render a run's views from what it recovered, and compare them with photographs and truth.
 
-    Renderings are path traced with full global illumination; the radiance field plays no part.
+    Renderings are path traced with full global illumination, without the radiance field.
 
     Args:
         run: folder of a fit.
@@ -66,7 +66,7 @@ def evaluate(
         tell: called with lines of progress.
 
     Returns:
-        What it writes to the run's metrics file; pictures go beside it.
+        The contents of the run's metrics file. Images are written beside it.
 
     Raises:
         UserError: the run or its data set cannot be read.
@@ -106,10 +106,10 @@ def evaluate(
 
 
 def description(config: FitConfig) -> dict:
-    """What tells a run from another: unknown, method, representations and estimator.
+    """What distinguishes runs: unknown, method, representations and estimator.
 
-    `representation` is that of the materials (φ), None where they are known, `radiance` that of
-    L_θ, None where the method has no radiance field.
+    `representation` is that of the materials, None if they are known; `radiance` is that of L_θ,
+    None if the method has no radiance field.
     """
     cached = requirements(config.chosen_method.terms).radiance
     return {
@@ -165,7 +165,7 @@ def _evaluate_view(
 
 
 def _evaluate_light(recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]) -> dict:
-    """Numbers and pictures of recovered light; nothing where light was known."""
+    """Scores and images of the lighting; empty if the run did not optimize it."""
     problem, data = recovered.problem, recovered.dataset.folder
     found: dict[str, Any] = {}
     if problem.environment is not None:
@@ -192,7 +192,7 @@ def _align_albedo(
 ) -> list[float] | None:
     """Add `albedo_psnr_aligned` to rows; returns the factor of each channel, one for all views.
 
-    Between albedo and light, photographs may not tell the scale.
+    Photographs may determine albedo and lighting only up to a common factor.
     """
     known = [(s, t, s.mask(t)) if s and t else None for s, t in materials]
     counted = [(s.albedo[m], t.albedo[m]) for s, t, m in filter(None, known)]

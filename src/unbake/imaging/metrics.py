@@ -1,4 +1,4 @@
-"""How far a picture is from its ground truth, in decibels."""
+"""PSNR of images against their ground truth."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     """Peak signal-to-noise ratio of a picture in dB, with peak 1, on linear and unclamped values.
 
     PSNR = 10 log10(1 / MSE), where MSE is the mean of (image − reference)² over the masked pixels
-    and all channels, summed in double precision. Values above 1 count in full: nothing is clamped,
-    tone-mapped or rescaled.
+    and all channels, in double precision. Values are not clamped, tone-mapped or rescaled.
 
     Args:
         image: (H, W) or (H, W, C), linear.
         reference: the ground truth, same shape and space.
-        mask: (H, W) bool, True where a pixel counts; None counts every pixel.
+        mask: (H, W) bool; None: all pixels.
 
     Returns:
-        dB; `inf` where the two agree exactly.
+        dB; `inf` if the two are equal.
 
     Raises:
-        UserError: a pixel that counts is not finite, as after a fit that diverged.
-        ValueError: the shapes differ, or no pixel counts.
+        UserError: a pixel inside the mask is not finite, as after a fit that diverged.
+        ValueError: the shapes differ, or the mask is empty.
 
     Source: PSNR as reported in Paper: Sec. 6, Fig. 6.
     """
@@ -57,14 +56,14 @@ def mean_psnr(values: Iterable[float | None]) -> float | None:
 
     Returns:
         The arithmetic mean of the dB values (not the PSNR of the pooled error), or None where no
-        view has a value. One view that agrees exactly makes the mean `inf`.
+        view has a value. An infinite value makes the mean infinite.
     """
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
 
 
 def _select(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The (N,) or (N, C) pixels that count."""
+    """The (N,) or (N, C) pixels inside the mask."""
     mask = np.asarray(mask)
     if mask.dtype != np.bool_ or mask.shape != picture.shape[:2]:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Pictures in and out: EXR, PNG, tone mapping, false colour, contact sheets."""
+"""EXR and PNG files, tone mapping, false colour, contact sheets."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
         exposure: stops.
 
     Returns:
-        uint8 of the same shape. Values that are not a number become 0.
+        uint8 of the same shape. NaN becomes 0.
 
     Source: IEC 61966-2-1.
     """
@@ -97,7 +97,7 @@ def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] to uint8 without any curve, for data such as roughness; clamps, rounds."""
+    """Values in [0, 1] to uint8 without the sRGB curve, clamped, for data such as roughness."""
     return np.round(_unit(np.asarray(values, dtype=np.float32)) * 255).astype(np.uint8)
 
 
@@ -111,7 +111,7 @@ def absolute_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}"
         )
-    with np.errstate(invalid="ignore"):  # inf − inf is shown as not finite, not warned about
+    with np.errstate(invalid="ignore"):  # inf − inf is not finite, and is painted so
         return np.abs(image - reference).mean(axis=2)
 
 
@@ -215,7 +215,7 @@ def _png(array: np.ndarray) -> bytes:
 
 
 def _unit(values: np.ndarray) -> np.ndarray:
-    """Clamped to [0, 1]; not-a-number and −inf become 0, inf becomes 1."""
+    """Clamp to [0, 1]; NaN and −inf become 0, inf becomes 1."""
     return np.clip(np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
 
 

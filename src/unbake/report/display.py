@@ -1,4 +1,4 @@
-"""Numbers as a page writes them, and what makes pictures of several runs compare."""
+"""Formatting of numbers, and exposure and error scales shared by the images of all runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Choice = Callable[[Iterable[float]], float]  # max or min
 
 
 def number(value: object) -> float | None:
-    """A number that can be shown, or None for null and not-a-number."""
+    """A number as float; None for NaN and for what is no number."""
     if not isinstance(value, int | float) or math.isnan(value):
         return None
     return float(value)
@@ -42,7 +42,7 @@ def percent(value: float | None) -> str:
 
 
 def best(values: Iterable[float | None], choose: Choice = max) -> float | None:
-    """The best of values, or None where there is nothing to choose between."""
+    """The best of at least two values, else None."""
     known = [value for value in values if value is not None]
     return choose(known) if len(known) > 1 else None
 
@@ -59,7 +59,7 @@ def marked(
 
 
 def evaluated(run: Run, picture: Path) -> Path:
-    """A picture that the run's evaluation left; UserError where it is gone."""
+    """A picture that the run's evaluation left; UserError if it is gone."""
     if not picture.is_file():
         again = f"{run.folder.evaluate_again} again"
         raise UserError("an evaluated picture is gone", picture, again)
@@ -110,24 +110,24 @@ def painted(values: np.ndarray, scale: float, mask: np.ndarray) -> str:
 
 
 def exposure(light: list[np.ndarray]) -> float:
-    """Stops that bring the 95th percentile of radiance to 0.8, in half stops."""
+    """The exposure in half stops that maps the 95th percentile of radiance to about 0.8."""
     bright = _percentile(light, 95)
     return round(2 * math.log2(0.8 / bright)) / 2 if bright > 0 else 0.0
 
 
 def error_scale(errors: list[list[np.ndarray]]) -> float:
-    """A scale for the errors of all runs.
+    """The upper end of the error scale of all runs.
 
-    It is rounded up to 1, 2 or 5 times 10^n from the best run's 97th percentile, so that a bad run
-    does not turn all others black.
+    It is the 97th percentile of the best run, rounded up to 1, 2 or 5 times 10^n: with that of the
+    worst run, errors of all others would be black.
     """
     high = np.array([_percentile(parts, 97) for parts in errors])
-    high = high[high > 1e-6]  # a run that agrees up to rounding needs no scale
+    high = high[high > 1e-6]  # not of a run without errors
     return _round_up(float(high.min())) if len(high) else 0.01
 
 
 def sample(values: np.ndarray, limit: int = 4096) -> np.ndarray:
-    """Some thousand of the finite values, evenly spaced."""
+    """About `limit` of the finite values, evenly spaced."""
     values = values[np.isfinite(values)]
     return values[:: max(1, len(values) // limit)]
 

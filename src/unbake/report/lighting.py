@@ -12,7 +12,7 @@ from unbake.dataset.lighting import true_environment
 from unbake.report import display
 from unbake.report.runs import Run
 
-#: Numbers of an environment map: how they are written, and which is best.
+#: Scores of an environment map: their format, and which is best.
 NUMBERS = {
     "sh_error": (display.percent, min),
     "sh_error_aligned": (display.percent, min),
@@ -33,7 +33,7 @@ def light_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
 
 
 def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
-    """Maps at one exposure, which suits the truth where it is known, and their errors."""
+    """Maps and their errors, at the exposure of the truth if it is known."""
     if not any(run.optimizes("environment") for run in runs):
         return None
     truth = true_environment(data)
@@ -79,7 +79,7 @@ def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
 
 
 def _numbers(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
-    """By quantity, a cell a run."""
+    """By score, a cell a run."""
     said = [run.metrics.get("environment") or {} for run in runs]
     return {
         key: display.marked([display.number(numbers.get(key)) for numbers in said], write, choose)

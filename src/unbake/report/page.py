@@ -1,4 +1,4 @@
-"""One self-contained HTML page that compares runs on the same data: numbers, pictures, charts."""
+"""One self-contained HTML page that compares runs on the same data: numbers, images, charts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PSNRS = {
     "albedo_psnr_aligned": "Aligned albedo",
     "roughness_psnr": "Roughness",
 }
-#: What an evaluation defines, and the name on the page; by the part of the page.
+#: Names on the page of what an evaluation defines.
 DEFINED = {
     "psnr": "PSNR",
     "albedo_psnr_aligned": "Aligned albedo",
@@ -74,7 +74,7 @@ class Scales:
 def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | None = None) -> Path:
     """Write one HTML page that compares evaluated runs with the ground truth and each other.
 
-    The page holds its pictures, styles and script itself and loads nothing from anywhere.
+    The page contains its images, styles and script and loads nothing from elsewhere.
     Pictures of renderings and albedo are linear RGB seen through the sRGB curve; roughness is shown
     without a curve. Larger pictures than 640 pixels are averaged down; PSNRs are those of
     the evaluation, from full resolution.
@@ -143,7 +143,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
 
 
 def _recovered(run: Run, view: View, quantity: str) -> Path | None:
-    """Where a run's picture of a view lies; None where there is none to be expected."""
+    """A run's image of a view; None if it was not evaluated or the quantity not optimized."""
     if not run.view(view.name) or not run.optimizes(quantity):
         return None
     return display.evaluated(run, run.folder.picture(view.split, view.name, quantity))
@@ -168,7 +168,7 @@ def _scales(runs: list[Run], views: list[View]) -> Scales:
 
 
 def _view_block(view: View, runs: list[Run], scales: Scales) -> dict[str, Any]:
-    """A view's pictures for the template: a column a quantity, in it truth and runs."""
+    """A view's images for the template: a column a quantity with truth and runs."""
     height, width = display.rgb(view.truth["render"])[0].shape[:2]
     quantities = [q for q in QUANTITIES if any(run.optimizes(q) for run in runs)]
     columns = [_column(view, runs, quantity, scales) for quantity in quantities]
@@ -235,7 +235,7 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
 
 
 def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What a method works with, as text, symbol and subscript; empty for old evaluations."""
+    """Representations, unknown and estimator of a run as text, symbol and subscript."""
     if "estimator" not in metrics:
         return []
     said = {key: str(metrics.get(key)) for key in ("representation", "radiance", "estimator")}
@@ -258,7 +258,7 @@ def _unknown(metrics: dict[str, Any]) -> str:
 
 
 def _optimized(runs: list[Run]) -> str:
-    """What the runs recovered, for the title."""
+    """What the runs optimized, for the title."""
     kinds = {_unknown(run.metrics) for run in runs}
     if len(kinds) == 1:
         return OPTIMIZED.get(kinds.pop(), "Scene")
@@ -283,7 +283,7 @@ def _seconds(value: object) -> str:
 
 
 def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
-    """What the numbers of the page's parts mean, as each evaluation says."""
+    """Definitions of the numbers in each part of the page, from the evaluations."""
     psnrs = _psnrs(runs)
     told = {k: v for k, v in DEFINED.items() if k in psnrs or k not in PSNRS}
     numbers = [_told(run, told) | _rendering(run) for run in runs]
@@ -306,7 +306,7 @@ def _rendering(run: Run) -> dict[str, str]:
 
 
 def _grouped(runs: list[Run], said: list[dict[str, str]]) -> list[dict[str, Any]]:
-    """One entry for runs that say the same; none for those that say nothing."""
+    """One entry for all runs with the same definitions; none for runs without."""
     entries: list[dict[str, Any]] = []
     for run, words in zip(runs, said, strict=True):
         same = next((entry for entry in entries if entry["words"] == words), None)
@@ -369,7 +369,7 @@ def _charts(
 
 
 def _race(runs: list[Run]) -> list[dict[str, Any]]:
-    """When each run reached each run's last score; empty where there is nothing to compare."""
+    """Times to the last score of each run; empty if fewer than two runs have scores."""
     targets = time_to_quality({run.label: score_curve(run.log) for run in runs})
     if len(targets) < 2:
         return []
@@ -392,7 +392,7 @@ def _first(times: Mapping[str, float | None]) -> float | None:
 
 
 def _validation_charts(runs: list[Run]) -> list[dict[str, Any]]:
-    """Of one view; nothing where all views were scored, which tells more."""
+    """Charts of the validation on one view; none if all views were scored."""
     logs = _validations(runs)
     if all(score_curve(run.log) for run, log in zip(runs, logs, strict=True) if log):
         return []
@@ -400,7 +400,7 @@ def _validation_charts(runs: list[Run]) -> list[dict[str, Any]]:
 
 
 def _validations(runs: list[Run]) -> list[list[dict[str, Any]]]:
-    """For each run its log records that hold a validation, with its numbers lifted up."""
+    """For each run its log records with a validation, whose numbers become keys of the record."""
     return [[r | r["validation"] for r in run.log if r.get("validation")] for run in runs]
 
 

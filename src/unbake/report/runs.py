@@ -14,13 +14,13 @@ from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.training.run_folder import RunFolder
 
-TRAINING_VIEWS = 4  # what was trained on says little about quality; a few views show overfitting
+TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
 
 
 @final
 @dataclass(frozen=True)
 class Run:
-    """What one run folder says about itself; `label` is its name on the page."""
+    """The contents of an evaluated run folder; `label` is its name on the page."""
 
     folder: RunFolder
     label: str
@@ -29,7 +29,7 @@ class Run:
     log: list[dict[str, Any]]
 
     def optimizes(self, quantity: str) -> bool:
-        """Whether the run has pictures or numbers of a quantity, rather than knew it."""
+        """Whether a quantity was unknown to the run, so that it has images or numbers of it."""
         unknown = str(self.metrics.get("unknown", "materials"))
         match quantity:
             case "render":
@@ -57,7 +57,7 @@ class View:
 
 
 def labels(runs: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Folder names; where two are alike, as many parent folders before them as tell them apart."""
+    """Folder names, preceded by as many parent folders as make them unique."""
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < len(paths):
         raise UserError("a run is given twice", remedy="Name each run folder once")

@@ -1,4 +1,4 @@
-"""What the surfaces of the demo room are painted with: (base_color (h, w, 3), roughness (h, w)).
+"""Textures of the surfaces of the demo room: (base_color (h, w, 3), roughness (h, w)).
 
 Linear RGB; nothing is finer than about 10 cm, so that photographs of 128 pixels resolve it.
 """

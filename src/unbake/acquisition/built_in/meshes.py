@@ -77,7 +77,7 @@ def quad(corner: Vec3, u: Vec3, v: Vec3, *, overlap: float = 0.0, unit_uv: bool 
 def box(low: Vec3, high: Vec3, *, omit: Sequence[str] = (), unit_uv: bool = False) -> Mesh:
     """An axis-aligned box; `omit` names the faces to leave out, as in ("-z", "+y").
 
-    Faces that rest on other surfaces are left out so that no surface is there which nobody sees.
+    Faces that rest on other surfaces can be left out: no camera sees them.
     UVs are metres from the lower corner of each face, or [0, 1] with `unit_uv`.
     """
     corner = np.asarray(low, dtype=np.float64)

@@ -21,7 +21,7 @@ VERSION = "3.0.0"
 
 @final
 class SceneWriter:
-    """A scene in the making: `scene.xml` beside the folders `meshes` and `textures`.
+    """Collects a scene, then writes `scene.xml` beside the folders `meshes` and `textures`.
 
     All colours are linear RGB, all paths in the scene file relative to it.
     """
@@ -46,8 +46,8 @@ class SceneWriter:
     def painted(self, name: str, base_color: np.ndarray, roughness: np.ndarray) -> str:
         """A `principled` material with textures: base_color (h, w, 3), roughness (h, w).
 
-        Roughness is drawn between 0.15 and 0.9 and lies between 0.175 and 0.55 here, as lacquer has
-        it: nothing that a photograph shows tells 0.7 from 0.9.
+        Roughness from 0.15 to 0.9 is mapped to 0.175 to 0.55, that of lacquer: photographs do not
+        distinguish 0.7 from 0.9.
         """
         roughness = 0.1 + 0.5 * roughness
         bsdf = self._principled(name)
@@ -96,7 +96,7 @@ class SceneWriter:
 
     def _principled(self, name: str) -> ElementTree.Element:
         bsdf = self._add(self._root, "bsdf", type="principled", id=name)
-        # Varnished (F0 = 0.08): roughness shows little under light from everywhere.
+        # Varnished (F0 = 0.08): under diffuse illumination roughness has little effect otherwise.
         self._add(bsdf, "float", name="specular", value="1.0")
         # By default half of all samples go to the specular lobe, which carries a few per cent of
         # the light: the weights of long diffuse paths then grow as 2^bounces.
@@ -118,7 +118,7 @@ class SceneWriter:
 
     def _texture(self, name: str, values: np.ndarray) -> str:
         path = self._subfolder("textures") / f"{name}.exr"
-        # Half precision is exact enough for a truth: what is in the file IS the truth.
+        # Half precision suffices: ground truth is rendered from these files.
         mi.Bitmap(np.ascontiguousarray(values, dtype=np.float16)).write(str(path))
         return f"textures/{path.name}"
 
