@@ -1,12 +1,20 @@
 # One command a job; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup lint test test-slow demo bench clean distclean
+.PHONY: help setup lint test test-fast test-slow docs demo bench clean distclean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-complete
 PYTEST := $(BIN)/python -m pytest
 FORMATTED := src tests benchmarks scripts
+# Dr.Jit compiles on one thread: two processes of tests take little more than half the time of one.
+WORKERS ?= 2
+PARALLEL := -n $(WORKERS) --dist worksteal
+# Tests of single functions, for the inner loop; what renders or fits is left to `make test`.
+FAST := tests/test_backend.py tests/test_config.py tests/test_equations.py tests/test_house.py \
+  tests/test_io.py tests/test_public_api.py tests/dataset tests/fields/test_emission.py \
+  tests/fields/test_fields.py tests/imaging tests/report tests/scene tests/training/test_schedule.py \
+  tests/transport/test_methods.py
 
 help: ## list these jobs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -30,11 +38,17 @@ lint: setup ## format, lint, layers and types, without running anything
 test: setup ## linters and the tests that take seconds
 	@status=0; \
 	$(MAKE) --no-print-directory lint || status=1; \
-	$(PYTEST) -m "not slow and not gpu" $(ARGS) || status=1; \
+	$(PYTEST) $(PARALLEL) -m "not slow and not gpu" $(ARGS) || status=1; \
 	exit $$status
+
+test-fast: setup ## tests of single functions, under a minute
+	@$(PYTEST) $(PARALLEL) -q -m "not slow and not gpu" $(FAST) $(ARGS)
 
 test-slow: setup ## every test, minutes; those for a GPU run where there is one
 	@$(PYTEST) --timeout 1800 $(ARGS)
+
+docs: setup ## the documentation site, into site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 demo: setup ## capture, fit, evaluate and report a small room into demo/ (FRESH=1 starts over)
 	@FRESH="$(FRESH)" bash scripts/demo.sh
@@ -43,7 +57,7 @@ bench: setup ## where the time of a step goes here, into benchmarks/results (STA
 	@$(BIN)/python benchmarks/run.py machine --again
 
 clean: ## remove the demo, builds and caches
-	rm -rf demo build dist src/*.egg-info .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf demo build dist site src/*.egg-info .pytest_cache .ruff_cache .import_linter_cache
 	find src tests scripts -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean ## the same and .venv

@@ -1,5 +1,6 @@
 """One Mitsuba variant for the whole session, and what tests of several folders share."""
 
+import os
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -11,6 +12,12 @@ from unbake import backend
 from unbake.errors import UserError
 
 ROOT = Path(__file__).parents[1]
+
+# Kernels that tests compile are kept by content, in a folder that processes and checkouts share.
+# Dr.Jit 1.5 sweeps its own folder at 100 MB, which the tests alone would fill.
+_CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+os.environ.setdefault("DRJIT_CACHE_DIR", str(_CACHE / "unbake" / "test-kernels"))
+os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(1 << 30))
 
 # Test modules import `support`; pytest's importlib mode puts no folder on the path.
 sys.path.insert(0, str(Path(__file__).parent))

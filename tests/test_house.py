@@ -126,3 +126,9 @@ def test_one_module_names_the_files_of_a_folder(what, repository):
 def test_a_file_name_outside_its_module_is_found(line, hits):
     _, *names = FILE_NAMES["run"]
     assert len(list(spelled(ast.parse(line), *names))) == hits
+
+
+def test_the_fast_tests_are_there(repository):
+    text = (repository / "Makefile").read_text("utf-8").replace("\\\n", " ")
+    paths = re.search(r"^FAST := (.*)$", text, flags=re.MULTILINE)[1].split()
+    assert len(paths) > 5 and [p for p in paths if not (repository / p).exists()] == []

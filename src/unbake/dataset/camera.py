@@ -39,9 +39,12 @@ class Camera:
     Args:
         to_world: (4, 4) float64, camera to world, world units, OpenGL axes (x right, y up, looks
             along -z).
-        fl_x, fl_y: focal lengths in pixels.
-        cx, cy: principal point in pixels from the left and the top edge.
-        width, height: image size in pixels.
+        fl_x: horizontal focal length in pixels.
+        fl_y: vertical focal length in pixels.
+        cx: principal point in pixels from the left edge.
+        cy: principal point in pixels from the top edge.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
 
     Raises:
         UserError: the pose is not a finite, right-handed rigid motion, a focal length is not
@@ -86,9 +89,12 @@ class Camera:
         """A camera at `origin` that looks at `target`, with the principal point in the middle.
 
         Args:
-            origin, target, up: (3,) in world units; `up` need not be perpendicular to the view.
+            origin: position of the camera, (3,) in world units.
+            target: a point that it looks at, (3,) in world units.
+            up: upward direction, (3,), not necessarily perpendicular to the view.
             fov_degrees: horizontal field of view, between 0 and 180 degrees.
-            width, height: image size in pixels.
+            width: of the image, in pixels.
+            height: of the image, in pixels.
 
         Raises:
             UserError: the points coincide, `up` is parallel to the view, or the field of view is
@@ -141,7 +147,8 @@ class Camera:
         """Origins and unit directions, (n, 3) each in world space, through film positions.
 
         Args:
-            px, py: (n,) in pixels from the left and the top edge; pixel centres are at k + 0.5.
+            px: (n,) in pixels from the left edge; pixel centres are at k + 0.5.
+            py: (n,) in pixels from the top edge.
         """
         x, y = (px - self.cx) / self.fl_x, -(py - self.cy) / self.fl_y
         local = np.stack([x, y, -np.ones_like(x)], axis=1)

@@ -38,7 +38,8 @@ class View:
         split: "train" or "heldout".
         camera: pose and intrinsics, in the image's pixels.
         image: linear RGB radiance, alpha 1 where a surface is seen; inside the data folder.
-        albedo, roughness: truth images, None where the data set has none.
+        albedo: its true picture; None where the data set has none.
+        roughness: likewise.
     """
 
     name: str
