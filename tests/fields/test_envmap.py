@@ -198,6 +198,33 @@ def test_lanes_that_are_not_active_are_zero_and_poison_nothing():
     assert all(np.isfinite(dr.grad(v)).all() for v in values.values())
 
 
+def test_directions_that_are_no_numbers_read_and_poison_no_table():
+    """Mitsuba asks for the environment along any ray that leaves the scene, whatever it is."""
+    bad = [np.nan, np.inf, -np.inf, 3e38]
+    good = np.array([[0, 0, 1], [0.6, 0, 0.8]], np.float32).T
+    environment, values = filled(8)
+    broken = np.array([(a, b, c) for a in (0, *bad) for b in (0, *bad) for c in bad], np.float32).T
+    d = vectors(np.concatenate([good, broken], axis=1))
+    radiance, pdf = environment.radiance(d), environment.pdf(d)
+    dr.backward(dr.sum(dr.sum(radiance)))
+    texels = np.array(environment.texels).reshape(-1, 4)[:, :3]
+    found = np.array(radiance)
+    assert np.isfinite(found).all() and np.isfinite(pdf).all()
+    assert (found.min(1) >= texels.min(0)).all() and (found.max(1) <= 1.0001 * texels.max(0)).all()
+    assert all(np.isfinite(dr.grad(v)).all() for v in values.values())
+
+    alone, _ = filled(8)
+    expected = np.array(alone.radiance(vectors(good)))
+    np.testing.assert_array_equal(found[:, :2], expected)
+
+
+def test_random_numbers_that_are_none_choose_directions():
+    environment, _ = filled(8)
+    u = np.array([np.nan, 0.5, 0.3, np.inf], np.float32)
+    direction, pdf = environment.sample(mi.Point2f(mi.Float(u), mi.Float(u[::-1].copy())))
+    assert np.isfinite(direction).all() and np.isfinite(pdf).all()
+
+
 def test_extreme_parameters_stay_finite_and_keep_a_gradient():
     environment, values = filled(8)
     for sign in (1, -1):

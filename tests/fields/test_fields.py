@@ -253,6 +253,21 @@ def test_a_lane_that_hit_nothing_poisons_nothing(bad, engine):
         np.testing.assert_allclose(found[name], clean[name], rtol=1e-4, atol=1e-4, err_msg=name)
 
 
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan, 3e38])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_surface_at_no_position_poisons_nothing(bad, engine):
+    """A degenerate triangle may say that it was hit, and not where."""
+    field, up = radiance(), mi.Vector3f(0, 0, 1)
+    parameters = randomised(field.function)
+    p = dr.select(dr.arange(mi.UInt32, 32) % 4 != 1, world_points(32), mi.Point3f(bad))
+    unit = np.array(field.domain.to_unit(p, mi.Bool(True)))
+    assert unit.min() >= 0 and unit.max() <= 1
+    value = field.evaluate(p, up, mi.Normal3f(up), mi.Color3f(0.5), mi.Bool(True), engine)
+    dr.backward(dr.sum(dr.sum(dr.square(value))))
+    assert np.isfinite(value).all()
+    assert all(np.isfinite(dr.grad(v)).all() for v in parameters.values())
+
+
 # ----------------------------------------------------------------------------------- materials
 
 

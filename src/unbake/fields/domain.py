@@ -47,4 +47,13 @@ class Domain:
         good.
         """
         unit = (mi.Point3f(p) - mi.Point3f(*self.centre)) / self.extent + 0.5
-        return dr.clip(dr.select(valid, unit, 0.5), 0, 1)
+        return bounded(dr.select(valid, unit, 0.5), 0, 1)
+
+
+def bounded(x: mi.Float | mi.Point3f | mi.Point2f, lower: float, upper: float):
+    """The nearest number in [lower, upper]; `lower` for what is not a number.
+
+    Dr.Jit 1.5's `clip`, `minimum` and `maximum` pass NaN on. As an index it would lie far outside
+    of any table.
+    """
+    return dr.fmin(dr.fmax(x, lower), upper)

@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .domain import bounded
+
 COARSEST = 4  #: texels along an edge of the first level
 UNIFORM_SHARE = 0.05  #: of the directions, drawn from the whole sphere, so that no density is zero
 BOUND = 20.0  #: of the log of radiance over scale, so that nothing overflows single precision
@@ -110,8 +112,9 @@ class EnvironmentMap:
         Gradients go to the parameters, not to `d`. Lanes that are not active get zero.
         """
         active, stride = mi.Bool(active), self.resolution + 2
-        p = to_square(dr.detach(d)) * self.resolution + 0.5
-        cell = mi.Point2u(dr.clip(p, 0, self.resolution))
+        # Directions that are no numbers look up a corner: as indices they would be out of bounds.
+        p = bounded(to_square(dr.detach(d)) * self.resolution + 0.5, 0, self.resolution + 1)
+        cell = mi.Point2u(dr.minimum(p, self.resolution))
         f = p - mi.Point2f(cell)
         first = cell.y * stride + cell.x
         texel = [
@@ -145,7 +148,7 @@ class EnvironmentMap:
         return self._density(to_square(dr.detach(d)), active)
 
     def _density(self, p: mi.Point2f, active: mi.Bool) -> mi.Float:
-        cell = mi.Point2u(dr.clip(p * self.resolution, 0, self.resolution - 1))
+        cell = mi.Point2u(bounded(p * self.resolution, 0, self.resolution - 1))
         texel = cell.y * self.resolution + cell.x
         chosen = dr.gather(mi.Float, self.tables["probability"], texel, active)
         return dr.lerp(chosen * self.resolution**2, 1, UNIFORM_SHARE) / (4 * math.pi)
@@ -296,4 +299,4 @@ def _inverted(
     before = dr.gather(mi.Float, sums, first + index - 1, mi.Bool(active) & (index > 0))
     chosen = dr.gather(mi.Float, sums, first + index, active) - before
     rest = (target - before) / dr.maximum(chosen, 1e-30)
-    return index, dr.clip(rest, 0, 1 - 2**-24)
+    return index, bounded(rest, 0, 1 - 2**-24)
