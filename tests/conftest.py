@@ -10,6 +10,7 @@ import pytest
 
 from unbake import backend
 from unbake.errors import UserError
+from unbake.quantities import QUANTITIES
 
 ROOT = Path(__file__).parents[1]
 
@@ -110,12 +111,12 @@ def cornell(tmp_path_factory) -> Path:
 def tiny(tmp_path_factory) -> Path:
     """A settings file of a fit that takes seconds: small networks, few samples, 30 steps."""
     grid = "levels = 2\ntable_log2 = 8\nbase_resolution = 2\n"
-    networks = "".join(
-        f"[{name}]\nwidth = 8\nhidden = 1\n[{name}.grid]\n{grid}"
-        for name in ("albedo", "roughness", "radiance")
+    fields = "".join(
+        f"[{name}.neural]\nwidth = 8\nhidden = 1\n[{name}.neural.grid]\n{grid}"
+        for name in (*(f"materials.{name}" for name in QUANTITIES), "radiance")
     )
     file = tmp_path_factory.mktemp("settings") / "tiny.toml"
-    file.write_text("steps = 30\npixels = 64\nspp = 4\nwarm_up = 0\n" + networks)
+    file.write_text("steps = 30\npixels = 64\nspp = 4\nwarm_up = 0\n" + fields)
     return file
 
 

@@ -69,7 +69,12 @@ def check_run(run: Path) -> None:
     entries = {"config.toml", "origin.json", "log.jsonl", "checkpoints", "previews", "evaluation"}
     assert {p.name for p in run.iterdir()} == entries
     config = read_toml(run / "config.toml")
-    assert (config.steps, config.seed, config.method, config.albedo.width) == (30, 3, "ours", 8)
+    assert (
+        config.steps,
+        config.seed,
+        config.method,
+        config.materials["albedo"]["neural"].width,
+    ) == (30, 3, "ours", 8)
     assert [p.name for p in (run / "checkpoints").iterdir()] == ["step-0000030.safetensors"]
     assert [p.name for p in (run / "previews").iterdir()] == ["step-000030.png"]
     lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]

@@ -1,11 +1,17 @@
 """Settings: TOML gives back what was written, and every mistake is named."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 import typing
+from pathlib import Path
 
 import pytest
 
 from unbake.config import (
+    BitmapConfig,
+    DenseGridConfig,
     FitConfig,
     GridConfig,
     NetworkConfig,
@@ -19,6 +25,8 @@ from unbake.config import (
 from unbake.errors import UserError
 
 PRESETS = typing.get_args(PresetName)
+#: For another process to find the package of this checkout.
+PATH = {"PYTHONPATH": str(Path(__file__).parents[1] / "src")}
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -33,8 +41,11 @@ def test_a_preset_survives_toml(name):
     "changes",
     [
         {"seed": 2**40, "steps": 1, "spp": 2, "method": "direct"},
-        {"learning_rate": 1e-300, "loss_epsilon": 1e20, "seconds": 1 / 3},
-        {"albedo": NetworkConfig(GridConfig(1, 4, 12, 7, 1.05), 3, 5)},
+        {"final_learning_rate": 1e-300, "loss_epsilon": 1e20, "seconds": 1 / 3},
+        {"materials": {"albedo": {"neural": NetworkConfig(GridConfig(1, 4, 12, 7, 1.05), 3, 5)}}},
+        {"materials": {"roughness": {"bitmap": BitmapConfig(9, 1e-300)}}},
+        {"radiance": {"grid": DenseGridConfig(7)}, "radiance_representation": "grid"},
+        {"quantities": ("roughness",), "representation": "bitmap"},
         {"transport": TransportConfig(0), "estimator": "two-pass"},
     ],
 )
@@ -46,19 +57,20 @@ def test_any_settings_survive_toml(changes):
 def test_every_field_is_written():
     lines = to_toml(FitConfig()).splitlines()
     for field in dataclasses.fields(FitConfig):
-        assert any(line.startswith((f"{field.name} = ", f"[{field.name}]")) for line in lines)
+        starts = (f"{field.name} = ", f"[{field.name}]", f"[{field.name}.")
+        assert any(line.startswith(starts) for line in lines)
 
 
 def test_absent_keys_come_from_the_named_preset():
     assert from_toml("") == preset("cpu")
-    config = from_toml('preset = "paper"\nsteps = 5\nlearning_rate = 1\n[radiance]\nwidth = 9\n')
-    assert (config.steps, config.learning_rate, config.radiance.width) == (5, 1.0, 9)
-    assert isinstance(config.learning_rate, float)
+    config = from_toml(
+        'preset = "paper"\nsteps = 5\nfinal_learning_rate = 1\n[radiance.neural]\nwidth = 9\n'
+    )
+    assert (config.steps, config.final_learning_rate) == (5, 1.0)
+    assert isinstance(config.final_learning_rate, float)
+    network = dataclasses.replace(preset("paper").radiance["neural"], width=9)
     expected = dataclasses.replace(
-        preset("paper"),
-        steps=5,
-        learning_rate=1.0,
-        radiance=dataclasses.replace(preset("paper").radiance, width=9),
+        preset("paper"), steps=5, final_learning_rate=1.0, radiance={"neural": network}
     )
     assert config == expected
 
@@ -74,18 +86,21 @@ def test_settings_cannot_be_changed_in_place():
         ("steps = ", "not valid TOML"),
         ("steps = 1\nsteps = 2", "not valid TOML"),
         ("stepz = 1", "stepz: unknown key. Known keys: .*steps"),
-        ("[radiance]\nwidht = 1", r"radiance.widht: unknown key. Known keys: grid, width"),
-        ("[radiance.grid]\nlevel = 1", r"radiance.grid.level: unknown key"),
+        (
+            "[radiance.neural]\nwidht = 1",
+            r"radiance.neural.widht: unknown key. Known keys: grid, width",
+        ),
+        ("[radiance.neural.grid]\nlevel = 1", r"radiance.neural.grid.level: unknown key"),
         ("[optimizer]\nrate = 1", "optimizer: unknown key"),
         ("radiance = 3", "radiance: must be a table"),
         ("[steps]\na = 1", "steps: must be int, not dict"),
         ("steps = 3.0", "steps: must be int, not float"),
         ("steps = true", "steps: must be int, not bool"),
-        ("learning_rate = true", "learning_rate: must be float, not bool"),
-        ('learning_rate = "fast"', "learning_rate: must be float, not str"),
-        ("learning_rate = [1]", "learning_rate: must be float, not list"),
-        ("learning_rate = 0", "learning_rate: must be positive, not 0.0"),
-        ("learning_rate = nan", "learning_rate: must be a finite number, not nan"),
+        ("final_learning_rate = true", "final_learning_rate: must be float, not bool"),
+        ('final_learning_rate = "fast"', "final_learning_rate: must be float, not str"),
+        ("final_learning_rate = [1]", "final_learning_rate: must be float, not list"),
+        ("final_learning_rate = 0", "final_learning_rate: must be positive, not 0.0"),
+        ("final_learning_rate = nan", "final_learning_rate: must be a finite number, not nan"),
         ("seconds = inf", "seconds: must be a finite number, not inf"),
         (f"seconds = {10**400}", "seconds: must be float"),
         ("steps = 0", "steps: must be 1 or more, not 0"),
@@ -99,19 +114,25 @@ def test_settings_cannot_be_changed_in_place():
         ("preset = 1", "preset: must be one of cpu, paper, release, not 1"),
         ("preset = [1]", "preset: must be one of"),
         ('method = "best"', "method: must be one of ours, no-prior, direct, ad-pt, .*not 'best'"),
-        ("[radiance]\nwidth = 0", r"radiance.width: must be 1 or more"),
-        ("[radiance]\nhidden = 0", r"radiance.hidden: must be 1 or more"),
-        ("[radiance.grid]\nlevels = 0", r"radiance.grid.levels: must be 1 or more"),
-        ("[radiance.grid]\nlevels = 99", r"radiance.grid.levels: must be such that"),
-        ("[radiance.grid]\nfeatures = 3", r"radiance.grid.features: must be 2, 4 or 8, not 3"),
-        ("[radiance.grid]\ntable_log2 = 60", r"radiance.grid.table_log2: must be 4 to 28"),
+        ("[radiance.neural]\nwidth = 0", r"radiance.neural.width: must be 1 or more"),
+        ("[radiance.neural]\nhidden = 0", r"radiance.neural.hidden: must be 1 or more"),
+        ("[radiance.neural.grid]\nlevels = 0", r"radiance.neural.grid.levels: must be 1 or more"),
+        ("[radiance.neural.grid]\nlevels = 99", r"radiance.neural.grid.levels: must be such that"),
         (
-            "[radiance.grid]\nbase_resolution = 0",
-            r"radiance.grid.base_resolution: must be 1 or more",
+            "[radiance.neural.grid]\nfeatures = 3",
+            r"radiance.neural.grid.features: must be 2, 4 or 8, not 3",
         ),
-        ("[radiance.grid]\ngrowth = 0.5", r"radiance.grid.growth: must be 1 or more"),
-        ("[radiance.grid]\ngrowth = nan", r"radiance.grid.growth: must be 1 or more"),
-        ("[radiance.grid]\ngrowth = inf", r"radiance.grid.levels: must be such that"),
+        (
+            "[radiance.neural.grid]\ntable_log2 = 60",
+            r"radiance.neural.grid.table_log2: must be 4 to 28",
+        ),
+        (
+            "[radiance.neural.grid]\nbase_resolution = 0",
+            r"radiance.neural.grid.base_resolution: must be 1 or more",
+        ),
+        ("[radiance.neural.grid]\ngrowth = 0.5", r"radiance.neural.grid.growth: must be 1 or more"),
+        ("[radiance.neural.grid]\ngrowth = nan", r"radiance.neural.grid.growth: must be 1 or more"),
+        ("[radiance.neural.grid]\ngrowth = inf", r"radiance.neural.grid.levels: must be such that"),
         ("[transport]\nmax_specular = -1", r"transport.max_specular: must be 0 or more"),
     ],
 )
@@ -129,3 +150,138 @@ def test_a_file_that_is_no_text_or_missing_is_named(tmp_path):
         read_toml(file)
     with pytest.raises(UserError, match="cannot be read"):
         read_toml(tmp_path)
+
+
+# -------------------------------------------------------------------------------- earlier formats
+
+
+#: Every key of format 1 that has moved, with a value that no preset has.
+FORMAT_1 = """
+preset = "paper"
+learning_rate = 0.5
+roughness_learning_rate = 0.25
+radiance_learning_rate = 0.125
+representation = "grid"
+[albedo]
+width = 11
+[albedo.grid]
+levels = 3
+[roughness]
+hidden = 5
+[radiance]
+width = 13
+[radiance.grid]
+features = 4
+[grid]
+albedo = 5
+roughness = 6
+radiance = 7
+learning_rate = 0.75
+roughness_learning_rate = 0.875
+radiance_learning_rate = 0.625
+[bitmap]
+albedo = 8
+roughness = 9
+learning_rate = 0.375
+roughness_learning_rate = 0.3125
+[regularisation]
+roughness_smoothness = 2.0
+"""
+FORMAT_2 = """
+format = 2
+preset = "paper"
+representation = "grid"
+[materials.albedo]
+neural = { width = 11, learning_rate = 0.5, grid = { levels = 3 } }
+grid = { cells = 5, learning_rate = 0.75 }
+bitmap = { resolution = 8, learning_rate = 0.375 }
+[materials.roughness]
+neural = { hidden = 5, learning_rate = 0.25 }
+grid = { cells = 6, learning_rate = 0.875 }
+bitmap = { resolution = 9, learning_rate = 0.3125 }
+[radiance]
+neural = { width = 13, learning_rate = 0.125, grid = { features = 4 } }
+grid = { cells = 7, learning_rate = 0.625 }
+[regularization]
+roughness_smoothness = 2.0
+"""
+
+
+@pytest.mark.parametrize("number", ["", "format = 1\n"], ids=["without number", "with number"])
+def test_settings_of_format_1_mean_the_same_today(number):
+    old = from_toml(number + FORMAT_1)
+    assert old == from_toml(FORMAT_2)
+    assert old.materials["albedo"]["neural"] == NetworkConfig(
+        dataclasses.replace(preset("paper").materials["albedo"]["neural"].grid, levels=3),
+        width=11,
+        hidden=1,
+        learning_rate=0.5,
+    )
+    assert old.radiance["grid"] == DenseGridConfig(7, 0.625)
+    assert from_toml(to_toml(old)) == old
+
+
+def test_a_file_without_a_format_may_have_keys_of_today():
+    config = from_toml("learning_rate = 0.5\n[radiance.grid]\ncells = 9\nlearning_rate = 0.25\n")
+    assert config.materials["albedo"]["neural"].learning_rate == 0.5
+    assert config.radiance["grid"] == DenseGridConfig(9, 0.25)
+    assert from_toml("[radiance.grid]\nlevels = 5").radiance["neural"].grid.levels == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("format = 3", "format: unknown format 3. This version of unbake reads formats 1 to 2"),
+        ("format = true", "format: unknown format True"),
+        ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),
+        ("[grid]\nalbdo = 1", "grid.albdo: unknown key. Known keys: albedo, roughness, radiance, "),
+        ("learning_rate = 1.0\nalbedo = 3", "materials.albedo.neural: must be a table|albedo: "),
+        ("[bitmap]\nalbedo = 0", "materials.albedo.bitmap.resolution: must be 1 to 8192, not 0"),
+        ("[roughness]\nwidth = 0", "materials.roughness.neural.width: must be 1 or more, not 0"),
+    ],
+)
+def test_a_mistake_in_an_old_file_is_named(text, message):
+    with pytest.raises(UserError, match=f"^here.toml: ({message})"):
+        from_toml(text, "here.toml")
+
+
+# ------------------------------------------------------------------- quantities, representations
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('quantities = ["albedo", "gloss"]', "quantities: no quantity named 'gloss'. There are a"),
+        ("quantities = []", "quantities: no quantity named. There are albedo, roughness"),
+        ('quantities = ["albedo", "albedo"]', "quantities: a quantity is named twice"),
+        ('quantities = "albedo"', "quantities: must be a list, not str"),
+        ("quantities = [1]", "quantities: must be str, not int"),
+        ("[materials.gloss.neural]\nwidth = 1", "materials.gloss: unknown key. Known keys: albedo"),
+        ("[materials.albedo.mesh]\nwidth = 1", "materials.albedo.mesh: unknown key"),
+        ("[materials.albedo.bitmap]\ncells = 1", "materials.albedo.bitmap.cells: unknown key"),
+        ("[radiance.bitmap]\nresolution = 1", "radiance.bitmap: unknown key. Known keys: neural"),
+        ("[radiance.grid]\nlearning_rate = nan", "radiance.grid.learning_rate: must be a finite"),
+        ('representation = "mesh"', "representation: must be one of neural, grid, bitmap, not 'm"),
+        ('radiance_representation = "bitmap"', "radiance_representation: must be one of neural, g"),
+        (
+            'quantities = ["albedo"]\n[regularization]\nroughness_smoothness = 1.0',
+            r"quantities: must be roughness at least, as \[regularization\] says, not 'albedo'",
+        ),
+    ],
+)
+def test_a_field_that_there_is_not_is_named(text, message):
+    with pytest.raises(UserError, match=f"^here.toml: {message}"):
+        from_toml("format = 2\n" + text, "here.toml")
+
+
+def test_quantities_stand_in_the_order_of_the_table():
+    config = FitConfig(quantities=("roughness", "albedo"))
+    assert config.quantities == ("albedo", "roughness") == tuple(config.material_settings)
+
+
+def test_settings_are_read_without_mitsuba():
+    code = "import sys, unbake.config; print({'drjit', 'mitsuba'} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | PATH
+    )
+    assert done.stdout.strip() == "set()", done.stderr

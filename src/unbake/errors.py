@@ -1,5 +1,7 @@
 """The one exception that reaches a user: what is wrong, where, and the remedy."""
 
+from __future__ import annotations
+
 
 class UserError(Exception):
     """Bad input or an unusable machine, told in one line.
@@ -21,3 +23,9 @@ class UserError(Exception):
     def __str__(self) -> str:
         text = self.what if self.where is None else f"{self.where}: {self.what}"
         return text if self.remedy is None else f"{text}. {self.remedy}"
+
+
+def require(good: bool, key: str, wanted: str, value: object) -> None:
+    """Raise a `UserError` unless a setting is good, which says what it must be."""
+    if not good:
+        raise UserError(f"must be {wanted}, not {value!r}", where=key)

@@ -111,7 +111,7 @@ def test_gradient_is_the_derivative_of_the_estimator(held_plugin, built_in, meth
     materials = StandIn(mi.Color3f(*ALBEDO), ROUGHNESS)
     parameters = {"albedo": materials.albedo, "roughness": materials.roughness}
     textures = material_textures(materials)
-    scene = with_bsdf(built_in(name), "principled", base_color=textures[0], roughness=textures[1])
+    scene = with_bsdf(built_in(name), "principled", **textures)
     dr.enable_grad(parameters)
     with materials_along_paths(materials):
         # No Russian roulette: which paths it ends depends on φ as well.
@@ -147,7 +147,7 @@ def test_the_whole_gradient_of_the_furnace(built_in, method, albedo):
     """With paths of up to d vertices, I = Σ ρⁱ for i < d, and ∂I/∂ρ = Σ i ρⁱ⁻¹."""
     materials = StandIn(albedo)
     parsed = parse(built_in("furnace"))
-    texture, _ = material_textures(materials)
+    texture = material_textures(materials)["base_color"]
     for node in parsed.state.nodes:
         if node.props.plugin_name() == "diffuse":
             node.props["reflectance"] = texture

@@ -123,8 +123,9 @@ def cut_out(bsdf):
 @pytest.mark.parametrize("parameter", ["red", "green", "blue", "roughness"])
 def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, parameter):
     materials = ConstantMaterials(mi.Color3f(*ALBEDO), ROUGHNESS)
-    albedo, roughness = material_textures(materials)
-    live = SceneView.of(room(wrap(principled(albedo, roughness))), materials, 8)
+    textures = material_textures(materials)
+    bsdf = principled(textures["base_color"], textures["roughness"])
+    live = SceneView.of(room(wrap(bsdf)), materials, 8)
     dr.enable_grad(materials.albedo, materials.roughness)
     image = objective(live)
     dr.backward(dr.mean(dr.mean(image)))

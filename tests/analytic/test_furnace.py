@@ -21,6 +21,7 @@ from support import (
 from unbake.config import GridConfig, NetworkConfig
 from unbake.dataset.pixels import CameraRays
 from unbake.fields.domain import Domain
+from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField
 from unbake.fields.texture import material_textures
@@ -113,7 +114,7 @@ def test_the_residual_alone_finds_the_radiance(
 ):
     scene = mi.load_file(str(built_in("furnace", albedo)))
     scene_view = SceneView.of(scene, None, 8)
-    network = Network(SMALL, extra=12, outputs=6, seed=1)
+    network = Network(SMALL, FieldSpec(outputs=6, extra=12, seed=1))
     field = RadianceField(network, Domain.of(scene.bbox()), scale=scale)
     truth = 1 / (1 - albedo)
 
@@ -169,7 +170,7 @@ def learnable(built_in):
     """The furnace with Lambertian walls whose albedo is read from a stand-in for the fields."""
     materials = ConstantMaterials(0.5)
     parsed = parse(built_in("furnace"))
-    albedo, _ = material_textures(materials)
+    albedo = material_textures(materials)["base_color"]
     for node in parsed.state.nodes:
         if node.props.plugin_name() == "diffuse":
             node.props["reflectance"] = albedo

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from support import TINY, seeded
 
-from unbake.config import GridConfig, NetworkConfig
-from unbake.fields.domain import Domain
-from unbake.fields.materials import ROUGHNESS_FLOOR, Materials, Volume, with_joint_gradients
+from unbake.fields.domain import Domain, SurfacePoint
+from unbake.fields.field import FieldSpec
+from unbake.fields.materials import Materials, with_joint_gradients
 from unbake.fields.network import Network, can_record_layout
 from unbake.fields.radiance import RadianceField
+from unbake.fields.settings import GridConfig, NetworkConfig
+from unbake.quantities import QUANTITIES
 
 LANES = 200
 #: The fused engine is for LLVM.
@@ -49,11 +51,11 @@ def randomised(network, seed=0):
 def test_engines_agree_on_values_and_gradients(config, extra, outputs):
     results = {}
     for engine in ENGINES:
-        network = Network(config, extra=extra, outputs=outputs, seed=3)
+        network = Network(config, FieldSpec(outputs=outputs, extra=extra, seed=3))
         parameters = randomised(network)
         more = [mi.Float(0.1 * i) + points().x for i in range(extra)]
         dr.enable_grad(more)
-        values = network(points(), more, engine)
+        values = network.evaluate(SurfacePoint(points()), more, engine)
         assert len(values) == outputs
         dr.backward(sum((i + 1) * dr.sum(v * v) for i, v in enumerate(values)))
         gradients = {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
@@ -76,9 +78,9 @@ def test_engines_agree_on_values_and_gradients(config, extra, outputs):
 def test_half_precision_is_near_single(engine):
     found = []
     for half in (False, True):
-        network = Network(WIDE, extra=0, outputs=3, seed=3, half=half)
+        network = Network(WIDE, FieldSpec(outputs=3, seed=3, half=half))
         parameters = randomised(network)
-        values = network(points(), [], engine)
+        values = network.evaluate(SurfacePoint(points()), [], engine)
         assert all(type(v) is mi.Float for v in values)
         dr.backward(sum((i + 1) * dr.mean(v * v) for i, v in enumerate(values)))
         gradients = {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
@@ -94,10 +96,10 @@ def test_half_precision_is_near_single(engine):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_gradient_of_one_output_of_several(engine):
     """The other outputs, which nobody uses, have none."""
-    network = Network(WIDE, extra=0, outputs=3, seed=3)
+    network = Network(WIDE, FieldSpec(outputs=3, seed=3))
     parameters = randomised(network)
     weight = points(seed=8).x
-    dr.backward(dr.sum(weight * network(points(), [], engine)[1]))
+    dr.backward(dr.sum(weight * network.evaluate(SurfacePoint(points()), [], engine)[1]))
     last = f"{WIDE.hidden}.bias"
     gradient = np.array(dr.grad(parameters[last])).ravel()
     np.testing.assert_allclose(gradient, [0, np.sum(weight), 0], rtol=1e-5)
@@ -105,32 +107,32 @@ def test_the_gradient_of_one_output_of_several(engine):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_without_gradients_values_are_the_same(engine):
-    network = Network(WIDE, extra=0, outputs=3, seed=3)
+    network = Network(WIDE, FieldSpec(outputs=3, seed=3))
     randomised(network)
-    live = network(points(), [], engine)
+    live = network.evaluate(SurfacePoint(points()), [], engine)
     with dr.suspend_grad():
-        still = network(points(), [], engine)
+        still = network.evaluate(SurfacePoint(points()), [], engine)
     assert dr.grad_enabled(live) and not dr.grad_enabled(still)
     np.testing.assert_allclose(np.array(live), np.array(still), rtol=1e-5)
 
 
 def test_network_is_a_matrix_product_with_rectified_layers():
     """Against NumPy, the features taken as they are."""
-    network = Network(WIDE, extra=2, outputs=3, seed=5)
+    network = Network(WIDE, FieldSpec(outputs=3, extra=2, seed=5))
     randomised(network)
     more = [points(seed=2).x, points(seed=3).y]
     x = np.array([np.array(f) for f in [*network.grid(list(points())), *more]], np.float64)
     for i, (weights, bias) in enumerate(network.layers):
         x = np.array(weights, np.float64) @ x + np.array(bias, np.float64)
         x = np.maximum(x, 0) if i < WIDE.hidden else x
-    values = np.array([np.array(v) for v in network(points(), more)])
+    values = np.array([np.array(v) for v in network.evaluate(SurfacePoint(points()), more)])
     np.testing.assert_allclose(values, x, rtol=1e-3, atol=1e-4 * np.abs(x).max())
 
 
 def test_grid_interpolates_between_the_corners_of_a_cell():
     """One dense level of 2³ corners: its features are trilinear in the position."""
     grid = GridConfig(levels=1, features=2, table_log2=10, base_resolution=2)
-    network = Network(NetworkConfig(grid=grid, width=4, hidden=1), extra=0, outputs=1, seed=0)
+    network = Network(NetworkConfig(grid=grid, width=4, hidden=1), FieldSpec(outputs=1))
     randomised(network)
     a = np.array([0.1, 0.2, 0.15])
     b = np.array([0.35, 0.2, 0.15])
@@ -145,7 +147,7 @@ def test_grid_interpolates_between_the_corners_of_a_cell():
 
 def test_equal_seeds_give_equal_networks_and_others_do_not():
     def flat(seed):
-        network = Network(TINY, extra=0, outputs=3, seed=seed)
+        network = Network(TINY, FieldSpec(outputs=3, seed=seed))
         return np.concatenate([np.array(v).ravel() for v in network.parameters().values()])
 
     np.testing.assert_array_equal(flat(1), flat(1))
@@ -153,12 +155,12 @@ def test_equal_seeds_give_equal_networks_and_others_do_not():
 
 
 def test_gradients_arrive_in_the_arrays_that_were_assigned():
-    network = Network(TINY, extra=0, outputs=1, seed=1)
+    network = Network(TINY, FieldSpec(outputs=1, seed=1))
     given = {k: type(v)(v) for k, v in network.parameters().items()}
     dr.enable_grad(given)
     network.assign(given)
     for engine in ENGINES:
-        (value,) = network(points(), [], engine)
+        (value,) = network.evaluate(SurfacePoint(points()), [], engine)
         dr.backward(dr.sum(value))
     assert all(np.any(np.array(dr.grad(v)) != 0) for v in given.values())
 
@@ -167,7 +169,7 @@ def test_gradients_arrive_in_the_arrays_that_were_assigned():
 
 
 def radiance(scale=2.0):
-    network = Network(TINY, extra=12, outputs=6, seed=1)
+    network = Network(TINY, FieldSpec(outputs=6, extra=12, seed=1))
     return RadianceField(network, Domain((1.0, 2.0, 3.0), 4.0), scale=scale)
 
 
@@ -272,9 +274,9 @@ def test_a_surface_at_no_position_poisons_nothing(bad, engine):
 
 
 def materials(seed=1):
-    albedo = Network(TINY, extra=0, outputs=3, seed=seed)
-    roughness = Network(TINY, extra=0, outputs=1, seed=seed + 1)
-    fields = Materials(Volume(albedo), Volume(roughness))
+    albedo = Network(TINY, FieldSpec(outputs=3, seed=seed, bounded=True))
+    roughness = Network(TINY, FieldSpec(outputs=1, seed=seed + 1, bounded=True))
+    fields = Materials({"albedo": albedo, "roughness": roughness})
     fields.domain = Domain((0.0, 0.0, 0.0), 2.0)
     return fields
 
@@ -287,14 +289,14 @@ def surface(p):
 
 def test_materials_stay_in_their_ranges():
     fields = materials()
-    for field in fields.fields.values():
+    for field in fields.values():
         values = randomised(field)
         values = {k: 20 * v for k, v in values.items()}
         field.assign(values)
     found = fields.evaluate(surface(points(2000)), mi.Bool(True))
-    albedo, roughness = np.array(found.albedo), np.array(found.roughness)
+    albedo, roughness = np.array(found["albedo"]), np.array(found["roughness"])
     assert np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1
-    assert roughness.min() >= ROUGHNESS_FLOOR - 1e-6 and roughness.max() <= 1
+    assert roughness.min() >= QUANTITIES["roughness"].lower - 1e-6 and roughness.max() <= 1
     # Both ends are reached, or the test would show nothing.
     assert albedo.min() < 0.01 and albedo.max() > 0.99
     assert roughness.min() < 0.03 and roughness.max() > 0.99
@@ -302,19 +304,19 @@ def test_materials_stay_in_their_ranges():
 
 def test_untrained_materials_are_grey():
     found = materials().evaluate(surface(points()), mi.Bool(True))
-    np.testing.assert_allclose(np.array(found.albedo), 0.5, atol=0.05)
+    np.testing.assert_allclose(np.array(found["albedo"]), 0.5, atol=0.05)
 
 
 def test_material_engines_agree():
     fields = materials()
-    for i, field in enumerate(fields.fields.values()):
+    for i, field in enumerate(fields.values()):
         randomised(field, i)
     si = surface(points())
     a, b = (fields.evaluate(si, mi.Bool(True), e) for e in ("tensor", "coopvec"))
-    np.testing.assert_allclose(np.array(a.albedo), np.array(b.albedo), atol=1e-5)
-    np.testing.assert_allclose(np.array(a.roughness), np.array(b.roughness), atol=1e-5)
+    np.testing.assert_allclose(np.array(a["albedo"]), np.array(b["albedo"]), atol=1e-5)
+    np.testing.assert_allclose(np.array(a["roughness"]), np.array(b["roughness"]), atol=1e-5)
     np.testing.assert_allclose(
-        np.array(fields.albedo_at(si, mi.Bool(True))), np.array(a.albedo), atol=1e-6
+        np.array(fields.evaluate_one("albedo", si, mi.Bool(True))), np.array(a["albedo"]), atol=1e-6
     )
 
 
@@ -323,16 +325,16 @@ def test_gradients_computed_together_are_those_computed_one_by_one(used):
     def gradients(through):
         fields = materials()
         parameters = {}
-        for i, (name, field) in enumerate(fields.fields.items()):
+        for i, (name, field) in enumerate(fields.items()):
             for key, value in randomised(field, i).items():
                 parameters[f"{name}.{key}"] = value
         fields.assign(parameters)
         found = through(fields.evaluate(surface(points()), mi.Bool(True)))
         loss = 0
         if used != "roughness":
-            loss += dr.sum(dr.square(found.albedo).x * found.albedo.z)
+            loss += dr.sum(dr.square(found["albedo"]).x * found["albedo"].z)
         if used != "albedo":
-            loss += dr.sum(found.roughness * dr.detach(found.albedo.y))
+            loss += dr.sum(found["roughness"] * dr.detach(found["albedo"].y))
         dr.backward(dr.sum(loss))
         return {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
 
@@ -347,8 +349,8 @@ def test_parameters_go_out_and_come_back():
     other.assign(one.parameters())
     si = surface(points())
     a, b = one.evaluate(si, mi.Bool(True)), other.evaluate(si, mi.Bool(True))
-    np.testing.assert_array_equal(np.array(a.albedo), np.array(b.albedo))
-    np.testing.assert_array_equal(np.array(a.roughness), np.array(b.roughness))
+    np.testing.assert_array_equal(np.array(a["albedo"]), np.array(b["albedo"]))
+    np.testing.assert_array_equal(np.array(a["roughness"]), np.array(b["roughness"]))
 
 
 # -------------------------------------------------------------------------------------- domain

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from support import TINY_FIT, seeded
 
-from unbake.config import BitmapConfig, DenseGridConfig
+from unbake.config import BitmapConfig, DenseGridConfig, update
 from unbake.errors import UserError
 from unbake.fields.bitmap import Bitmaps
 from unbake.fields.domain import Domain, SurfacePoint
+from unbake.fields.field import FieldSpec
 from unbake.fields.grid import DenseGrid
 from unbake.fields.materials import make_materials
 from unbake.fields.network import Network
@@ -22,12 +23,18 @@ REPRESENTATIONS = ["neural", "grid", "bitmap"]
 
 
 def settings(representation="neural", radiance="neural"):
-    return dataclasses.replace(
+    small = update(
         TINY_FIT,
-        representation=representation,
-        radiance_representation=radiance,
-        grid=DenseGridConfig(albedo=5, roughness=3, radiance=4),
-        bitmap=BitmapConfig(albedo=6, roughness=4),
+        {
+            "materials": {
+                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}},
+                "roughness": {"grid": {"cells": 3}, "bitmap": {"resolution": 4}},
+            },
+            "radiance": {"grid": {"cells": 4}},
+        },
+    )
+    return dataclasses.replace(
+        small, representation=representation, radiance_representation=radiance
     )
 
 
@@ -61,7 +68,9 @@ def interactions(lanes=LANES):
 
 
 def made(representation):
-    fields = make_materials(settings(representation), ["one"], seed=3)
+    fields = make_materials(
+        representation, settings(representation).material_settings, ["one"], seed=3
+    )
     fields.domain = Domain((0.0, 0.0, 0.0), 2.0)
     return fields
 
@@ -72,8 +81,8 @@ def made(representation):
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
 def test_untrained_materials_are_grey(representation):
     found = made(representation).evaluate(interactions(), mi.Bool(True))
-    np.testing.assert_allclose(np.array(found.albedo), 0.5, atol=0.05)
-    np.testing.assert_allclose(np.array(found.roughness), 0.51, atol=0.05)
+    np.testing.assert_allclose(np.array(found["albedo"]), 0.5, atol=0.05)
+    np.testing.assert_allclose(np.array(found["roughness"]), 0.51, atol=0.05)
 
 
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
@@ -84,7 +93,7 @@ def test_gradients_are_those_of_finite_differences(representation, engine):
 
     def value():
         found = fields.evaluate(si, mi.Bool(True), engine)
-        total = dr.sum(found.albedo * mi.Color3f(1, 2, 3)) + 2 * found.roughness
+        total = dr.sum(found["albedo"] * mi.Color3f(1, 2, 3)) + 2 * found["roughness"]
         return dr.sum(total * (1 + mi.Float(si.p.x)))
 
     dr.backward(value())
@@ -113,11 +122,11 @@ def test_engines_agree(representation):
     fields, si = made(representation), interactions()
     randomised(fields)
     a, b = (fields.evaluate(si, mi.Bool(True), engine) for engine in ("tensor", "coopvec"))
-    assert np.ptp(np.array(a.albedo)) > 0.1 and np.ptp(np.array(a.roughness)) > 0.1
-    np.testing.assert_allclose(np.array(a.albedo), np.array(b.albedo), atol=1e-5)
-    np.testing.assert_allclose(np.array(a.roughness), np.array(b.roughness), atol=1e-5)
-    alone = fields.albedo_at(si, mi.Bool(True))
-    np.testing.assert_allclose(np.array(alone), np.array(a.albedo), atol=1e-6)
+    assert np.ptp(np.array(a["albedo"])) > 0.1 and np.ptp(np.array(a["roughness"])) > 0.1
+    np.testing.assert_allclose(np.array(a["albedo"]), np.array(b["albedo"]), atol=1e-5)
+    np.testing.assert_allclose(np.array(a["roughness"]), np.array(b["roughness"]), atol=1e-5)
+    alone = fields.evaluate_one("albedo", si, mi.Bool(True))
+    np.testing.assert_allclose(np.array(alone), np.array(a["albedo"]), atol=1e-6)
 
 
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
@@ -126,12 +135,12 @@ def test_parameters_go_out_and_come_back(representation):
     randomised(one, seed=1)
     randomised(other, seed=2)
     si = interactions()
-    before = np.array(other.evaluate(si, mi.Bool(True)).albedo)
+    before = np.array(other.evaluate(si, mi.Bool(True))["albedo"])
     other.assign(one.parameters())
     a, b = one.evaluate(si, mi.Bool(True)), other.evaluate(si, mi.Bool(True))
-    np.testing.assert_array_equal(np.array(a.albedo), np.array(b.albedo))
-    np.testing.assert_array_equal(np.array(a.roughness), np.array(b.roughness))
-    assert (before != np.array(b.albedo)).any()
+    np.testing.assert_array_equal(np.array(a["albedo"]), np.array(b["albedo"]))
+    np.testing.assert_array_equal(np.array(a["roughness"]), np.array(b["roughness"]))
+    assert (before != np.array(b["albedo"])).any()
 
 
 @pytest.mark.parametrize("bad", [np.inf, np.nan, 3e38])
@@ -142,7 +151,7 @@ def test_a_lane_that_hit_nothing_poisons_nothing(representation, bad):
         parameters = randomised(fields)
         found = fields.evaluate(si, valid)
         near = fields.evaluate_near(si, valid, mi.Point2f(0.3, 0.6), 0.1)
-        total = found.roughness + near.roughness + dr.sum(found.albedo + near.albedo)
+        total = found["roughness"] + near["roughness"] + dr.sum(found["albedo"] + near["albedo"])
         dr.backward(dr.sum(dr.select(valid, dr.square(total), 0)))
         return np.array(total), {k: np.array(dr.grad(v)).ravel() for k, v in parameters.items()}
 
@@ -182,20 +191,25 @@ def test_near_points_show_a_slope(representation):
     """Differences at near points are small with the radius, and not zero."""
     fields, si = made(representation), interactions()
     randomised(fields)
-    here = np.array(fields.evaluate(si, mi.Bool(True)).roughness)
+    here = np.array(fields.evaluate(si, mi.Bool(True))["roughness"])
     mean = []
     for radius in (0.001, 0.1):
         near = fields.evaluate_near(si, mi.Bool(True), mi.Point2f(*uniform(2)), radius)
-        mean.append(np.abs(np.array(near.roughness) - here).mean())
+        mean.append(np.abs(np.array(near["roughness"]) - here).mean())
     assert 0 < mean[0] < 0.05 * mean[1]
 
 
 # ------------------------------------------------------------------------------------------ grid
 
 
+def radiance_field(representation, domain, *, scale, seed):
+    config = settings(radiance=representation)
+    return make_radiance(representation, config.radiance_settings, domain, scale=scale, seed=seed)
+
+
 def test_a_grid_is_exact_on_a_linear_function():
     """Up to the faces of the cube: corners of cells lie on them."""
-    grid, cells = DenseGrid(4, outputs=3), 4
+    grid, cells = DenseGrid(DenseGridConfig(4), FieldSpec(outputs=3)), 4
     k, j, i = np.meshgrid(*3 * [np.arange(cells + 1) / cells], indexing="ij")  # x varies fastest
     linear = np.stack([1 + 2 * i - j, j + 3 * k, i - k, 0 * i], -1)
     (name,) = grid.parameters()
@@ -203,13 +217,13 @@ def test_a_grid_is_exact_on_a_linear_function():
     x, y, z = np.array(uniform(3)).reshape(3, -1)
     x[:3], y[:3], z[:3] = [0, 1, 1], [0, 1, 0], [0, 1, 1]
     p = mi.Point3f(*(mi.Float(c) for c in (x, y, z)))
-    found = np.array([np.array(v) for v in grid(p, [])])
+    found = np.array([np.array(v) for v in grid.evaluate(SurfacePoint(p))])
     np.testing.assert_allclose(found, [1 + 2 * x - y, y + 3 * z, x - z], atol=1e-5)
 
 
 @pytest.mark.parametrize(("outputs", "features"), [(1, 2), (3, 4), (6, 8)])
 def test_a_grid_has_a_value_of_its_own_at_every_corner(outputs, features):
-    grid = DenseGrid(9, outputs=outputs)
+    grid = DenseGrid(DenseGridConfig(9), FieldSpec(outputs=outputs))
     (values,) = grid.parameters().values()
     assert dr.width(values) >= features * 10**3
     # Distinct values at all corners come back from all corners: nothing is hashed.
@@ -217,12 +231,12 @@ def test_a_grid_has_a_value_of_its_own_at_every_corner(outputs, features):
     grid.assign({"corners": mi.Float(dr.arange(mi.UInt32, count))})
     lane = dr.arange(mi.UInt32, 10**3)
     p = mi.Point3f(mi.Float(lane % 10), mi.Float(lane // 10 % 10), mi.Float(lane // 100)) / 9
-    found = np.array(grid(p, [])[0])
+    found = np.array(grid.evaluate(SurfacePoint(p))[0])
     assert len(np.unique(np.round(found))) == 10**3
 
 
 def test_a_radiance_grid_takes_the_calls_of_a_network():
-    field = make_radiance(settings(radiance="grid"), Domain.unit(), scale=2.0, seed=1)
+    field = radiance_field("grid", Domain.unit(), scale=2.0, seed=1)
     p, n = mi.Point3f(*uniform(3)), dr.zeros(mi.Normal3f, LANES)
     w = mi.Vector3f(0, 0, 1)
     untrained = field.evaluate(p, w, n, mi.Color3f(0.5), mi.Bool(True))
@@ -240,14 +254,19 @@ def test_a_radiance_grid_takes_the_calls_of_a_network():
 
 def test_both_representations_of_radiance_are_made():
     kinds = {
-        "neural": make_radiance(settings(), Domain.unit(), scale=1.0, seed=1).function,
-        "grid": make_radiance(settings(radiance="grid"), Domain.unit(), scale=1.0, seed=1).function,
+        "neural": radiance_field("neural", Domain.unit(), scale=1.0, seed=1).function,
+        "grid": radiance_field("grid", Domain.unit(), scale=1.0, seed=1).function,
     }
     assert isinstance(kinds["neural"], Network) and isinstance(kinds["grid"], DenseGrid)
     assert isinstance(RadianceField(kinds["grid"], Domain.unit(), scale=1.0), RadianceField)
 
 
 # --------------------------------------------------------------------------------------- bitmaps
+
+
+def bitmaps_of(resolution, names, channels):
+    spec = FieldSpec(outputs=channels, bounded=True, materials=tuple(names))
+    return Bitmaps(BitmapConfig(resolution), spec)
 
 
 def logit(values):
@@ -259,14 +278,14 @@ def assign_values(bitmaps, values):
     bitmaps.assign({"texels": mi.Float(logit(values).astype(np.float32).ravel())})
 
 
-def look_up(bitmaps, u, v, slot=0):
+def look_up(bitmaps, u, v, material=0):
     u, v = (mi.Float(np.asarray(c, np.float32)) for c in (u, v))
-    point = SurfacePoint(mi.Point3f(0), mi.Point2f(u, v), mi.UInt32(slot))
-    return np.array([np.array(c) for c in bitmaps(point)])
+    point = SurfacePoint(mi.Point3f(0), mi.Point2f(u, v), mi.UInt32(material))
+    return np.array([np.array(c) for c in bitmaps.evaluate(point)])
 
 
 def test_a_bitmap_is_exact_on_a_linear_function():
-    bitmaps, size = Bitmaps(8, ["one"], channels=3), 8
+    bitmaps, size = bitmaps_of(8, ["one"], 3), 8
     row, column = np.meshgrid(*2 * [(np.arange(size) + 0.5) / size], indexing="ij")
     linear = [0.1 + 0.8 * column, 0.9 - 0.8 * row, 0.2 + 0.3 * row + 0.3 * column]
     assign_values(bitmaps, np.stack(linear, -1)[None])
@@ -277,7 +296,7 @@ def test_a_bitmap_is_exact_on_a_linear_function():
 
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_bitmaps_repeat(size):
-    bitmaps = Bitmaps(size, ["one"], channels=3)
+    bitmaps = bitmaps_of(size, ["one"], 3)
     randomised(bitmaps)
     u, v = np.array(uniform(2)).reshape(2, -1)
     first = look_up(bitmaps, u, v)
@@ -290,7 +309,7 @@ def test_bitmaps_repeat(size):
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_bitmaps_equal_mitsubas_own(channels):
-    bitmaps = Bitmaps(5, ["other", "this"], channels=channels)
+    bitmaps = bitmaps_of(5, ["other", "this"], channels)
     randomised(bitmaps)
     values = bitmaps.to_arrays()["this"]
     assert values.shape == (5, 5, channels) and values.dtype == np.float32
@@ -299,18 +318,18 @@ def test_bitmaps_equal_mitsubas_own(channels):
     point = SurfacePoint(mi.Point3f(0), si.uv, mi.UInt32(1))
     expected = np.array(stock.eval_1(si) if channels == 1 else stock.eval(si))
     expected = expected.reshape(channels, -1)
-    found = np.array([np.array(c) for c in bitmaps(point)])
+    found = np.array([np.array(c) for c in bitmaps.evaluate(point)])
     assert np.ptp(found) > 0.1
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 def test_a_texel_that_is_not_touched_stays(tmp_path):
-    bitmaps = Bitmaps(8, ["one", "two"], channels=1)
+    bitmaps = bitmaps_of(8, ["one", "two"], 1)
     optimizer = mi.ad.Adam(0.1, bitmaps.parameters(), mask_updates=True)
     for _ in range(3):
         bitmaps.assign(dict(optimizer.items()))
         point = SurfacePoint(mi.Point3f(0), mi.Point2f(3.5 / 8, 6.5 / 8), mi.UInt32(1))
-        dr.backward(dr.sum(bitmaps(point)[0]))
+        dr.backward(dr.sum(bitmaps.evaluate(point)[0]))
         optimizer.step()
     moved = np.array(optimizer["texels"]).reshape(2, 8, 8)
     assert moved[1, 6, 3] < -0.2
@@ -320,4 +339,4 @@ def test_a_texel_that_is_not_touched_stays(tmp_path):
 
 def test_bitmaps_beyond_an_array_are_an_error():
     with pytest.raises(UserError, match="30 bitmaps of 8192 x 8192 pixels"):
-        Bitmaps(8192, ["x"] * 30, channels=3)
+        bitmaps_of(8192, ["x"] * 30, 3)

@@ -16,7 +16,7 @@ from support import (
     seeded,
 )
 
-from unbake.config import BitmapConfig, DenseGridConfig
+from unbake.config import BitmapConfig, update
 from unbake.errors import UserError
 from unbake.fields.materials import make_materials
 from unbake.fields.texture import material_textures, slots_of
@@ -32,12 +32,18 @@ REPRESENTATIONS = ["neural", "grid", "bitmap"]
 
 
 def settings(representation="neural", radiance="neural"):
-    return dataclasses.replace(
+    small = update(
         TINY_FIT,
-        representation=representation,
-        radiance_representation=radiance,
-        grid=DenseGridConfig(albedo=5, roughness=3, radiance=4),
-        bitmap=BitmapConfig(albedo=6, roughness=4),
+        {
+            "materials": {
+                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}},
+                "roughness": {"grid": {"cells": 3}, "bitmap": {"resolution": 4}},
+            },
+            "radiance": {"grid": {"cells": 4}},
+        },
+    )
+    return dataclasses.replace(
+        small, representation=representation, radiance_representation=radiance
     )
 
 
@@ -96,15 +102,15 @@ def with_slots(tmp_path):
     parsed = parse(path)
     edit.to_principled(parsed)
     names = edit.material_names(parsed)
-    config = dataclasses.replace(settings("bitmap"), bitmap=BitmapConfig(albedo=1, roughness=1))
-    fields = make_materials(config, names, seed=0)
-    each = [material_textures(fields, slot) for slot in range(len(names))]
+    single = dict.fromkeys(("albedo", "roughness"), BitmapConfig(resolution=1))
+    fields = make_materials("bitmap", single, names, seed=0)
+    each = [material_textures(fields, number) for number in range(len(names))]
     edit.set_own_textures(parsed, each)
     scene = parsed.instantiate()
     fields.slots = slots_of(scene)
     colours = {name: 0.2 + 0.15 * i for i, name in enumerate(names)}
     assign_values(
-        fields.fields["albedo"],
+        fields["albedo"],
         np.repeat(list(colours.values()), 3).reshape(-1, 1, 1, 3),
     )
     return SceneView.of(scene, fields, 4), colours
@@ -205,16 +211,16 @@ def test_bitmaps_render_as_mitsubas_own(built_in):
     parsed = parse(built_in("cornell"))
     edit.to_principled(parsed)
     names = edit.material_names(parsed)
-    fields = problem.materials.fields
+    fields = problem.materials
     stock = []
     for name in names:
         albedo, roughness = (fields[k].to_arrays()[name] for k in ("albedo", "roughness"))
         roughness = 0.02 + 0.98 * roughness
         stock.append(
-            [
-                mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(a), "raw": True})
-                for a in (albedo, roughness)
-            ]
+            {
+                slot: mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(a), "raw": True})
+                for slot, a in (("base_color", albedo), ("roughness", roughness))
+            }
         )
     edit.set_own_textures(parsed, stock)
     scene = parsed.instantiate()

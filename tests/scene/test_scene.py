@@ -9,7 +9,6 @@ import pytest
 
 from unbake.errors import UserError
 from unbake.fields.emission import Emission, emission_textures
-from unbake.fields.materials import Material
 from unbake.fields.texture import material_textures
 from unbake.imaging.pictures import write_exr
 from unbake.scene import edit, emitters
@@ -135,13 +134,16 @@ class Painted:
     def __init__(self, albedo, roughness):
         self.albedo, self.roughness = albedo, roughness
 
+    def __iter__(self):
+        return iter(("albedo", "roughness"))
+
     def evaluate(self, si, valid, engine="coopvec"):
         lanes = dr.zeros(mi.Float, dr.width(si.p))
-        return Material(mi.Color3f(self.albedo) + lanes, self.roughness + lanes)
+        return {"albedo": mi.Color3f(self.albedo) + lanes, "roughness": self.roughness + lanes}
 
 
 def painted(parsed, albedo, roughness):
-    edit.set_textures(parsed, *material_textures(Painted(albedo, roughness)))
+    edit.set_textures(parsed, material_textures(Painted(albedo, roughness)))
     return parsed.instantiate()
 
 
@@ -164,7 +166,7 @@ def test_all_other_parameters_stay(parse):
     extra = "".join(f'<float name="{key}" value="{value}"/>' for key, value in keys.items())
     content = BALL.format(PRINCIPLED.replace("</bsdf>", extra + "</bsdf>"))
     parsed = parse(content)
-    edit.set_textures(parsed, *material_textures(Painted([0.6, 0.3, 0.1], 0.2)))
+    edit.set_textures(parsed, material_textures(Painted([0.6, 0.3, 0.1], 0.2)))
     (node,) = parsed.principled_nodes()
     assert {key: pytest.approx(node.props[key]) for key in keys} == keys
     assert np.allclose(
@@ -187,7 +189,7 @@ def test_bitmaps_give_way_to_fields(parse, tmp_path):
 def test_nothing_to_fit_is_an_error(parse):
     parsed = parse(BALL.format('<bsdf type="dielectric"/>'))
     with pytest.raises(UserError, match=r"scene.xml: no material to fit"):
-        edit.set_textures(parsed, None, None)
+        edit.set_textures(parsed, {})
 
 
 def test_roughness_is_shown_in_place_of_albedo(parse):

@@ -76,9 +76,9 @@ def test_fields_in_the_place_of_materials(built_in):
     colour, roughness = (0.7, 0.4, 0.2), 0.3
     materials = ConstantMaterials(mi.Color3f(*colour), roughness)
     ours, stock = parse(built_in("cornell")), parse(built_in("cornell"))
-    edit.set_textures(ours, *material_textures(materials))
+    edit.set_textures(ours, material_textures(materials))
     paint = mi.load_dict({"type": "rgb", "value": list(colour)})
-    edit.set_textures(stock, paint, roughness)
+    edit.set_textures(stock, {"base_color": paint, "roughness": roughness})
     scene_view = SceneView.of(ours.instantiate(), materials, 8)
     compare(scene_view, stock.instantiate(), built_in_cameras("cornell", 12))
 

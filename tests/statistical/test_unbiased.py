@@ -103,7 +103,7 @@ def room(built_in):
     """The Cornell box with one principled material whose albedo each lane can have its own of."""
     materials = ConstantMaterials(0.5, 0.4)
     parsed = parse(built_in("cornell"))
-    edit.set_textures(parsed, *material_textures(materials))
+    edit.set_textures(parsed, material_textures(materials))
     return SceneView.of(parsed.instantiate(), materials, 8)
 
 

@@ -17,7 +17,7 @@ from support import (
 )
 
 from unbake.acquisition.capture import CaptureSettings, capture
-from unbake.config import DenseGridConfig, LightingConfig, from_toml
+from unbake.config import LightingConfig, from_toml, update
 from unbake.dataset.lighting import true_environment
 from unbake.errors import UserError
 from unbake.evaluation.lighting import recovered_emitters, sh_error
@@ -50,8 +50,9 @@ def photographs(tmp_path_factory):
 
 def fitted(dataset, unknown, *, steps=200, **settings):
     """The problem after a short fit, and the mean radiance that it began with."""
-    settings = {"pixels": 64, "warm_up": 20, "learning_rate": 0.02, "lighting": FAST} | settings
+    settings = {"pixels": 64, "warm_up": 20, "lighting": FAST} | settings
     config = dataclasses.replace(TINY_FIT, unknown=unknown, **settings)
+    config = update(config, {"materials": {"albedo": {"neural": {"learning_rate": 0.02}}}})
     pixels = training_pixels(dataset, clip_negative=False)
     mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
@@ -94,7 +95,7 @@ def mean_albedo(problem, dataset):
     rays = pixel_rays([view.camera for view in dataset.train], 1, 0)
     si = problem.scene_view.scene.ray_intersect(rays)
     with dr.suspend_grad():
-        albedo = np.array(problem.materials.evaluate(si, si.is_valid()).albedo)
+        albedo = np.array(problem.materials.evaluate(si, si.is_valid())["albedo"])
     return albedo[:, np.array(si.is_valid())].mean(1)
 
 
@@ -233,8 +234,9 @@ def start(built_in, unknown, method, background="hidden"):
         lighting=LightingConfig(resolution=8),
         # Networks along paths, in virtual calls, take seconds to compile.
         representation="grid" if method == "prb" else "neural",
-        grid=DenseGridConfig(albedo=5, roughness=3),
     )
+    cells = {"albedo": {"grid": {"cells": 5}}, "roughness": {"grid": {"cells": 3}}}
+    config = update(config, {"materials": cells})
     problem = make_problem(built_in(name), background, config, 0.2)
     pixels = grey_photographs(built_in_cameras(name, 8, views=2))
     return TrainingStep(problem, pixels, config), initial_state(problem)

@@ -9,7 +9,6 @@ import pytest
 from support import TINY_FIT, built_in_cameras, grey_photographs, pixel_rays, seeded
 
 from unbake.config import LightingConfig, RegularizationConfig
-from unbake.fields.materials import Material
 from unbake.training.problem import make_problem
 from unbake.training.regularizers import is_anchored, regularization_terms
 from unbake.training.state import initial_state
@@ -29,8 +28,8 @@ def floats(values):
 
 def material(albedo, roughness):
     """A lane for each number; grey albedo."""
-    result = Material(mi.Color3f(floats(albedo)), floats(roughness))
-    dr.enable_grad(result.albedo, result.roughness)
+    result = {"albedo": mi.Color3f(floats(albedo)), "roughness": floats(roughness)}
+    dr.enable_grad(result)
     return result
 
 
@@ -53,9 +52,9 @@ def test_smoothness_is_the_mean_difference_of_the_lanes_that_count():
     value = roughness_smoothness(here, near, valid)
     assert value[0] == pytest.approx((0.1 + 0.4 + 0) / 3)
     dr.backward(value)
-    np.testing.assert_allclose(dr.grad(here.roughness), [-1 / 3, 1 / 3, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(dr.grad(near.roughness), [1 / 3, -1 / 3, 0, 0], atol=1e-6)
-    assert not np.array(dr.grad(here.albedo)).any()
+    np.testing.assert_allclose(dr.grad(here["roughness"]), [-1 / 3, 1 / 3, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(dr.grad(near["roughness"]), [1 / 3, -1 / 3, 0, 0], atol=1e-6)
+    assert not np.array(dr.grad(here["albedo"])).any()
 
 
 @pytest.mark.parametrize("term", [roughness_smoothness, "ties", "mean"])
@@ -69,7 +68,9 @@ def test_no_lane_that_counts_is_no_division_by_zero(term):
         value = term(here, material([0, 0], [1, 1]), none)
     dr.backward(value)
     assert value[0] == 0
-    assert np.isfinite(dr.grad(here.roughness)).all() and np.isfinite(dr.grad(here.albedo)).all()
+    assert (
+        np.isfinite(dr.grad(here["roughness"])).all() and np.isfinite(dr.grad(here["albedo"])).all()
+    )
 
 
 # ---------------------------------------------------------------------------------------- ties
@@ -82,9 +83,9 @@ def test_ties_are_weighted_by_the_likeness_of_albedo():
     alike, apart = 0.4**2, np.exp(-3 * 0.1**2 / (2 * 0.1**2)) * 0.6**2
     assert value[0] == pytest.approx((2 * alike + 2 * apart) / 4, rel=1e-5)
     dr.backward(value)
-    roughness = np.array(dr.grad(here.roughness))
+    roughness = np.array(dr.grad(here["roughness"]))
     assert roughness[0] == pytest.approx(-roughness[2]) and roughness[0] < 0
-    assert not np.array(dr.grad(here.albedo)).any()
+    assert not np.array(dr.grad(here["albedo"])).any()
 
 
 def test_other_albedo_and_lanes_that_do_not_count_tie_nothing():
@@ -100,13 +101,13 @@ def test_other_albedo_and_lanes_that_do_not_count_tie_nothing():
 
 def test_the_deviation_of_the_mean_is_exact():
     colours = mi.Color3f(floats([0.1, 0.3, 9]), floats([0.2, 0.6, 9]), floats([0.5, 0.5, 9]))
-    here = Material(colours, floats([0, 0, 0]))
-    dr.enable_grad(here.albedo)
+    here = {"albedo": colours, "roughness": floats([0, 0, 0])}
+    dr.enable_grad(here["albedo"])
     value = mean_albedo_deviation(here, mi.Bool([True, True, False]), 0.5)
     assert value[0] == pytest.approx(0.3**2 + 0.1**2, rel=1e-5)
     dr.backward(value)
     np.testing.assert_allclose(
-        dr.grad(here.albedo), [[-0.3, -0.3, 0], [-0.1, -0.1, 0], [0, 0, 0]], atol=1e-6
+        dr.grad(here["albedo"]), [[-0.3, -0.3, 0], [-0.1, -0.1, 0], [0, 0, 0]], atol=1e-6
     )
 
 
@@ -250,7 +251,7 @@ def test_a_fit_with_a_term_logs_it_and_is_smoother(built_in, method, term, weigh
         state.publish(problem)
         si = problem.scene_view.scene.ray_intersect(pixel_rays(cameras, 1, 0))
         with dr.suspend_grad():
-            roughness = np.array(problem.materials.evaluate(si, si.is_valid()).roughness)
+            roughness = np.array(problem.materials.evaluate(si, si.is_valid())["roughness"])
         return roughness[np.array(si.is_valid())].std(), logged
 
     rough, without = fitted(0.0)

@@ -5,21 +5,37 @@ import dataclasses
 import pytest
 from support import TINY_FIT
 
-from unbake.config import BitmapConfig, DenseGridConfig, FitConfig, LightingConfig
+from unbake.config import (
+    BitmapConfig,
+    DenseGridConfig,
+    FitConfig,
+    LightingConfig,
+    NetworkConfig,
+    update,
+)
 from unbake.training.problem import make_problem
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 
 STEADY = FitConfig(
-    learning_rate=0.2,
-    roughness_learning_rate=0.05,
-    radiance_learning_rate=0.1,
     final_learning_rate=0.01,
     warm_up=0,
-    grid=DenseGridConfig(
-        learning_rate=0.3, roughness_learning_rate=0.4, radiance_learning_rate=0.5
-    ),
-    bitmap=BitmapConfig(learning_rate=0.6, roughness_learning_rate=0.7),
+    materials={
+        "albedo": {
+            "neural": NetworkConfig(learning_rate=0.2),
+            "grid": DenseGridConfig(learning_rate=0.3),
+            "bitmap": BitmapConfig(learning_rate=0.6),
+        },
+        "roughness": {
+            "neural": NetworkConfig(learning_rate=0.05),
+            "grid": DenseGridConfig(learning_rate=0.4),
+            "bitmap": BitmapConfig(learning_rate=0.7),
+        },
+    },
+    radiance={
+        "neural": NetworkConfig(learning_rate=0.1),
+        "grid": DenseGridConfig(learning_rate=0.5),
+    },
     lighting=LightingConfig(learning_rate=0.8),
 )
 
@@ -68,8 +84,9 @@ def test_each_representation_has_its_rates(settings, albedo, roughness, radiance
 @pytest.mark.parametrize("representation", ["neural", "grid", "bitmap"])
 @pytest.mark.parametrize("unknown", ["materials", "lighting", "materials+lighting", "emission"])
 def test_every_parameter_has_a_rate(unknown, representation, built_in):
-    small = {"grid": DenseGridConfig(albedo=4, roughness=4), "bitmap": BitmapConfig(albedo=4)}
-    config = dataclasses.replace(TINY_FIT, unknown=unknown, representation=representation, **small)
+    small = {"grid": {"cells": 4}, "bitmap": {"resolution": 4}}
+    config = dataclasses.replace(TINY_FIT, unknown=unknown, representation=representation)
+    config = update(config, {"materials": {"albedo": small, "roughness": small}})
     scene = "cornell" if unknown in ("materials", "emission") else "still"
     problem = make_problem(built_in(scene), "visible", config, 0.2)
     state, rates = initial_state(problem), learning_rates(config, 0, 0)

@@ -151,7 +151,7 @@ def test_split_halves_and_two_passes_have_one_expectation(built_in):
     materials = Everywhere(0.6, 0.4)
     parsed = parse(built_in("cornell"))
     edit.to_principled(parsed)
-    edit.set_textures(parsed, *material_textures(materials))
+    edit.set_textures(parsed, material_textures(materials))
     scene = parsed.instantiate()
     spp, integrator = 4, path_replay(3, 3, False)
     cameras = built_in_cameras("cornell", 16)

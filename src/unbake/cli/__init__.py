@@ -27,7 +27,7 @@ from .options import (
     Methods,
     Preset,
     Prior,
-    RadianceRepresentation,
+    Quantities,
     Representation,
     Run,
     Runs,
@@ -136,8 +136,9 @@ def fit(
     bounces: Count = None,
     prior: Prior = None,
     max_depth: Count = None,
+    quantities: Quantities = None,
     representation: Representation = None,
-    radiance: RadianceRepresentation = None,
+    radiance: Representation = None,
     seed: Count = None,
     settings: File = None,
     resume: Flag = False,
@@ -147,8 +148,8 @@ def fit(
 
     Ctrl-C stops after the present step and keeps what was learned; --resume goes on from there.
 
-    Unknown: materials are albedo and roughness, lighting is the environment map, emission is colour
-    and strength of the lights.
+    Unknown: materials are the quantities named (albedo and roughness), lighting is the environment
+    map, emission is colour and strength of the lights.
 
     Methods: ours; no-prior (radiance learned from images alone), direct (no indirect light), ad-pt
     (path tracing, differentiated), prb (path replay). From direct to ours the ablation goes by
@@ -167,8 +168,9 @@ def fit(
         bounces: Differentiable bounces of ours before the radiance field is asked (default: 1).
         prior: Where ours takes the residual: one-bounce, or extra-bounce (default) at x2 as well.
         max_depth: Longest path of ad-pt and prb (default: 15).
-        representation: Of materials: networks (default), 3D grids, or bitmaps in UV coordinates.
-        radiance: Representation of the radiance field: a network (default) or a 3D grid.
+        quantities: What is unknown of materials (default: albedo roughness).
+        representation: Of materials: neural (default), grid (3D), or bitmap (in UV coordinates).
+        radiance: Representation of the radiance field: neural (default) or grid (3D).
         seed: Seed of weights and samples (default: 0).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
@@ -184,6 +186,7 @@ def fit(
         "bounces": bounces,
         "prior": prior,
         "max-depth": max_depth,
+        "quantities": quantities,
         "representation": representation,
         "radiance": radiance,
         "seed": seed,

@@ -31,12 +31,8 @@ Unknown = Annotated[config.Unknown | None, arg(metavar="WHAT", help_behavior_hin
 Prior = Annotated[
     config.PriorName | None, arg(metavar="{one-bounce,extra-bounce}", help_behavior_hint="")
 ]
-Representation = Annotated[
-    config.Representation | None, arg(metavar="{neural,grid,bitmap}", help_behavior_hint="")
-]
-RadianceRepresentation = Annotated[
-    config.RadianceRepresentation | None, arg(metavar="{neural,grid}", help_behavior_hint="")
-]
+Quantities = Annotated[tuple[str, ...] | None, arg(metavar="NAMES", help_behavior_hint="")]
+Representation = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
 
 

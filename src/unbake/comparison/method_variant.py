@@ -6,8 +6,9 @@ import typing
 from dataclasses import dataclass, replace
 from typing import final
 
-from ..config import Estimator, FitConfig, Representation
+from ..config import Estimator, FitConfig
 from ..errors import UserError
+from ..fields.registry import representations
 from ..transport.methods import METHODS
 
 
@@ -17,7 +18,7 @@ class MethodVariant:
     """A method, how it represents materials, and its estimator; None: as shared settings say."""
 
     method: str
-    representation: Representation | None = None
+    representation: str | None = None
     estimator: Estimator | None = None
 
     @staticmethod
@@ -29,7 +30,7 @@ class MethodVariant:
         """
         choices = {
             "method": tuple(METHODS),
-            "representation": typing.get_args(Representation),
+            "representation": representations(),
             "estimator": typing.get_args(Estimator),
         }
         words = text.split(":")

@@ -16,7 +16,7 @@ import drjit as dr
 from ..acquisition.built_in import write_scene
 from ..acquisition.capture import CaptureSettings, capture
 from ..comparison.method_variant import MethodVariant
-from ..config import DenseGridConfig, FitConfig, PathConfig, PriorName
+from ..config import FitConfig, PathConfig, PriorName, update
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..scene.edit import to_principled
@@ -86,9 +86,11 @@ def _measure(
         spp=spp,
         radiance_spp=0,
         radiance_representation="grid",
-        grid=DenseGridConfig(albedo=grid, roughness=grid, radiance=grid),
         path=PathConfig(max_depth=PATHS[albedo][0], rr_depth=1),
     )
+    cells = {"grid": {"cells": grid}}
+    fields = {"materials": dict.fromkeys(shared.quantities, cells), "radiance": cells}
+    shared = update(shared, fields)
     found: Findings = {curve.name: {"seconds": []} for curve in CURVES}
     for turn in range(TURNS):
         for curve in CURVES:

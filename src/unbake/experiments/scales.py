@@ -5,22 +5,16 @@ SMOKE = """
 pixels = 64
 spp = 4
 preview_seconds = 600.0
-[albedo]
+[materials.albedo.neural]
 width = 8
 hidden = 1
-[albedo.grid]
-levels = 2
-table_log2 = 8
-[roughness]
+grid = { levels = 2, table_log2 = 8 }
+[materials.roughness.neural]
 width = 8
 hidden = 1
-[roughness.grid]
-levels = 2
-table_log2 = 8
-[radiance]
+grid = { levels = 2, table_log2 = 8 }
+[radiance.neural]
 width = 8
 hidden = 1
-[radiance.grid]
-levels = 2
-table_log2 = 8
+grid = { levels = 2, table_log2 = 8 }
 """

@@ -31,26 +31,24 @@ _CAMERAS = Path(__file__).parent / "cameras"
 #: Settings at cpu scale: rooms have finer grids and larger batches than single objects.
 _ROOM = """
 pixels = 2048
-learning_rate = 0.008
-radiance_learning_rate = 0.008
 loss_epsilon = 0.01
 preview_seconds = 600.0
-[albedo.grid]
-levels = 9
-table_log2 = 16
-[roughness.grid]
+[materials.albedo.neural]
+learning_rate = 0.008
+grid = { levels = 9, table_log2 = 16 }
+[materials.roughness.neural.grid]
 levels = 6
-[radiance.grid]
-levels = 7
-table_log2 = 16
+[radiance.neural]
+learning_rate = 0.008
+grid = { levels = 7, table_log2 = 16 }
 """
 _OBJECT = """
 pixels = 1024
 loss_epsilon = 0.01
 preview_seconds = 600.0
-[albedo.grid]
+[materials.albedo.neural.grid]
 levels = 8
-[roughness.grid]
+[materials.roughness.neural.grid]
 levels = 5
 """
 

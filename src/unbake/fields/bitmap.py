@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
 from .domain import SurfacePoint
-from .network import Engine, sigmoid
+from .field import Cost, Engine, Field, FieldSpec
+from .network import first_value, sigmoid
+from .settings import BitmapConfig
 
 
-class Bitmaps:
+class Bitmaps(Field):
     """A square bitmap for each of several materials, bilinear and repeated.
 
-    Texels hold logits and are bounded before they are interpolated, so that Mitsuba's `bitmap` with
-    the values of `to_arrays` is the same function. They start at 0.5.
-
-    Args:
-        size: texels along an edge.
-        names: of the materials, in the order of `SurfacePoint.slot`.
-        channels: 3 or 1.
+    Texels of bounded bitmaps hold logits and are bounded before they are interpolated, so that
+    Mitsuba's `bitmap` with the values of `to_arrays` is the same function. They depend on texture
+    coordinates alone, not on further inputs.
 
     Raises:
         UserError: the texels are more than an array can hold.
@@ -28,51 +28,57 @@ class Bitmaps:
     Paper: Sec. 8.
     """
 
-    def __init__(self, size: int, names: list[str], *, channels: int) -> None:
-        self.size = size
-        self.names = names
-        self.channels = channels
-        count = len(names) * size * size * channels
+    def __init__(self, settings: BitmapConfig, spec: FieldSpec) -> None:
+        self.size = size = settings.resolution
+        self.names = spec.materials
+        self.channels = spec.outputs
+        self.bounded = spec.bounded
+        count = len(self.names) * size * size * self.channels
         if count >= 1 << 32:
             raise UserError(
-                f"{len(names)} bitmaps of {size} x {size} pixels are too many for an array",
-                remedy="Lower the resolution in the table [bitmap] of the settings",
+                f"{len(self.names)} bitmaps of {size} x {size} pixels are too many for an array",
+                remedy="Lower the resolution in the tables [materials.*.bitmap] of the settings",
             )
-        self.texels = dr.zeros(mi.Float, count)
+        self.texels = dr.full(mi.Float, first_value(spec), count)
         dr.make_opaque(self.texels)
 
     def parameters(self) -> dict[str, mi.Float]:
-        """The trainable array by name; `assign` takes it back."""
+        """Its one name is `texels`."""
         return {"texels": self.texels}
 
     def assign(self, parameters: dict[str, mi.Float]) -> None:
-        """Use this array from now on; gradients arrive in the very array given."""
+        """Use these arrays from now on."""
         self.texels = parameters["texels"]
 
-    def __call__(self, point: SurfacePoint, engine: Engine | None = None) -> list[mi.Float]:
-        """Look the bitmaps up; the engine makes no difference.
-
-        Returns:
-            One array for each channel, [0,1].
-        """
+    def evaluate(
+        self,
+        point: SurfacePoint,
+        extra: Sequence[mi.Float] = (),
+        engine: Engine | None = None,
+    ) -> list[mi.Float]:
+        """Look the bitmaps up."""
         # As in Mitsuba, texels are centred at (i + 1/2) / size and v grows with the row.
         left, right, u = self._neighbours(point.uv.x)
         above, below, v = self._neighbours(point.uv.y)
         return [
             dr.lerp(dr.lerp(a, b, u), dr.lerp(c, d, u), v)
             for a, b, c, d in zip(
-                self._texel(point.slot, above, left),
-                self._texel(point.slot, above, right),
-                self._texel(point.slot, below, left),
-                self._texel(point.slot, below, right),
+                self._texel(point.material, above, left),
+                self._texel(point.material, above, right),
+                self._texel(point.material, below, left),
+                self._texel(point.material, below, right),
                 strict=True,
             )
         ]
 
+    def cost(self) -> Cost:
+        """Four texels."""
+        return Cost(0, 4 * 4 * self.channels)
+
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The bitmaps by the names of their materials, float32, shape (size, size, channels)."""
         shape = (len(self.names), self.size, self.size, self.channels)
-        values = np.array(sigmoid(dr.detach(self.texels))).reshape(shape)
+        values = np.array(self._bound(dr.detach(self.texels))).reshape(shape)
         return dict(zip(self.names, values, strict=True))
 
     def _neighbours(self, x: mi.Float) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
@@ -86,9 +92,12 @@ class Bitmaps:
         after = dr.select(after >= self.size, 0, after)
         return mi.UInt32(before), mi.UInt32(after), position - first
 
-    def _texel(self, slot: mi.UInt32, row: mi.UInt32, column: mi.UInt32) -> list[mi.Float]:
-        texel = (slot * self.size + row) * self.size + column
+    def _texel(self, material: mi.UInt32, row: mi.UInt32, column: mi.UInt32) -> list[mi.Float]:
+        texel = (material * self.size + row) * self.size + column
         return [
-            sigmoid(dr.gather(mi.Float, self.texels, texel * self.channels + c))
+            self._bound(dr.gather(mi.Float, self.texels, texel * self.channels + c))
             for c in range(self.channels)
         ]
+
+    def _bound(self, x: mi.Float) -> mi.Float:
+        return sigmoid(x) if self.bounded else x

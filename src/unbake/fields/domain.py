@@ -11,11 +11,11 @@ import numpy as np
 
 @dataclass
 class SurfacePoint:
-    """Where a material is asked for, in every kind of coordinates that its fields may want."""
+    """Where a field is asked, in every kind of coordinates that a representation may want."""
 
     position: mi.Point3f  # [0,1]³
-    uv: mi.Point2f  # texture coordinates, as they are: without bounds, maybe not finite
-    slot: mi.UInt32  # number of the material, where materials have fields of their own
+    uv: mi.Point2f | None = None  # texture coordinates: without bounds, maybe not finite
+    material: mi.UInt32 | None = None  # its number, where each material has a field of its own
 
 
 @dataclass(frozen=True)

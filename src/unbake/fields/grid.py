@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
 
-from .network import Engine
+from .domain import SurfacePoint
+from .field import Cost, Engine, Field, FieldSpec
+from .network import first_value, sigmoid
+from .settings import DenseGridConfig
 
 
-class DenseGrid:
+class DenseGrid(Field):
     """A vector-valued function of a position in [0,1]³, trilinear between the corners of cells.
 
-    It is called as a `Network` is, and starts at zero as well.
-
-    Args:
-        cells: cells along an axis.
-        outputs: number of outputs.
+    It depends on the position alone, not on further inputs. Where it is bounded, that happens after
+    the interpolation.
 
     Paper: Sec. 6.2, Fig. 5.
     """
 
-    def __init__(self, cells: int, *, outputs: int) -> None:
-        self.outputs = outputs
-        corners = cells + 1
-        features = max(2, 1 << (outputs - 1).bit_length())
+    def __init__(self, settings: DenseGridConfig, spec: FieldSpec) -> None:
+        self.outputs = spec.outputs
+        self.bounded = spec.bounded
+        corners = settings.cells + 1
+        features = max(2, 1 << (spec.outputs - 1).bit_length())
         # A hash grid of one level whose table has room for every corner hashes nothing.
         self.grid = nn.HashGridEncoding(
             mi.Float,
@@ -35,28 +38,27 @@ class DenseGrid:
             base_resolution=corners,
             align_corners=True,
         )
-        self.grid.data = dr.zeros(mi.Float, self.grid.n_params)
+        self.grid.data = dr.full(mi.Float, first_value(spec), self.grid.n_params)
         dr.make_opaque(self.grid.data)
 
     def parameters(self) -> dict[str, mi.Float]:
-        """The trainable array by name; `assign` takes it back."""
+        """Its one name is `corners`."""
         return {"corners": self.grid.data}
 
     def assign(self, parameters: dict[str, mi.Float]) -> None:
-        """Use this array from now on; gradients arrive in the very array given."""
+        """Use these arrays from now on."""
         self.grid.data = parameters["corners"]
 
-    def __call__(
-        self, position: mi.Point3f, extra: list[mi.Float], engine: Engine | None = None
+    def evaluate(
+        self,
+        point: SurfacePoint,
+        extra: Sequence[mi.Float] = (),
+        engine: Engine | None = None,
     ) -> list[mi.Float]:
-        """Evaluate the grid.
+        """Look the grid up; the caller masks points outside of [0,1]³ or not finite."""
+        outputs = list(self.grid(list(point.position)))[: self.outputs]
+        return [sigmoid(x) for x in outputs] if self.bounded else outputs
 
-        Args:
-            position: points in [0,1]³; the caller masks points that lie outside or are not finite.
-            extra: not used: a grid depends on the position alone.
-            engine: not used: a grid is the same on both.
-
-        Returns:
-            One array for each output.
-        """
-        return list(self.grid(list(position)))[: self.outputs]
+    def cost(self) -> Cost:
+        """Eight corners."""
+        return Cost(0, 4 * 8 * self.grid.n_output_features)

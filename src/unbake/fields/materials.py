@@ -1,105 +1,87 @@
-"""The unknown materials φ: albedo and roughness as functions on surfaces (Sec. 5.1)."""
+"""The unknown materials φ: quantities as functions on surfaces (Sec. 5.1)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import drjit as dr
 import mitsuba as mi
 
-from ..config import FitConfig
-from .bitmap import Bitmaps
+from ..quantities import CARRIED, QUANTITIES, Quantity, channels_of, in_order
+from . import registry
 from .domain import Domain, SurfacePoint
-from .grid import DenseGrid
-from .network import Engine, Network, sigmoid
+from .field import Engine, Field, FieldSpec
+from .settings import FieldSettings
 
-ROUGHNESS_FLOOR = 0.02  #: below it, the microfacet density overflows single precision
-
-
-@dataclass
-class Material:
-    """Albedo (linear RGB, [0,1]) and perceptual roughness (α_GGX = roughness², [0.02,1])."""
-
-    albedo: mi.Color3f
-    roughness: mi.Float
+#: Values by the name of their quantity: linear RGB, or one number, within the quantity's bounds.
+#: Roughness is perceptual (α_GGX = roughness²).
+Material = dict[str, "mi.Color3f | mi.Float"]
 
 
-class Volume:
-    """A function of the position alone, bounded to [0,1]: a network or a grid, as a field φ."""
-
-    def __init__(self, function: Network | DenseGrid) -> None:
-        self.function = function
-
-    def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
-        """The trainable arrays by name."""
-        return self.function.parameters()
-
-    def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
-        """Use these arrays from now on."""
-        self.function.assign(parameters)
-
-    def __call__(self, point: SurfacePoint, engine: Engine | None = None) -> list[mi.Float]:
-        """One array for each output, [0,1]."""
-        return [sigmoid(x) for x in self.function(point.position, [], engine)]
-
-
-class Materials:
-    """Albedo and roughness fields.
-
-    Roughness shows far less in photographs than albedo does, so that its field may well be coarser.
+class Materials(Mapping[str, Field]):
+    """The fields of the unknown quantities, by name.
 
     Args:
-        albedo: a field of three outputs.
-        roughness: a field of one output.
+        fields: by quantity, each with as many outputs as the quantity has channels, in (0, 1).
 
     Paper: Sec. 5.1, 5.3.
     """
 
-    def __init__(self, albedo: Volume | Bitmaps, roughness: Volume | Bitmaps) -> None:
+    def __init__(self, fields: Mapping[str, Field]) -> None:
         #: Set once the scene's extent is known, before the first evaluation. (The scene is made
         #: with textures of these materials in it.)
         self.domain = Domain.unit()
         #: The number of each shape's material, by `registry_number`. It is needed where materials
         #: have fields of their own, and then set together with the domain.
         self.slots: dict[int, int] = {}
-        self.fields = {"albedo": albedo, "roughness": roughness}
         #: Whether textures read the values put on the surface interaction by `carry`. It must not
         #: change between an evaluation and its differentiation, which calls the textures again.
         self.carried = True
+        self._fields = {name: fields[name] for name in in_order(fields)}
+
+    def __getitem__(self, name: str) -> Field:
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
-        """The trainable arrays φ by name."""
+        """The trainable arrays φ by name; the first word is the quantity's."""
         return {
             f"{name}.{key}": value
-            for name, field in self.fields.items()
+            for name, field in self.items()
             for key, value in field.parameters().items()
         }
 
-    def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
+    def assign(self, parameters: Mapping[str, mi.Float | mi.TensorXf]) -> None:
         """Use these arrays from now on."""
-        for name, field in self.fields.items():
+        for name, field in self.items():
             field.assign({k: parameters[f"{name}.{k}"] for k in field.parameters()})
 
     def stand_alone(self) -> None:
         """From now on, textures evaluate the fields themselves, as stock integrators need it."""
-        for field in self.fields.values():
-            if isinstance(field, Volume) and isinstance(field.function, Network):
-                field.function.pack()
+        for field in self.values():
+            field.prepare()
         self.carried = False
-
-    def albedo_at(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> mi.Color3f:
-        """The albedo alone, where no BSDF will be asked."""
-        return mi.Color3f(self.fields["albedo"](self._locate(si, valid)))
 
     def evaluate(
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine | None = None
     ) -> Material:
-        """The materials at surface interactions; see `Network.__call__` for the engines."""
+        """The materials at surface interactions; see `Field.evaluate` for the engines."""
         point = self._locate(si, valid)
-        albedo = self.fields["albedo"](point, engine)
-        (roughness,) = self.fields["roughness"](point, engine)
-        roughness = dr.fma(roughness, 1 - ROUGHNESS_FLOOR, ROUGHNESS_FLOOR)
-        return Material(mi.Color3f(albedo), roughness)
+        return {
+            name: _bounded(QUANTITIES[name], field.evaluate(point, (), engine))
+            for name, field in self.items()
+        }
+
+    def evaluate_one(
+        self, name: str, si: mi.SurfaceInteraction3f, valid: mi.Bool
+    ) -> mi.Color3f | mi.Float:
+        """One quantity alone, where no BSDF will be asked."""
+        return _bounded(QUANTITIES[name], self[name].evaluate(self._locate(si, valid)))
 
     def evaluate_near(
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, sample: mi.Point2f, radius: float
@@ -120,24 +102,32 @@ class Materials:
 
     def _locate(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> SurfacePoint:
         position = self.domain.to_unit(si.p, valid)
-        slot = self._slot(si.shape) if self.slots else mi.UInt32(0)
-        return SurfacePoint(position, si.uv, slot)
+        number = self._number(si.shape) if self.slots else mi.UInt32(0)
+        return SurfacePoint(position, si.uv, number)
 
-    def _slot(self, shape: mi.ShapePtr) -> mi.UInt32:
+    def _number(self, shape: mi.ShapePtr) -> mi.UInt32:
         # Each shape is asked once, while this is recorded. (A table would be an array that comes
         # from outside of a frozen function.)
         return dr.dispatch(shape, lambda s: mi.UInt32(self.slots.get(registry_number(s), 0)))
 
 
+def _bounded(quantity: Quantity, values: list[mi.Float]) -> mi.Color3f | mi.Float:
+    """Values in (0, 1) to the quantity's bounds."""
+    lower, span = quantity.lower, quantity.upper - quantity.lower
+    if (lower, span) != (0, 1):
+        values = [dr.fma(x, span, lower) for x in values]
+    return mi.Color3f(values) if quantity.channels == 3 else values[0]
+
+
 def with_joint_gradients(material: Material) -> Material:
     """The same material, whose gradients are computed together; not inside of loops.
 
-    One after the other, those of albedo and of roughness would each differentiate every BSDF that
-    reads the material.
+    One after the other, those of each quantity would differentiate every BSDF that reads the
+    material.
     """
     if not dr.grad_enabled(material):
         return material
-    return Material(*dr.custom(_Together, [material.albedo, material.roughness]))
+    return dr.custom(_Together, material)
 
 
 class _Together(dr.CustomOp):
@@ -160,40 +150,64 @@ def registry_number(shape: mi.Shape) -> int:
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
-def make_materials(config: FitConfig, names: list[str], *, seed: int) -> Materials:
-    """Fresh materials in the representation that the settings name.
+def make_materials(
+    representation: str,
+    settings: Mapping[str, FieldSettings],
+    names: Sequence[str],
+    *,
+    seed: int,
+    half: bool = False,
+) -> Materials:
+    """Fresh materials.
 
     Args:
-        names: of the scene's materials; bitmaps alone want to know them.
-        seed: of the initial weights of networks.
+        representation: name of the representation of all quantities.
+        settings: of that representation, by quantity; they say which quantities are unknown.
+        names: of the scene's materials, for representations with a field for each.
+        seed: of initial parameters.
+        half: products may be in half precision.
 
     Raises:
-        UserError: bitmaps would be larger than an array can be.
+        UserError: there is no such representation or quantity, or a field would be too large.
 
     Paper: Sec. 5.3, Fig. 5, Sec. 8.
     """
-    match config.representation:
-        case "neural":
-            half = config.half_precision
-            albedo = Network(config.albedo, extra=0, outputs=3, seed=seed, half=half)
-            roughness = Network(config.roughness, extra=0, outputs=1, seed=seed + 1, half=half)
-            return Materials(Volume(albedo), Volume(roughness))
-        case "grid":
-            albedo = DenseGrid(config.grid.albedo, outputs=3)
-            roughness = DenseGrid(config.grid.roughness, outputs=1)
-            return Materials(Volume(albedo), Volume(roughness))
-        case "bitmap":
-            return Materials(
-                Bitmaps(config.bitmap.albedo, names, channels=3),
-                Bitmaps(config.bitmap.roughness, names, channels=1),
-            )
+    fields = {}
+    for number, (name, quantity) in enumerate(QUANTITIES.items()):
+        if name not in settings:
+            continue
+        spec = FieldSpec(
+            outputs=quantity.channels,
+            bounded=True,
+            initial=(quantity.initial - quantity.lower) / (quantity.upper - quantity.lower),
+            seed=seed + number,
+            half=half,
+            materials=tuple(names),
+        )
+        fields[name] = registry.representation(representation).field(settings[name], spec)
+    return Materials(fields)
 
 
 def carry(si: mi.SurfaceInteraction3f, material: Material) -> None:
     """Put the materials of a vertex on its surface interaction, for the textures to read.
 
-    They travel in `dn_du` and `dn_dv`, which no BSDF uses. So fields are asked once a vertex,
-    outside of any virtual call, however often BSDFs ask for their textures.
+    They travel in `dn_du` and `dn_dv`, which no BSDF uses, in the order of the table `QUANTITIES`.
+    So fields are asked once a vertex, outside of any virtual call, however often BSDFs ask for
+    their textures.
     """
-    si.dn_du = mi.Vector3f(material.albedo)
-    si.dn_dv = mi.Vector3f(material.roughness, 0, 0)
+    numbers = []
+    for name in in_order(material):
+        value = material[name]
+        numbers += list(value) if QUANTITIES[name].channels == 3 else [value]
+    numbers += [0] * (CARRIED - len(numbers))
+    si.dn_du, si.dn_dv = mi.Vector3f(numbers[:3]), mi.Vector3f(numbers[3:])
+
+
+def read_carried(si: mi.SurfaceInteraction3f, names: Iterable[str]) -> Material:
+    """What `carry` put on a surface interaction."""
+    numbers = [*si.dn_du, *si.dn_dv]
+    found: Material = {}
+    for name, part in channels_of(names).items():
+        values = numbers[part]
+        found[name] = mi.Color3f(values) if len(values) == 3 else values[0]
+    return found

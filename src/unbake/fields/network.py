@@ -9,43 +9,37 @@ layers on LLVM. The *fused* engine does narrow ones in one kernel, with gradient
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
 
 import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
 import numpy as np
 
-from ..config import NetworkConfig
-
-Engine = Literal["fused", "tensor", "coopvec"]
+from .domain import SurfacePoint
+from .field import Cost, Engine, Field, FieldSpec
+from .settings import NetworkConfig
 
 #: Neurons of a layer up to which the fused engine is the faster one.
 _NARROW = 48
 
 
-class Network:
+class Network(Field):
     """A vector-valued function of a position in [0,1]³ and of further inputs.
 
-    Args:
-        config: sizes of grid and perceptron.
-        extra: number of inputs besides the position's encoding.
-        outputs: number of outputs.
-        seed: seed of the initial weights.
-        half: multiply matrices in half precision. Weights, tables and results stay single.
+    In half precision matrices are multiplied so. Weights, tables and results stay single.
 
-    The last layer starts small, so that every output starts near zero.
+    The last layer starts small, so that every output starts near zero, or near its initial value.
 
     Paper: Sec. 5.3.
     """
 
-    def __init__(
-        self, config: NetworkConfig, *, extra: int, outputs: int, seed: int, half: bool = False
-    ) -> None:
-        self.half = half
-        rng = np.random.default_rng(seed)
-        g = config.grid
+    def __init__(self, settings: NetworkConfig, spec: FieldSpec) -> None:
+        self.half = spec.half
+        self.bounded = spec.bounded
+        rng = np.random.default_rng(spec.seed)
+        g = settings.grid
         self.grid = nn.HashGridEncoding(
             mi.Float,
             3,
@@ -56,48 +50,59 @@ class Network:
             per_level_scale=g.growth,
         )
         self.grid.data = from_numpy(mi.Float, rng.uniform(-1e-4, 1e-4, self.grid.n_params))
-        self.inputs = self.grid.n_output_features + extra
-        self.outputs = outputs
+        self.inputs = self.grid.n_output_features + spec.extra
+        self.outputs = spec.outputs
 
-        sizes = [self.inputs, *[config.width] * config.hidden, outputs]
+        sizes = [self.inputs, *[settings.width] * settings.hidden, spec.outputs]
         self.layers: list[tuple[mi.TensorXf, mi.TensorXf]] = []
         for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            bound = math.sqrt(6 / fan_in) * (0.1 if layer == config.hidden else 1)
+            bound = math.sqrt(6 / fan_in) * (0.1 if layer == settings.hidden else 1)
             weights = from_numpy(mi.Float, rng.uniform(-bound, bound, fan_out * fan_in))
             weights = mi.TensorXf(weights, (fan_out, fan_in))
             self.layers.append((weights, dr.zeros(mi.TensorXf, (fan_out, 1))))
+        if first_value(spec):
+            weights, bias = self.layers[-1]
+            self.layers[-1] = (weights, dr.full(mi.TensorXf, first_value(spec), bias.shape))
         self._packed: list | None = None
 
+    @property
+    def recordable(self) -> bool:
+        """Whether layers can be laid out while `dr.freeze` records."""
+        return can_record_layout()
+
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
-        """The trainable arrays by name; `assign` takes them back."""
+        """Names: `grid`, and `weights` and `bias` of each layer."""
         named = {"grid": self.grid.data}
         for i, (weights, bias) in enumerate(self.layers):
             named |= {f"{i}.weights": weights, f"{i}.bias": bias}
         return named
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
-        """Use these arrays from now on; gradients arrive in the very arrays given."""
+        """Use these arrays from now on."""
         self.grid.data = parameters["grid"]
         self.layers = [
             (parameters[f"{i}.weights"], parameters[f"{i}.bias"]) for i in range(len(self.layers))
         ]
         self._packed = None
 
-    def __call__(
-        self, position: mi.Point3f, extra: list[mi.Float], engine: Engine | None = None
+    def evaluate(
+        self,
+        point: SurfacePoint,
+        extra: Sequence[mi.Float] = (),
+        engine: Engine | None = None,
     ) -> list[mi.Float]:
-        """Evaluate the network.
+        """Evaluate the network; the caller masks points outside of [0,1]³ or not finite."""
+        features = [*self.grid(list(point.position)), *extra]
+        outputs = self._outputs(features, engine or self._usual_engine())
+        return [sigmoid(x) for x in outputs] if self.bounded else outputs
 
-        Args:
-            position: points in [0,1]³; the caller masks points that lie outside or are not finite.
-            extra: the further inputs, as many as the constructor was told.
-            engine: `coopvec` inside of virtual calls and loops; None: the fastest one elsewhere.
+    def cost(self) -> Cost:
+        """The products of all layers, and eight corners of each level of the grid."""
+        products = sum(weights.shape[0] * weights.shape[1] for weights, _ in self.layers)
+        return Cost(products, 4 * 8 * self.grid.n_output_features)
 
-        Returns:
-            One array for each output.
-        """
-        features = [*self.grid(list(position)), *extra]
-        match engine or self._usual_engine():
+    def _outputs(self, features: list[mi.Float], engine: Engine) -> list[mi.Float]:
+        match engine:
             case "fused":
                 if dr.grad_enabled(self.layers, features):
                     return dr.custom(_Perceptron, features, self.layers)
@@ -108,6 +113,7 @@ class Network:
                 return self._tensor(features)
             case "coopvec":
                 return self._coopvec(features)
+        raise ValueError(f"no engine named {engine!r}")
 
     def _usual_engine(self) -> Engine:
         narrow = max(weights.shape[0] for weights, _ in self.layers) <= _NARROW
@@ -126,7 +132,7 @@ class Network:
 
     def _coopvec(self, features: list[mi.Float]) -> list[mi.Float]:
         if self._packed is None:
-            self.pack()
+            self.prepare()
         number = mi.Float16 if self.half else mi.Float
         x = nn.CoopVec([number(f) for f in features])
         for weights, bias in self._packed[:-1]:
@@ -134,12 +140,8 @@ class Network:
         weights, bias = self._packed[-1]
         return [mi.Float(y) for y in nn.matvec(weights, x, bias)]
 
-    def pack(self) -> None:
-        """Lay the layers out for cooperative vectors.
-
-        Needed once after `assign`, and before any evaluation inside a virtual call or loop, where
-        it can no longer be done.
-        """
+    def prepare(self) -> None:
+        """Lay the layers out for cooperative vectors."""
         kind = mi.TensorXf16 if self.half else mi.TensorXf
         flat = [kind(a) for weights, bias in self.layers for a in (weights, _flat(bias))]
         if can_record_layout():
@@ -246,6 +248,11 @@ def can_record_layout() -> bool:
 def sigmoid(x: mi.Float) -> mi.Float:
     """1 / (1 + exp(−x))."""
     return dr.rcp(1 + dr.exp(-x))
+
+
+def first_value(spec: FieldSpec) -> float:
+    """What a field holds, before it is bounded by `sigmoid`, for its outputs to start as wanted."""
+    return math.log(spec.initial / (1 - spec.initial)) if spec.bounded else 0.0
 
 
 def from_numpy(array_type: type, values: np.ndarray) -> mi.Float | mi.UInt32:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..config import FitConfig
-from .domain import Domain
-from .grid import DenseGrid
-from .network import Engine, Network
+from . import registry
+from .domain import Domain, SurfacePoint
+from .field import Engine, Field, FieldSpec
+from .settings import FieldSettings
 
 
 class RadianceField:
@@ -21,14 +21,14 @@ class RadianceField:
     Emission is not part of it: the rendering equation's E is known and added analytically.
 
     Args:
-        function: six outputs, of a position and twelve further inputs.
+        function: six outputs without bounds, of a position and twelve further inputs.
         scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good
             one.
 
     Paper: Sec. 3.1, 5.3.
     """
 
-    def __init__(self, function: Network | DenseGrid, domain: Domain, *, scale: float) -> None:
+    def __init__(self, function: Field, domain: Domain, *, scale: float) -> None:
         self.domain = domain
         self.scale = scale
         self.function = function
@@ -65,23 +65,36 @@ class RadianceField:
         unit = self.domain.to_unit(p, valid)
         extra = [*(2 * unit - 1), *w, *n, *dr.detach(albedo)]
         extra = [dr.select(valid, x, 0) for x in extra]
-        raw = [self.scale * _squareplus(x) for x in self.function(unit, extra, engine)]
+        outputs = self.function.evaluate(SurfacePoint(unit), extra, engine)
+        raw = [self.scale * _squareplus(x) for x in outputs]
         diffuse, rest = mi.Color3f(raw[:3]), mi.Color3f(raw[3:])
         return dr.select(valid, 1.5 * dr.detach(albedo) * diffuse + 0.25 * rest, 0)
 
 
-def make_radiance(config: FitConfig, domain: Domain, *, scale: float, seed: int) -> RadianceField:
-    """A fresh radiance field in the representation that the settings name.
+def make_radiance(
+    representation: str,
+    settings: FieldSettings,
+    domain: Domain,
+    *,
+    scale: float,
+    seed: int,
+    half: bool = False,
+) -> RadianceField:
+    """A fresh radiance field.
+
+    Args:
+        representation: name of its representation.
+        settings: of that representation.
+        scale: see `RadianceField`.
+        seed: of initial parameters.
+        half: products may be in half precision.
 
     Paper: Sec. 5.3, Fig. 5.
     """
-    match config.radiance_representation:
-        case "neural":
-            half = config.half_precision
-            function = Network(config.radiance, extra=12, outputs=6, seed=seed, half=half)
-        case "grid":
-            function = DenseGrid(config.grid.radiance, outputs=6)
-    return RadianceField(function, domain, scale=scale)
+    spec = FieldSpec(outputs=6, extra=12, seed=seed, half=half)
+    return RadianceField(
+        registry.representation(representation).field(settings, spec), domain, scale=scale
+    )
 
 
 def _squareplus(x: mi.Float) -> mi.Float:

@@ -6,18 +6,22 @@ import re
 
 import mitsuba as mi
 
-from .materials import Material, Materials, registry_number
+from ..quantities import QUANTITIES
+from .materials import Materials, read_carried, registry_number
+
+#: By which the BSDF's parameters tell the number of its material.
+_NUMBER = "material_number"
 
 
-def material_textures(materials: Materials, slot: int = 0) -> tuple[mi.Texture, mi.Texture]:
-    """Two textures, for the albedo and for the roughness of a `principled` BSDF.
+def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Texture]:
+    """A texture for each unknown quantity, by the slot of a `principled` BSDF that it is for.
 
     They read what `carry` put on the surface interaction. After `materials.stand_alone()` they
     evaluate the field at the interaction instead, with cooperative vectors, so that any integrator
     of Mitsuba can render the recovered scene.
 
     Args:
-        slot: number of the material, where materials have fields of their own; see `slots_of`.
+        number: of the material, where materials have fields of their own; see `slots_of`.
 
     Paper: Sec. 5.1.
     """
@@ -26,28 +30,27 @@ def material_textures(materials: Materials, slot: int = 0) -> tuple[mi.Texture, 
     class FieldTexture(mi.Texture):
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            self.channel = props["channel"]
+            self.quantity = props["quantity"]
 
-        def lookup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Material:
+        def lookup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f | mi.Float:
             if materials.carried:
-                return Material(mi.Color3f(si.dn_du), si.dn_dv.x)
-            return materials.evaluate(si, mi.Bool(active), engine="coopvec")
+                material = read_carried(si, materials)
+            else:
+                material = materials.evaluate(si, mi.Bool(active), engine="coopvec")
+            return material[self.quantity]
 
         def eval(self, si, active=True):
-            material = self.lookup(si, active)
-            if self.channel == "albedo":
-                return material.albedo
-            return mi.Color3f(material.roughness)
+            return mi.Color3f(self.lookup(si, active))
 
         def eval_1(self, si, active=True):
-            material = self.lookup(si, active)
-            return mi.luminance(material.albedo) if self.channel == "albedo" else material.roughness
+            value = self.lookup(si, active)
+            return mi.luminance(value) if isinstance(value, mi.Color3f) else value
 
         def eval_3(self, si, active=True):
             return self.eval(si, active)
 
         def traverse(self, callback):
-            callback.put("slot", slot, mi.ParamFlags.NonDifferentiable)
+            callback.put(_NUMBER, number, mi.ParamFlags.NonDifferentiable)
 
         def mean(self):
             return mi.Float(0.5)
@@ -59,14 +62,14 @@ def material_textures(materials: Materials, slot: int = 0) -> tuple[mi.Texture, 
             return True
 
         def to_string(self):
-            return f"FieldTexture[{self.channel}]"
+            return f"FieldTexture[{self.quantity}]"
 
-    textures = []
-    for channel in ("albedo", "roughness"):
+    textures = {}
+    for name in materials:
         props = mi.Properties()
-        props["channel"] = channel
-        textures.append(FieldTexture(props))
-    return textures[0], textures[1]
+        props["quantity"] = name
+        textures[QUANTITIES[name].slot] = FieldTexture(props)
+    return textures
 
 
 def slots_of(scene: mi.Scene) -> dict[int, int]:
@@ -99,4 +102,4 @@ def _shapes(scene: mi.Scene) -> list[mi.Shape]:
 def _slot_of(shape: mi.Shape) -> int | None:
     bsdf = shape.bsdf()
     found = [] if bsdf is None else mi.traverse(bsdf).items()
-    return next((value for key, value in found if key.endswith("base_color.slot")), None)
+    return next((value for key, value in found if key.endswith(_NUMBER)), None)

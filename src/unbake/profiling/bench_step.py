@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import drjit as dr
@@ -156,18 +157,23 @@ def _settings(config: FitConfig) -> dict:
         "pixels": config.pixels,
         "spp": config.spp,
         "radiance_spp": config.radiance_samples,
-        "radiance": f"{config.radiance.width} x {config.radiance.hidden}",
-        "albedo": f"{config.albedo.width} x {config.albedo.hidden}",
-        "roughness": f"{config.roughness.width} x {config.roughness.hidden}",
+        "radiance": asdict(config.radiance_settings),
+        "materials": {name: asdict(field) for name, field in config.material_settings.items()},
     }
+
+
+def _sizes(field: dict) -> str:
+    """The sizes of a field, without its learning rate and the details of its hash grid."""
+    sizes = {k: v for k, v in field.items() if k != "learning_rate" and not isinstance(v, dict)}
+    return " ".join(f"{key} {value}" for key, value in sizes.items())
 
 
 def _print(result: dict, console: Console) -> None:
     s, wall = result["settings"], result["milliseconds_per_step"]
     console.print(
-        f"{result['method']}, {s['pixels']} pixels x {s['spp']} samples, radiance net "
-        f"{s['radiance']} of {s['radiance_spp']} samples, albedo net {s['albedo']}, "
-        f"roughness net {s['roughness']}"
+        f"{result['method']}, {s['pixels']} pixels x {s['spp']} samples; radiance "
+        f"{_sizes(s['radiance'])} of {s['radiance_spp']} samples; "
+        + "; ".join(f"{name} {_sizes(field)}" for name, field in s["materials"].items())
     )
     console.print(
         f"{wall:.1f} ms a step, [bold]{result['samples_per_second'] / 1e3:.0f} k samples/s[/]; "

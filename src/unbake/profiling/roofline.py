@@ -11,9 +11,7 @@ import mitsuba as mi
 
 from ..config import FitConfig
 from ..dataset.pixels import PixelSource
-from ..fields.grid import DenseGrid
-from ..fields.materials import Volume
-from ..fields.network import Network
+from ..fields.field import Field
 from ..training.problem import Problem
 from ..training.state import State
 from ..transport.objective import requirements
@@ -129,34 +127,26 @@ def _of_learning(problem: Problem, wanted: Requirements, *, all_samples: bool) -
 def _materials(problem: Problem, *, gradient: bool) -> Work:
     work = Work(0, 0, 0)
     if problem.materials is not None:
-        for field in problem.materials.fields.values():
+        for field in problem.materials.values():
             work += _evaluation(field, gradient=gradient)
     return work
 
 
 def _albedo(problem: Problem) -> Work:
-    if problem.materials is None:
+    if problem.materials is None or "albedo" not in problem.materials:
         return Work(0, 0, 0)
-    return _evaluation(problem.materials.fields["albedo"], gradient=False)
+    return _evaluation(problem.materials["albedo"], gradient=False)
 
 
 def _radiance(problem: Problem, *, gradient: bool) -> Work:
     return _evaluation(problem.radiance.function, gradient=gradient)
 
 
-def _evaluation(field: object, *, gradient: bool) -> Work:
+def _evaluation(field: Field, *, gradient: bool) -> Work:
     """Work of asking a field once, and of its gradient."""
-    function = field.function if isinstance(field, Volume) else field
-    match function:
-        case Network():
-            products = sum(weights.shape[0] * weights.shape[1] for weights, _ in function.layers)
-            floats = 8 * function.grid.n_output_features
-        case DenseGrid():
-            products, floats = 0, 8 * function.grid.n_output_features
-        case _:
-            products, floats = 0, 4 * function.channels
+    cost = field.cost()
     # The gradient of a lookup reads and writes where the lookup read.
-    once = Work(0, products, 4 * floats)
+    once = Work(0, cost.multiply_adds, cost.bytes)
     return once.times(_WITH_GRADIENT if gradient else 1)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -62,23 +62,23 @@ def material_names(scene: ParsedScene) -> list[str]:
     return names
 
 
-def set_textures(scene: ParsedScene, albedo: object, roughness: object) -> None:
-    """Give every `principled` BSDF these textures; its other parameters keep their values.
+def set_textures(scene: ParsedScene, textures: Mapping[str, object]) -> None:
+    """Give every `principled` BSDF these textures, by parameter; all its other parameters stay.
 
     Raises:
         UserError: there is no such BSDF, so nothing could be fitted.
     """
-    set_own_textures(scene, [(albedo, roughness)] * len(material_names(scene)))
+    set_own_textures(scene, [textures] * len(material_names(scene)))
 
 
-def set_own_textures(scene: ParsedScene, textures: list[tuple[object, object]]) -> None:
-    """Give each `principled` BSDF an albedo and a roughness texture of its own.
+def set_own_textures(scene: ParsedScene, textures: Sequence[Mapping[str, object]]) -> None:
+    """Give each `principled` BSDF textures of its own, by parameter.
 
     BSDFs with textures of their own are not merged, nor are their shapes.
     """
-    for node, (albedo, roughness) in zip(scene.principled_nodes(), textures, strict=True):
-        node.props["base_color"] = albedo
-        node.props["roughness"] = roughness
+    for node, own in zip(scene.principled_nodes(), textures, strict=True):
+        for slot, texture in own.items():
+            node.props[slot] = texture
 
 
 def show_roughness_as_albedo(scene: ParsedScene) -> None:

@@ -124,7 +124,7 @@ def fit(
             if not (full or last or due):
                 continue
 
-            entry = _log_entry(recent, progress, rates["albedo"])
+            entry = _log_entry(recent, progress, rates[config.quantities[0]])
             skipped = skipped + entry["skipped"] if entry["skipped"] == len(recent) else 0
             recent.clear()
             # Scores, checkpoints and previews are not training: the clock stands still.
@@ -137,7 +137,7 @@ def fit(
                 raise UserError(
                     f"the loss was not finite in the last {skipped} steps",
                     where=run,
-                    remedy="Lower learning_rate, or look for extreme pixels in the images",
+                    remedy="Lower the learning rates, or look for extreme pixels in the images",
                 )
             if last or progress.seconds - saved_at >= config.checkpoint_seconds:
                 save_checkpoint(folder, state, progress)

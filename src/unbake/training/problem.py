@@ -21,6 +21,7 @@ from ..fields.emission import Emission, emission_textures
 from ..fields.envmap import EnvironmentMap, environment_emitter
 from ..fields.materials import Materials, make_materials
 from ..fields.radiance import RadianceField, make_radiance
+from ..fields.registry import representation
 from ..fields.texture import material_textures, slots_of
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
@@ -108,13 +109,20 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
     domain = Domain.of(loaded.bbox())
     if materials is not None:
         materials.domain = domain
-        if config.representation == "bitmap":
+        if representation(config.representation).unwrapped:
             edit.require_unwrapped(loaded, scene)
             materials.slots = slots_of(loaded)
 
     radiance = None
     if requirements(config.chosen_method.terms).radiance:
-        radiance = make_radiance(config, domain, scale=scale, seed=int(seeds[1]))
+        radiance = make_radiance(
+            config.radiance_representation,
+            config.radiance_settings,
+            domain,
+            scale=scale,
+            seed=int(seeds[1]),
+            half=config.half_precision,
+        )
     scene_view = SceneView.of(loaded, materials, config.transport.max_specular)
     return Problem(
         scene_view,
@@ -130,12 +138,18 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
 
 def _unknown_materials(parsed: ParsedScene, config: FitConfig, seed: int) -> Materials:
     names = edit.material_names(parsed)
-    materials = make_materials(config, names, seed=seed)
-    if config.representation == "bitmap":
-        each = [material_textures(materials, slot) for slot in range(len(names))]
+    materials = make_materials(
+        config.representation,
+        config.material_settings,
+        names,
+        seed=seed,
+        half=config.half_precision,
+    )
+    if representation(config.representation).unwrapped:
+        each = [material_textures(materials, number) for number in range(len(names))]
         edit.set_own_textures(parsed, each)
     else:
-        edit.set_textures(parsed, *material_textures(materials))
+        edit.set_textures(parsed, material_textures(materials))
     return materials
 
 

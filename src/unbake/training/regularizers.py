@@ -30,7 +30,7 @@ def regularization_terms(
     vertex = find_vertex(scene_view, ray, everywhere, sampler, hide_emitters=problem.hide_emitters)
     valid = vertex.valid & scene_view.is_optimized(vertex.si.shape)
     here = materials.evaluate(vertex.si, valid)
-    dr.eval(here.albedo, here.roughness)
+    dr.eval(here)
     terms: dict[str, mi.Float] = {}
     if r.roughness_smoothness:
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), r.radius)
@@ -50,6 +50,6 @@ def is_anchored(problem: Problem, config: FitConfig) -> bool:
 
     They do where they see the environment itself, and where there is light that is known.
     """
-    both = problem.materials is not None and problem.environment is not None
+    both = problem.environment is not None and "albedo" in (problem.materials or ())
     alone = len(problem.scene_view.scene.emitters()) == 1
     return both and alone and problem.hide_emitters and config.lighting.anchor > 0

@@ -17,21 +17,8 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     """
     decay = config.final_learning_rate ** min(done, 1.0)
     rise = min(1.0, (step + 1) / (config.warm_up + 1))
-    albedo, roughness = config.learning_rate, config.roughness_learning_rate
-    match config.representation:
-        case "grid":
-            albedo, roughness = config.grid.learning_rate, config.grid.roughness_learning_rate
-        case "bitmap":
-            albedo, roughness = config.bitmap.learning_rate, config.bitmap.roughness_learning_rate
-    radiance = config.radiance_learning_rate
-    if config.radiance_representation == "grid":
-        radiance = config.grid.radiance_learning_rate
-    unknowns = {
-        "albedo": albedo,
-        "roughness": roughness,
-        "environment": config.lighting.learning_rate,
-        "emission": config.lighting.learning_rate,
-    }
+    unknowns = {name: field.learning_rate for name, field in config.material_settings.items()}
+    unknowns |= dict.fromkeys(("environment", "emission"), config.lighting.learning_rate)
     return {name: rate * decay * rise for name, rate in unknowns.items()} | {
-        "radiance": radiance * decay
+        "radiance": config.radiance_settings.learning_rate * decay
     }

@@ -35,15 +35,17 @@ def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
     material = with_joint_gradients(scene_view.materials.evaluate(si, vertex.valid))
     si = mi.SurfaceInteraction3f(si)
     carry(si, material)
-    return replace(vertex, si=si, albedo=dr.detach(material.albedo))
+    if "albedo" not in material:
+        return attach_albedo(scene_view, replace(vertex, si=si))
+    return replace(vertex, si=si, albedo=dr.detach(material["albedo"]))
 
 
 def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
     """Look up the albedo alone, where light goes no further and only L_θ wants to know it."""
-    if scene_view.materials is None:
+    if scene_view.materials is None or "albedo" not in scene_view.materials:
         albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
     else:
-        albedo = scene_view.materials.albedo_at(vertex.si, vertex.valid)
+        albedo = scene_view.materials.evaluate_one("albedo", vertex.si, vertex.valid)
     return replace(vertex, albedo=dr.detach(albedo))
 
 

@@ -13,7 +13,7 @@ def roughness_smoothness(here: Material, near: Material, valid: mi.Bool) -> mi.F
 
     Absolute rather than squared: borders between materials stay sharp.
     """
-    difference = dr.abs(here.roughness - near.roughness)
+    difference = dr.abs(here["roughness"] - near["roughness"])
     return _mean(dr.select(valid, difference, 0), valid)
 
 
@@ -30,7 +30,7 @@ def albedo_ties_roughness(
     """
     lane = dr.arange(mi.UInt32, dr.width(valid))
     other = dr.select(lane + shift < dr.width(valid), lane + shift, lane + shift - dr.width(valid))
-    albedo, roughness = dr.detach(here.albedo), here.roughness
+    albedo, roughness = dr.detach(here["albedo"]), here["roughness"]
     dr.eval(albedo, roughness, valid)
     distance = dr.squared_norm(albedo - dr.gather(mi.Color3f, albedo, other))
     both = valid & dr.gather(mi.Bool, valid, other)
@@ -41,7 +41,7 @@ def albedo_ties_roughness(
 
 def mean_albedo_deviation(here: Material, valid: mi.Bool, mean: float) -> mi.Float:
     """Squared deviation of the mean albedo from a number, summed over channels."""
-    means = [_mean(dr.select(valid, channel, 0), valid) for channel in here.albedo]
+    means = [_mean(dr.select(valid, channel, 0), valid) for channel in here["albedo"]]
     return sum(dr.square(m - mean) for m in means)
 
 

@@ -14,7 +14,6 @@ from typing import Protocol
 import mitsuba as mi
 
 from ..errors import UserError
-from ..fields.network import Network, can_record_layout
 from ..fields.radiance import RadianceField
 from .loss import RelativeL2, squared_error
 from .methods import BOUNCES, PATH_REPLAY, PHOTOMETRIC, Method
@@ -162,10 +161,8 @@ class PathReplaySampler:
         requirements(method.terms)
         self._integrator = path_replay(context.max_depth, context.rr_depth, context.hide_emitters)
         materials = context.scene_view.materials
-        fields = [] if materials is None else materials.fields.values()
-        # Inside Mitsuba's loop, networks are cooperative vectors.
-        networks = any(isinstance(getattr(f, "function", f), Network) for f in fields)
-        self.can_be_recorded = not networks or can_record_layout()
+        # Inside Mitsuba's loop, fields are evaluated as they were prepared.
+        self.can_be_recorded = all(field.recordable for field in (materials or {}).values())
 
     def prepared(self) -> AbstractContextManager:
         """Paths find the fields' materials."""

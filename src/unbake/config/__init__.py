@@ -1,0 +1,53 @@
+"""The settings of a fit, read from and written to TOML. Needs neither Mitsuba nor Dr.Jit."""
+
+from __future__ import annotations
+
+from ..fields.settings import (
+    BitmapConfig,
+    DenseGridConfig,
+    FieldSettings,
+    GridConfig,
+    NetworkConfig,
+)
+from .fit import (
+    MOST_BOUNCES,
+    Estimator,
+    FitConfig,
+    LightingConfig,
+    PathConfig,
+    Precision,
+    PresetName,
+    PriorName,
+    Reference,
+    RegularizationConfig,
+    TransportConfig,
+    Unknown,
+)
+from .presets import preset
+from .tables import update
+from .toml import from_toml, read_toml, to_toml
+
+__all__ = [
+    "MOST_BOUNCES",
+    "BitmapConfig",
+    "DenseGridConfig",
+    "Estimator",
+    "FieldSettings",
+    "FitConfig",
+    "GridConfig",
+    "LightingConfig",
+    "NetworkConfig",
+    "PathConfig",
+    "Precision",
+    "PresetName",
+    "PriorName",
+    "Reference",
+    "RegularizationConfig",
+    "TransportConfig",
+    "Unknown",
+    "from_toml",
+    "preset",
+    "read_toml",
+    "to_toml",
+    "update",
+]

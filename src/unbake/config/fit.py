@@ -1,0 +1,281 @@
+"""The settings of a fit, as frozen dataclasses.
+
+Every field cites the section of the paper (or says that the choice is ours).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..errors import UserError, require
+from ..fields.registry import representation, representations
+from ..fields.settings import FieldSettings
+from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
+from ..transport.methods import METHODS, Method
+from .tables import update
+
+Estimator = Literal["auto", "split-halves", "two-pass"]
+Reference = Literal["smoothed", "photograph"]
+PriorName = Literal["one-bounce", "extra-bounce"]
+Unknown = Literal["materials", "lighting", "materials+lighting", "emission"]
+Precision = Literal["single", "half"]
+PresetName = Literal["cpu", "paper", "release"]
+
+
+@dataclass(frozen=True)
+class TransportConfig:
+    """How light is sampled (Sec. 4.2, 7)."""
+
+    max_specular: int = 8  #: longest chain of mirrors, glass and cut-outs followed (Sec. 7)
+
+    def __post_init__(self) -> None:
+        require(self.max_specular >= 0, "max_specular", "0 or more", self.max_specular)
+
+
+@dataclass(frozen=True)
+class PathConfig:
+    """Paths of the methods that follow them to their end, `ad-pt` and `prb` (Sec. 6)."""
+
+    max_depth: int = 15  #: longest path in bounces, plus one (Mitsuba's meaning)
+    rr_depth: int = 5  #: bounces before Russian roulette, which goes on with 0.95 at most
+
+    def __post_init__(self) -> None:
+        for name in ("max_depth", "rr_depth"):
+            require(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class LightingConfig:
+    """The unknown environment map and the unknown strength of lights (Sec. 5.1, Fig. 8).
+
+    Where materials are unknown as well, the environment is never seen directly and no other light
+    is known, albedo and light are known up to one factor a channel. It is then chosen such that the
+    mean albedo of what the training views see is `mean_albedo`.
+    """
+
+    resolution: int = 64  #: texels along an edge of the square that the sphere is mapped to
+    learning_rate: float = 0.02  #: Adam, log radiance
+    mean_albedo: float = 0.5  #: the convention, each channel (ours)
+    anchor: float = 1.0  #: weight of the squared deviation from it
+
+    def __post_init__(self) -> None:
+        known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
+        require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
+        require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
+        anchored = math.isfinite(self.anchor) and self.anchor >= 0
+        require(anchored, "anchor", "0 or more", self.anchor)
+        require(self.learning_rate > 0, "learning_rate", "positive", self.learning_rate)
+
+
+@dataclass(frozen=True)
+class RegularizationConfig:
+    """What is believed of materials where photographs say little; all off by default (ours)."""
+
+    roughness_smoothness: float = 0.0  #: weight of differences between near points
+    radius: float = 0.02  #: how near, as a fraction of the scene's (or the bitmap's) edge
+    albedo_ties_roughness: float = 0.0  #: weight of roughness differences at similar albedo
+    similarity: float = 0.1  #: distance of albedos (linear RGB) that still count as similar
+
+    def __post_init__(self) -> None:
+        for name in ("roughness_smoothness", "albedo_ties_roughness"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, "0 or more", value)
+        for name in ("radius", "similarity"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value > 0, name, "positive", value)
+
+
+#: Bounces that can be differentiated before the radiance field takes over.
+MOST_BOUNCES = 16
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Everything that decides what a fit does, apart from its data set."""
+
+    preset: PresetName = "cpu"
+    unknown: Unknown = "materials"
+    method: str = "ours"  #: see `transport/methods.py`
+    bounces: int = 1  #: differentiable bounces before L_θ is asked (Sec. 6.3); `ours` only
+    prior: PriorName = "extra-bounce"  #: where the residual is taken (Sec. 4.2); `ours` only
+    quantities: tuple[str, ...] = DEFAULT_QUANTITIES  #: unknown of materials (Sec. 5.1)
+    representation: str = "neural"  #: of the materials (Sec. 5.1, Fig. 5, Sec. 8)
+    radiance_representation: str = "neural"  #: of L_θ (Sec. 5.3, Fig. 5)
+    seed: int = 0
+
+    steps: int = 2400  #: training steps (Table 1)
+    seconds: float = 0.0  #: stop after this much training time instead (0: count steps)
+    pixels: int = 1024  #: batch size in pixels (Table 1)
+    spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
+    radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
+
+    final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)
+    warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
+    estimator: Estimator = "auto"  #: unbiased squared error (Sec. 5.2); see `halves`
+    loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)
+    loss_epsilon: float = 0.001  #: added to the denominator of the relative L2 loss (release: 0.01)
+
+    #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
+    materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
+    #: Of L_θ, by representation (Sec. 5.3).
+    radiance: Mapping[str, FieldSettings] = field(default_factory=dict)
+    precision: Precision = "single"  #: of the networks' products; all else is single (ours)
+    lighting: LightingConfig = field(default_factory=LightingConfig)
+    regularization: RegularizationConfig = field(default_factory=RegularizationConfig)
+    transport: TransportConfig = field(default_factory=TransportConfig)
+    path: PathConfig = field(default_factory=PathConfig)
+
+    checkpoint_seconds: float = 60.0  #: time between checkpoints
+    preview_seconds: float = 30.0  #: time between preview pictures
+    score_seconds: float = 0.0  #: time between scores on all held-out views (0: never)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float):
+                require(math.isfinite(value), name, "a finite number", value)
+        require(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
+        few = self.radiance_spp
+        require(few >= 0 and few % 2 == 0, "radiance_spp", "an even number, 0 or more", few)
+        for name in ("steps", "pixels"):
+            require(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+        require(
+            self.final_learning_rate > 0,
+            "final_learning_rate",
+            "positive",
+            self.final_learning_rate,
+        )
+        times = ("seconds", "checkpoint_seconds", "preview_seconds", "score_seconds")
+        for name in (*times, "warm_up", "seed"):
+            require(getattr(self, name) >= 0, name, "0 or more", getattr(self, name))
+        require(self.loss_epsilon > 0, "loss_epsilon", "positive", self.loss_epsilon)
+        require(
+            1 <= self.bounces <= MOST_BOUNCES,
+            "bounces",
+            f"1 to {MOST_BOUNCES} (every bounce is kept in memory; prb follows longer paths)",
+            self.bounces,
+        )
+        require(self.method in METHODS, "method", f"one of {', '.join(METHODS)}", self.method)
+        if not METHODS[self.method].takes_options:
+            require(self.bounces == 1, "bounces", f"1 for the method {self.method}", self.bounces)
+            only = f"extra-bounce for the method {self.method}"
+            require(self.prior == "extra-bounce", "prior", only, self.prior)
+        self._complete_fields()
+
+    def _complete_fields(self) -> None:
+        """Check what fields there are, and fill in the settings that were not given."""
+        try:
+            chosen = in_order(self.quantities)
+        except UserError as error:
+            raise UserError(error.what, "quantities", error.remedy) from None
+        ties, r = {"roughness"}, self.regularization
+        if r.albedo_ties_roughness:
+            ties.add("albedo")
+        if self.learns_materials and (r.roughness_smoothness or r.albedo_ties_roughness):
+            wanted = f"{' and '.join(sorted(ties))} at least, as [regularization] says"
+            require(ties <= set(chosen), "quantities", wanted, ", ".join(chosen))
+        for key, names in (
+            ("representation", representations()),
+            ("radiance_representation", representations(radiance=True)),
+        ):
+            value = getattr(self, key)
+            require(value in names, key, f"one of {', '.join(names)}", value)
+        materials = {
+            name: _completed(
+                self.materials.get(name, {}),
+                {form: default_settings(name, form) for form in representations()},
+            )
+            for name in [*QUANTITIES, *self.materials]
+            if quantity(name)
+        }
+        of_radiance = {form: representation(form).radiance for form in representations()}
+        radiance = _completed(self.radiance, {f: s for f, s in of_radiance.items() if s})
+        # Frozen: the completed settings take the place of what was given.
+        for key, value in (
+            ("quantities", chosen),
+            ("materials", materials),
+            ("radiance", radiance),
+        ):
+            object.__setattr__(self, key, value)
+
+    @property
+    def halves(self) -> bool:
+        """Whether squared errors come from split halves of a pixel's samples.
+
+        With `estimator = "auto"` every method has its usual one: split halves in one pass for ours
+        and its ablations, two decorrelated passes for `ad-pt` and `prb`, as in Mitsuba.
+        """
+        if self.estimator == "auto":
+            return not self.follows_paths
+        return self.estimator == "split-halves"
+
+    @property
+    def half_precision(self) -> bool:
+        """Whether networks multiply in half precision."""
+        return self.precision == "half"
+
+    @property
+    def follows_paths(self) -> bool:
+        """Whether the method follows paths to their end, and has no radiance field."""
+        return METHODS[self.method].follows_paths
+
+    @property
+    def chosen_method(self) -> Method:
+        """The method, with its residuals where `prior` says."""
+        method = METHODS[self.method]
+        return method.without_extra_bounce() if self.prior == "one-bounce" else method
+
+    @property
+    def learns_materials(self) -> bool:
+        """Whether quantities of the materials are unknown."""
+        return self.unknown in ("materials", "materials+lighting")
+
+    @property
+    def learns_environment(self) -> bool:
+        """Whether the environment map is unknown."""
+        return self.unknown in ("lighting", "materials+lighting")
+
+    @property
+    def material_settings(self) -> dict[str, FieldSettings]:
+        """Settings of the chosen representation, by unknown quantity."""
+        return {name: self.materials[name][self.representation] for name in self.quantities}
+
+    @property
+    def radiance_settings(self) -> FieldSettings:
+        """Settings of the chosen representation of L_θ."""
+        return self.radiance[self.radiance_representation]
+
+    @property
+    def radiance_samples(self) -> int:
+        """Camera samples a pixel that L_θ learns of."""
+        return min(self.radiance_spp or self.spp, self.spp)
+
+    @property
+    def samples_per_step(self) -> int:
+        """Camera samples of a training step."""
+        return self.pixels * self.spp
+
+
+def default_settings(name: str, form: str) -> FieldSettings:
+    """What a quantity's field is like unless settings say otherwise.
+
+    Args:
+        name: of the quantity.
+        form: name of the representation.
+    """
+    return update(representation(form).settings, quantity(name).settings.get(form, {}))
+
+
+def _completed(
+    given: Mapping[str, FieldSettings], defaults: Mapping[str, FieldSettings]
+) -> dict[str, FieldSettings]:
+    """The settings given and the defaults of the others, by representation."""
+    for form, settings in given.items():
+        if form not in defaults:
+            raise ValueError(f"{form!r} is none of {', '.join(defaults)}")
+        if type(settings) is not type(defaults[form]):
+            kinds = type(defaults[form]).__name__, type(settings).__name__
+            raise TypeError("settings of {form!r} are {}, not {}".format(*kinds, form=form))
+    return {**defaults, **given}

@@ -1,0 +1,97 @@
+"""Settings files of earlier formats, read as if they were written today."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from ..errors import UserError
+from ..fields.settings import GridConfig
+
+#: Version of the settings file.
+FORMAT = 2
+
+#: Where keys of format 1, which knew albedo and roughness alone, are now.
+_MOVED = {
+    "learning_rate": "materials.albedo.neural.learning_rate",
+    "roughness_learning_rate": "materials.roughness.neural.learning_rate",
+    "radiance_learning_rate": "radiance.neural.learning_rate",
+    "albedo": "materials.albedo.neural",
+    "roughness": "materials.roughness.neural",
+    "radiance": "radiance.neural",
+    "grid.albedo": "materials.albedo.grid.cells",
+    "grid.roughness": "materials.roughness.grid.cells",
+    "grid.radiance": "radiance.grid.cells",
+    "grid.learning_rate": "materials.albedo.grid.learning_rate",
+    "grid.roughness_learning_rate": "materials.roughness.grid.learning_rate",
+    "grid.radiance_learning_rate": "radiance.grid.learning_rate",
+    "bitmap.albedo": "materials.albedo.bitmap.resolution",
+    "bitmap.roughness": "materials.roughness.bitmap.resolution",
+    "bitmap.learning_rate": "materials.albedo.bitmap.learning_rate",
+    "bitmap.roughness_learning_rate": "materials.roughness.bitmap.learning_rate",
+    "regularisation": "regularization",
+}
+_GROUPS = ("grid", "bitmap")
+
+
+def migrated(table: dict[str, Any]) -> dict[str, Any]:
+    """A table of settings in today's format, without its number.
+
+    A file that does not tell its format may have keys of both.
+
+    Raises:
+        UserError: the format is not known, or a key of an old table is not.
+    """
+    table = dict(table)
+    version = table.pop("format", None)
+    if version is not None and (type(version) is not int or not 1 <= version <= FORMAT):
+        remedy = f"This version of unbake reads formats 1 to {FORMAT}"
+        raise UserError(f"unknown format {version!r}", "format", remedy)
+    if version == FORMAT:
+        return table
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        if key in _GROUPS and isinstance(value, dict):
+            for inner, setting in value.items():
+                dotted = f"{key}.{inner}"
+                if dotted not in _MOVED:
+                    known = [k.partition(".")[2] for k in _MOVED if k.startswith(f"{key}.")]
+                    raise UserError("unknown key", dotted, f"Known keys: {', '.join(known)}")
+                _put(found, _MOVED[dotted], setting, dotted)
+        elif key == "radiance" and version is None and not _is_network(value):
+            _put(found, key, value, key)
+        else:
+            _put(found, _MOVED.get(key, key), value, key)
+    return found
+
+
+def _is_network(radiance: object) -> bool:
+    """Whether the table [radiance] is that of a network, as in format 1.
+
+    In format 2 it holds tables of representations. One of these is named `grid`, as the network's
+    hash grid was.
+    """
+    if not isinstance(radiance, dict):
+        return False
+    if "width" in radiance or "hidden" in radiance:
+        return True
+    grid = radiance.get("grid")
+    hashed = {field.name for field in dataclasses.fields(GridConfig)}
+    return isinstance(grid, dict) and bool(hashed & grid.keys())
+
+
+def _put(table: dict[str, Any], dotted: str, value: Any, key: str) -> None:
+    """Put a value where a dotted key says, beside what is there already."""
+    *outer, last = dotted.split(".")
+    for name in outer:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise UserError("must be a table", key)
+    if isinstance(value, dict):
+        inner = table.setdefault(last, {})
+        if not isinstance(inner, dict):
+            raise UserError("must be a table", key)
+        for name, item in value.items():
+            _put(inner, name, item, f"{key}.{name}")
+    else:
+        table[last] = value

@@ -1,0 +1,74 @@
+"""Settings changed by nested tables, as a TOML file holds them.
+
+Unknown keys and wrong types are errors, so that a misspelt setting is never silently ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar, cast
+
+from ..errors import UserError
+
+Settings = TypeVar("Settings")
+
+
+def update(settings: Settings, table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Settings:
+    """Settings with the values of a table.
+
+    Args:
+        settings: a dataclass, or dataclasses by name.
+        table: nested as the settings are; what is absent stays.
+        path: keys that lead to the table, for errors.
+
+    Raises:
+        UserError: a key is unknown, or a value has the wrong type or range.
+    """
+    if isinstance(settings, Mapping):
+        current = dict(settings)
+        hints = dict.fromkeys(current)
+    else:
+        hints = typing.get_type_hints(type(settings))
+        current = {key: getattr(settings, key) for key in hints}
+    changes = {}
+    for key, value in table.items():
+        here = (*path, key)
+        dotted = ".".join(here)
+        if key not in current:
+            known = ", ".join(current)
+            raise UserError("unknown key", where=dotted, remedy=f"Known keys: {known}")
+        if dataclasses.is_dataclass(current[key]) or isinstance(current[key], Mapping):
+            if not isinstance(value, Mapping):
+                raise UserError("must be a table", where=dotted)
+            changes[key] = update(current[key], value, here)
+        else:
+            changes[key] = typed(value, hints[key], dotted)
+    if isinstance(settings, Mapping):
+        return cast(Settings, {**current, **changes})
+    try:
+        return dataclasses.replace(cast(Any, settings), **changes)
+    except UserError as error:
+        where = ".".join((*path, *([error.where] if error.where else [])))
+        raise UserError(error.what, where, error.remedy) from None
+
+
+def typed(value: object, hint: Any, where: str) -> Any:
+    """The value as the type that an annotation asks for; raises a `UserError` otherwise."""
+    if typing.get_origin(hint) in (Literal, types.UnionType):
+        choices = typing.get_args(hint)
+        if value not in choices:
+            raise UserError(f"must be one of {', '.join(choices)}, not {value!r}", where=where)
+        return value
+    if typing.get_origin(hint) is tuple:
+        (item, _) = typing.get_args(hint)
+        if not isinstance(value, list | tuple):
+            raise UserError(f"must be a list, not {type(value).__name__}", where=where)
+        return tuple(typed(x, item, where) for x in value)
+    if hint is float and type(value) is int and abs(value) < 1 << 53:
+        return float(value)
+    if type(value) is not hint:
+        raise UserError(f"must be {hint.__name__}, not {type(value).__name__}", where=where)
+    return value

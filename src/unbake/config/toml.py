@@ -1,0 +1,85 @@
+"""Settings as TOML text, in which every setting stands."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+from .fit import FitConfig, PresetName
+from .migration import FORMAT, migrated
+from .presets import preset
+from .tables import typed, update
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+def to_toml(config: FitConfig) -> str:
+    """The settings as TOML text; `from_toml` gives the same settings back.
+
+    Fields that the fit does not have are left out where they are as in the preset: a file does not
+    name representations that are registered by chance.
+    """
+    table = dataclasses.asdict(config)
+    base = preset(config.preset)
+    for name, forms in config.materials.items():
+        used = config.representation if name in config.quantities else None
+        kept = _kept(forms, base.materials[name], used)
+        table["materials"][name] = {form: table["materials"][name][form] for form in kept}
+    kept = _kept(config.radiance, base.radiance, config.radiance_representation)
+    table["radiance"] = {form: table["radiance"][form] for form in kept}
+    lines: list[str] = []
+    _write_table({"format": FORMAT} | table, (), lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _kept(forms: Mapping[str, Any], base: Mapping[str, Any], used: str | None) -> list[str]:
+    return [form for form, value in forms.items() if form == used or value != base[form]]
+
+
+def _write_table(table: dict, path: tuple[str, ...], lines: list[str]) -> None:
+    values = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    if path and values:
+        lines += ["", f"[{'.'.join(path)}]"]
+    lines += [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            _write_table(value, (*path, key), lines)
+
+
+def from_toml(text: str, where: str = "settings") -> FitConfig:
+    """Settings from TOML text; keys that are absent keep the value of the named preset.
+
+    Settings of earlier formats are understood.
+
+    Raises:
+        UserError: the text is not TOML, a key is unknown, or a value has the wrong type or range.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"not valid TOML ({error})", where=where) from None
+    try:
+        table = migrated(table)
+        name = typed(table.get("preset", "cpu"), PresetName, "preset")
+        return update(preset(name), table)
+    except UserError as error:
+        raise UserError(error.what, where=f"{where}: {error.where}", remedy=error.remedy) from None
+
+
+def read_toml(path: Path) -> FitConfig:
+    """Settings from a TOML file; see `from_toml`."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot be read ({error.strerror})", path, "Check the path") from None
+    except UnicodeDecodeError:
+        raise UserError("is not UTF-8 text", path, "Save it as UTF-8") from None
+    return from_toml(text, str(path))

@@ -1,0 +1,93 @@
+"""What every representation implements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Protocol
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from .domain import SurfacePoint
+
+#: How networks multiply; see `network.py`. Other representations may do without.
+Engine = Literal["fused", "tensor", "coopvec"]
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """What a field is asked to be, whatever its representation.
+
+    Args:
+        outputs: numbers at a point.
+        extra: inputs beside the point; representations of the position alone ignore them.
+        bounded: every output lies in (0, 1), and `initial` between; otherwise outputs are any
+            numbers, and start near zero.
+        initial: value of every output of an untrained field that is bounded.
+        seed: of random initial parameters.
+        half: products may be in half precision.
+        materials: names of the scene's materials, in the order of `SurfacePoint.material`.
+    """
+
+    outputs: int
+    extra: int = 0
+    bounded: bool = False
+    initial: float = 0.5
+    seed: int = 0
+    half: bool = False
+    materials: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Work of one evaluation at one point, without its gradient."""
+
+    multiply_adds: float
+    bytes: float  # read from tables of parameters
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(self.multiply_adds + other.multiply_adds, self.bytes + other.bytes)
+
+
+class Field(Protocol):
+    """A trainable function of points on surfaces.
+
+    Representations may inherit from it for the members that have a value here.
+    """
+
+    #: Whether `dr.freeze` can record `prepare`.
+    recordable: bool = True
+
+    def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The trainable arrays by name; `assign` takes them back."""
+        ...
+
+    def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
+        """Use these arrays from now on; gradients arrive in the very arrays given."""
+        ...
+
+    def prepare(self) -> None:
+        """Do what evaluations inside virtual calls and loops cannot do; needed after `assign`."""
+
+    def evaluate(
+        self,
+        point: SurfacePoint,
+        extra: Sequence[mi.Float] = (),
+        engine: Engine | None = None,
+    ) -> list[mi.Float]:
+        """Evaluate the field.
+
+        Args:
+            point: where; positions lie in [0,1]³.
+            extra: the further inputs, as many as `FieldSpec` says.
+            engine: `coopvec` inside of virtual calls and loops; None: the fastest one elsewhere.
+
+        Returns:
+            One array for each output.
+        """
+        ...
+
+    def cost(self) -> Cost:
+        """Work of one evaluation, for the least time that a step could take."""
+        ...

@@ -1,0 +1,88 @@
+"""Sizes and learning rates of the representations that come with the package.
+
+They are read and written as tables of the settings file, and need neither Mitsuba nor Dr.Jit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from ..errors import require
+
+_FINEST = "base_resolution * growth^(levels - 1) is 2^24 or less"
+
+
+class FieldSettings(Protocol):
+    """Settings of any representation: a frozen dataclass, with a learning rate at least."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Adam's rate for the field's parameters."""
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """A multiresolution hash grid over the unit cube (Sec. 5.3; Müller et al. 2022)."""
+
+    levels: int = 8  #: number of resolutions
+    features: int = 2  #: features of each level
+    table_log2: int = 15  #: log2 of the largest number of entries of a level
+    base_resolution: int = 4  #: cells along an axis of the coarsest level
+    growth: float = 2.0  #: ratio of resolutions of neighbouring levels
+
+    def __post_init__(self) -> None:
+        require(self.levels >= 1, "levels", "1 or more", self.levels)
+        require(self.features in (2, 4, 8), "features", "2, 4 or 8", self.features)
+        require(4 <= self.table_log2 <= 28, "table_log2", "4 to 28", self.table_log2)
+        require(self.base_resolution >= 1, "base_resolution", "1 or more", self.base_resolution)
+        require(self.growth >= 1, "growth", "1 or more", self.growth)
+        # Cells of a finer level than that are smaller than single precision tells positions apart.
+        finest = math.log2(self.base_resolution) + (self.levels - 1) * math.log2(self.growth)
+        require(finest <= 24, "levels", f"such that {_FINEST}", self.levels)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """A multilayer perceptron on top of a hash grid (Sec. 5.3)."""
+
+    grid: GridConfig = field(default_factory=GridConfig)
+    width: int = 32  #: neurons of a hidden layer
+    hidden: int = 2  #: number of hidden layers
+    learning_rate: float = 0.01  #: Adam (Sec. 5.4: 5e-4)
+
+    def __post_init__(self) -> None:
+        for name in ("width", "hidden"):
+            require(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+        require_rate(self.learning_rate)
+
+
+@dataclass(frozen=True)
+class DenseGridConfig:
+    """A dense 3D grid with trilinear interpolation over the scene's cube (Fig. 5)."""
+
+    cells: int = 32  #: along an axis
+    learning_rate: float = 0.05  #: Adam
+
+    def __post_init__(self) -> None:
+        require(1 <= self.cells <= 512, "cells", "1 to 512", self.cells)
+        require_rate(self.learning_rate)
+
+
+@dataclass(frozen=True)
+class BitmapConfig:
+    """A square bitmap in the UV coordinates of each material (Sec. 8)."""
+
+    resolution: int = 64  #: pixels along an edge
+    learning_rate: float = 0.05  #: Adam
+
+    def __post_init__(self) -> None:
+        require(1 <= self.resolution <= 8192, "resolution", "1 to 8192", self.resolution)
+        require_rate(self.learning_rate)
+
+
+def require_rate(rate: float) -> None:
+    """Raise an error unless this can be a learning rate."""
+    require(math.isfinite(rate), "learning_rate", "a finite number", rate)
+    require(rate > 0, "learning_rate", "positive", rate)
