@@ -19,7 +19,7 @@ CUT, LIVE = (2, 3, 6), (1, 2, 4)
 def furnace(built_in):
     scene = parse(built_in("furnace", ALBEDO)).instantiate()
     parameters = mi.traverse(scene)
-    keys = [key for key in parameters if key.endswith("reflectance.value")]
+    keys = [key for key, _ in parameters if key.endswith("reflectance.value")]
     assert keys
 
     def assign(value):

@@ -1,4 +1,4 @@
-"""The paper's tables and figures, a file each; the library knows nothing of them."""
+"""The paper's tables and figures, one module each. The rest of the library does not use them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Derivatives of pixels by one parameter of a material, as each method would estimate them."""
+"""Derivatives of pixels by one parameter of a material, as estimated by each method."""
 
 from __future__ import annotations
 
@@ -21,16 +21,13 @@ RR_DEPTH = 3
 @final
 @dataclass(frozen=True)
 class Estimates:
-    """What pixels are, and their derivatives.
-
-    All are linear RGB, shape (pixels, 3).
+    """Pixels and their derivatives: linear RGB, shape (pixels, 3).
 
     Args:
         image: with all light.
-        derivative: of it.
-        cut: by longest path (Mitsuba's meaning, 2 is direct light): image and derivative.
-        attached: by the number k of differentiable bounces, the derivative with an exact L after
-            them.
+        derivative: of the image.
+        cut: image and derivative by maximum path length, as Mitsuba counts (2 is direct light).
+        attached: derivative by the number k of differentiable bounces, followed by the exact L.
     """
 
     image: np.ndarray
@@ -54,15 +51,19 @@ def estimate(
 ) -> Estimates:
     """Estimate pixels and derivatives along the same paths for all methods.
 
-    Each bounce is differentiated by itself, forwards; the product rule along a path then gives what
-    any method finds on it: those that end paths early, and those that let gradients through the
-    first k bounces only, after which the incident radiance is taken as it is.
+    Each bounce is differentiated by itself in forward mode. The product rule along a path then
+    gives the estimates of all methods: of those that end paths early, and of those that
+    differentiate the first k bounces and take the incident radiance after them as constant.
 
     Args:
-        assign: gives the scene the parameter's value.
-        value: of the parameter.
-        max_depth: longest path that counts as all light.
-        cut: longest paths of methods that end them earlier.
+        assign: sets the parameter of the scene.
+        value: value of the parameter.
+        through: makes the camera rays.
+        pixels: number of pixels.
+        spp: samples per pixel.
+        seed: seed of all samples.
+        max_depth: maximum path length that counts as all light.
+        cut: maximum path lengths of methods that end paths earlier.
         attached: numbers k of differentiable bounces.
 
     Paper: Fig. 4, Sec. 6.3.
@@ -72,10 +73,10 @@ def estimate(
     names += [f"attached {k}" for k in attached]
     sums = {name: np.zeros((pixels, 3)) for name in names}
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
-        found = _along(
+        estimates = _along(
             scene_view, assign, value, ray, part_seed, max_depth, set(cut), tuple(attached)
         )
-        for name, samples in found.items():
+        for name, samples in estimates.items():
             means = [np.array(dr.block_sum(c, spp)) / spp for c in samples]
             sums[name][part] = np.stack(means, -1)
     return Estimates(
@@ -97,14 +98,14 @@ def _along(
     attached: tuple[int, ...],
 ) -> dict[str, mi.Color3f]:
     """The estimates of each sample."""
-    found: dict[str, mi.Color3f] = {}
+    estimates: dict[str, mi.Color3f] = {}
     lanes = dr.width(ray)
     sampler = mi.load_dict({"type": "independent"})
     _reseed(sampler, seed, 0, lanes)
     with dr.suspend_grad():
         x = find_vertex(scene_view, ray, mi.Bool(True), sampler)
     total, β = mi.Color3f(x.emitted), mi.Color3f(x.throughput)
-    # How throughput and sum change with the parameter: by all bounces, and by the first k alone.
+    # Derivatives of throughput and sum: by all bounces, and by the first k bounces.
     ks = (max_depth, *attached)
     dβ = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
     dtotal = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
@@ -141,14 +142,14 @@ def _along(
         β *= w * t
         dr.eval(total, β, dβ, dtotal, lane)
         if number + 1 in cut:
-            found[f"cut {number + 1}"] = mi.Color3f(total)
-            found[f"cut' {number + 1}"] = mi.Color3f(dtotal[max_depth])
+            estimates[f"cut {number + 1}"] = mi.Color3f(total)
+            estimates[f"cut' {number + 1}"] = mi.Color3f(dtotal[max_depth])
     assign(mi.Float(value))
-    found["image"], found["derivative"] = total, dtotal[max_depth]
-    for depth in cut:  # where all paths had ended before
-        found.setdefault(f"cut {depth}", total)
-        found.setdefault(f"cut' {depth}", dtotal[max_depth])
-    return found | {f"attached {k}": dtotal[k] for k in attached}
+    estimates["image"], estimates["derivative"] = total, dtotal[max_depth]
+    for depth in cut:  # if all paths ended earlier
+        estimates.setdefault(f"cut {depth}", total)
+        estimates.setdefault(f"cut' {depth}", dtotal[max_depth])
+    return estimates | {f"attached {k}": dtotal[k] for k in attached}
 
 
 def _reseed(sampler: mi.Sampler, seed: int, number: int, lanes: int) -> None:

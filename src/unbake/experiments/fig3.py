@@ -1,4 +1,4 @@
-"""Figure 3: the time of a step of every method, scene by scene."""
+"""Figure 3: the step time of every method on each scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ METHODS = {
     "PRB": "prb",
     "AD-PT": "ad-pt",
 }
-#: Seconds of a step, read off the authors' bars (RTX 3090).
+#: Seconds per step, read off the bars of the paper (RTX 3090).
 PUBLISHED: Mapping[str, Mapping[str, float]] = {
     "STAIRCASE": {"ours": 0.86, "PRB": 3.2, "AD-PT": 2.55, "no prior": 0.78, "direct": 0.53},
     "LIVING ROOM": {"ours": 0.78, "PRB": 1.7, "AD-PT": 1.55},
@@ -41,7 +41,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
     jobs = []
     for scene in scenes_at(context):
         scene.require(context)
-        # What a step takes has nothing to do with how good photographs are.
+        # The step time does not depend on the noise of the photographs.
         shots = dataclasses.replace(
             scene.capture_settings(context), resolution=context.pick(16, 64, 128), spp=1
         )
@@ -76,21 +76,21 @@ def _measure(
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows, lines = [], []
     for scene in scenes_at(context):
-        measured, theirs = findings[scene.folder], PUBLISHED.get(scene.name, {})
+        measured, published = findings[scene.folder], PUBLISHED.get(scene.name, {})
         times = {name: measured[name].get("milliseconds_per_step") for name in METHODS}
         ours, cells = times["ours"], []
         for name in METHODS:
             row = {"scene": scene.label, "method": name, "milliseconds": times[name]}
             if times[name] and ours:
                 row["times_ours"] = times[name] / ours
-            if name in theirs:
-                row["published_times_ours"] = theirs[name] / theirs["ours"]
+            if name in published:
+                row["published_times_ours"] = published[name] / published["ours"]
             rows.append(row | {"error": measured[name].get("error")})
             if name != "ours":
                 cells.append(_ratio(row))
         lines.append([scene.label, "failed" if ours is None else f"{ours:.0f} ms", *cells])
     others = [f"{name} / ours" for name in METHODS if name != "ours"]
-    caption = "In brackets: the authors' bars, on their scenes and an RTX 3090.\n\n"
+    caption = "In brackets: the bars of the paper, on its scenes and an RTX 3090.\n\n"
     return ExperimentResult(
         rows, caption + markdown(["scene", "ours", *others], lines), lambda path: _draw(path, rows)
     )
@@ -115,16 +115,16 @@ def _draw(path: Path, rows: list[dict]) -> None:
             for row in rows
             if row["method"] == method
         }
-        mine = {x: row["times_ours"] for x, row in at.items() if "times_ours" in row}
-        panel.bar(list(mine), list(mine.values()), 0.15, label=method, color=f"C{number}")
-        theirs = {
+        measured = {x: row["times_ours"] for x, row in at.items() if "times_ours" in row}
+        panel.bar(list(measured), list(measured.values()), 0.15, label=method, color=f"C{number}")
+        published = {
             x: row["published_times_ours"] for x, row in at.items() if "published_times_ours" in row
         }
-        panel.plot(list(theirs), list(theirs.values()), "k_", markersize=7)
+        panel.plot(list(published), list(published.values()), "k_", markersize=7)
     panel.set_xticks(range(len(scenes)), scenes, fontsize=7)
-    panel.set_ylabel("time of a step / ours\n(–: the authors')")
+    panel.set_ylabel("step time / ours\n(–: the paper)")
     panel.legend(fontsize=7)
     save_figure(figure, path)
 
 
-EXPERIMENT = Experiment("fig3", "Time of a step, scene by scene (Fig. 3)", _jobs, _result)
+EXPERIMENT = Experiment("fig3", "Step time by scene (Fig. 3)", _jobs, _result)

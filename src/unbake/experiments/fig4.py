@@ -1,4 +1,4 @@
-"""Figure 4: the gradients of a roughness in STAIRCASE, and which of them each method misses."""
+"""Figure 4: gradients of a roughness in STAIRCASE, as estimated by each method."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from .jobs import Findings, Job
 from .scenes import STAIRCASE
 from .tables import markdown
 
-#: Roughness of the wood of stairs and picture frames: where it is, and where it should be.
+#: Current and target roughness of the wood of stairs and picture frames.
 VALUES = tuple(round(0.2 + 0.05 * i, 2) for i in range(15))
-#: Longest paths of PRB, and differentiable bounces of ours.
+#: Maximum path lengths of PRB, and numbers of differentiable bounces of ours.
 CUTS, ATTACHED = (2, 4, 10, 15, 30), (1, 2, 4)
-#: The wood's texture: its materials have no names.
+#: The texture of the wood, which identifies its materials: they have no names.
 WOOD = "WoodPanel"
-#: All light, in practice: Russian roulette ends paths before.
+#: Practically all light: Russian roulette ends paths earlier.
 MAX_DEPTH = 40
-#: By how much the scene's own film is divided for the table's loss, which compares images with the
-#: product of an error and a derivative: noise in both fades as pixels get larger.
+#: Resolution of the scene's film over that of the table's loss. A gradient is the product of an
+#: error and a derivative; larger pixels reduce the noise of both.
 COARSE = 80
-#: Degree of the polynomials over the roughness that stand for the values of a pixel.
+#: Degree of the polynomials that are fitted to the values of a pixel over the roughness.
 DEGREE = 3
 #: ε of the relative L2 loss.
 EPSILON = 0.01
-#: As columns of the figure.
+#: Columns of the figure.
 METHODS = (
     "reference",
     "direct",
     *(f"PRB {depth}" for depth in CUTS),
     *(f"ours, k = {k}" for k in ATTACHED),
 )
-#: The authors' values: method, current and target roughness, gradient.
+#: The published values: method, current and target roughness, gradient.
 _PUBLISHED = Path(__file__).parent / "published" / "fig4.csv"
 
 
 @final
 @dataclass(frozen=True)
 class _Wood:
-    """STAIRCASE, seen as its authors did, and the roughness of its wood."""
+    """STAIRCASE with the camera of its scene file, and the roughness of its wood."""
 
     scene_view: SceneView
     rays: CameraRays
@@ -65,12 +65,12 @@ class _Wood:
     @staticmethod
     def of(context: ExperimentContext, shrunk: int) -> _Wood:
         parsed = parse(STAIRCASE.unpacked(context))
-        texture, found = mi.load_dict({"type": "uniform", "value": 0.5}), False
+        texture, present = mi.load_dict({"type": "uniform", "value": 0.5}), False
         for node in parsed.principled_nodes():
             if WOOD in _picture(parsed, node):
                 node.props["roughness"] = texture
-                found = True
-        if not found:
+                present = True
+        if not present:
             raise UserError(f"no material has a texture {WOOD!r}", parsed.path)
         scene = parsed.instantiate()
         parameters = mi.traverse(texture)
@@ -100,7 +100,7 @@ class _Wood:
 
 
 def _picture(parsed: ParsedScene, node: object) -> str:
-    """The file of a material's albedo, empty if it is no picture."""
+    """The image file of a material's albedo, or an empty string."""
     texture = referenced(parsed, node.props["base_color"])
     return "" if texture is None else str(texture.props.get("filename", ""))
 
@@ -133,7 +133,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
 
 
 def _shrunk(context: ExperimentContext) -> int:
-    """By how much the scene's own film is divided in what is rendered for the table."""
+    """Resolution of the scene's film over that of the renderings for the table."""
     return context.pick(80, 16, 8)
 
 
@@ -150,10 +150,10 @@ def _picture_file(context: ExperimentContext) -> Path:
 
 
 def _at(context: ExperimentContext, value: float, shrunk: int, spp: int) -> Findings:
-    """Images and derivatives of all methods at one roughness, kept as an array beside the part.
+    """Images and derivatives of all methods at one roughness, kept in a file of arrays.
 
-    Two independent passes: an error from one and a derivative from the other make an unbiased
-    gradient. The target, from a third one, has no noise in common with either.
+    There are two independent passes: the product of an error from one and a derivative from the
+    other is unbiased. The target comes from a third pass, independent of both.
     """
     wood = _Wood.of(context, shrunk)
     a, b = (wood.estimate(value, spp, seed) for seed in (1, 2))
@@ -179,15 +179,15 @@ def _at(context: ExperimentContext, value: float, shrunk: int, spp: int) -> Find
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with open(path, "wb") as file:  # numpy would add its own ending to a name
+    with open(path, "wb") as file:  # np.savez appends .npz to names
         np.savez(file, **arrays)
 
 
 def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """What each method takes for the image, and for its derivative."""
-    found = {"reference": (e.image, e.derivative), "direct": e.cut[2]}
-    found |= {f"PRB {depth}": e.cut[depth] for depth in CUTS}
-    return found | {f"ours, k = {k}": (e.image, e.attached[k]) for k in ATTACHED}
+    """Image and derivative of each method."""
+    methods = {"reference": (e.image, e.derivative), "direct": e.cut[2]}
+    methods |= {f"PRB {depth}": e.cut[depth] for depth in CUTS}
+    return methods | {f"ours, k = {k}": (e.image, e.attached[k]) for k in ATTACHED}
 
 
 def _pictures(context: ExperimentContext, shrunk: int, spp: int, zoom: int) -> Findings:
@@ -195,18 +195,18 @@ def _pictures(context: ExperimentContext, shrunk: int, spp: int, zoom: int) -> F
     wood = _Wood.of(context, shrunk)
     e = wood.estimate(0.5, spp, 1)
     shape = (wood.camera.height, wood.camera.width, 3)
-    found = {m: np.abs(d).mean(-1).reshape(shape[:2]) for m, (_, d) in _methods(e).items()}
-    # A few paths of much light would hide all the others: means of small blocks, where there is
-    # room for it, and a scale that most pixels of the reference stay below.
+    pictures = {m: np.abs(d).mean(-1).reshape(shape[:2]) for m, (_, d) in _methods(e).items()}
+    # Averages over blocks and a scale that most of the reference stays below: a few paths with a
+    # large contribution would hide all others.
     longest = max(shape[:2]) // 2 if context.scale != "smoke" else max(shape[:2])
-    found = {method: shrink(picture, longest) for method, picture in found.items()}
-    scale = max(float(np.percentile(found["reference"], 95)), 1e-6)
+    pictures = {method: shrink(picture, longest) for method, picture in pictures.items()}
+    scale = max(float(np.percentile(pictures["reference"], 95)), 1e-6)
     cells = [shrink(tonemap(e.image.reshape(shape)).astype(float), longest).astype(np.uint8)]
-    cells += [false_colour(picture, scale) for picture in found.values()]
+    cells += [false_colour(picture, scale) for picture in pictures.values()]
     cells = [cell.repeat(zoom, 0).repeat(zoom, 1) for cell in cells]
     half = -(-len(cells) // 2)
     write_png(_picture_file(context), montage([cells[:half], cells[half:]]))
-    return {"shown": ["image", *found], "scale": scale}
+    return {"shown": ["image", *pictures], "scale": scale}
 
 
 # ------------------------------------------------------------------------------------------- table
@@ -215,59 +215,68 @@ def _pictures(context: ExperimentContext, shrunk: int, spp: int, zoom: int) -> F
 def smoothed(
     arrays: Mapping[float, Mapping[str, np.ndarray]], height: int, width: int, block: int
 ) -> dict[float, dict[str, np.ndarray]]:
-    """Means of blocks of pixels, and polynomials of them over the parameter, evaluated at it.
+    """Average blocks of pixels and smooth them by polynomials over the parameter.
 
     Args:
-        arrays: by value of the parameter, and by name: shape (height * width, 3).
-        block: rows and columns of a block.
+        arrays: by value of the parameter and by name, each of shape (height * width, 3).
+        height: rows of the images.
+        width: columns of the images.
+        block: size of a block in pixels.
 
     Returns:
-        The same, of shape (blocks, 3).
+        Arrays by the same keys, each of shape (blocks, 3).
     """
     values = sorted(arrays)
     powers = np.vander(np.array(values) - np.mean(values), min(DEGREE + 1, len(values)))
-    onto = powers @ np.linalg.pinv(powers)
-    found: dict[float, dict[str, np.ndarray]] = {value: {} for value in values}
+    projection = powers @ np.linalg.pinv(powers)
+    result: dict[float, dict[str, np.ndarray]] = {value: {} for value in values}
     for key in arrays[values[0]]:
         films = (arrays[v][key].astype(np.float64).reshape(height, width, 3) for v in values)
         means = np.stack([block_means(film, block) for film in films])
-        for value, fit in zip(values, np.tensordot(onto, means, 1), strict=True):
-            found[value][key] = fit.reshape(-1, 3)
-    return found
+        for value, fit in zip(values, np.tensordot(projection, means, 1), strict=True):
+            result[value][key] = fit.reshape(-1, 3)
+    return result
 
 
 def gradient_table(
     arrays: Mapping[float, Mapping[str, np.ndarray]], method: str
 ) -> tuple[list[float], np.ndarray]:
-    """Gradients of the relative L2 loss by the parameter, (current, target), of a method.
+    """Gradients of the relative L2 loss by the parameter, as estimated by a method.
 
     Args:
-        arrays: by value of the parameter, then by name: `target`, and `a` and `b`, the two passes,
-            followed by the method and `image` or `derivative`.
+        arrays: by value of the parameter and by name: `target`, and for both passes `a METHOD
+            image`, `a METHOD derivative`, `b METHOD image` and `b METHOD derivative`.
+        method: one of `METHODS`.
+
+    Returns:
+        The values of the parameter, and an array of gradients, (current, target).
 
     Paper: Eq. 6, Sec. 5.2, 5.4.
     """
     values = sorted(arrays)
     table = np.zeros((len(values), len(values)))
     for i, current in enumerate(values):
-        found = arrays[current]
-        for j, wanted in enumerate(values):
-            target = arrays[wanted]["target"]
+        passes = arrays[current]
+        for j, aim in enumerate(values):
+            target = arrays[aim]["target"]
             weight = 2 / (target**2 + EPSILON)
             for one, other in ("ab", "ba"):
-                error = found[f"{one} {method} image"] - target
-                table[i, j] += 0.5 * (weight * error * found[f"{other} {method} derivative"]).mean()
+                error = passes[f"{one} {method} image"] - target
+                table[i, j] += (
+                    0.5 * (weight * error * passes[f"{other} {method} derivative"]).mean()
+                )
     return values, table
 
 
 def agreement(values: list[float], table: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """How a table of gradients agrees with the reference.
+    """How well a table of gradients agrees with the reference.
 
     Returns:
-        relative_rmse: √(mean squared difference / mean squared reference). correlation. slope: of
-        the line through zero that fits the table best. sign_agreement: share of entries off the
-        diagonal whose signs are the same. diagonal: mean magnitude where current and target are
-        equal and there should be no gradient, relative to the root mean square of the reference.
+        `relative_rmse`: √(mean squared difference / mean squared reference); `correlation`;
+        `slope` of the line through zero that fits the table best; `sign_agreement`: fraction of
+        entries off the diagonal with equal signs; `diagonal`: mean magnitude where current and
+        target are equal and the gradient should be zero, over the root mean square of the
+        reference.
     """
     size = np.sqrt((reference**2).mean())
     off = ~np.eye(len(values), dtype=bool)
@@ -281,16 +290,16 @@ def agreement(values: list[float], table: np.ndarray, reference: np.ndarray) -> 
 
 
 def published_tables() -> dict[str, tuple[list[float], np.ndarray]]:
-    """The tables that the authors published, as `gradient_table` returns them."""
+    """The published tables by method, in the form of `gradient_table`."""
     cells: dict[str, dict[tuple[float, float], float]] = {method: {} for method in METHODS}
     with open(_PUBLISHED, encoding="utf-8", newline="") as lines:
         for row in csv.DictReader(lines):
             place = float(row["current"]), float(row["target"])
             cells[row["method"]][place] = float(row["gradient"])
     tables = {}
-    for method, known in cells.items():
-        values = sorted({current for current, _ in known})
-        tables[method] = values, np.array([[known[c, t] for t in values] for c in values])
+    for method, gradients in cells.items():
+        values = sorted({current for current, _ in gradients})
+        tables[method] = values, np.array([[gradients[c, t] for t in values] for c in values])
     return tables
 
 
@@ -303,40 +312,40 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
     film = findings[_arrays(context, _values(context)[0]).stem]
     arrays = smoothed(arrays, film["height"], film["width"], COARSE // _shrunk(context))
     tables = {method: gradient_table(arrays, method) for method in METHODS}
-    theirs = published_tables()
+    published = published_tables()
     rows, lines = [], []
     for method, (values, table) in tables.items():
-        mine = agreement(values, table, tables["reference"][1])
-        their = agreement(*theirs[method], theirs["reference"][1])
-        rows.append({"method": method} | mine | {f"published_{k}": v for k, v in their.items()})
-        digits = {k: 3 if k == "diagonal" else 2 for k in mine}
-        told = (f"{mine[k]:.{digits[k]}f} ({their[k]:.{digits[k]}f})" for k in mine)
-        lines.append([method, *told])
+        here = agreement(values, table, tables["reference"][1])
+        paper = agreement(*published[method], published["reference"][1])
+        rows.append({"method": method} | here | {f"published_{k}": v for k, v in paper.items()})
+        digits = {k: 3 if k == "diagonal" else 2 for k in here}
+        cells = (f"{here[k]:.{digits[k]}f} ({paper[k]:.{digits[k]}f})" for k in here)
+        lines.append([method, *cells])
     titles = ["method", "relative RMSE", "correlation", "slope", "sign agreement", "diagonal"]
-    caption = "In brackets: the same of the authors' published table.\n\n"
-    everything = [
+    caption = "In brackets: the same for the published table.\n\n"
+    gradients = [
         {"method": m, "current": c, "target": t, "gradient": float(table[i, j])}
         for m, (values, table) in tables.items()
         for i, c in enumerate(values)
         for j, t in enumerate(values)
     ]
     return ExperimentResult(
-        [*rows, *everything],
+        [*rows, *gradients],
         caption + markdown(titles, lines),
-        lambda path: _draw(path, tables, theirs),
+        lambda path: _draw(path, tables, published),
     )
 
 
-def _draw(path: Path, tables: Mapping, theirs: Mapping) -> None:
+def _draw(path: Path, tables: Mapping, published: Mapping) -> None:
     from matplotlib.figure import Figure
 
-    rows = [("here", tables), ("published", theirs)]
+    rows = [("here", tables), ("published", published)]
     figure = Figure(figsize=(1.5 * len(METHODS), 1.7 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), len(METHODS), squeeze=False)
-    for line, (title, shown) in zip(panels, rows, strict=True):
-        most = np.abs(shown["reference"][1]).max()
+    for line, (title, methods) in zip(panels, rows, strict=True):
+        most = np.abs(methods["reference"][1]).max()
         for panel, method in zip(line, METHODS, strict=True):
-            values, table = shown[method]
+            values, table = methods[method]
             edges = (values[0], values[-1], values[0], values[-1])
             panel.imshow(table, cmap="RdBu", vmin=-most, vmax=most, origin="lower", extent=edges)
             panel.set_title(method, fontsize=8)

@@ -1,4 +1,4 @@
-"""Figure 5: time and memory of a step in the cube, as paths get longer."""
+"""Figure 5: time and memory of a step in the cube over the length of paths."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class _Curve:
     name: str
     variant: str
     prior: PriorName = "extra-bounce"
-    #: Whether the path's loop is one kernel (a mega kernel) or one for each bounce. Ours and AD-PT
-    #: have no loop.
+    #: Whether the loop over bounces is one kernel (a megakernel) or one kernel for each bounce.
+    #: Ours and AD-PT have no loop.
     symbolic: bool = True
-    #: Milliseconds of a step that the authors' figure shows, at first and at last; RTX 3090, 256²
-    #: pixels x 16 samples, grids of 256³.
+    #: Milliseconds per step in the paper's figure: RTX 3090, 256² pixels x 16 samples, grids of
+    #: 256³.
     published: str = ""
 
 
@@ -53,7 +53,7 @@ CURVES = (
     _Curve("PRB, a kernel a bounce", "prb:grid", symbolic=False, published="up to 4272"),
     _Curve("AD-PT", "ad-pt:grid", published="1742 at 0.95, then out of memory"),
 )
-#: How often methods take turns.
+#: How often each method is measured: a machine whose speed changes then affects all of them.
 TURNS = 2
 
 
@@ -91,10 +91,10 @@ def _measure(
     cells = {"grid": {"cells": grid}}
     fields = {"materials": dict.fromkeys(shared.quantities, cells), "radiance": cells}
     shared = update(shared, fields)
-    found: Findings = {curve.name: {"seconds": []} for curve in CURVES}
+    findings: Findings = {curve.name: {"seconds": []} for curve in CURVES}
     for turn in range(TURNS):
         for curve in CURVES:
-            row = found[curve.name]
+            row = findings[curve.name]
             if "error" in row:
                 continue
             config = MethodVariant.of(curve.variant).settings(shared)
@@ -111,17 +111,16 @@ def _measure(
                 continue
             row["seconds"] += times
             row["memory"] = memory
-            told = f"{1e3 * statistics.median(times):.0f} ms"
-            context.tell(f"turn {turn + 1}, albedo {albedo}, {curve.name}: {told}")
-    return found
+            median = f"{1e3 * statistics.median(times):.0f} ms"
+            context.tell(f"turn {turn + 1}, albedo {albedo}, {curve.name}: {median}")
+    return findings
 
 
 def _cube(context: ExperimentContext, albedo: float) -> Dataset:
-    """A small data set of the cube, whose walls scatter as diffuse ones do.
+    """A small data set of the cube with nearly Lambertian walls.
 
-    What is unknown is the albedo of `principled` BSDFs. Without their specular lobe, and with the
-    roughness of a half that fields start with, they are nearly Lambertian: paths are as long as in
-    Table 2, which they would not be otherwise.
+    The fits optimize `principled` BSDFs. Without a specular lobe, and with the initial roughness of
+    0.5, these are nearly Lambertian, and paths are as long as in Table 2.
     """
     small = CaptureSettings(views=8, held_out=0, resolution=32, spp=4, max_depth=16)
     folder = context.work / "data" / f"cube-{albedo}-{digest(asdict(small))}"
@@ -143,21 +142,21 @@ def _cube(context: ExperimentContext, albedo: float) -> Dataset:
 def _steps(
     dataset: Dataset, config: FitConfig, albedo: float, steps: int, *, frozen: bool
 ) -> tuple[list[float], int | None]:
-    """Seconds of steps after warm-up, and the bytes that one needs beyond what a fit always holds.
+    """Seconds of steps after warm-up, and the bytes of memory that a step adds to those of the fit.
 
-    Loops that are evaluated cannot be recorded, so that such steps are traced each time.
+    `dr.freeze` cannot record evaluated loops (Dr.Jit 1.5): such steps are traced anew each time.
     """
     gc.collect()
     dr.flush_malloc_cache()
     fit = begin_fit(dataset, config)
     _paint(fit, albedo)
-    still = dict.fromkeys(("albedo", "roughness", "radiance"), 0.0)
+    constant = dict.fromkeys(("albedo", "roughness", "radiance"), 0.0)
 
     def step(number: int) -> None:
         if frozen:
-            fit.step(fit.state, number, still)
+            fit.step(fit.state, number, constant)
         else:
-            fit.state.set_learning_rates(still)
+            fit.state.set_learning_rates(constant)
             fit.step.unfrozen(fit.state, number)
         dr.sync_thread()
 
@@ -173,7 +172,7 @@ def _steps(
 
 
 def _paint(fit: FreshFit, albedo: float) -> None:
-    """Let the albedo's grid say what the walls are: it decides how long paths are."""
+    """Set the grid of the albedo to that of the walls, which determines the length of paths."""
     raw = math.log(albedo / (1 - albedo))
     for name, value in list(fit.state.phi.items()):
         if name.startswith("albedo"):
@@ -182,11 +181,11 @@ def _paint(fit: FreshFit, albedo: float) -> None:
 
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
-    for name_of_job, methods in findings.items():
+    for job, methods in findings.items():
         good = {name: m for name, m in methods.items() if "error" not in m}
         seconds = {name: statistics.median(m["seconds"]) for name, m in good.items()}
         for name, measured in methods.items():
-            row = {"albedo": float(name_of_job.removeprefix("albedo-")), "method": name}
+            row = {"albedo": float(job.removeprefix("albedo-")), "method": name}
             if name in good:
                 memory = measured["memory"]
                 row["milliseconds"] = 1e3 * seconds[name]
@@ -198,15 +197,15 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
     for title, key, digits in (
         ("Milliseconds of a step", "milliseconds", 0),
         ("As multiples of ours", "times_ours", 2),
-        ("Memory that a step takes, MB", "memory_mb", 0),
+        ("Memory of a step, MB", "memory_mb", 0),
     ):
         lines = []
         for curve in CURVES:
-            mine = {row["albedo"]: row for row in rows if row["method"] == curve.name}
-            line = [curve.name, *(_cell(mine[albedo], key, digits) for albedo in albedos)]
+            cells = {row["albedo"]: row for row in rows if row["method"] == curve.name}
+            line = [curve.name, *(_cell(cells[albedo], key, digits) for albedo in albedos)]
             lines.append([*line, curve.published] if key == "milliseconds" else line)
         titles = ["method", *(f"{albedo:g}" for albedo in albedos)]
-        titles += ["the authors'"] if key == "milliseconds" else []
+        titles += ["the paper"] if key == "milliseconds" else []
         tables.append(f"{title}, at an albedo of:\n\n{markdown(titles, lines)}")
     return ExperimentResult(rows, "\n\n".join(tables), lambda path: _draw(path, rows))
 
@@ -224,19 +223,21 @@ def _draw(path: Path, rows: list[dict]) -> None:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     panels = figure.subplots(1, 2)
     for number, curve in enumerate(CURVES):
-        mine = [row for row in rows if row["method"] == curve.name]
+        measured = [row for row in rows if row["method"] == curve.name]
         for panel, key in zip(panels, ("milliseconds", "memory_mb"), strict=True):
-            known = [row for row in mine if row.get(key) is not None]
+            known = [row for row in measured if row.get(key) is not None]
             x, y = [row["albedo"] for row in known], [row[key] for row in known]
             panel.plot(x, y, color=f"C{number}", marker=".", label=curve.name)
-            lost = [row["albedo"] for row in mine if row["error"]]
-            if lost and y:
-                panel.plot(lost, [max(y)] * len(lost), "x", color=f"C{number}")
-    for panel, title in zip(panels, ("ms a step", "MB that a step takes"), strict=True):
+            failed = [row["albedo"] for row in measured if row["error"]]
+            if failed and y:
+                panel.plot(failed, [max(y)] * len(failed), "x", color=f"C{number}")
+    for panel, title in zip(panels, ("ms per step", "MB per step"), strict=True):
         panel.set(xlabel="albedo of the walls", ylabel=title, yscale="log")
         panel.grid(alpha=0.3)
     panels[1].legend(fontsize=7)
     save_figure(figure, path)
 
 
-EXPERIMENT = Experiment("fig5", "A step in the cube as paths get longer (Fig. 5)", _jobs, _result)
+EXPERIMENT = Experiment(
+    "fig5", "A step in the cube over the length of paths (Fig. 5)", _jobs, _result
+)

@@ -1,4 +1,4 @@
-"""Figures 1 and 6: what every method makes of the eight scenes."""
+"""Figures 1 and 6: the materials that each method recovers in the eight scenes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .tables import decibels, markdown
 
 #: Columns of the figure.
 METHODS = {"direct": "direct", "PRB": "prb", "ours": "ours", "no prior": "no-prior"}
-#: Held-out views that are shown of each scene.
+#: Held-out views of each scene in the pictures.
 VIEWS = (0, 1)
 
 

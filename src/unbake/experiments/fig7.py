@@ -1,4 +1,4 @@
-"""Figure 7: from direct illumination to ours, one step after the other."""
+"""Figure 7: the ablation for materials, from direct illumination to ours."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .tables import decibels, markdown
 
 #: Columns of the figure.
 METHODS = ABLATION | {"ours without prior": "no-prior"}
-#: The held-out view that is shown.
+#: The held-out view in the picture.
 VIEW = 0
 
 
 def _scene_fits(context: ExperimentContext) -> SceneFits:
-    # As in Figure 6, so that what both show is fitted once.
+    # With the settings of Figure 6: both share the fits.
     return SceneFits.of(context, scenes_at(context)[0], METHODS.values())
 
 

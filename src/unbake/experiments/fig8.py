@@ -1,4 +1,4 @@
-"""Figure 8: the ablation for an unknown environment map, around an object of known material."""
+"""Figure 8: the ablation for an environment map that is optimized, with known materials."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .scene_fits import ABLATION, SceneFits, exposure
 from .scenes import scenes_at
 from .tables import decibels, markdown
 
-#: The held-out view that is shown below the maps.
+#: The held-out view below the maps.
 VIEW = 0
 
 
@@ -37,9 +37,9 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
         fit = findings[scene_fits.scene.folder][method]
         row = {"step": title} | scene_fits.row(context, method, fit) | fit["environment"]
         rows.append({key: value for key, value in row.items() if value is not None})
-        off, relit = f"{100 * row['sh_error']:.1f} %", decibels(row["relight_psnr"])
-        lines.append([title, row["steps"], off, relit, decibels(row["render_psnr"])])
-    titles = ["step", "steps", "low frequencies off", "relighting", "rendering"]
+        error, relit = f"{100 * row['sh_error']:.1f} %", decibels(row["relight_psnr"])
+        lines.append([title, row["steps"], error, relit, decibels(row["render_psnr"])])
+    titles = ["step", "steps", "SH error", "relighting", "rendering"]
     caption = f"{scene_fits.scene.label}, materials known; PSNR in dB, "
     caption += "renderings: mean over held-out views\n\n"
     sheet = _picture(context, scene_fits)
@@ -49,7 +49,7 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
 
 
 def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
-    """The maps that were found, and a view lit by them; the truth on the right."""
+    """The recovered maps, and a view lit by them; the truth on the right."""
     view = scene_fits.heldout(context)[VIEW]
     runs = [scene_fits.run(context, method) for method in ABLATION.values()]
     maps = [read_exr(run.environment()) for run in runs]

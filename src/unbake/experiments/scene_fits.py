@@ -1,4 +1,4 @@
-"""Methods against each other on the paper's scenes: what Figures 6, 7 and 8 have in common."""
+"""Fits of several methods on a scene of the paper, for Figures 6, 7 and 8."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
 from .scenes import PaperScene
 
-#: The ablation, from direct illumination to ours; Figures 7 and 8.
+#: The methods of the ablation, from direct illumination to ours, by their title.
 ABLATION = {
     "direct": "direct",
     "+ prior": "with-prior",
@@ -33,8 +33,8 @@ ABLATION = {
     "+ second bounce": "with-second-bounce",
     "+ LHS (ours)": "ours",
 }
-#: What is shown of a view, from top to bottom.
-SHOWN = ("render", "albedo", "roughness")
+#: Rows of a picture, for each view.
+ROWS = ("render", "albedo", "roughness")
 MATERIALS = ("albedo_psnr", "roughness_psnr")
 QUALITIES = (*MATERIALS, "render_psnr")
 
@@ -42,13 +42,13 @@ QUALITIES = (*MATERIALS, "render_psnr")
 @final
 @dataclass(frozen=True)
 class SceneFits:
-    """Methods that are fitted to a scene, and evaluated.
+    """Fits of several methods on a scene, with their evaluation.
 
     Args:
-        scene: what they see.
-        methods: of `unbake fit`, in the order of the picture's columns.
-        config: settings of all, with their length.
-        spp: samples a pixel of the final renderings.
+        scene: the scene.
+        methods: names of methods, in the order of the picture's columns.
+        config: settings of all fits, including their length.
+        spp: samples per pixel of the final renderings.
     """
 
     scene: PaperScene
@@ -58,7 +58,7 @@ class SceneFits:
 
     @staticmethod
     def of(context: ExperimentContext, scene: PaperScene, methods: Iterable[str]) -> SceneFits:
-        """Fits that last as long as cpu scale has time for, or take the paper's steps."""
+        """Fits with the length of the scale: the paper's steps, or a time on a CPU."""
         config = dataclasses.replace(
             scene.settings(context),
             seconds=context.pick(0.0, 120.0 if scene.room else 60.0, 0.0),
@@ -69,30 +69,33 @@ class SceneFits:
         return SceneFits(scene, list(methods), config, spp=context.pick(2, 32, 128))
 
     def settings(self, context: ExperimentContext) -> dict[str, Any]:
-        """All that decides what is found."""
+        """Everything that the findings depend on."""
         fits = {"methods": list(self.methods), "fit": asdict(self.config), "spp": self.spp}
         return fits | self.scene.described(context)
 
     def runs(self, context: ExperimentContext) -> Path:
-        """The folder of the runs: other settings have another one, experiments share it."""
+        """The folder of the runs. Experiments with the same settings share it."""
         described = self.scene.described(context) | {"fit": asdict(self.config), "spp": self.spp}
         return context.work / "runs" / f"{self.scene.folder}-{digest(described)}"
 
     def jobs(self, context: ExperimentContext) -> list[Job]:
         """Jobs that render the data set, fit the methods and evaluate them."""
         work = functools.partial(self.fitted, context)
-        many = len(self.methods)
-        # Compiling and evaluation, a method.
-        seconds = context.pick(2.0 * many, 30.0 * many, None)
-        waits = many * self.config.seconds
+        count = len(self.methods)
+        # Compiling and evaluation of each method.
+        seconds = context.pick(2.0 * count, 30.0 * count, None)
+        waits = count * self.config.seconds
         fits = Job(self.scene.folder, self.settings(context), work, seconds, waits)
         return [self.scene.capture(context), fits]
 
     def fitted(self, context: ExperimentContext) -> Findings:
-        """Fit and evaluate, as `unbake compare` does; what was found of each method.
+        """Fit and evaluate the methods, as `unbake compare` does.
+
+        Returns:
+            By method: its row of the comparison, with the metrics of each view as `per_view`.
 
         Raises:
-            UserError: a method failed. The same call goes on with it.
+            UserError: a method failed. The same call continues with it.
         """
         out = self.runs(context)
         result = compare(
@@ -104,14 +107,14 @@ class SceneFits:
             console=context.console,
         )
         kept = ("steps", "samples", "seconds", "milliseconds_per_step", "heldout", "score")
-        found = {}
+        findings = {}
         for method, row in result["methods"].items():
             if "error" in row:
                 raise UserError(f"{method} failed: {row['error']}")
             metrics = self.run(context, method).metrics()
-            found[method] = {k: row[k] for k in (*kept, "environment") if k in row}
-            found[method]["per_view"] = metrics["per_view"]
-        return found
+            findings[method] = {k: row[k] for k in (*kept, "environment") if k in row}
+            findings[method]["per_view"] = metrics["per_view"]
+        return findings
 
     def run(self, context: ExperimentContext, method: str) -> RunFolder:
         """The run of a method."""
@@ -121,85 +124,89 @@ class SceneFits:
         """The held-out views."""
         return Dataset.load(self.scene.data(context)).heldout
 
-    def row(self, context: ExperimentContext, method: str, found: Findings) -> dict[str, Any]:
-        """What tables say of a method: its length, and means over the held-out views."""
-        length = {key: found[key] for key in ("steps", "samples", "seconds")}
-        *_, mean = self.qualities(context, method, found)
+    def row(self, context: ExperimentContext, method: str, fit: Findings) -> dict[str, Any]:
+        """Length of a fit and its mean PSNRs, as a row of data."""
+        length = {key: fit[key] for key in ("steps", "samples", "seconds")}
+        *_, mean = self.qualities(context, method, fit)
         return {"method": method, "scene": self.scene.label} | length | mean
 
     def qualities(
-        self, context: ExperimentContext, method: str, row: Findings
+        self, context: ExperimentContext, method: str, fit: Findings
     ) -> list[dict[str, Any]]:
-        """PSNRs of a method in each held-out view, and last their means over the views.
+        """PSNRs of a method in each held-out view, followed by their means over the views.
 
-        Renderings are means of blocks of pixels, multiplied by the photograph's `exposure` and
-        clipped to [0,1]. By itself, each pixel is mostly noise where light is hard to find, and
-        other than for `unbake evaluate`, a scene may be brighter than 1 all over.
+        Renderings are averaged over blocks of pixels, multiplied by the photograph's `exposure` and
+        clipped to [0,1]. Single pixels are mostly noise in scenes with difficult light, and scenes
+        may be brighter than 1 everywhere. `unbake evaluate` does neither.
         """
         rows, size = [], context.pick(1, 4, 4)
-        for view, known in zip(self.heldout(context), row["per_view"], strict=True):
+        for view, metrics in zip(self.heldout(context), fit["per_view"], strict=True):
             file = self.run(context, method).picture(view.split, view.name, "render")
-            photograph, found = read_exr(view.image), read_exr(file)[..., :3]
-            require_same_size(found, photograph, file)
+            photograph, rendering = read_exr(view.image), read_exr(file)[..., :3]
+            require_same_size(rendering, photograph, file)
             scale = exposure(photograph)
-            images = [block_means(p[..., :3], size) * scale for p in (found, photograph)]
+            images = [block_means(p[..., :3], size) * scale for p in (rendering, photograph)]
             images = [np.clip(image, 0, 1) for image in images]
             whole = block_means(_foreground(photograph).astype(float), size) >= 1
             rows.append(
                 {"views": view.name}
-                | {key: known[key] for key in MATERIALS}
+                | {key: metrics[key] for key in MATERIALS}
                 | {"render_psnr": psnr(*images, whole) if whole.any() else None}
             )
         mean = {key: mean_psnr(r[key] for r in rows) for key in QUALITIES}
         return [*rows, {"views": "mean of held-out"} | mean]
 
     def picture(self, context: ExperimentContext, views: Sequence[int]) -> np.ndarray:
-        """Held-out views as each method sees them, the truth on the right.
+        """Held-out views, a column for each method and the truth on the right.
 
         Args:
-            views: numbers of held-out views, each with rows for what is `SHOWN`.
+            views: numbers of held-out views, each with the rows of `ROWS`.
         """
         sheet = []
         for view in (self.heldout(context)[number] for number in views):
             scale = exposure(read_exr(view.image))
             truth = {"render": view.image, "albedo": view.albedo, "roughness": view.roughness}
-            for what in SHOWN:
+            for quantity in ROWS:
                 runs = (self.run(context, method) for method in self.methods)
-                found = [run.picture(view.split, view.name, what) for run in runs]
-                factor = scale if what == "render" else 1.0
-                sheet.append([_cell(path, what, factor, view) for path in (*found, truth[what])])
+                files = [run.picture(view.split, view.name, quantity) for run in runs]
+                factor = scale if quantity == "render" else 1.0
+                files.append(truth[quantity])
+                sheet.append([_cell(file, quantity, factor, view) for file in files])
         return montage(sheet)
 
 
-def at_equal_samples(found: Mapping[str, Findings]) -> dict[str, dict[str, float | None]]:
-    """Scores of all methods when each had as many samples as the one that took the fewest.
+def at_equal_samples(fits: Mapping[str, Findings]) -> dict[str, dict[str, float | None]]:
+    """PSNRs of all methods after the samples of the method that took the fewest.
 
-    Between two scores, PSNR is a straight line over samples.
+    PSNR is interpolated linearly over samples between two scores.
+
+    Returns:
+        By method: `samples`, and a PSNR by key; None if the method has no scores.
     """
-    fewest = min(row["samples"] for row in found.values())
-    at: dict[str, dict[str, float | None]] = {}
-    for method, row in found.items():
-        each = row["samples"] / row["steps"]
-        at[method] = {"samples": fewest}
+    fewest = min(fit["samples"] for fit in fits.values())
+    equal: dict[str, dict[str, float | None]] = {}
+    for method, fit in fits.items():
+        each = fit["samples"] / fit["steps"]
+        equal[method] = {"samples": fewest}
         for key in MATERIALS:
-            known = [(p["step"] * each, p[key]) for p in row["score"] if p.get(key) is not None]
-            x, y = zip(*known, strict=True) if known else ((), ())
-            at[method][key] = float(np.interp(fewest, x, y)) if known else None
-    return at
+            scores = [(p["step"] * each, p[key]) for p in fit["score"] if p.get(key) is not None]
+            x, y = zip(*scores, strict=True) if scores else ((), ())
+            equal[method][key] = float(np.interp(fewest, x, y)) if scores else None
+    return equal
 
 
-def _cell(file: Path | None, what: str, factor: float, view: View) -> np.ndarray:
-    """A picture times a factor, in sRGB but for roughness; grey where there is none."""
+def _cell(file: Path | None, quantity: str, factor: float, view: View) -> np.ndarray:
+    """A picture times a factor, in sRGB unless it is roughness; grey if there is none."""
     if file is None or not file.is_file():
         return np.full((view.camera.height, view.camera.width, 3), 128, np.uint8)
     pixels, _ = rgb(file)
-    return to_bytes(pixels) if what == "roughness" else tonemap(factor * pixels)
+    return to_bytes(pixels) if quantity == "roughness" else tonemap(factor * pixels)
 
 
 def exposure(photograph: np.ndarray) -> float:
-    """What to multiply a picture with so that 95 % of the photograph's pixels are at most 1."""
-    seen = photograph[_foreground(photograph)][:, :3].max(-1)
-    return 1 / max(float(np.percentile(seen, 95)), 1e-6) if len(seen) else 1.0
+    """The factor with which 95 % of the photograph's foreground is at most 1."""
+    values = photograph[_foreground(photograph)][:, :3].max(-1)
+    return 1 / max(float(np.percentile(values, 95)), 1e-6) if len(values) else 1.0
 
 
 def _foreground(photograph: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The paper's scenes, or what stands in for them, and their data sets."""
+"""The paper's scenes, with substitutes for those that are not published, and their data sets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .speed import capture_seconds
 
 _CAMERAS = Path(__file__).parent / "cameras"
 
-#: Settings at cpu scale: rooms have finer grids and larger batches than single objects.
+#: Settings at cpu scale. Rooms have finer grids and larger batches than single objects.
 _ROOM = """
 pixels = 2048
 loss_epsilon = 0.01
@@ -59,19 +59,20 @@ class PaperScene:
     """A scene of the paper.
 
     Args:
-        name: in the paper.
-        folder: of the published scene, or its archive FOLDER.tar.xz; its camera file has the same
-            name.
-        file: of the scene in the folder.
-        room: whether cameras stand inside of it.
-        views: that are learned from; six more are held out.
-        steps: of the paper's fits.
-        spp: samples a pixel of photographs at cpu scale, more where light is hard to find: what is
-            too dark by chance weighs more in the relative loss than what is too bright.
-        stands_in: what is shown where the paper's scene is not published; empty: it is that scene.
-        albedo_power: every albedo is replaced by this power of it, below 1 to raise it, as the
-            authors did in STAIRCASE.
-        environment: an environment map to use instead of the scene's own, of `envmaps_blender`.
+        name: its name in the paper.
+        folder: folder of the published scene, or its archive FOLDER.tar.xz. The camera file has the
+            same name.
+        file: scene file in the folder.
+        room: whether the cameras stand inside.
+        views: number of training views; six more are held out.
+        steps: length of the paper's fits.
+        spp: samples per pixel of the photographs at cpu scale. Scenes with difficult light need
+            more: in the relative loss, pixels that are too dark by noise weigh more than pixels
+            that are too bright.
+        stands_in: name of the substitute if the paper's scene is not published, otherwise empty.
+        albedo_power: exponent that is applied to every albedo. The authors raised the albedo of
+            STAIRCASE; a value below 1 does so.
+        environment: environment map of `envmaps_blender` that replaces the scene's own.
     """
 
     name: str
@@ -97,23 +98,23 @@ class PaperScene:
 
     @property
     def lit_by(self) -> str | None:
-        """What stands in the place of the scene's own light, as it is known."""
+        """The light that replaces the scene's own; None for rooms."""
         return None if self.room else self.environment or "its own map, clamped at zero"
 
     def require(self, context: ExperimentContext) -> None:
-        """Find out whether the scene is there, before anything takes hours.
+        """Check that the scene is there, before anything takes hours.
 
         Raises:
-            UserError: it is not.
+            UserError: it is missing.
         """
         for name in (self.folder, "envmaps_blender") if self.environment else (self.folder,):
-            _found(context, name)
+            _published(context, name)
 
     def unpacked(self, context: ExperimentContext) -> Path:
-        """The scene's XML file, of the published scene or of what was changed in it.
+        """The XML file of the scene, with the changes to the published one.
 
         Raises:
-            UserError: the scene is not among the published ones at hand, or damaged.
+            UserError: the published scene is missing or damaged.
         """
         source = _unpacked(context, self.folder) / self.file
         if not source.is_file():
@@ -136,7 +137,7 @@ class PaperScene:
         return changed / "scene.xml"
 
     def settings(self, context: ExperimentContext) -> FitConfig:
-        """The settings of fits, apart from method and length."""
+        """The settings of fits, except for method and length."""
         match context.scale:
             case "smoke":
                 return from_toml(SMOKE)
@@ -154,7 +155,7 @@ class PaperScene:
     def described(
         self, context: ExperimentContext, shots: CaptureSettings | None = None
     ) -> dict[str, Any]:
-        """All that decides what the data set is."""
+        """Everything that the data set depends on."""
         return {
             "photographs": asdict(shots or self.capture_settings(context)),
             "albedo_power": self.albedo_power,
@@ -163,12 +164,12 @@ class PaperScene:
         }
 
     def data(self, context: ExperimentContext, shots: CaptureSettings | None = None) -> Path:
-        """The folder of the scene's data set: other settings have another one."""
+        """The folder of the data set; each combination of settings has its own."""
         name = f"{self.folder}-{digest(self.described(context, shots))}"
         return context.work / "data" / name
 
     def captured(self, context: ExperimentContext, shots: CaptureSettings | None = None) -> Path:
-        """The data set's folder, after it was rendered if it is not there."""
+        """Render the data set if it is not there, and return its folder."""
         folder = self.data(context, shots)
         if not folder.exists():
             capture(
@@ -181,10 +182,10 @@ class PaperScene:
         return folder
 
     def capture(self, context: ExperimentContext) -> Job:
-        """The part of an experiment that renders the data set, if no other one has done it.
+        """The job that renders the data set, unless another experiment has done so.
 
         Raises:
-            UserError: the published scene is not at hand.
+            UserError: the published scene is missing.
         """
         self.require(context)
         shots, folder = self.capture_settings(context), self.data(context)
@@ -262,12 +263,12 @@ SCENES = (
 
 
 def scenes_at(context: ExperimentContext) -> tuple[PaperScene, ...]:
-    """The scenes of an experiment: all of them, or the quickest one to see that it runs."""
+    """The scenes of an experiment: all, or at smoke scale the quickest one."""
     return SCENES[-1:] if context.scale == "smoke" else SCENES
 
 
-def _found(context: ExperimentContext, name: str) -> Path:
-    """The folder of a published scene, or the archive where there is only that."""
+def _published(context: ExperimentContext, name: str) -> Path:
+    """The folder of a published scene, or its archive if there is no folder."""
     folder, archive = context.scenes / name, context.scenes / f"{name}.tar.xz"
     for place in (folder, context.out / "work" / "published" / name):
         if place.is_dir():
@@ -279,35 +280,35 @@ def _found(context: ExperimentContext, name: str) -> Path:
 
 
 def _unpacked(context: ExperimentContext, name: str) -> Path:
-    """The folder of a published scene; unpacks its archive where there is only that."""
-    found = _found(context, name)
-    if found.is_dir():
-        return found
+    """The folder of a published scene. Unpacks the archive if there is no folder."""
+    place = _published(context, name)
+    if place.is_dir():
+        return place
     own = context.out / "work" / "published" / name
     partial = own.with_name(f"{name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        with tarfile.open(found) as file:
+        with tarfile.open(place) as file:
             file.extractall(partial, filter="data")
         (partial / name).rename(own)
     except (tarfile.TarError, lzma.LZMAError, EOFError, OSError) as error:
         what = f"the archive cannot be unpacked to a folder {name!r} ({error})"
-        raise UserError(what, found, "Get it again, or unpack it by hand") from error
+        raise UserError(what, place, "Get it again, or unpack it by hand") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return own
 
 
 def _raise_albedo(scene: ParsedScene, power: float, folder: Path) -> None:
-    """Replace every albedo, of colours and of bitmaps, by a power of it (linear)."""
+    """Apply an exponent to every albedo, colours and bitmaps, in linear RGB."""
     for node in scene.principled_nodes():
         colour = node.props["base_color"]
-        found = referenced(scene, colour)
-        if found is None:
+        node_of_texture = referenced(scene, colour)
+        if node_of_texture is None:
             node.props["base_color"] = mi.ScalarColor3d([c**power for c in colour])
             continue
-        texture = found.props
+        texture = node_of_texture.props
         if "filename" not in texture:
             raise UserError("an albedo is a texture that is no bitmap", scene.path)
         source = Path(texture["filename"])
@@ -320,7 +321,7 @@ def _raise_albedo(scene: ParsedScene, power: float, folder: Path) -> None:
 
 
 def _set_environment(scene: ParsedScene, map_: Path | None, folder: Path) -> None:
-    """Let an environment map light the scene, or its own one, without negative texels."""
+    """Light the scene with an environment map, or its own one, with negative texels set to zero."""
     for node in scene.state.nodes:
         if node.props.plugin_name() == "envmap":
             file = map_ or Path(node.props["filename"])

@@ -1,4 +1,4 @@
-"""Table 1: the scenes, their views and how long their paths are."""
+"""Table 1: the scenes, their views and the length of their paths."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .jobs import Findings, Job
 from .scenes import SCENES, PaperScene
 from .tables import markdown
 
-#: Scene: mean path length, views, samples a pixel, log2 of pixels a step (paper).
+#: By scene: mean path length, views, samples per pixel, log2 of pixels per step.
 PUBLISHED = {
     "STAIRCASE": (4.74, 26, 16, 14),
     "KITCHEN": (3.67, 62, 64, 12),
@@ -33,7 +33,7 @@ PUBLISHED = {
     "FICUS": (1.43, 25, 64, 12),
     "DRAGON": (1.26, 25, 64, 12),
 }
-#: The paper's paths: limited to 15, with a chance of 0.95 at most to survive Russian roulette.
+#: Limits of the paper: path length, and probability to survive Russian roulette.
 MAX_DEPTH, SURVIVAL = 15, 0.95
 
 
@@ -92,7 +92,7 @@ def _measure(context: ExperimentContext, scene: PaperScene, pixels: int, spp: in
     lengths = np.concatenate(lengths)
     trained = [camera for split, camera in posed if split == "train"]
     return {
-        # Paths that see nothing at all are no paths.
+        # Camera rays that hit nothing do not count.
         "path_length": float(lengths[lengths > 0].mean(dtype=np.float64)),
         "train": len(trained),
         "heldout": len(posed) - len(trained),

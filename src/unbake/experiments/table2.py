@@ -1,4 +1,4 @@
-"""Table 2: how long the paths in a closed cube are."""
+"""Table 2: the length of paths in a closed cube."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .experiment import Experiment, ExperimentContext, ExperimentResult
 from .jobs import Findings, Job
 from .tables import markdown
 
-#: Albedo: the longest path, and the mean, that the paper tells.
+#: By albedo: maximum and mean path length in the paper.
 PUBLISHED = {
     0.3: (5, 1.43),
     0.5: (7, 1.98),
@@ -27,7 +27,7 @@ PUBLISHED = {
     0.95: (84, 19.76),
     0.97: (140, 32.89),
 }
-#: So long that no path ends there.
+#: A maximum path length that no path reaches.
 ENDLESS = 4096
 
 
@@ -45,7 +45,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
 
 
 def _measure(folder: Path, albedo: float, pixels: int, spp: int) -> Findings:
-    """Lengths of the paths of a path tracer whose Russian roulette absorbs as the walls do."""
+    """Path lengths if Russian roulette ends paths with the absorption of the walls."""
     scene = parse(write_scene("cube", folder / f"cube-{albedo}", albedo=albedo)).instantiate()
     scene_view = SceneView.of(scene, None, 0)
     cameras = [
@@ -54,14 +54,14 @@ def _measure(folder: Path, albedo: float, pixels: int, spp: int) -> Findings:
     ]
     rays = CameraRays.of(cameras)
     limit, _ = PUBLISHED[albedo]
-    found: Findings = {"limit": limit}
+    findings: Findings = {"limit": limit}
     for name, most in (("limited", limit), ("endless", ENDLESS)):
         lengths = [
             np.array(path_lengths(scene_view, ray, seed, max_depth=most, rr_depth=2))
             for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
         ]
-        found[name] = float(np.concatenate(lengths).mean(dtype=np.float64))
-    return found
+        findings[name] = float(np.concatenate(lengths).mean(dtype=np.float64))
+    return findings
 
 
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
