@@ -231,8 +231,11 @@ def test_a_file_without_a_format_may_have_keys_of_today():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("format = 3", "format: unknown format 3. This version of unbake reads formats 1 to 2"),
-        ("format = true", "format: unknown format True"),
+        (
+            "format = 3",
+            r"format: was written by a newer unbake \(format 3; .* up to 2\). Update unbake",
+        ),
+        ("format = true", "format: 'format' is True, not a positive whole number"),
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),
         ("[grid]\nalbdo = 1", "grid.albdo: unknown key. Known keys: albedo, roughness, radiance, "),
         ("learning_rate = 1.0\nalbedo = 3", "materials.albedo.neural: must be a table|albedo: "),

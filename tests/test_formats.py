@@ -84,6 +84,26 @@ def test_a_run_of_the_first_version_goes_on(first, run, unbake):
     assert json.loads(run.origin_file.read_text())["format"] == 1
 
 
+def test_settings_of_the_first_version_are_told_beside_new_ones(run, tmp_path):
+    new = RunFolder(tmp_path / "new")
+    new.write_settings(run.settings())
+    assert new.config_file.read_text() != run.config_file.read_text()
+    told, again = run.settings_table(), new.settings_table()
+    assert told["materials"]["albedo"]["neural"]["width"] == 8
+    assert told["regularization"] == again["regularization"]
+    for quantity, forms in again["materials"].items():
+        for form, settings in forms.items():
+            assert told["materials"][quantity][form] == settings
+
+
+def test_newer_settings_are_refused_by_a_fit_and_a_report(run, tmp_path):
+    run.config_file.write_text("format = 9\n" + run.config_file.read_text())
+    said = NEWER.format(file="config.toml: format", version=9, known=2)
+    for use in (load_run, lambda path: write_report([path], tmp_path / "report.html")):
+        with pytest.raises(UserError, match=said):
+            use(run.path)
+
+
 def set_format(file, version):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"format": version}))
 

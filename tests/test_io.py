@@ -7,8 +7,8 @@ import os
 import pytest
 
 from unbake.errors import UserError
+from unbake.formats import check_format
 from unbake.io import (
-    check_format,
     inside,
     read_object,
     read_text,

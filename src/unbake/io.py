@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -161,29 +161,6 @@ def read_object(path: Path, remedy: str | None = None) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise UserError("the file does not hold a JSON object", path, remedy or "Repair it")
     return content
-
-
-def check_format(keys: Mapping[str, Any], newest: int, where: object) -> int:
-    """The format of a file's content: its "format", 1 where it names none.
-
-    Args:
-        keys: the file's content.
-        newest: the newest format that can be read.
-        where: the file.
-
-    Raises:
-        UserError: the format is newer, or not a positive whole number.
-    """
-    version = keys.get("format", 1)
-    if type(version) is not int or version < 1:
-        raise UserError(f"'format' is {version!r}, not a positive whole number", where, "Repair it")
-    if version > newest:
-        raise UserError(
-            f"was written by a newer unbake (format {version}; this one reads up to {newest})",
-            where,
-            "Update unbake",
-        )
-    return version
 
 
 def number(keys: dict[str, Any], key: str, where: str) -> float:

@@ -155,7 +155,7 @@ def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
     text = write_report(made[1], tmp_path / "report.html").read_text()
     differing, shared = text.split("What differs between the runs.")[1].split("<details>")
     assert "method" in differing and "steps" not in differing
-    assert "radiance.width" in shared and "<td>true</td>" in shared
+    assert "radiance.neural.width" in shared and "<td>true</td>" in shared
 
 
 def test_the_page_loads_nothing(made, tmp_path: Path):

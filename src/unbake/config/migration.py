@@ -7,6 +7,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..fields.settings import GridConfig
+from ..formats import check_format
 
 #: Version of the settings file.
 FORMAT = 2
@@ -40,13 +41,13 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
     A file that does not tell its format may have keys of both.
 
     Raises:
-        UserError: the format is not known, or a key of an old table is not.
+        UserError: the format is newer, or a key of an old table is not known.
     """
     table = dict(table)
-    version = table.pop("format", None)
-    if version is not None and (type(version) is not int or not 1 <= version <= FORMAT):
-        remedy = f"This version of unbake reads formats 1 to {FORMAT}"
-        raise UserError(f"unknown format {version!r}", "format", remedy)
+    version = table.get("format")
+    if version is not None:
+        check_format(table, FORMAT, "format")
+        del table["format"]
     if version == FORMAT:
         return table
     found: dict[str, Any] = {}

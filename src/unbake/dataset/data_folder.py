@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any, final
 
 from ..errors import UserError
-from ..io import check_format, inside, read_object, relative, write_json
+from ..formats import check_format
+from ..io import inside, read_object, relative, write_json
 
 #: The file that makes a folder a data set.
 TRANSFORMS = "transforms.json"

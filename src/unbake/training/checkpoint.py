@@ -20,7 +20,8 @@ from safetensors.numpy import save
 
 from ..errors import UserError
 from ..fields.network import from_numpy
-from ..io import check_format, write_atomically
+from ..formats import check_format
+from ..io import write_atomically
 from .run_folder import RunFolder
 from .state import State
 

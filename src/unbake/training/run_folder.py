@@ -23,8 +23,10 @@ from pathlib import Path
 from typing import Any, final
 
 from ..config import FitConfig, read_toml, to_toml
+from ..config.migration import migrated
 from ..errors import UserError
-from ..io import check_format, read_object, read_text, remove_unfinished, write_json, write_text
+from ..formats import check_format
+from ..io import read_object, read_text, remove_unfinished, write_json, write_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -143,13 +145,17 @@ class RunFolder:
         return read_toml(self.config_file)
 
     def settings_table(self) -> dict[str, Any]:
-        """The settings as they stand in the file, also where this version knows a key no more.
+        """The settings as tables, with today's names, also where a value is none of today's.
 
         Raises:
-            UserError: the file is missing or is not TOML.
+            UserError: the file is missing, is not TOML, or is of a newer version.
         """
+        text = read_text(self.config_file, _GIVE_RUN)
         try:
-            return tomllib.loads(read_text(self.config_file, _GIVE_RUN))
+            return migrated(tomllib.loads(text))
+        except UserError as error:
+            where = f"{self.config_file}: {error.where}"
+            raise UserError(error.what, where, error.remedy) from None
         except tomllib.TOMLDecodeError as error:
             what = f"the settings are not valid TOML ({error})"
             raise UserError(what, self.config_file, _GIVE_RUN) from None
