@@ -114,10 +114,10 @@ def place_room(
     candidates = _candidates(scene, positions, points, seen, up, fov, seed)
     if len(candidates.eye) < views + held_out:
         raise UserError(f"no room for {views + held_out} cameras in the scene", remedy=_REMEDY)
-    light = _importance(scene, positions, points, seen, seed)
-    train = _greedy(candidates, views, light, [], diagonal)
+    weights = _importance(scene, positions, points, seen, seed)
+    train = _greedy(candidates, views, weights, [], diagonal)
     trained = 1 - np.prod(1 - candidates.value[train], axis=0, dtype=np.float64)
-    tests = _greedy(candidates, held_out, light * trained, train, diagonal)
+    tests = _greedy(candidates, held_out, weights * trained, train, diagonal)
     chosen = [("train", i) for i in train] + [("heldout", i) for i in tests]
     return [(split, _look_at(candidates, i, up, fov)) for split, i in chosen]
 
@@ -245,20 +245,20 @@ def _importance(
     mostly noise, and a bright adjoining room must not outweigh the room itself.
     """
     rng = np.random.default_rng(seed)
-    light = np.zeros(len(points.position))
+    radiance = np.zeros(len(points.position))
     for turn in range(_VIEWERS):
         viewer = positions[np.argmax(seen * rng.random(seen.shape), axis=0)]
-        light += (
+        radiance += (
             free_space.outgoing_radiance(scene, viewer, points.position, seed + turn) / _VIEWERS
         )
     shown = free_space.visibility(scene, free_space.sensor_probes(scene, seed)[:32], points).any(
         axis=0
     )
     shown = shown if shown.any() else seen.any(axis=0)
-    usual = np.median(light[shown]) if shown.any() else 0.0
+    usual = np.median(radiance[shown]) if shown.any() else 0.0
     if usual == 0:
         return np.ones(len(points.position))
-    exposure = light / usual
+    exposure = radiance / usual
     return 0.25 + 0.75 * exposure / (exposure + 0.5) / (1 + exposure / _OVEREXPOSED)
 
 

@@ -205,7 +205,7 @@ def _print(result: dict[str, Any], console: Console) -> None:
             _number(row["samples_per_second"], 0),
         )
     console.print(table)
-    _print_light(result["methods"], console)
+    _print_lighting(result["methods"], console)
     targets = result["time_to_quality"]
     if len(targets) < 2:
         return
@@ -218,7 +218,7 @@ def _print(result: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def _print_light(rows: dict[str, dict[str, Any]], console: Console) -> None:
+def _print_lighting(rows: dict[str, dict[str, Any]], console: Console) -> None:
     maps = {name: row["environment"] for name, row in rows.items() if row.get("environment")}
     if maps:
         table = Table("run", title="Environment map", title_justify="left")
@@ -231,8 +231,8 @@ def _print_light(rows: dict[str, dict[str, Any]], console: Console) -> None:
         console.print(table)
     for name, row in rows.items():
         known = [x for x in row.get("emission", ()) if x["emission_error"] is not None]
-        for light in known:
-            console.print(f"{name}: {light['name']} {100 * light['emission_error']:.2f} % off")
+        for emitter in known:
+            console.print(f"{name}: {emitter['name']} {100 * emitter['emission_error']:.2f} % off")
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -85,9 +85,9 @@ def evaluate(
         materials.append((seen, truth))
         values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in row if k.endswith("_psnr"))
         tell(f"{view.name}: {', '.join(values)}")
-    light = _evaluate_light(recovered, folder, tell)
+    recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     if recovered.config.unknown == "materials+lighting":
-        light["albedo_scale"] = _align_albedo(rows, materials)
+        recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
         "steps": recovered.progress.step,
@@ -95,9 +95,9 @@ def evaluate(
         "seconds": round(recovered.progress.seconds, 2),
         "heldout": _summary(rows, "heldout"),
         "train": _summary(rows, "train"),
-        **light,
+        **recovered_lighting,
         "per_view": rows,
-        "definitions": DEFINITIONS | (lighting.DEFINITIONS if light else {}),
+        "definitions": DEFINITIONS | (lighting.DEFINITIONS if recovered_lighting else {}),
         "data": str(dataset.folder),
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
     }
@@ -164,7 +164,9 @@ def _evaluate_view(
     return row, seen, truth
 
 
-def _evaluate_light(recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]) -> dict:
+def _evaluate_lighting(
+    recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]
+) -> dict:
     """Scores and images of the lighting; empty if the run did not optimize it."""
     problem, data = recovered.problem, recovered.dataset.folder
     found: dict[str, Any] = {}

@@ -109,9 +109,9 @@ def painted(values: np.ndarray, scale: float, mask: np.ndarray) -> str:
     return pictures.png_data_uri(pictures.false_colour(small, scale, inside))
 
 
-def exposure(light: list[np.ndarray]) -> float:
+def exposure(radiance: list[np.ndarray]) -> float:
     """The exposure in half stops that maps the 95th percentile of radiance to about 0.8."""
-    bright = _percentile(light, 95)
+    bright = _percentile(radiance, 95)
     return round(2 * math.log2(0.8 / bright)) / 2 if bright > 0 else 0.0
 
 

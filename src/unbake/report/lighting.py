@@ -21,15 +21,15 @@ NUMBERS = {
 }
 
 
-def light_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
-    """The section's contents for the template: `maps` and `lights`, each None where not optimized.
+def lighting_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
+    """The contents of the section: `maps` and `emitters`, each None if no run optimized it.
 
     Raises:
         UserError: a map is gone, cannot be read, or has another size than the true one.
     """
     if not any(run.optimizes("environment") or run.optimizes("emission") for run in runs):
         return None
-    return {"maps": _maps(runs, data), "lights": _lights(runs)}
+    return {"maps": _maps(runs, data), "emitters": _emitters(runs)}
 
 
 def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
@@ -87,20 +87,20 @@ def _numbers(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _lights(runs: list[Run]) -> list[dict[str, Any]] | None:
-    """One row a light: its true strength, and each run's with its error."""
+def _emitters(runs: list[Run]) -> list[dict[str, Any]] | None:
+    """One row an emitter: its true strength, and each run's with its error."""
     if not any(run.optimizes("emission") for run in runs):
         return None
     found = [{row["name"]: row for row in run.metrics.get("emission") or ()} for run in runs]
     rows = []
-    for name in dict.fromkeys(name for lights in found for name in lights):
-        said = [lights.get(name, {}) for lights in found]
-        truth = next((light["truth"] for light in said if light.get("truth")), None)
-        errors = [display.number(light.get("emission_error")) for light in said]
+    for name in dict.fromkeys(name for emitters in found for name in emitters):
+        said = [emitters.get(name, {}) for emitters in found]
+        truth = next((emitter["truth"] for emitter in said if emitter.get("truth")), None)
+        errors = [display.number(emitter.get("emission_error")) for emitter in said]
         cells = [
             cell
-            | {"strength": _colour(light.get("strength")), "optimized": run.optimizes("emission")}
-            for cell, light, run in zip(
+            | {"strength": _colour(emitter.get("strength")), "optimized": run.optimizes("emission")}
+            for cell, emitter, run in zip(
                 display.marked(errors, display.percent, min), said, runs, strict=True
             )
         ]

@@ -17,7 +17,7 @@ from unbake.evaluation.convergence import score_curve, time_to_quality
 from unbake.imaging import pictures
 from unbake.io import write_text
 from unbake.report import charts, display
-from unbake.report.lighting import light_section
+from unbake.report.lighting import lighting_section
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
@@ -114,7 +114,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             runs=loaded,
             psnrs=_psnrs(loaded).values(),
             rows=_table(loaded),
-            light=light_section(loaded, data),
+            light=lighting_section(loaded, data),
             optimized=_optimized(loaded),
             materials=any(run.optimizes("albedo") for run in loaded),
             failed=failed or {},
@@ -151,20 +151,20 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
 
 def _scales(runs: list[Run], views: list[View]) -> Scales:
     """Exposure and error scales from all pictures of the page."""
-    light: list[np.ndarray] = []
+    radiance: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
     for view in views:
         for quantity, path in view.truth.items():
             reference, mask = display.rgb(path)
             if quantity == "render":
-                light.append(display.sample(reference.mean(axis=2)[mask]))
+                radiance.append(display.sample(reference.mean(axis=2)[mask]))
             for run, parts in zip(runs, errors[quantity], strict=True):
                 recovered = _recovered(run, view, quantity)
                 if recovered is not None:
                     error = display.error(display.rgb(recovered)[0], reference, recovered)
                     parts.append(display.sample(error[mask]))
     error_scales = {q: display.error_scale(errors[q]) for q in QUANTITIES}
-    return Scales(display.exposure(light), error_scales)
+    return Scales(display.exposure(radiance), error_scales)
 
 
 def _view_block(view: View, runs: list[Run], scales: Scales) -> dict[str, Any]:
@@ -287,11 +287,11 @@ def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
     psnrs = _psnrs(runs)
     told = {k: v for k, v in DEFINED.items() if k in psnrs or k not in PSNRS}
     numbers = [_told(run, told) | _rendering(run) for run in runs]
-    light = {
+    lighting = {
         kind: [_told(run, words) if run.optimizes(kind) else {} for run in runs]
         for kind, words in LIGHT_DEFINED.items()
     }
-    return {part: _grouped(runs, said) for part, said in ({"numbers": numbers} | light).items()}
+    return {part: _grouped(runs, said) for part, said in ({"numbers": numbers} | lighting).items()}
 
 
 def _told(run: Run, names: dict[str, str]) -> dict[str, str]:

@@ -86,10 +86,10 @@ def read_run(path: Path, label: str) -> Run:
     for key, kind in {"environment": dict, "emission": list}.items():
         if not isinstance(metrics.get(key), kind | None):
             raise UserError(f"`{key}` is of the wrong type", metrics_file, evaluate)
-    lights = metrics.get("emission") or ()
-    if not all(isinstance(row, dict) and isinstance(row.get("name"), str) for row in lights):
+    emitters = metrics.get("emission") or ()
+    if not all(isinstance(row, dict) and isinstance(row.get("name"), str) for row in emitters):
         raise UserError("a light of `emission` has no name", metrics_file, evaluate)
-    if metrics.get("unknown") == "emission" and not lights:
+    if metrics.get("unknown") == "emission" and not emitters:
         raise UserError("`emission` has no light", metrics_file, evaluate)
     settings = dict(_flatten(folder.settings_table()))
     return Run(folder, label, metrics, settings, folder.log())
