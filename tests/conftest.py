@@ -99,7 +99,8 @@ def unbake(monkeypatch, capfd):
 @pytest.fixture(scope="session")
 def cornell(tmp_path_factory) -> Path:
     """A captured data set, to be read alone: two views and a held-out one, 16 x 16 pixels."""
-    from unbake.acquisition.capture import CaptureSettings, capture
+    from unbake.acquisition.capture import capture
+    from unbake.acquisition.settings import CaptureSettings
 
     folder = tmp_path_factory.mktemp("captured") / "cornell"
     small = CaptureSettings(views=2, held_out=1, resolution=16, spp=8, max_depth=6)

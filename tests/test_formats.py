@@ -9,7 +9,8 @@ import pytest
 from unbake.dataset.data_folder import DataFolder
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
-from unbake.evaluation.evaluate import EvaluationSettings, evaluate
+from unbake.evaluation.evaluate import evaluate
+from unbake.evaluation.settings import EvaluationSettings
 from unbake.report.page import write_report
 from unbake.training import checkpoint
 from unbake.training.recovered import load_run

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 from .errors import UserError as UserError
 
 if TYPE_CHECKING:
-    from .acquisition.capture import CaptureSettings as CaptureSettings
     from .acquisition.capture import capture as capture
+    from .acquisition.settings import CaptureSettings as CaptureSettings
     from .backend import activate as activate
     from .config import FitConfig as FitConfig
     from .config import preset as preset
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from .dataset.pixels import RayBatch as RayBatch
     from .dataset.views import Dataset as Dataset
     from .dataset.views import View as View
-    from .evaluation.evaluate import EvaluationSettings as EvaluationSettings
     from .evaluation.evaluate import evaluate as evaluate
+    from .evaluation.settings import EvaluationSettings as EvaluationSettings
     from .fields.domain import SurfacePoint as SurfacePoint
     from .fields.materials import Material as Material
     from .fields.materials import Materials as Materials
@@ -93,10 +93,12 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "backend": ("activate",),
     "errors": ("UserError",),
     "config": ("FitConfig", "preset", "read_toml", "to_toml"),
-    "acquisition.capture": ("CaptureSettings", "capture"),
+    "acquisition.settings": ("CaptureSettings",),
+    "acquisition.capture": ("capture",),
     "training.loop": ("fit",),
     "training.recovered": ("load_run",),
-    "evaluation.evaluate": ("EvaluationSettings", "evaluate"),
+    "evaluation.settings": ("EvaluationSettings",),
+    "evaluation.evaluate": ("evaluate",),
     "report.page": ("write_report",),
     # Data sets.
     "dataset.camera": ("Camera",),
@@ -129,7 +131,16 @@ _MODULES: dict[str, tuple[str, ...]] = {
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 # Modules above that are imported without Mitsuba.
-_PURE = frozenset({"backend", "config", "errors", "transport.methods"})
+_PURE = frozenset(
+    {
+        "acquisition.settings",
+        "evaluation.settings",
+        "backend",
+        "config",
+        "errors",
+        "transport.methods",
+    }
+)
 
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

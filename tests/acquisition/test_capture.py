@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.dataset.camera import LookAt, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError

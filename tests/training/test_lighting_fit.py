@@ -16,7 +16,8 @@ from support import (
     seeded,
 )
 
-from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.config import LightingConfig, from_toml, update
 from unbake.dataset.lighting import true_environment
 from unbake.errors import UserError

@@ -11,7 +11,8 @@ import pytest
 from rich.console import Console
 from support import TINY_FIT
 
-from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.config import LightingConfig
 from unbake.dataset.lighting import ROWS, true_environment
 from unbake.dataset.views import Dataset

@@ -11,7 +11,8 @@ import pytest
 
 from unbake.config import read_toml
 from unbake.errors import UserError
-from unbake.evaluation.evaluate import EvaluationSettings, evaluate
+from unbake.evaluation.evaluate import evaluate
+from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training.loop import TIME_EVERY, fit
 from unbake.training.recovered import load_run

@@ -16,7 +16,8 @@ from support import (
     stock_path,
 )
 
-from unbake.acquisition.capture import CaptureSettings, capture
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse

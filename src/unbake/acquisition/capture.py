@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -24,22 +23,10 @@ from ..transport.render import parts_of, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
 from .placement import coverage, is_room, place
+from .settings import CaptureSettings
 
 #: Samples a pixel of the truth images, which are noisy at edges only.
 TRUTH_SAMPLES = 16
-
-
-@dataclass(frozen=True)
-class CaptureSettings:
-    """How a data set is rendered."""
-
-    views: int = 24  #: training views, without a camera file
-    held_out: int = 4  #: held-out views, without a camera file
-    resolution: int = 128  #: width and height in pixels, unless the camera file has its own
-    spp: int = 100  #: camera samples a pixel, stratified
-    max_depth: int = 64  #: longest path; paths cut short would be fitted as darker materials
-    rr_depth: int = 8  #: bounces before Russian roulette
-    seed: int = 0
 
 
 def capture(

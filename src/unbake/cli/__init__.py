@@ -6,40 +6,45 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 from rich.console import Console
 from rich.text import Text
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from .. import backend, experiments
+from ..acquisition.settings import CaptureSettings
+from ..config import FitConfig
 from ..errors import UserError
+from ..evaluation.settings import EvaluationSettings
 from ..training.run_folder import RunFolder
+from .flags import flags, given, with_options
 from .options import (
-    Count,
     Data,
     Experiment,
     File,
     Flag,
     Folder,
-    Method,
     Methods,
     Preset,
-    Prior,
-    Quantities,
-    Representation,
     Run,
     Runs,
     Scale,
     Scene,
-    Seconds,
-    Unknown,
     chosen_settings,
     exclude,
-    overridden,
     require,
+    with_length,
 )
+
+if TYPE_CHECKING:
+    CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = Any
+else:
+    CaptureFlags = flags(CaptureSettings)
+    FitFlags = flags(FitConfig, presets=True)
+    EvaluationFlags = flags(EvaluationSettings)
+    CompareFlags = flags(FitConfig, presets=True, without=("method",))
 
 
 def main() -> None:
@@ -78,45 +83,22 @@ def capture(
     scene: Positional[Scene],
     /,
     out: Path,
-    views: int = 24,
-    held_out: int = 4,
     cameras: File = None,
-    resolution: int = 128,
-    spp: int = 100,
-    max_depth: int = 64,
-    seed: int = 0,
+    *,
+    capture: OmitArgPrefixes[CaptureFlags],
 ) -> None:
     """Render a data set from a Mitsuba scene: photographs, cameras, and the true materials.
 
     Args:
         scene: A Mitsuba 3 XML file, or a built-in scene: demo, still, cornell, cube, furnace.
         out: Folder to write; it must not exist.
-        views: Views to learn from. Cameras are placed automatically.
-        held_out: Further views that are kept apart, to judge results by.
         cameras: Camera file (or transforms.json) to use instead of --views and --held-out.
-        resolution: Width and height of the images in pixels.
-        spp: Samples per pixel: more mean less noise, and more time.
-        max_depth: Longest light path; too short a limit looks like darker materials.
-        seed: Seed of all random numbers.
+        capture: How the data set is rendered.
     """
-    require("views", views, 1)
-    require("held-out", held_out, 0)
-    require("resolution", resolution, 2)
-    require("spp", spp, 1)
-    require("max-depth", max_depth, 1)
-    require("seed", seed, 0)
+    settings = with_options(CaptureSettings(), given(capture))
     backend.activate()
-    from ..acquisition.capture import CaptureSettings
     from ..acquisition.capture import capture as run
 
-    settings = CaptureSettings(
-        views=views,
-        held_out=held_out,
-        resolution=resolution,
-        spp=spp,
-        max_depth=max_depth,
-        seed=seed,
-    )
     start = time.perf_counter()
     run(scene, out, settings, cameras=cameras, tell=_say)
     _say(f"wrote {out} in {time.perf_counter() - start:.0f} s; next: unbake fit {out} --out RUN")
@@ -126,79 +108,37 @@ def fit(
     data: Positional[Data],
     /,
     out: Path,
-    steps: Count = None,
-    seconds: Seconds = None,
-    spp: Count = None,
-    batch: Count = None,
     preset: Preset = None,
-    unknown: Unknown = None,
-    method: Method = None,
-    bounces: Count = None,
-    prior: Prior = None,
-    max_depth: Count = None,
-    quantities: Quantities = None,
-    representation: Representation = None,
-    radiance: Representation = None,
-    seed: Count = None,
     settings: File = None,
     resume: Flag = False,
     clip_negative: Flag = False,
+    *,
+    fit: OmitArgPrefixes[FitFlags],
 ) -> int:
     """Recover materials or lighting from the photographs of a data set.
 
     Ctrl-C stops after the present step and keeps what was learned; --resume goes on from there.
 
-    Unknown: materials are the quantities named (albedo and roughness), lighting is the environment
-    map, emission is colour and strength of the lights.
-
-    Methods: ours; no-prior (radiance learned from images alone), direct (no indirect light), ad-pt
-    (path tracing, differentiated), prb (path replay). From direct to ours the ablation goes by
-    with-prior, with-stop-gradient and with-second-bounce.
-
     Args:
         data: Folder of the data set, with its transforms.json.
         out: Folder to write the run to: settings, log, checkpoints, previews.
-        steps: Length of the fit in training steps (cpu: 2400, paper and release: 18000).
-        seconds: Length of the fit in seconds of training, instead of steps.
-        spp: Samples per pixel in a step, an even number (cpu: 8, paper and release: 16).
-        batch: Pixels in a step (cpu: 1024, paper and release: 16384).
         preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
-        unknown: What to recover: materials (default), lighting, materials+lighting or emission.
-        method: ours (default), no-prior, direct, ad-pt, prb, or a step of the ablation.
-        bounces: Differentiable bounces of ours before the radiance field is asked (default: 1).
-        prior: Where ours takes the residual: one-bounce, or extra-bounce (default) at x2 as well.
-        max_depth: Longest path of ad-pt and prb (default: 15).
-        quantities: What is unknown of materials (default: albedo roughness).
-        representation: Of materials: neural (default), grid (3D), or bitmap (in UV coordinates).
-        radiance: Representation of the radiance field: neural (default) or grid (3D).
-        seed: Seed of weights and samples (default: 0).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
         clip_negative: Take negative pixels as zero instead of refusing them.
+        fit: Settings that differ from those of the preset or the file.
     """
-    start: dict[str, object] = {"preset": preset, "settings": settings}
-    length: dict[str, object] = {"steps": steps, "seconds": seconds}
-    other: dict[str, object] = {
-        "spp": spp,
-        "batch": batch,
-        "unknown": unknown,
-        "method": method,
-        "bounces": bounces,
-        "prior": prior,
-        "max-depth": max_depth,
-        "quantities": quantities,
-        "representation": representation,
-        "radiance": radiance,
-        "seed": seed,
-    }
+    changes = given(fit)
     if resume:
-        exclude("resume", start | other)
+        length = {"steps", "seconds"}
+        others = {name: value for name, value in changes.items() if name not in length}
+        exclude("resume", {"preset": preset, "settings": settings} | others)
         folder = RunFolder(out)
         folder.require_resumable()
         chosen = folder.settings()
     else:
         chosen = chosen_settings(preset, settings)
-    chosen = overridden(chosen, length | other)
+    chosen = with_length(chosen, changes)
     backend.activate()
     from ..training.loop import fit as run
 
@@ -213,35 +153,19 @@ def fit(
     return 0
 
 
-def evaluate(
-    run: Positional[Run],
-    /,
-    spp: int = 64,
-    max_depth: int = 48,
-    train_views: int = 4,
-    clip_negative: Flag = False,
-) -> None:
+def evaluate(run: Positional[Run], /, *, evaluate: OmitArgPrefixes[EvaluationFlags]) -> None:
     """Render views with what was recovered and measure it against the truth.
 
     Writes pictures and metrics.json to RUN/evaluation.
 
     Args:
         run: Folder that `unbake fit` wrote.
-        spp: Samples per pixel: more mean less noise, and more time.
-        max_depth: Longest light path.
-        train_views: How many of the views learned from to render, beside all held-out ones.
-        clip_negative: Take negative pixels of photographs as zero, as in a fit with this option.
+        evaluate: How views are rendered.
     """
-    require("spp", spp, 1)
-    require("max-depth", max_depth, 1)
-    require("train-views", train_views, 0)
+    settings = with_options(EvaluationSettings(), given(evaluate))
     backend.activate()
-    from ..evaluation.evaluate import EvaluationSettings
     from ..evaluation.evaluate import evaluate as go
 
-    settings = EvaluationSettings(
-        spp=spp, max_depth=max_depth, train_views=train_views, clip_negative=clip_negative
-    )
     metrics = go(run, settings, tell=_say)
     for split in ("heldout", "train"):
         values = {k: v for k, v in metrics[split].items() if k != "views"}
@@ -270,17 +194,13 @@ def compare(
     /,
     methods: Methods,
     out: Path,
-    steps: Count = None,
-    seconds: Seconds = None,
-    spp: Count = None,
-    batch: Count = None,
     preset: Preset = None,
-    unknown: Unknown = None,
-    seed: Count = None,
     settings: File = None,
     score_seconds: Annotated[float, arg(metavar="SECONDS")] = 5.0,
     evaluate_spp: int = 32,
     clip_negative: Flag = False,
+    *,
+    compare: OmitArgPrefixes[CompareFlags],
 ) -> int:
     """Fit several methods with the same settings, evaluate them, and tell which is good how soon.
 
@@ -293,22 +213,15 @@ def compare(
         methods: Methods of `unbake fit`, such as: ours prb direct. METHOD:REPRESENTATION, such as
             prb:bitmap, also says how materials are represented (neural, grid or bitmap).
         out: Folder to write to.
-        steps: Length of each fit in training steps.
-        seconds: Length of each fit in seconds of training, instead of steps.
-        spp: Samples per pixel in a step, an even number.
-        batch: Pixels in a step.
         preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
-        unknown: What to recover: materials (default), lighting, materials+lighting or emission.
-        seed: Seed of weights and samples (default: 0).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         score_seconds: Training time between scores on all held-out views (0: no scores).
         evaluate_spp: Samples per pixel of the final renderings.
         clip_negative: Take negative pixels as zero instead of refusing them.
+        compare: Settings of all methods that differ from those of the preset or the file.
     """
     require("evaluate-spp", evaluate_spp, 1)
-    chosen = chosen_settings(preset, settings)
-    given: dict[str, object] = {"steps": steps, "seconds": seconds, "spp": spp, "batch": batch}
-    chosen = overridden(chosen, given | {"unknown": unknown, "seed": seed})
+    chosen = with_length(chosen_settings(preset, settings), given(compare))
     try:
         chosen = dataclasses.replace(chosen, score_seconds=score_seconds)
     except UserError as error:
@@ -316,7 +229,6 @@ def compare(
     backend.activate()
     from ..comparison.compare import compare as run
     from ..comparison.method_variant import MethodVariant
-    from ..evaluation.evaluate import EvaluationSettings
 
     variants = [MethodVariant.of(method) for method in methods]
     evaluation = EvaluationSettings(spp=evaluate_spp, clip_negative=clip_negative)

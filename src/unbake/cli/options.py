@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, arg
 
 from .. import config, experiments
 from ..errors import UserError
+from .flags import with_options
 
 Scene = Annotated[str, arg(metavar="SCENE")]
 Data = Annotated[Path, arg(metavar="DATA")]
@@ -19,20 +20,11 @@ Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint=
 Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 #: Where None stands for what preset or settings file say, "default: None" would tell nothing.
-Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
-Seconds = Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")]
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
 Preset = Annotated[
     config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
 ]
-Method = Annotated[str | None, arg(metavar="METHOD", help_behavior_hint="")]
-Unknown = Annotated[config.Unknown | None, arg(metavar="WHAT", help_behavior_hint="")]
-Prior = Annotated[
-    config.PriorName | None, arg(metavar="{one-bounce,extra-bounce}", help_behavior_hint="")
-]
-Quantities = Annotated[tuple[str, ...] | None, arg(metavar="NAMES", help_behavior_hint="")]
-Representation = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
 
 
@@ -44,26 +36,12 @@ def chosen_settings(preset: config.PresetName | None, settings: Path | None) -> 
     return config.read_toml(settings)
 
 
-def overridden(settings: config.FitConfig, given: dict[str, object]) -> config.FitConfig:
-    """Settings with the options that were given; errors name the option."""
-    keys = {"batch": "pixels", "radiance": "radiance_representation"}
-    if given["steps"] is not None and given["seconds"] is not None:
-        exclude("seconds", {"steps": given["steps"]})
-    if given["steps"] is not None:
+def with_length(settings: config.FitConfig, values: dict[str, Any]) -> config.FitConfig:
+    """Settings with the options that were given; steps or seconds take the place of each other."""
+    if "steps" in values:
+        exclude("seconds", {"steps": values["steps"]} if "seconds" in values else {})
         settings = dataclasses.replace(settings, seconds=0.0)
-    # The method first: whether other options make sense depends on it.
-    for option, value in sorted(given.items(), key=lambda item: item[0] != "method"):
-        if value is None:
-            continue
-        try:
-            if option == "max-depth":
-                path = dataclasses.replace(settings.path, max_depth=value)
-                settings = dataclasses.replace(settings, path=path)
-            else:
-                settings = dataclasses.replace(settings, **{keys.get(option, option): value})
-        except UserError as error:
-            raise UserError(error.what, f"--{option}", error.remedy) from None
-    return settings
+    return with_options(settings, values)
 
 
 def exclude(option: str, others: dict[str, object]) -> None:

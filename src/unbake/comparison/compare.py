@@ -16,7 +16,8 @@ from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..evaluation.convergence import milliseconds_per_step, score_curve, time_to_quality
-from ..evaluation.evaluate import EvaluationSettings, description, evaluate
+from ..evaluation.evaluate import description, evaluate
+from ..evaluation.settings import EvaluationSettings
 from ..io import write_json
 from ..machine import machine
 from ..report.page import write_report

@@ -23,6 +23,7 @@ from .fit import (
     TransportConfig,
     Unknown,
 )
+from .flag import Flag
 from .presets import preset
 from .tables import update
 from .toml import from_toml, read_toml, to_toml
@@ -34,6 +35,7 @@ __all__ = [
     "Estimator",
     "FieldSettings",
     "FitConfig",
+    "Flag",
     "GridConfig",
     "LightingConfig",
     "NetworkConfig",

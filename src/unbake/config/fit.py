@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from ..errors import UserError, require
 from ..fields.registry import representation, representations
 from ..fields.settings import FieldSettings
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
 from ..transport.methods import METHODS, Method
+from .flag import Flag
 from .tables import update
 
 Estimator = Literal["auto", "split-halves", "two-pass"]
@@ -39,7 +40,8 @@ class TransportConfig:
 class PathConfig:
     """Paths of the methods that follow them to their end, `ad-pt` and `prb` (Sec. 6)."""
 
-    max_depth: int = 15  #: longest path in bounces, plus one (Mitsuba's meaning)
+    #: Longest path in bounces, plus one (Mitsuba's meaning).
+    max_depth: Annotated[int, Flag("Longest path of ad-pt and prb")] = 15
     rr_depth: int = 5  #: bounces before Russian roulette, which goes on with 0.95 at most
 
     def __post_init__(self) -> None:
@@ -92,24 +94,100 @@ class RegularizationConfig:
 MOST_BOUNCES = 16
 
 
+# What the command line tells of the tables whose rows settings name.
+
+
+def _quantities() -> dict[str, str]:
+    return {name: row.title.lower() for name, row in QUANTITIES.items()}
+
+
+def _methods() -> dict[str, str]:
+    return {name: method.title for name, method in METHODS.items()}
+
+
+def _representations() -> dict[str, str]:
+    return {name: representation(name).title for name in representations()}
+
+
+def _of_radiance() -> dict[str, str]:
+    return {name: representation(name).title for name in representations(radiance=True)}
+
+
 @dataclass(frozen=True)
 class FitConfig:
     """Everything that decides what a fit does, apart from its data set."""
 
     preset: PresetName = "cpu"
-    unknown: Unknown = "materials"
-    method: str = "ours"  #: see `transport/methods.py`
-    bounces: int = 1  #: differentiable bounces before L_θ is asked (Sec. 6.3); `ours` only
-    prior: PriorName = "extra-bounce"  #: where the residual is taken (Sec. 4.2); `ours` only
-    quantities: tuple[str, ...] = DEFAULT_QUANTITIES  #: unknown of materials (Sec. 5.1)
-    representation: str = "neural"  #: of the materials (Sec. 5.1, Fig. 5, Sec. 8)
-    radiance_representation: str = "neural"  #: of L_θ (Sec. 5.3, Fig. 5)
-    seed: int = 0
+    unknown: Annotated[
+        Unknown,
+        Flag(
+            "What to recover: materials (the --quantities), lighting (the environment map), "
+            "materials+lighting, or emission (colour and strength of the lights)",
+            metavar="WHAT",
+        ),
+    ] = "materials"
+    #: Of materials (Sec. 5.1).
+    quantities: Annotated[
+        tuple[str, ...],
+        Flag(
+            "What is unknown of materials, one or more of these",
+            metavar="NAME",
+            choices=_quantities,
+        ),
+    ] = DEFAULT_QUANTITIES
+    #: A row of the table in `transport/methods.py`.
+    method: Annotated[
+        str,
+        Flag(
+            "Method",
+            metavar="METHOD",
+            choices=_methods,
+        ),
+    ] = "ours"
+    #: Sec. 6.3; `ours` only.
+    bounces: Annotated[
+        int, Flag("Differentiable bounces of ours before the radiance field is asked")
+    ] = 1
+    #: Sec. 4.2; `ours` only.
+    prior: Annotated[
+        PriorName, Flag("Where ours takes the residual: extra-bounce is at x2 as well as at x1")
+    ] = "extra-bounce"
+    #: Of the materials (Sec. 5.1, Fig. 5, Sec. 8).
+    representation: Annotated[
+        str,
+        Flag(
+            "How materials are represented",
+            metavar="NAME",
+            choices=_representations,
+        ),
+    ] = "neural"
+    #: Of L_θ (Sec. 5.3, Fig. 5).
+    radiance_representation: Annotated[
+        str,
+        Flag(
+            "How the radiance field is represented",
+            name="radiance",
+            metavar="NAME",
+            choices=_of_radiance,
+        ),
+    ] = "neural"
+    seed: Annotated[int, Flag("Seed of weights and samples")] = 0
 
-    steps: int = 2400  #: training steps (Table 1)
-    seconds: float = 0.0  #: stop after this much training time instead (0: count steps)
-    pixels: int = 1024  #: batch size in pixels (Table 1)
-    spp: int = 8  #: camera samples a pixel a step (Table 1); even, for the split halves
+    #: Table 1.
+    steps: Annotated[int, Flag("Length of the fit in training steps")] = 2400
+    #: Stop after this much training time instead (0: count steps).
+    seconds: Annotated[
+        float,
+        Flag(
+            "Length of the fit in seconds of training, instead of steps",
+            metavar="SECONDS",
+            tell_default=False,
+        ),
+    ] = 0.0
+    #: Batch size in pixels (Table 1).
+    pixels: Annotated[int, Flag("Pixels in a step", name="batch")] = 1024
+    #: Camera samples a pixel a step (Table 1); even, for the split halves.
+    spp: Annotated[int, Flag("Samples per pixel in a step, an even number")] = 8
     radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
 
     final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from ..training.validation import GroundTruth, MaterialBuffers, finite, read_vie
 from ..transport.objective import requirements
 from ..transport.render import render_radiance
 from . import lighting
+from .settings import EvaluationSettings
 
 DEFINITIONS = {
     "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
@@ -36,18 +37,6 @@ DEFINITIONS = {
 
 
 METRICS = ("render_psnr", "render_psnr_unclamped", "albedo_psnr", "roughness_psnr")
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """How the recovered scene is rendered."""
-
-    spp: int = 64  #: camera samples a pixel
-    max_depth: int = 48  #: longest path: bounces, plus one; specular ones are not counted
-    rr_depth: int = 5  #: bounces before Russian roulette
-    train_views: int = 4  #: training views to render; all held-out views are rendered
-    material_spp: int = 16  #: camera samples a pixel of the albedo and roughness pictures
-    clip_negative: bool = False  #: clip negative pixels of photographs, as always if the fit did
 
 
 def evaluate(

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..acquisition.capture import CaptureSettings
+from ..acquisition.settings import CaptureSettings
 from ..comparison.bench_methods import bench_methods
 from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig

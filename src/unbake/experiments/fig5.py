@@ -14,7 +14,8 @@ from typing import final
 import drjit as dr
 
 from ..acquisition.built_in import write_scene
-from ..acquisition.capture import CaptureSettings, capture
+from ..acquisition.capture import capture
+from ..acquisition.settings import CaptureSettings
 from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig, PathConfig, PriorName, update
 from ..dataset.views import Dataset

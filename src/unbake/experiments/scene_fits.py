@@ -16,7 +16,7 @@ from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig
 from ..dataset.views import Dataset, View
 from ..errors import UserError
-from ..evaluation.evaluate import EvaluationSettings
+from ..evaluation.settings import EvaluationSettings
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import block_means, montage, read_exr, to_bytes, tonemap
 from ..report.display import require_same_size, rgb

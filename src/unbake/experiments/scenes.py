@@ -13,7 +13,8 @@ from typing import Any, final
 import mitsuba as mi
 import numpy as np
 
-from ..acquisition.capture import CaptureSettings, capture
+from ..acquisition.capture import capture
+from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig, from_toml
 from ..dataset.data_folder import DataFolder
 from ..dataset.views import Dataset

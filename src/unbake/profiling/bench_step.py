@@ -16,7 +16,8 @@ import drjit as dr
 from rich.console import Console
 from rich.table import Table
 
-from ..acquisition.capture import CaptureSettings, capture
+from ..acquisition.capture import capture
+from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
