@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,7 +14,10 @@ import numpy as np
 import pytest
 
 from unbake import cli
-from unbake.config import preset, read_toml
+from unbake.cli.flags import flags, options, with_options
+from unbake.config import FitConfig, NetworkConfig, preset, read_toml
+from unbake.errors import UserError
+from unbake.fields import registry
 from unbake.imaging.pictures import read_exr
 
 SOURCE = str(Path(cli.__file__).parents[2])
@@ -263,3 +267,32 @@ def test_one_core_is_enough(tmp_path):
         env=os.environ | {"PYTHONPATH": SOURCE}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done
+
+
+def test_every_wrong_option_is_told_at_once(unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = unbake("fit", "data", "--out", "run", "--steps", "0", "--spp", "3", "--batch", "0")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    for told in ("--steps: must be 1", "--spp: must be an even", "--batch: must be 1"):
+        assert told in outcome.err
+
+
+def test_options_are_made_of_the_settings(unbake):
+    """Every field with a flag has its option in fit and, but for the method, in compare."""
+    names = {option.name for option in options(FitConfig)}
+    assert {"steps", "batch", "quantities", "max-depth", "radiance"} <= names
+    for command, missing in (("fit", set()), ("compare", {"method"})):
+        text = unbake(command, "--help").out
+        assert {name for name in names if f"--{name} " not in text} == missing
+
+
+def test_a_registered_representation_is_an_option_like_any_other(monkeypatch):
+    with pytest.raises(UserError, match=r"--representation: must be one of neural, grid, bitmap"):
+        with_options(FitConfig(), {"representation": "wide"})
+    monkeypatch.setattr(registry, "_REPRESENTATIONS", dict(registry._REPRESENTATIONS))
+    wide = registry.Representation("wide", "wide net", NetworkConfig(width=64), make="no:where")
+    registry.register_representation(wide)
+    (told,) = (f for f in fields(flags(FitConfig, presets=True)) if f.name == "representation")
+    assert "wide (wide net)" in str(told.type)
+    chosen = with_options(FitConfig(), {"representation": "wide"})
+    assert chosen.material_settings["albedo"].width == 64

@@ -121,7 +121,7 @@ def _value(settings: object, path: tuple[str, ...]) -> object:
     return settings
 
 
-def given(chosen: object) -> dict[str, Any]:
+def given(chosen: Any) -> dict[str, Any]:
     """By option, what was given of flags whose default is None."""
     named = {f.name.replace("_", "-"): getattr(chosen, f.name) for f in dataclasses.fields(chosen)}
     return {name: value for name, value in named.items() if value is not None}
