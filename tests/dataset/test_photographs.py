@@ -52,7 +52,7 @@ def test_pixels_are_those_of_the_images(dataset, background, where, monkeypatch)
     if where == "disk":
         monkeypatch.setattr(module, "IN_MEMORY", 0)
     made = dataset(background)
-    found, truth = Photographs.load(made, False), rgba(made)
+    found, truth = Photographs.load(made, False, smoothed=True), rgba(made)
     assert isinstance(found.table, np.memmap) == (where == "disk")
     assert (found.bytes == 0) == (where == "disk")
     np.testing.assert_array_equal(found.table[:, :3], truth[:, :3])
@@ -74,13 +74,55 @@ def test_batches_are_the_same_from_memory_and_from_a_file(dataset, monkeypatch):
 
     def drawn():
         sampler.seed(0, 64)
-        batch = PixelSource(rays, Photographs.load(made, False)).draw(3, 32).batch(rays, sampler, 2)
+        batch = PixelSource(rays, Photographs.load(made, False, smoothed=True))
+        batch = batch.draw(3, 32).batch(rays, sampler, 2)
         return [np.array(x) for x in (batch.target, batch.smoothed, batch.ray.d)]
 
     in_memory = drawn()
     monkeypatch.setattr(module, "IN_MEMORY", 0)
     for a, b in zip(in_memory, drawn(), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_a_blurred_copy_is_made_only_where_it_is_asked_for(dataset, where, monkeypatch):
+    if where == "disk":
+        monkeypatch.setattr(module, "IN_MEMORY", 0)
+    made = dataset()
+    rays = CameraRays.of([v.camera for v in made.train])
+    sampler = mi.load_dict({"type": "independent"})
+
+    def drawn(found):
+        sampler.seed(0, 64)
+        batch = PixelSource(rays, found).draw(3, 32).batch(rays, sampler, 2)
+        return batch, [np.array(x) for x in (batch.target, batch.ray.d)]
+
+    plain = Photographs.load(made, False)
+    batch, values = drawn(plain)
+    assert plain.table.shape[1] == 3 and batch.smoothed is None and not plain.smoothed
+    both = Photographs.load(made, False, smoothed=True)
+    assert both.table.shape[1] == 6 and both.smoothed
+    assert both.bytes - plain.bytes == (plain.table.nbytes if where == "memory" else 0)
+    batch, others = drawn(both)
+    assert batch.smoothed is not None
+    for a, b in zip(values, others, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_both(
+    dataset, on_disk, monkeypatch
+):
+    made, read = dataset(), []
+    decode = module.read_image
+    monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))
+    decoded = []
+    for smoothed in (False, False, True, True, False):
+        found = Photographs.load(made, False, smoothed=smoothed)
+        np.testing.assert_array_equal(found.table[:, :3], rgba(made)[:, :3])
+        assert found.smoothed == smoothed
+        assert found.bytes == 0
+        decoded.append(len(read) // len(made.train))
+    assert decoded == [1, 1, 2, 2, 2]
 
 
 def test_images_are_decoded_once(dataset, on_disk, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -19,8 +19,8 @@ from .views import Dataset, View, read_image
 #: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
 #: set's folder, of which the system keeps in memory what it has room for.
 IN_MEMORY = 512 << 20
-#: Linear RGB, and the same of the photograph blurred.
-_COLUMNS = 6
+#: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
+_COLUMNS, _WITH_BLURRED = 3, 6
 
 
 @final
@@ -29,7 +29,8 @@ class Photographs:
     """Linear RGB of all pixels of several views, row by row and view after view.
 
     Args:
-        table: shape (pixels, 6), float32: radiance, and radiance blurred over 5 x 5 pixels.
+        table: float32, shape (pixels, 3): radiance; or (pixels, 6): radiance, and radiance blurred
+            over 5 x 5 pixels.
         chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
             background pixels say nothing about the scene and only those with alpha > 0 are taken
             (the paper: at least half of them).
@@ -48,6 +49,11 @@ class Photographs:
         return len(self.table if self.chosen is None else self.chosen)
 
     @property
+    def smoothed(self) -> bool:
+        """Whether there is a blurred copy."""
+        return self.table.shape[1] == _WITH_BLURRED
+
+    @property
     def bytes(self) -> int:
         """Memory that the pixels take, unless they lie in a file."""
         held = [a for a in (self.table, self.chosen) if a is not None]
@@ -55,7 +61,12 @@ class Photographs:
 
     @staticmethod
     def of(
-        cameras: Sequence[Camera], rgb: np.ndarray, alpha: np.ndarray, *, foreground_only: bool
+        cameras: Sequence[Camera],
+        rgb: np.ndarray,
+        alpha: np.ndarray,
+        *,
+        foreground_only: bool,
+        smoothed: bool = False,
     ) -> Photographs:
         """Photographs that are in memory already.
 
@@ -64,14 +75,19 @@ class Photographs:
             rgb: linear RGB of all views' pixels, row by row, view after view, shape (pixels, 3).
             alpha: coverage of the same pixels, shape (pixels,).
             foreground_only: train only on pixels with alpha > 0.
+            smoothed: keep a blurred copy, too.
         """
-        table = np.empty((len(rgb), _COLUMNS), np.float32)
+        table = np.empty((len(rgb), _WITH_BLURRED if smoothed else _COLUMNS), np.float32)
         images = zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
         return _fill(table, images, foreground_only)
 
     @staticmethod
-    def load(dataset: Dataset, clip_negative: bool) -> Photographs:
+    def load(dataset: Dataset, clip_negative: bool, *, smoothed: bool = False) -> Photographs:
         """The training views of a data set; every image is read once, also over many fits.
+
+        Args:
+            clip_negative: take negative pixels as zero.
+            smoothed: keep a blurred copy, too, which doubles the memory.
 
         Raises:
             UserError: an image is bad, or there are too many for memory and the data set's folder
@@ -80,10 +96,11 @@ class Photographs:
         views = dataset.train
         hidden = dataset.background == "hidden"
         count = sum(view.camera.width * view.camera.height for view in views)
-        if 4 * _COLUMNS * count <= IN_MEMORY:
-            table = np.empty((count, _COLUMNS), np.float32)
+        columns = _WITH_BLURRED if smoothed else _COLUMNS
+        if 4 * columns * count <= IN_MEMORY:
+            table = np.empty((count, columns), np.float32)
             return _fill(table, _decoded(views, clip_negative), hidden)
-        return _cached(dataset, views, count, clip_negative, hidden)
+        return _cached(dataset, views, count, columns, clip_negative, hidden)
 
 
 def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:
@@ -99,13 +116,14 @@ def _decoded(views: Sequence[View], clip_negative: bool) -> Iterator[tuple[Camer
 def _fill(
     table: np.ndarray, images: Iterable[tuple[Camera, np.ndarray]], foreground_only: bool
 ) -> Photographs:
-    """Put images, RGBA, into a table one after the other."""
+    """Put images, RGBA, into a table one after the other; blurred, too, if it has room for that."""
     start, total, seen = 0, 0.0, []
     for camera, pixels in images:
         stop = start + len(pixels)
         rgb, foreground = pixels[:, :3], pixels[:, 3] > 0
         table[start:stop, :3] = rgb
-        table[start:stop, 3:] = _blurred(rgb.reshape(camera.height, camera.width, 3))
+        if table.shape[1] == _WITH_BLURRED:
+            table[start:stop, 3:] = _blurred(rgb.reshape(camera.height, camera.width, 3))
         counted = rgb[foreground] if foreground_only else rgb
         total += float(counted.sum(dtype=np.float64))
         if foreground_only:
@@ -127,17 +145,28 @@ def _blurred(image: np.ndarray, radius: int = 2) -> np.ndarray:
 
 
 def _cached(
-    dataset: Dataset, views: Sequence[View], count: int, clip_negative: bool, hidden: bool
+    dataset: Dataset,
+    views: Sequence[View],
+    count: int,
+    columns: int,
+    clip_negative: bool,
+    hidden: bool,
 ) -> Photographs:
     """Photographs in a file that is made where it is missing, or made from other images."""
     data = DataFolder(dataset.folder)
     key = {
         "images": [[str(v.image), v.image.stat().st_mtime_ns] for v in views if v.image.is_file()],
         "pixels": count,
+        "columns": columns,
         "clip_negative": clip_negative,
         "foreground_only": hidden,
     }
     found = _open_cache(data, key)
+    if found is None and columns < _WITH_BLURRED:
+        # A fit that asked for more has left a file that will do.
+        found = _open_cache(data, key | {"columns": _WITH_BLURRED})
+        if found is not None:
+            found = replace(found, table=found.table[:, :columns])
     if found is None:
         try:
             _write_cache(data, views, key)
@@ -145,7 +174,7 @@ def _cached(
             raise UserError(
                 f"the decoded photographs cannot be written ({error.strerror})",
                 data.cache,
-                f"They take {4 * _COLUMNS * count / 1e9:.1f} GB. Make room, or the folder writable",
+                f"They take {4 * columns * count / 1e9:.1f} GB. Make room, or the folder writable",
             ) from None
         found = _open_cache(data, key)
     return found
@@ -170,7 +199,7 @@ def _write_cache(data: DataFolder, views: Sequence[View], key: dict) -> None:
     # The key is written last: without it the rest is taken for unfinished.
     data.cache_key.unlink(missing_ok=True)
     path = data.cached_photographs
-    table = np.lib.format.open_memmap(path, "w+", np.float32, (key["pixels"], _COLUMNS))
+    table = np.lib.format.open_memmap(path, "w+", np.float32, (key["pixels"], key["columns"]))
     try:
         _reserve(path)
     except OSError:

@@ -75,15 +75,16 @@ class PixelBatch:
     """Some pixels: which ones they are, and what the photographs show there; a PyTree."""
 
     count: int
+    smoothed: bool  # whether blurred photographs are with them
     _packed: mi.UInt32  # numbers, then bits of colours: one array, so that a step copies one
 
     @staticmethod
     def of(numbers: np.ndarray, colours: np.ndarray) -> PixelBatch:
-        """Pixels by their numbers, shape (n,), and the rows of `Photographs.table`, (n, 6)."""
-        packed = np.empty((7, len(numbers)), np.uint32)
+        """Pixels by their numbers, shape (n,), and the rows of `Photographs.table`."""
+        packed = np.empty((1 + colours.shape[1], len(numbers)), np.uint32)
         packed[0] = numbers
         packed[1:] = np.ascontiguousarray(colours.T).view(np.uint32)
-        return PixelBatch(len(numbers), from_numpy(mi.UInt32, packed))
+        return PixelBatch(len(numbers), colours.shape[1] > 3, from_numpy(mi.UInt32, packed))
 
     def batch(self, rays: CameraRays, sampler: mi.Sampler, spp: int) -> RayBatch:
         """Jittered camera rays through the pixels (box filter), and their colours.
@@ -94,8 +95,9 @@ class PixelBatch:
         number = self._row(0, dr.arange(mi.UInt32, self.count * spp) // spp)
         ray = rays.through(number, sampler.next_2d())
         pixel = dr.arange(mi.UInt32, self.count)
-        rgb = [dr.reinterpret_array(mi.Float, self._row(1 + i, pixel)) for i in range(6)]
-        return RayBatch(mi.Color3f(rgb[:3]), mi.Color3f(rgb[3:]), ray)
+        columns = range(6 if self.smoothed else 3)
+        rgb = [dr.reinterpret_array(mi.Float, self._row(1 + i, pixel)) for i in columns]
+        return RayBatch(mi.Color3f(rgb[:3]), mi.Color3f(rgb[3:]) if self.smoothed else None, ray)
 
     def _row(self, row: int, pixel: mi.UInt32) -> mi.UInt32:
         return dr.gather(mi.UInt32, self._packed, pixel + row * self.count)
@@ -106,7 +108,7 @@ class RayBatch:
     """Pixels and the camera rays of their samples."""
 
     target: mi.Color3f  # photographs, linear RGB, one lane a pixel
-    smoothed: mi.Color3f  # the same from photographs blurred over 5 x 5 pixels
+    smoothed: mi.Color3f | None  # the same from photographs blurred over 5 x 5 pixels, if kept
     ray: mi.Ray3f  # `spp` consecutive lanes a pixel, world space
 
 
@@ -129,10 +131,17 @@ class PixelSource:
 
     @staticmethod
     def of(
-        cameras: Sequence[Camera], rgb: np.ndarray, alpha: np.ndarray, *, foreground_only: bool
+        cameras: Sequence[Camera],
+        rgb: np.ndarray,
+        alpha: np.ndarray,
+        *,
+        foreground_only: bool,
+        smoothed: bool = False,
     ) -> PixelSource:
         """The pixels of views in memory; see `Photographs.of`."""
-        found = Photographs.of(cameras, rgb, alpha, foreground_only=foreground_only)
+        found = Photographs.of(
+            cameras, rgb, alpha, foreground_only=foreground_only, smoothed=smoothed
+        )
         return PixelSource(CameraRays.of(cameras), found)
 
     def draw(self, seed: int, count: int) -> PixelBatch:

@@ -24,7 +24,8 @@ class FreshFit:
 
 def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     """A fit of a data set that writes nothing."""
-    pixels = training_pixels(dataset, clip_negative=False)
+    smoothed = config.loss_reference == "smoothed"
+    pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed)
     mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     return FreshFit(problem, pixels, TrainingStep(problem, pixels, config), initial_state(problem))

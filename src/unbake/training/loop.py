@@ -72,7 +72,9 @@ def fit(
         folder.require_new()
     dataset = Dataset.load(data)
     clip_negative = clip_negative or (resume and folder.origin().clip_negative)
-    pixels = training_pixels(dataset, clip_negative=clip_negative)
+    pixels = training_pixels(
+        dataset, clip_negative=clip_negative, smoothed=config.loss_reference == "smoothed"
+    )
     mean_radiance = pixels.photographs.mean
     if resume:
         _require_same_photographs(folder, data, mean_radiance)

@@ -164,8 +164,14 @@ def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list
     return made[0], [emitter.name for emitter in named]
 
 
-def training_pixels(dataset: Dataset, *, clip_negative: bool) -> PixelSource:
+def training_pixels(
+    dataset: Dataset, *, clip_negative: bool, smoothed: bool = False
+) -> PixelSource:
     """The pixels of the training views.
+
+    Args:
+        clip_negative: take negative pixels as zero.
+        smoothed: keep a blurred copy of the photographs, for `loss_reference = "smoothed"`.
 
     Raises:
         UserError: there is no training view, an image is bad, or all pixels are black.
@@ -175,7 +181,7 @@ def training_pixels(dataset: Dataset, *, clip_negative: bool) -> PixelSource:
         raise UserError(
             "no training view", dataset.folder, f'Give frames of {TRANSFORMS} "split": "train"'
         )
-    photographs = Photographs.load(dataset, clip_negative)
+    photographs = Photographs.load(dataset, clip_negative, smoothed=smoothed)
     if not photographs.count:
         raise UserError("no foreground pixel in any training view", dataset.folder)
     if photographs.mean <= 0:

@@ -48,6 +48,9 @@ class TrainingStep:
     """
 
     def __init__(self, problem: Problem, pixels: PixelSource, config: FitConfig) -> None:
+        smoothed = config.loss_reference == "smoothed"
+        if smoothed and not pixels.photographs.smoothed:
+            raise ValueError("the loss is relative to smoothed photographs, which were not made")
         # What is left of earlier problems would be found, half gone, by the recording of this one.
         gc.collect()
         self._problem = problem
