@@ -1,0 +1,146 @@
+"""Unknown materials are found wherever they stand, everything else stays as it is."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scene_texts import BALL, DIFFUSE, PRINCIPLED, ROUGHPLASTIC, WRAPPERS, render
+
+from unbake.errors import UserError
+from unbake.fields.texture import material_textures
+from unbake.imaging.pictures import write_exr
+from unbake.scene import edit
+
+
+def plugins(parsed):
+    return [node.props.plugin_name() for node in parsed.state.nodes]
+
+
+# ------------------------------------------------------------------------------- to_principled
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+@pytest.mark.parametrize(
+    ("bsdf", "roughness"), [(DIFFUSE, 0.9), (ROUGHPLASTIC, 0.2)], ids=["diffuse", "roughplastic"]
+)
+def test_diffuse_and_rough_plastic_become_principled(wrapper, bsdf, roughness, parse):
+    parsed = parse(BALL.format(WRAPPERS[wrapper].format(bsdf)))
+    assert not parsed.principled_nodes()
+    assert edit.to_principled(parsed) == 1
+    (node,) = parsed.principled_nodes()
+    assert set(node.props.keys()) == {"base_color", "roughness"}
+    assert np.allclose(node.props["base_color"], [0.6, 0.3, 0.1])
+    assert node.props["roughness"] == pytest.approx(roughness)
+    assert not {"diffuse", "roughplastic"} & set(plugins(parsed))
+    # A second time there is nothing left to do
+    assert edit.to_principled(parsed) == 0
+    assert np.isfinite(render(parsed.instantiate(), 2)).all()
+
+
+def test_the_defaults_of_mitsuba_are_kept(parse):
+    parsed = parse(
+        BALL.format('<bsdf type="diffuse"/>') + BALL.format('<bsdf type="roughplastic"/>')
+    )
+    assert edit.to_principled(parsed) == 2
+    found = [(n.props["base_color"], n.props["roughness"]) for n in parsed.principled_nodes()]
+    assert found == [(0.5, 0.9), (0.5, pytest.approx(math.sqrt(0.1)))]
+
+
+def test_other_materials_stay(parse):
+    others = ["dielectric", "conductor", "roughconductor", "plastic", "principled"]
+    parsed = parse("".join(BALL.format(f'<bsdf type="{name}"/>') for name in others))
+    assert edit.to_principled(parsed) == 0
+    assert [name for name in plugins(parsed) if name in others] == others
+
+
+def test_one_material_of_two_shapes_is_changed_once(parse):
+    shared = DIFFUSE.replace("<bsdf", '<bsdf id="shared"', 1)
+    parsed = parse(shared + 2 * BALL.format('<ref id="shared"/>'))
+    assert edit.to_principled(parsed) == 1
+    assert len(parsed.instantiate().shapes()) in (1, 2)
+
+
+def test_a_converted_diffuse_scene_looks_much_the_same(parse):
+    before = render(parse(BALL.format(DIFFUSE)).instantiate(), 256)
+    parsed = parse(BALL.format(DIFFUSE))
+    edit.to_principled(parsed)
+    after = render(parsed.instantiate(), 256)
+    assert 0.02 < np.abs(after - before).mean() + 0.02 < 0.08
+
+
+# -------------------------------------------------------------------------------- set_textures
+
+
+class Painted:
+    """Materials of one colour, for textures that are asked from inside stock integrators."""
+
+    carried = False
+
+    def __init__(self, albedo, roughness):
+        self.albedo, self.roughness = albedo, roughness
+
+    def __iter__(self):
+        return iter(("albedo", "roughness"))
+
+    def evaluate(self, si, valid, engine="coopvec"):
+        lanes = dr.zeros(mi.Float, dr.width(si.p))
+        return {"albedo": mi.Color3f(self.albedo) + lanes, "roughness": self.roughness + lanes}
+
+
+def painted(parsed, albedo, roughness):
+    edit.set_textures(parsed, material_textures(Painted(albedo, roughness)))
+    return parsed.instantiate()
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_fields_are_used_inside_every_wrapper(wrapper, parse):
+    content = BALL.format(WRAPPERS[wrapper].format(PRINCIPLED))
+    expected = render(parse(content).instantiate())
+    same = render(painted(parse(content), [0.6, 0.3, 0.1], 0.2))
+    assert np.allclose(same, expected, rtol=1e-3, atol=1e-3)
+    other_albedo = render(painted(parse(content), [0.1, 0.3, 0.1], 0.2))
+    assert np.abs(other_albedo[..., 0] - expected[..., 0]).max() > 0.1
+    other_roughness = render(painted(parse(content), [0.6, 0.3, 0.1], 0.9))
+    assert np.abs(other_roughness - expected).max() > 1e-3
+
+
+def test_all_other_parameters_stay(parse):
+    keys = {"metallic": 0.3, "specular": 0.8, "clearcoat": 0.4, "clearcoat_gloss": 0.6,
+            "sheen": 0.2, "sheen_tint": 0.7, "spec_tint": 0.1, "flatness": 0.5,
+            "anisotropic": 0.25}  # fmt: skip
+    extra = "".join(f'<float name="{key}" value="{value}"/>' for key, value in keys.items())
+    content = BALL.format(PRINCIPLED.replace("</bsdf>", extra + "</bsdf>"))
+    parsed = parse(content)
+    edit.set_textures(parsed, material_textures(Painted([0.6, 0.3, 0.1], 0.2)))
+    (node,) = parsed.principled_nodes()
+    assert {key: pytest.approx(node.props[key]) for key in keys} == keys
+    assert np.allclose(
+        render(parsed.instantiate()), render(parse(content).instantiate()), rtol=1e-3, atol=1e-3
+    )
+
+
+def test_bitmaps_give_way_to_fields(parse, tmp_path):
+    write_exr(tmp_path / "paint.exr", np.random.default_rng(0).random((8, 8, 3)))
+    bitmap = '<texture type="bitmap" name="base_color"><string name="filename" value="paint.exr"/>'
+    content = BALL.format(f'<bsdf type="principled">{bitmap}</texture></bsdf>')
+    assert np.allclose(
+        render(painted(parse(content), [0.6, 0.3, 0.1], 0.2)),
+        render(parse(BALL.format(PRINCIPLED)).instantiate()),
+        rtol=1e-3,
+        atol=1e-3,
+    )
+
+
+def test_nothing_to_fit_is_an_error(parse):
+    parsed = parse(BALL.format('<bsdf type="dielectric"/>'))
+    with pytest.raises(UserError, match=r"scene.xml: no material to fit"):
+        edit.set_textures(parsed, {})
+
+
+def test_roughness_is_shown_in_place_of_albedo(parse):
+    content = '<bsdf type="principled"><float name="roughness" value="0.3"/></bsdf>'
+    parsed = parse(BALL.format(content) + BALL.format('<bsdf type="principled"/>'))
+    edit.show_roughness_as_albedo(parsed)
+    assert [n.props["base_color"] for n in parsed.principled_nodes()] == [pytest.approx(0.3), 0.5]

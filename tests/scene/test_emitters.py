@@ -1,0 +1,119 @@
+"""Emitters and the environment: named, told with their strength, replaced by unknowns."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scene_texts import BALL, DIFFUSE
+
+from unbake.errors import UserError
+from unbake.fields.emission import Emission, emission_textures
+from unbake.scene import edit, emitters
+from unbake.scene import parse as scenes
+
+
+def test_a_scene_needs_light(parse):
+    parsed = parse(BALL.format(DIFFUSE))
+    emitters.require_emitters(parsed.instantiate(), parsed.path)
+    dark = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    with pytest.raises(UserError, match="the scene has no light source"):
+        emitters.require_emitters(dark, parsed.path)
+
+
+SKIES = {
+    "constant": '<emitter type="constant" id="sky"/>',
+    "envmap": '<emitter type="envmap"><string name="filename" value="bump.exr"/></emitter>',
+    "sunsky": '<emitter type="sunsky"/>',
+}
+LAMP = (
+    '<shape type="sphere" id="lamp"><point name="center" value="3,0,0"/>'
+    '<emitter type="area"><rgb name="radiance" value="4 5 6"/></emitter></shape>'
+)
+#: Every kind of light, with the name and the strength that are told of it.
+LIGHTS = {
+    ("point light", (1, 2, 3)): '<emitter type="point">'
+    '<rgb name="intensity" value="1 2 3"/></emitter>',
+    ("bulb", (2.5, 2.5, 2.5)): '<emitter type="point" id="bulb">'
+    '<float name="intensity" value="2.5"/></emitter>',
+    ("spot light", (1, 1, 1)): '<emitter type="spot"/>',
+    ("sun", None): '<emitter type="directional" id="sun"><spectrum type="blackbody" '
+    'name="irradiance"><float name="temperature" value="5000"/></spectrum></emitter>',
+    ("constant light", (1, 1, 1)): '<emitter type="constant"/>',
+    ("lamp", (4, 5, 6)): LAMP,
+    ("screen", None): '<shape type="rectangle" id="screen"><emitter type="area">'
+    '<texture type="checkerboard" name="radiance"/></emitter></shape>',
+    ("panel", (2, 2, 2)): '<shape type="rectangle"><emitter type="area" id="panel">'
+    '<texture type="d65" name="radiance"><float name="scale" value="2"/></texture>'
+    "</emitter></shape>",
+    ("beam", (3, 3, 3)): '<shape type="rectangle"><emitter type="directionalarea" id="beam">'
+    '<float name="radiance" value="3"/></emitter></shape>',
+}  # fmt: skip
+
+
+def constant(*rgb):
+    return mi.load_dict({"type": "constant", "radiance": {"type": "rgb", "value": list(rgb)}})
+
+
+@pytest.mark.parametrize("kind", SKIES)
+def test_an_environment_is_replaced_whatever_it_is(kind, parse_lit):
+    parsed = parse_lit(SKIES[kind] + LAMP)
+    edit.set_environment(parsed, constant(0.1, 0.2, 0.3))
+    scene = parsed.instantiate()
+    assert len(scene.emitters()) == 2  # the lamp stays
+    np.testing.assert_allclose(
+        emitters.environment_latlong(scene, 4), np.full((4, 8, 3), [0.1, 0.2, 0.3]), rtol=1e-5
+    )
+
+
+def test_a_scene_without_environment_has_none_to_fit(parse_lit):
+    parsed = parse_lit(LAMP)
+    with pytest.raises(UserError, match=r"scene.xml: the scene has no environment map to fit. Add"):
+        edit.set_environment(parsed, constant(1, 1, 1))
+    with pytest.raises(UserError, match="the scene has no environment map"):
+        emitters.environment_latlong(parsed.instantiate(), 4)
+
+
+def test_lights_are_told_by_name_and_strength(parse_lit):
+    found = emitters.named_emitters(parse_lit("".join(LIGHTS.values())))
+    assert len(found) == len(LIGHTS)
+    told = {light.name: light.strength for light in found}
+    assert told == {n: s if s is None else pytest.approx(s) for n, s in LIGHTS}
+
+
+def test_no_two_lights_have_one_name(parse_lit):
+    lights = '<emitter type="point"/>' * 3 + '<emitter type="spot"/>'
+    names = [light.name for light in emitters.named_emitters(parse_lit(lights))]
+    assert names == ["point light 1", "point light 2", "point light 3", "spot light"]
+
+
+def test_a_light_without_an_id_has_the_name_of_its_file(built_in, tmp_path):
+    parsed = scenes.parse(built_in("cornell"))
+    assert [light.name for light in emitters.named_emitters(parsed)] == ["light_shape"]
+    copied = scenes.parse(scenes.write(parsed, tmp_path))
+    assert [light.name for light in emitters.named_emitters(copied)] == ["light"]
+
+
+def test_every_light_gets_a_texture_of_its_own(parse_lit):
+    parsed = parse_lit("".join(LIGHTS.values()))
+    before = emitters.named_emitters(parsed)
+
+    def make(count):
+        strengths = Emission(count, scale=1.0)
+        numbers = np.arange(3 * count, dtype=np.float32)
+        strengths.assign({"log": mi.Float(np.log(numbers + 1))})
+        strengths.prepare()
+        return emission_textures(strengths)
+
+    assert edit.set_emission(parsed, make) == before
+    strengths = [light.strength for light in emitters.named_emitters(parsed)]
+    np.testing.assert_allclose(np.ravel(strengths), np.arange(27) + 1, rtol=1e-5)
+    shown = " ".join(str(emitter) for emitter in parsed.instantiate().emitters())
+    assert all(f"Strength[{i}]" in shown for i in range(9))
+
+
+@pytest.mark.parametrize("kind", ["envmap", "sunsky"])
+def test_a_scene_lit_by_its_environment_alone_has_no_light_to_fit(kind, parse_lit):
+    parsed = parse_lit(SKIES[kind])
+    assert emitters.named_emitters(parsed) == []
+    with pytest.raises(UserError, match=r"scene.xml: the scene has no light to fit: no area") as e:
+        edit.set_emission(parsed, lambda count: [])
+    assert "--unknown lighting" in str(e.value) and "\n" not in str(e.value)

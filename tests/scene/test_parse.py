@@ -1,0 +1,85 @@
+"""Scenes are read and copied with all their files; what is missing is named."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scene_texts import BALL, DIFFUSE, ROOM, render
+
+from unbake.errors import UserError
+from unbake.imaging.pictures import write_exr
+from unbake.scene import parse as scenes
+
+
+@pytest.fixture
+def with_files(tmp_path):
+    """A scene with a mesh and two bitmaps in folders of their own; `absolute` paths or not."""
+
+    def make(absolute):
+        root = tmp_path / "original"
+        (root / "meshes").mkdir(parents=True)
+        rng = np.random.default_rng(1)
+        write_exr(root / "textures" / "paint.exr", rng.random((8, 8, 3)))
+        write_exr(root / "light" / "paint.exr", rng.random((8, 16, 3)))
+        mesh = mi.load_dict({"type": "cube"})
+        mesh.write_ply(str(root / "meshes" / "box.ply"))
+        start = f"{root}/" if absolute else ""
+        text = ROOM.replace(
+            '<emitter type="constant"><rgb name="radiance" value="1 1 1"/></emitter>',
+            '<emitter type="envmap">'
+            f'<string name="filename" value="{start}light/paint.exr"/></emitter>',
+        ).format(
+            f'<shape type="ply"><string name="filename" value="{start}meshes/box.ply"/>'
+            '<bsdf type="twosided"><bsdf type="principled">'
+            '<texture type="bitmap" name="base_color">'
+            f'<string name="filename" value="{start}textures/paint.exr"/></texture>'
+            "</bsdf></bsdf></shape>"
+        )
+        (root / "scene.xml").write_text(text)
+        return root / "scene.xml"
+
+    return make
+
+
+@pytest.mark.parametrize("absolute", [False, True], ids=["relative", "absolute"])
+def test_a_copy_has_all_files_and_looks_the_same(absolute, with_files, tmp_path, monkeypatch):
+    source = with_files(absolute)
+    # Names are relative to the scene, not to where one happens to stand
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    expected = render(scenes.parse(source).instantiate())
+    assert expected.std() > 0.05
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    path = scenes.write(scenes.parse(source), copy)
+    assert path == copy / "scene.xml"
+    source.parent.rename(tmp_path / "gone")
+    assert str(tmp_path) not in path.read_text()
+    copy.rename(tmp_path / "moved")
+    again = render(scenes.parse(tmp_path / "moved" / "scene.xml").instantiate())
+    assert np.allclose(again, expected, atol=1e-5)
+    files = [p for p in (tmp_path / "moved").rglob("*") if p.is_file()]
+    assert len(files) == 4 and {p.suffix for p in files} == {".xml", ".ply", ".exr"}
+
+
+@pytest.mark.parametrize("name", ["meshes/box.ply", "textures/paint.exr", "light/paint.exr"])
+def test_a_missing_file_is_named_with_its_line(name, with_files):
+    source = with_files(False)
+    (source.parent / name).unlink()
+    with pytest.raises(UserError, match=rf"scene.xml \(line \d+.*the file '{name}' does not exist"):
+        scenes.parse(source)
+
+
+def test_a_missing_scene_is_named(tmp_path):
+    with pytest.raises(UserError, match=r"none.xml: no such scene file"):
+        scenes.parse(tmp_path / "none.xml")
+
+
+def test_a_scene_that_fails_does_not_disturb_the_next_one(parse):
+    """A light without its shape stayed behind, and the next virtual call ended the process."""
+    light = '<shape type="rectangle"><emitter type="area"/></shape>'
+    kept = []
+    for _ in range(2):
+        with pytest.raises(UserError, match='Plugin "nothing" not found') as caught:
+            parse(light + '<shape type="nothing"/>').instantiate()
+        kept.append(caught)
+    assert np.isfinite(render(parse(light + BALL.format(DIFFUSE)).instantiate(), 2)).all()
