@@ -69,7 +69,7 @@ def grey_photographs(cameras: list[Camera], value: float = 0.3) -> PixelSource:
     """Training pixels with a little texture, as a fit wants them."""
     count = sum(c.width * c.height for c in cameras)
     rgb = value * np.random.default_rng(7).uniform(0.5, 1.5, (count, 3))
-    return PixelSource.of(cameras, rgb, np.ones(count), foreground_only=False, smoothed=True)
+    return PixelSource.of(cameras, rgb, np.ones(count), foreground_only=False)
 
 
 # ----------------------------------------------------------------------------- training steps

@@ -97,7 +97,7 @@ def test_a_blurred_copy_is_made_only_where_it_is_asked_for(dataset, where, monke
         batch = PixelSource(rays, found).draw(3, 32).batch(rays, sampler, 2)
         return batch, [np.array(x) for x in (batch.target, batch.ray.d)]
 
-    plain = Photographs.load(made, False)
+    plain = Photographs.load(made, False, smoothed=False)
     batch, values = drawn(plain)
     assert plain.table.shape[1] == 3 and batch.smoothed is None and not plain.smoothed
     both = Photographs.load(made, False, smoothed=True)

@@ -182,7 +182,7 @@ def step_gradients(built_in, config, steps, first=0):
     problem = make_problem(built_in("cornell"), "visible", config, 0.2)
     camera = dataclasses.replace(built_in_cameras("cornell", 4)[0], width=1, height=1)
     photograph = np.array([[0.25, 0.2, 0.1]])
-    pixels = PixelSource.of([camera], photograph, np.ones(1), foreground_only=False, smoothed=True)
+    pixels = PixelSource.of([camera], photograph, np.ones(1), foreground_only=False)
     φ = problem.materials.parameters()
     state = State(mi.ad.SGD(1.0, φ), mi.ad.SGD(1.0, problem.radiance.parameters()))
     step = TrainingStep(problem, pixels, config)

@@ -54,7 +54,7 @@ def fitted(dataset, unknown, *, steps=200, **settings):
     settings = {"pixels": 64, "warm_up": 20, "lighting": FAST} | settings
     config = dataclasses.replace(TINY_FIT, unknown=unknown, **settings)
     config = update(config, {"materials": {"albedo": {"neural": {"learning_rate": 0.02}}}})
-    pixels = training_pixels(dataset, clip_negative=False, smoothed=True)
+    pixels = training_pixels(dataset, clip_negative=False)
     mean = pixels.photographs.mean
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)

@@ -66,7 +66,7 @@ class Photographs:
         alpha: np.ndarray,
         *,
         foreground_only: bool,
-        smoothed: bool = False,
+        smoothed: bool = True,
     ) -> Photographs:
         """Photographs that are in memory already.
 
@@ -82,7 +82,7 @@ class Photographs:
         return _fill(table, images, foreground_only)
 
     @staticmethod
-    def load(dataset: Dataset, clip_negative: bool, *, smoothed: bool = False) -> Photographs:
+    def load(dataset: Dataset, clip_negative: bool, *, smoothed: bool = True) -> Photographs:
         """The training views of a data set; every image is read once, also over many fits.
 
         Args:

@@ -136,7 +136,7 @@ class PixelSource:
         alpha: np.ndarray,
         *,
         foreground_only: bool,
-        smoothed: bool = False,
+        smoothed: bool = True,
     ) -> PixelSource:
         """The pixels of views in memory; see `Photographs.of`."""
         found = Photographs.of(

@@ -164,14 +164,13 @@ def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list
     return made[0], [emitter.name for emitter in named]
 
 
-def training_pixels(
-    dataset: Dataset, *, clip_negative: bool, smoothed: bool = False
-) -> PixelSource:
+def training_pixels(dataset: Dataset, *, clip_negative: bool, smoothed: bool = True) -> PixelSource:
     """The pixels of the training views.
 
     Args:
         clip_negative: take negative pixels as zero.
-        smoothed: keep a blurred copy of the photographs, for `loss_reference = "smoothed"`.
+        smoothed: keep a blurred copy of the photographs, which `loss_reference = "smoothed"` needs
+            and which takes as much memory again.
 
     Raises:
         UserError: there is no training view, an image is bad, or all pixels are black.
