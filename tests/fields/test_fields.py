@@ -9,7 +9,8 @@ from support import TINY, seeded
 from unbake.fields.domain import Domain, SurfacePoint
 from unbake.fields.field import FieldSpec
 from unbake.fields.materials import Materials, with_joint_gradients
-from unbake.fields.network import Network, can_record_layout
+from unbake.fields.network import Network
+from unbake.fields.perceptron import can_record_layout
 from unbake.fields.radiance import RadianceField
 from unbake.fields.settings import GridConfig, NetworkConfig
 from unbake.quantities import QUANTITIES
@@ -122,7 +123,7 @@ def test_network_is_a_matrix_product_with_rectified_layers():
     randomised(network)
     more = [points(seed=2).x, points(seed=3).y]
     x = np.array([np.array(f) for f in [*network.grid(list(points())), *more]], np.float64)
-    for i, (weights, bias) in enumerate(network.layers):
+    for i, (weights, bias) in enumerate(network.perceptron.layers):
         x = np.array(weights, np.float64) @ x + np.array(bias, np.float64)
         x = np.maximum(x, 0) if i < WIDE.hidden else x
     values = np.array([np.array(v) for v in network.evaluate(SurfacePoint(points()), more)])
@@ -207,7 +208,7 @@ def test_radiance_is_positive_and_its_gradient_is_alive(raw):
     parameters = {k: dr.zeros(type(v), v.shape) for k, v in field.parameters().items()}
     last = list(parameters)[-1]
     shape = parameters[last].shape
-    assert shape == (field.function.outputs, 1)
+    assert shape == (field.function.perceptron.outputs, 1)
     parameters[last] = mi.TensorXf([raw] * shape[0], shape)
     dr.enable_grad(parameters[last])
     field.assign(parameters)

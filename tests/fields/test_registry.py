@@ -17,8 +17,8 @@ from support import (
 from unbake.config import FitConfig, from_toml, to_toml
 from unbake.errors import UserError, require
 from unbake.fields import registry
+from unbake.fields.arrays import sigmoid
 from unbake.fields.field import Cost, Field, FieldSpec
-from unbake.fields.network import sigmoid
 from unbake.fields.registry import Representation, register_representation
 from unbake.fields.settings import DenseGridConfig
 from unbake.training.problem import make_problem

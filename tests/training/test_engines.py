@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import TINY_FIT, built_in_cameras, grey_photographs
 
-from unbake.fields.network import Network, can_record_layout
+from unbake.fields.perceptron import Perceptron, can_record_layout
 from unbake.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from unbake.training.problem import make_problem
 from unbake.training.run_folder import RunFolder
@@ -52,7 +52,7 @@ def trained(built_in, steps):
 def test_one_step_is_the_same_on_every_engine(built_in, monkeypatch, engine):
     rows = []
     for used in ("fused", engine):
-        monkeypatch.setattr(Network, "_usual_engine", lambda self, used=used: used)
+        monkeypatch.setattr(Perceptron, "_usual_engine", lambda self, used=used: used)
         rows.append(gradients(*start(built_in, "single"), 5))
     (terms, row), (others, other) = rows
     for name, value in terms.items():

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..fields.network import from_numpy
+from ..fields.arrays import from_numpy
 from .camera import Camera
 from .photographs import Photographs
 

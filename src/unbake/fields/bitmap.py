@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from .arrays import first_value, sigmoid
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
-from .network import first_value, sigmoid
 from .settings import BitmapConfig
 
 

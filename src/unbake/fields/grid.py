@@ -8,9 +8,9 @@ import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
 
+from .arrays import first_value, sigmoid
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
-from .network import first_value, sigmoid
 from .settings import DenseGridConfig
 
 

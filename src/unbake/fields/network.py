@@ -1,43 +1,27 @@
-"""A hash grid with a multilayer perceptron on top, evaluated by one of three engines.
-
-The *cooperative vector* engine runs anywhere, also inside a BSDF or a symbolic loop, and is the
-fast one on CUDA; on LLVM its gradients are slow. The other two need evaluated arrays. The *tensor*
-engine multiplies matrices over all points at once, a layer after the other: the fast one for wide
-layers on LLVM. The *fused* engine does narrow ones in one kernel, with gradients of its own.
-"""
+"""A hash grid with a perceptron on top: the representation of the paper (Sec. 5.3)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from itertools import pairwise
 
-import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
 import numpy as np
 
+from .arrays import from_numpy
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
+from .perceptron import Perceptron, can_record_layout
 from .settings import NetworkConfig
-
-#: Neurons of a layer up to which the fused engine is the faster one.
-_NARROW = 48
 
 
 class Network(Field):
     """A vector-valued function of a position in [0,1]³ and of further inputs.
 
-    In half precision matrices are multiplied so. Weights, tables and results stay single.
-
-    The last layer starts small, so that every output starts near zero, or near its initial value.
-
     Paper: Sec. 5.3.
     """
 
     def __init__(self, settings: NetworkConfig, spec: FieldSpec) -> None:
-        self.half = spec.half
-        self.bounded = spec.bounded
         rng = np.random.default_rng(spec.seed)
         g = settings.grid
         self.grid = nn.HashGridEncoding(
@@ -50,20 +34,8 @@ class Network(Field):
             per_level_scale=g.growth,
         )
         self.grid.data = from_numpy(mi.Float, rng.uniform(-1e-4, 1e-4, self.grid.n_params))
-        self.inputs = self.grid.n_output_features + spec.extra
-        self.outputs = spec.outputs
-
-        sizes = [self.inputs, *[settings.width] * settings.hidden, spec.outputs]
-        self.layers: list[tuple[mi.TensorXf, mi.TensorXf]] = []
-        for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            bound = math.sqrt(6 / fan_in) * (0.1 if layer == settings.hidden else 1)
-            weights = from_numpy(mi.Float, rng.uniform(-bound, bound, fan_out * fan_in))
-            weights = mi.TensorXf(weights, (fan_out, fan_in))
-            self.layers.append((weights, dr.zeros(mi.TensorXf, (fan_out, 1))))
-        if first_value(spec):
-            weights, bias = self.layers[-1]
-            self.layers[-1] = (weights, dr.full(mi.TensorXf, first_value(spec), bias.shape))
-        self._packed: list | None = None
+        inputs = self.grid.n_output_features + spec.extra
+        self.perceptron = Perceptron(inputs, settings.width, settings.hidden, spec, rng)
 
     @property
     def recordable(self) -> bool:
@@ -71,19 +43,17 @@ class Network(Field):
         return can_record_layout()
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
-        """Names: `grid`, and `weights` and `bias` of each layer."""
-        named = {"grid": self.grid.data}
-        for i, (weights, bias) in enumerate(self.layers):
-            named |= {f"{i}.weights": weights, f"{i}.bias": bias}
-        return named
+        """Names: `grid`, and those of the perceptron."""
+        return {"grid": self.grid.data, **self.perceptron.parameters()}
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
         """Use these arrays from now on."""
         self.grid.data = parameters["grid"]
-        self.layers = [
-            (parameters[f"{i}.weights"], parameters[f"{i}.bias"]) for i in range(len(self.layers))
-        ]
-        self._packed = None
+        self.perceptron.assign(parameters)
+
+    def prepare(self) -> None:
+        """Lay the layers out for cooperative vectors."""
+        self.perceptron.prepare()
 
     def evaluate(
         self,
@@ -92,176 +62,8 @@ class Network(Field):
         engine: Engine | None = None,
     ) -> list[mi.Float]:
         """Evaluate the network; the caller masks points outside of [0,1]³ or not finite."""
-        features = [*self.grid(list(point.position)), *extra]
-        outputs = self._outputs(features, engine or self._usual_engine())
-        return [sigmoid(x) for x in outputs] if self.bounded else outputs
+        return self.perceptron.evaluate([*self.grid(list(point.position)), *extra], engine)
 
     def cost(self) -> Cost:
         """The products of all layers, and eight corners of each level of the grid."""
-        products = sum(weights.shape[0] * weights.shape[1] for weights, _ in self.layers)
-        return Cost(products, 4 * 8 * self.grid.n_output_features)
-
-    def _outputs(self, features: list[mi.Float], engine: Engine) -> list[mi.Float]:
-        match engine:
-            case "fused":
-                if dr.grad_enabled(self.layers, features):
-                    return dr.custom(_Perceptron, features, self.layers)
-                outputs = self._coopvec(features)  # there is nothing to keep
-                dr.eval(outputs)
-                return outputs
-            case "tensor":
-                return self._tensor(features)
-            case "coopvec":
-                return self._coopvec(features)
-        raise ValueError(f"no engine named {engine!r}")
-
-    def _usual_engine(self) -> Engine:
-        narrow = max(weights.shape[0] for weights, _ in self.layers) <= _NARROW
-        return "fused" if narrow and can_record_layout() and not self.half else "tensor"
-
-    def _tensor(self, features: list[mi.Float]) -> list[mi.Float]:
-        kind = mi.TensorXf16 if self.half else mi.TensorXf
-        x = kind(mi.TensorXf(mi.ArrayXf(features)))
-        for weights, bias in self.layers[:-1]:
-            x = dr.maximum(kind(weights) @ x + kind(bias), 0)
-        weights, bias = self.layers[-1]
-        x = mi.TensorXf(kind(weights) @ x + kind(bias))
-        width = x.shape[1]
-        lane = dr.arange(mi.UInt32, width)
-        return [dr.gather(mi.Float, x.array, lane + i * width) for i in range(self.outputs)]
-
-    def _coopvec(self, features: list[mi.Float]) -> list[mi.Float]:
-        if self._packed is None:
-            self.prepare()
-        number = mi.Float16 if self.half else mi.Float
-        x = nn.CoopVec([number(f) for f in features])
-        for weights, bias in self._packed[:-1]:
-            x = dr.maximum(nn.matvec(weights, x, bias), 0)
-        weights, bias = self._packed[-1]
-        return [mi.Float(y) for y in nn.matvec(weights, x, bias)]
-
-    def prepare(self) -> None:
-        """Lay the layers out for cooperative vectors."""
-        kind = mi.TensorXf16 if self.half else mi.TensorXf
-        flat = [kind(a) for weights, bias in self.layers for a in (weights, _flat(bias))]
-        if can_record_layout():
-            views = [nn.view(a) for a in flat]
-        else:
-            views = nn.pack(*flat, layout="training")
-        self._packed = list(zip(views[::2], views[1::2], strict=True))
-
-
-class _Perceptron(dr.CustomOp):
-    """A narrow perceptron in one kernel each way, rather than several for each layer.
-
-    Only the weights' gradients, sums over all lanes, are products of matrices. What they multiply
-    is kept in memory: inputs of layers as (lanes, inputs), gradients of outputs as (outputs,
-    lanes), so that neither needs to be transposed.
-    """
-
-    def eval(self, features, layers):
-        self.layers = [(nn.view(weights), nn.view(_flat(bias))) for weights, bias in layers]
-        x = nn.CoopVec(features)
-        self.inputs = [_to_rows(list(x))]
-        for weights, bias in self.layers[:-1]:
-            x = dr.maximum(nn.matvec(weights, x, bias), 0)
-            self.inputs.append(_to_rows(list(x)))
-        weights, bias = self.layers[-1]
-        outputs = list(nn.matvec(weights, x, bias))
-        dr.eval(self.inputs, outputs)
-        return outputs
-
-    def backward(self):
-        lanes = self.inputs[0].shape[0]
-        # An output that nobody used has a gradient of a single zero.
-        gradient = [g + dr.zeros(mi.Float, lanes) for g in self.grad_out()]
-        dr.eval(gradient)
-        kept: list[mi.TensorXf] = []
-        for number in reversed(range(len(self.layers))):
-            kept.insert(0, mi.TensorXf(mi.ArrayXf(gradient)))
-            weights, _ = self.layers[number]
-            gradient = list(nn.matvec(weights, nn.CoopVec(gradient), transpose=True))
-            if number > 0:
-                active = [x > 0 for x in _from_rows(self.inputs[number])]
-                gradient = [dr.select(on, g, 0) for on, g in zip(active, gradient, strict=True)]
-                # One kernel a layer: a longer one would run out of registers.
-                dr.eval(kept, gradient)
-        dr.eval(kept, gradient)
-        self.set_grad_in("features", gradient)
-        self.set_grad_in(
-            "layers",
-            [(g @ x, _lane_sums(g)) for g, x in zip(kept, self.inputs, strict=True)],
-        )
-
-    def name(self):
-        return "perceptron"
-
-
-def _flat(bias: mi.TensorXf) -> mi.TensorXf:
-    return mi.TensorXf(bias.array)
-
-
-def _lane_sums(rows: mi.TensorXf) -> mi.TensorXf:
-    outputs, lanes = rows.shape
-    return mi.TensorXf(dr.block_sum(rows.array, lanes), (outputs, 1))
-
-
-def _to_rows(values: list[mi.Float]) -> mi.TensorXf:
-    """Arrays as the columns of a matrix with a row for each lane."""
-    count, lanes = len(values), dr.width(values)
-    size = _packet_size(count)
-    rows = dr.empty(mi.Float, lanes * count)
-    first = dr.arange(mi.UInt32, lanes) * (count // size)
-    for i in range(count // size):
-        packet = mi.ArrayXf(values[i * size : (i + 1) * size]) if size > 1 else values[i]
-        dr.scatter(rows, packet, first + i, mode=dr.ReduceMode.Permute)
-    return mi.TensorXf(rows, (lanes, count))
-
-
-def _from_rows(rows: mi.TensorXf) -> list[mi.Float]:
-    """The arrays that `_to_rows` was given."""
-    lanes, count = rows.shape
-    size = _packet_size(count)
-    first = dr.arange(mi.UInt32, lanes) * (count // size)
-    if size == 1:
-        return [dr.gather(mi.Float, rows.array, first + i) for i in range(count)]
-    packets = [
-        dr.gather(mi.ArrayXf, rows.array, first + i, shape=(size, lanes))
-        for i in range(count // size)
-    ]
-    return [packet[j] for packet in packets for j in range(size)]
-
-
-def _packet_size(count: int) -> int:
-    """Neighbouring floats that are read and written at once: a power of two that divides all."""
-    return min(16, count & -count)
-
-
-def can_record_layout() -> bool:
-    """Whether a frozen function can lay layers out for cooperative vectors.
-
-    LLVM takes them as they are. The layout that CUDA wants is made by a call that is not recorded.
-    """
-    return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-
-
-def sigmoid(x: mi.Float) -> mi.Float:
-    """1 / (1 + exp(−x))."""
-    return dr.rcp(1 + dr.exp(-x))
-
-
-def first_value(spec: FieldSpec) -> float:
-    """What a field holds, before it is bounded by `sigmoid`, for its outputs to start as wanted."""
-    return math.log(spec.initial / (1 - spec.initial)) if spec.bounded else 0.0
-
-
-def from_numpy(array_type: type, values: np.ndarray) -> mi.Float | mi.UInt32:
-    """A flat copy of an array in Dr.Jit's own memory.
-
-    The array type's constructor would map NumPy's memory, whose release no frozen function can
-    record.
-    """
-    mapped = array_type(np.asarray(values).ravel())
-    own = mapped * dr.opaque(array_type, 1)
-    dr.eval(own)
-    return own
+        return Cost(self.perceptron.multiply_adds, 4 * 8 * self.grid.n_output_features)

@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ..errors import UserError
-from ..fields.network import from_numpy
+from ..fields.arrays import from_numpy
 from ..formats import check_format
 from ..io import write_atomically
 from .run_folder import RunFolder

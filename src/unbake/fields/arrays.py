@@ -1,0 +1,33 @@
+"""Dr.Jit arrays of fields: copies of NumPy's, and values that are bounded."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .field import FieldSpec
+
+
+def sigmoid(x: mi.Float) -> mi.Float:
+    """1 / (1 + exp(−x))."""
+    return dr.rcp(1 + dr.exp(-x))
+
+
+def first_value(spec: FieldSpec) -> float:
+    """What a field holds, before it is bounded by `sigmoid`, for its outputs to start as wanted."""
+    return math.log(spec.initial / (1 - spec.initial)) if spec.bounded else 0.0
+
+
+def from_numpy(array_type: type, values: np.ndarray) -> mi.Float | mi.UInt32:
+    """A flat copy of an array in Dr.Jit's own memory.
+
+    The array type's constructor would map NumPy's memory, whose release no frozen function can
+    record.
+    """
+    mapped = array_type(np.asarray(values).ravel())
+    own = mapped * dr.opaque(array_type, 1)
+    dr.eval(own)
+    return own
