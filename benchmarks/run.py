@@ -133,7 +133,7 @@ RIVALS = (
     "no-prior",
 )  # fmt: skip
 ROOM_RIVALS = ("ours", "prb", "ad-pt:neural:split-halves", "direct", "no-prior")
-ROOM = {"data": STAIRCASE, "settings": "staircase.toml"}
+ROOM = "staircase.toml"
 
 #: By the name of the file of results; that of `machine` is named after the machine.
 BENCHMARKS: dict[str, Compare | Steps | Machine] = {
@@ -145,21 +145,21 @@ BENCHMARKS: dict[str, Compare | Steps | Machine] = {
             ("no-prior", "demo", None, 100),
             ("direct", "demo", None, 100),
             ("prb", "demo", None, 100),
-            ("ours", STAIRCASE, "staircase.toml", 40),
+            ("ours", STAIRCASE, ROOM, 40),
         ),
     ),
     "methods-demo": Steps("steps", "demo", STEP_METHODS),
-    "methods-staircase": Steps("steps", methods=STEP_METHODS, **ROOM),
+    "methods-staircase": Steps("steps", STAIRCASE, STEP_METHODS, ROOM),
     # Equal time, and equal samples.
     "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=90),
     "equal-demo": Compare("rivals", "demo", ("ours", "prb"), steps=2400),
     "rivals-staircase": Compare(
-        "rivals", methods=ROOM_RIVALS, seconds=180, options=COARSE_RENDERING, **ROOM
+        "rivals", STAIRCASE, ROOM_RIVALS, seconds=180, options=COARSE_RENDERING, settings=ROOM
     ),
     # What PRB has after 20 minutes; `rivals` shows when ours has it.
     "long-demo": Compare("long", "demo", ("prb",), seconds=1200),
     "long-staircase": Compare(
-        "long", methods=("prb",), seconds=1200, options=COARSE_RENDERING, **ROOM
+        "long", STAIRCASE, ("prb",), seconds=1200, options=COARSE_RENDERING, settings=ROOM
     ),
     "ablation-materials": Compare(
         "ablation", "demo", ABLATION, steps=2400, seeds=(0, 1, 2), options=NO_SCORES

@@ -12,18 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-# The code of this checkout, here and in the commands that jobs run.
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+from rich.console import Console
 
-from rich.console import Console  # noqa: E402
-
-from unbake.dataset.data_folder import DataFolder  # noqa: E402
-from unbake.errors import UserError  # noqa: E402
-from unbake.experiments import Name  # noqa: E402
-from unbake.experiments.commands import (  # noqa: E402
+from unbake.dataset.data_folder import DataFolder
+from unbake.errors import UserError
+from unbake.experiments import Name
+from unbake.experiments.commands import (
     call_settings,
     command,
     end_of_call,
@@ -31,11 +25,12 @@ from unbake.experiments.commands import (  # noqa: E402
     run_jobs,
     unbake,
 )
-from unbake.experiments.jobs import Findings, Job, JobRunner, Unfinished  # noqa: E402
-from unbake.experiments.scales import SMOKE  # noqa: E402
-from unbake.io import write_text  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake.experiments.jobs import Findings, Job, JobRunner, Unfinished
+from unbake.experiments.scales import SMOKE
+from unbake.io import write_text
+from unbake.training.run_folder import RunFolder
 
+ROOT = Path(__file__).parents[1]
 FIGURES = get_args(Name)
 #: Tables and figures that need no published scene.
 WITHOUT_SCENES = ("table2", "fig5")

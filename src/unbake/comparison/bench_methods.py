@@ -1,4 +1,4 @@
-"""The step time of several methods, side by side in one run."""
+"""Step times of several methods, measured in turn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 
 import drjit as dr
 from rich.console import Console
-from rich.table import Table
 
 from ..config import FitConfig
 from ..dataset.views import Dataset
@@ -20,10 +19,11 @@ from ..machine import machine
 from ..training.fresh_fit import begin_fit
 from ..training.schedule import learning_rates
 from .method_variant import MethodVariant
+from .tables import print_step_times
 
-#: Steps of a method before anything is measured.
+#: Steps of a method before the measurement.
 WARM_UP = 6
-#: A machine that gets slower meets all methods, not the last ones alone.
+#: How often each method is measured: a machine whose speed changes then affects all of them.
 TURNS = 2
 
 
@@ -35,17 +35,18 @@ def bench_methods(
     out: Path | None,
     console: Console,
 ) -> dict:
-    """Measure steps of several methods, in two turns, so that all meet the same machine.
+    """Measure the step times of several methods, in turns.
 
     Args:
-        data: a data set's folder.
-        contenders: what to measure; times are compared with the first one's.
-        shared: settings of all.
-        steps: steps of each, to take the median of.
+        data: folder of the data set.
+        variants: the methods. Times are relative to the first one.
+        shared: settings of all methods.
+        steps: number of measured steps of each method.
         out: JSON file to write.
+        console: shows progress and a table.
 
     Returns:
-        All that is printed. The row of a method that failed has its `error` instead of times.
+        The content of the file. The row of a method that failed has its `error` instead of times.
 
     Raises:
         UserError: the data set cannot be used, or every method failed.
@@ -62,10 +63,10 @@ def bench_methods(
                 continue
             try:
                 seconds[i] += _timed(dataset, config, -(-steps // TURNS))
-                told = f"{1e3 * statistics.median(seconds[i]):.1f} ms"
+                text = f"{1e3 * statistics.median(seconds[i]):.1f} ms"
             except UserError as error:
-                errors[i], told = error, f"error: {error}"
-            line = f"turn {turn + 1}, {variant.name}: {told}"
+                errors[i], text = error, f"error: {error}"
+            line = f"turn {turn + 1}, {variant.name}: {text}"
             console.print(line, highlight=False, markup=False, soft_wrap=True)
     if len(errors) == len(configs):
         raise errors[0]
@@ -81,30 +82,14 @@ def bench_methods(
         row["times_the_first"] = None if 0 in errors else median / statistics.median(seconds[0])
         rows.append(row)
     result = {"machine": machine(), "steps": steps, "data": dataset.folder.name, "rows": rows}
-    table = Table("method", "materials", "radiance", "estimator")
-    for title in ("ms a step", "k samples/s", "times the first"):
-        table.add_column(title, justify="right")
-    for row in rows:
-        known = (row["method"], row["representation"] or "known", row["radiance"] or "none")
-        if "error" in row:
-            table.add_row(*known, row["estimator"], "failed")
-            continue
-        ratio = row["times_the_first"]
-        table.add_row(
-            *known,
-            row["estimator"],
-            f"{row['milliseconds_per_step']:.1f}",
-            f"{row['samples_per_second'] / 1e3:.0f}",
-            "—" if ratio is None else f"{ratio:.2f}",
-        )
-    console.print(table)
+    print_step_times(rows, console)
     if out is not None:
         write_json(out, result)
     return result
 
 
 def _timed(dataset: Dataset, config: FitConfig, steps: int) -> list[float]:
-    """Seconds of steps after warm-up, of a fit that is then forgotten."""
+    """Seconds of each step of a new fit, after warm-up."""
     fit, times = begin_fit(dataset, config), []
     for i in range(WARM_UP + steps):
         start = time.perf_counter()

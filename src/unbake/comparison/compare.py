@@ -1,4 +1,4 @@
-"""Methods against each other on the same data with the same settings."""
+"""Several methods on the same data set with the same settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import drjit as dr
 from rich.console import Console
-from rich.table import Table
 
 from ..config import FitConfig
 from ..dataset.views import Dataset
@@ -25,22 +24,24 @@ from ..training.checkpoint import Progress
 from ..training.loop import fit
 from ..training.run_folder import RunFolder
 from .method_variant import MethodVariant
+from .tables import print_comparison
 
 DEFINITIONS = {
     "seconds": "training time: without scores, previews and checkpoints, with the compilation of "
     "the first steps",
     "milliseconds_per_step": "median after the first steps",
-    "start_up_seconds": "what training took beyond its steps at that median, most of it compilation"
-    " (kernels that an earlier run compiled are taken from a cache)",
+    "start_up_seconds": "training time beyond its steps at that median, most of it compilation "
+    "(kernels of earlier runs are cached)",
     "samples_per_second": "camera samples of a step over that median; of two passes, one counts",
-    "memory_mb": "largest resident memory of the process, which fits method after method",
-    "score": "mean PSNR over all held-out views during training, from few samples",
-    "time_to_quality": "target: a run's last score of albedo; seconds: when a run reached it and "
-    "never fell below it again, between scores on a straight line; null: never",
+    "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
+    "score": "mean PSNR over all held-out views during training, with few samples per pixel",
+    "time_to_quality": "target: the last albedo PSNR of a run; seconds: training time after which "
+    "a run stays above it, interpolated linearly between scores; null: never",
 }
 
-#: What an evaluation says of recovered light.
-LIGHT = ("environment", "emission", "albedo_scale")
+#: Metrics of an evaluation that describe recovered lighting.
+LIGHTING = ("environment", "emission", "albedo_scale")
+#: Keys of an evaluation that the comparison needs.
 NUMBERS = {"steps", "samples", "seconds", "heldout", "train"}
 
 
@@ -56,24 +57,25 @@ def compare(
 ) -> dict[str, Any]:
     """Fit, evaluate and report several methods, one after the other.
 
-    Runs go to `out`/NAME. Those that are finished are kept, interrupted ones go on. A method that
+    The runs are in `out`/NAME. Finished runs are kept, interrupted ones continue. A method that
     fails is recorded with its error.
 
     Args:
-        data: a data set's folder.
-        contenders: what to compare.
-        out: the folder to write: a folder a run, `compare.json` and `report.html`.
-        config: settings of all runs; `method` is of no account.
+        data: folder of the data set.
+        variants: the methods.
+        out: folder to write: a folder for each run, `compare.json` and `report.html`.
+        config: settings of all runs; its `method` is ignored.
         evaluation: how results are rendered.
-        clip_negative: take negative pixels as zero.
+        clip_negative: set negative pixels to zero.
+        console: shows progress and tables.
 
     Returns:
-        What it writes to `compare.json`.
+        The content of `compare.json`.
 
     Raises:
         UserError: the data set cannot be used, a run in `out` has other settings or data, or every
             method failed.
-        KeyboardInterrupt: a fit was stopped; the same call goes on.
+        KeyboardInterrupt: a fit was stopped. The same call continues.
 
     Paper: Sec. 6.1, Fig. 3.
     """
@@ -99,7 +101,7 @@ def compare(
             errors.append(error)
             rows[name] = description(settings) | {"error": str(error)}
             console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        # Memory of one method is not to be missed by the next.
+        # Free the memory of this method for the next one.
         gc.collect()
         dr.flush_malloc_cache()
     if len(errors) == len(rows):
@@ -119,12 +121,12 @@ def compare(
     good = [out / name for name, row in rows.items() if "error" not in row]
     failed = {name: row["error"] for name, row in rows.items() if "error" in row}
     write_report(good, out / "report.html", failed)
-    _print(result, console)
+    print_comparison(result, console)
     return result
 
 
 def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:
-    """Refuse a run of other settings or data: it would be compared as if it were this one."""
+    """Refuse a run in the folder that has other settings or data."""
     if not run.exists:
         return
     stored = vars(run.settings())
@@ -156,7 +158,7 @@ def _fitted(
 def _evaluated(
     run: RunFolder, progress: Progress, settings: EvaluationSettings, console: Console
 ) -> dict[str, Any]:
-    """The run's metrics: those it has, if they are of this state and these settings."""
+    """Metrics of the run. Evaluates it unless they are of this state and these settings."""
     if run.metrics_file.is_file():
         metrics = run.metrics()
         render = {"spp": settings.spp, "max_depth": settings.max_depth}
@@ -181,60 +183,5 @@ def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:
         "heldout": metrics["heldout"],
         "train": metrics["train"],
         "score": score_curve(log),
-        **{key: metrics[key] for key in LIGHT if key in metrics},
+        **{key: metrics[key] for key in LIGHTING if key in metrics},
     }
-
-
-# -------------------------------------------------------------------------------------------- table
-
-
-def _print(result: dict[str, Any], console: Console) -> None:
-    table = Table("run", title="Held-out views, PSNR in dB", title_justify="left")
-    for title in ("render", "albedo", "rough.", "steps", "time", "ms/step", "samples/s"):
-        table.add_column(title, justify="right")
-    for name, row in result["methods"].items():
-        if "error" in row:
-            table.add_row(name, *["failed"] + [""] * 6)
-            continue
-        quality = [row["heldout"].get(f"{k}_psnr") for k in ("render", "albedo", "roughness")]
-        table.add_row(
-            name,
-            *[_number(value, 2) for value in quality],
-            str(row["steps"]),
-            f"{row['seconds']:.0f} s",
-            _number(row["milliseconds_per_step"], 1),
-            _number(row["samples_per_second"], 0),
-        )
-    console.print(table)
-    _print_lighting(result["methods"], console)
-    targets = result["time_to_quality"]
-    if len(targets) < 2:
-        return
-    table = Table("albedo PSNR of", "dB", title="Seconds to that quality", title_justify="left")
-    for name in targets[0]["seconds"]:
-        table.add_column(name, justify="right")
-    for target in targets:
-        times = [_number(seconds, 1) for seconds in target["seconds"].values()]
-        table.add_row(target["run"], _number(target["albedo_psnr"], 2), *times)
-    console.print(table)
-
-
-def _print_lighting(rows: dict[str, dict[str, Any]], console: Console) -> None:
-    maps = {name: row["environment"] for name, row in rows.items() if row.get("environment")}
-    if maps:
-        table = Table("run", title="Environment map", title_justify="left")
-        for title in ("low frequencies off", "aligned", "relighting", "aligned"):
-            table.add_column(title, justify="right")
-        for name, found in maps.items():
-            errors = [f"{100 * found[k]:.1f} %" for k in ("sh_error", "sh_error_aligned")]
-            relit = [f"{found[k]:.1f} dB" for k in ("relight_psnr", "relight_psnr_aligned")]
-            table.add_row(name, *errors, *relit)
-        console.print(table)
-    for name, row in rows.items():
-        known = [x for x in row.get("emission", ()) if x["emission_error"] is not None]
-        for emitter in known:
-            console.print(f"{name}: {emitter['name']} {100 * emitter['emission_error']:.2f} % off")
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "—" if value is None else f"{value:.{digits}f}"

@@ -1,4 +1,4 @@
-"""A method as it takes part in a comparison."""
+"""A method with its representation of materials and its estimator, as a comparison runs it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from ..transport.methods import METHODS
 @final
 @dataclass(frozen=True)
 class MethodVariant:
-    """A method, how it represents materials, and its estimator; None: as shared settings say."""
+    """A method, its representation of materials and its estimator.
+
+    Args:
+        method: name of the method.
+        representation: representation of materials; None takes that of the shared settings.
+        estimator: estimator of gradients; None takes that of the shared settings.
+    """
 
     method: str
     representation: str | None = None
@@ -36,12 +42,12 @@ class MethodVariant:
         words = text.split(":")
         if len(words) > len(choices):
             raise UserError(f"{text!r} has too many parts", "--methods", "METHOD:REPRESENTATION")
-        said: dict[str, typing.Any] = dict(zip(choices, words, strict=False))
-        for what, word in said.items():
+        chosen: dict[str, typing.Any] = dict(zip(choices, words, strict=False))
+        for what, word in chosen.items():
             if word not in choices[what]:
                 remedy = f"There are {', '.join(choices[what])}"
                 raise UserError(f"no {what} named {word!r}", "--methods", remedy)
-        return MethodVariant(**said)
+        return MethodVariant(**chosen)
 
     @property
     def name(self) -> str:

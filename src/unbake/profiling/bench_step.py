@@ -1,4 +1,4 @@
-"""Where the time of a training step goes."""
+"""Time, memory and phases of a training step."""
 
 from __future__ import annotations
 
@@ -31,17 +31,18 @@ from ..training.step import TrainingStep
 from .phases import Phases, kernel_history, milliseconds
 from .roofline import roofline
 
-#: Steps before anything is measured.
+#: Steps before the measurement.
 WARM_UP = 20
-#: Steps that are taken apart, to take the median of.
-APART = 7
+#: Steps that are split into phases; the median counts.
+SPLIT = 7
 
 
 @contextmanager
 def small_data(data: Path | None, scene: str) -> Iterator[Path]:
-    """A data set's folder: the one given, or a small capture of a scene, for a while.
+    """The folder of a data set, or of a temporary one that is rendered here.
 
     Args:
+        data: folder of a data set; None renders a scene.
         scene: a built-in scene's name, or a Mitsuba XML file.
     """
     if data is not None:
@@ -57,26 +58,27 @@ def small_data(data: Path | None, scene: str) -> Iterator[Path]:
 def bench_step(
     data: Path, config: FitConfig, steps: int, out: Path | None, console: Console
 ) -> dict:
-    """Measure the training step on a data set, and take it apart.
+    """Measure the training step of a method on a data set, and its phases.
 
     Times are medians after warm-up. A camera sample is one path from the camera with its RHS and
-    all gradients; those that L_θ learns of have their LHS and both residuals as well.
+    all gradients. Samples that train L_θ also have an LHS and residuals.
 
     Args:
-        data: a data set's folder.
+        data: folder of the data set.
         config: settings of the step.
-        steps: to take the median of.
+        steps: number of measured steps.
         out: JSON file to write.
+        console: shows the results.
 
     Returns:
-        All that is printed.
+        The content of the file.
     """
     dataset = Dataset.load(data)
     fit = begin_fit(dataset, config)
     result = {"machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(fit.step, fit.state, config, steps)
-    result["phases"] = _taken_apart(fit.step, fit.state)
+    result["phases"] = _phases(fit.step, fit.state)
     result["memory_mb"] = _memory(fit.pixels, fit.state)
     result["roofline"] = roofline(fit.problem, fit.pixels, fit.state, config)
     _print(result, console)
@@ -86,7 +88,7 @@ def bench_step(
 
 
 def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -> dict:
-    """The step as a fit takes it: wall time, time in kernels, and what is left for the host."""
+    """The step of a fit: wall time, time in kernels and time in Python."""
     rates = learning_rates(config, config.warm_up, 0.0)
     for i in range(WARM_UP):
         step(state, i, rates)
@@ -103,7 +105,7 @@ def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -
         python.append(time.perf_counter() - start)
         dr.sync_thread()
     in_kernels, last = [], []
-    for i in range(WARM_UP + steps, WARM_UP + steps + APART):
+    for i in range(WARM_UP + steps, WARM_UP + steps + SPLIT):
         with kernel_history() as kernels:
             step(state, i, rates)
         in_kernels.append(milliseconds(kernels))
@@ -120,10 +122,10 @@ def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -
     }
 
 
-def _taken_apart(step: TrainingStep, state: State) -> dict:
+def _phases(step: TrainingStep, state: State) -> dict:
     """Milliseconds and launches of each phase of a step: medians over steps traced anew."""
     recorded = []
-    for i in range(APART + 1):
+    for i in range(SPLIT + 1):
         phases = Phases()
         with phases.recorded():
             step.unfrozen(state, i)
@@ -140,7 +142,7 @@ def _taken_apart(step: TrainingStep, state: State) -> dict:
 
 
 def _memory(pixels: PixelSource, state: State) -> dict:
-    """Megabytes of this process, and what of them is known by owner."""
+    """Megabytes of this process, and of its large arrays by owner."""
     owned = {
         name: 3 * 4 * sum(dr.width(a) for a in adam.values()) for name, adam in state.optimizers()
     }

@@ -1,4 +1,4 @@
-"""Which part of a training step its time goes to."""
+"""Phases of a training step: which kernels belong to which."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import mitsuba as mi
 from ..dataset.pixels import PixelBatch
 from ..transport import operator, path_sample, samplers
 
-#: What is done outside of all calls below counts as this.
+#: Kernels outside of the calls below belong to this phase.
 OPTIMISER = "optimiser"
-#: What a step calls, and the part that the work of it belongs to. What is called inside of another
-#: one counts for itself alone.
+#: Functions that a step calls, and their phase. Kernels of a nested call belong to its own phase.
 _CALLS = (
     (PixelBatch, "batch", "batch"),
     (path_sample, "find_vertex", "ray tracing"),
@@ -32,7 +31,7 @@ _CALLS = (
 
 @contextmanager
 def kernel_history() -> Iterator[list[dict]]:
-    """A list that is filled at the end with the kernels launched meanwhile."""
+    """Yield a list; at the end it has the kernels that were launched meanwhile."""
     kernels: list[dict] = []
     dr.sync_thread()
     dr.kernel_history_clear()
@@ -44,15 +43,15 @@ def kernel_history() -> Iterator[list[dict]]:
 
 
 def milliseconds(kernels: Iterable[dict]) -> float:
-    """Time in kernels."""
+    """Execution time of kernels."""
     return sum(k["execution_time"] for k in kernels)
 
 
 class Phases:
-    """Kernels of a step by the part that they belong to.
+    """Kernels of training steps by phase.
 
-    Everything that a part returns is computed before the next one begins. So kernels of several
-    parts, which a step would run as one, are taken apart, and all take a little longer.
+    Everything that a phase returns is evaluated before the next one begins. This splits kernels
+    that belong to several phases, so that the phases together take longer than the step.
     """
 
     def __init__(self) -> None:
@@ -61,11 +60,11 @@ class Phases:
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
-        """Record the steps taken meanwhile; they must not be frozen."""
+        """Record the steps that run meanwhile. They must not be frozen."""
         calls = (*_CALLS, (mi.ad.Adam, "step", OPTIMISER))
         before = [getattr(owner, name) for owner, name, _ in calls]
-        for (owner, name, part), function in zip(calls, before, strict=True):
-            setattr(owner, name, self._told(function, part))
+        for (owner, name, phase), function in zip(calls, before, strict=True):
+            setattr(owner, name, self._recorded_call(function, phase))
         dr.kernel_history_clear()
         try:
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -75,11 +74,11 @@ class Phases:
             for (owner, name, _), function in zip(calls, before, strict=True):
                 setattr(owner, name, function)
 
-    def _told(self, function: Callable, part: str) -> Callable:
+    def _recorded_call(self, function: Callable, phase: str) -> Callable:
         @functools.wraps(function)
-        def told(*args, **kwargs):
+        def call(*args, **kwargs):
             self._collect()
-            self._stack.append(part)
+            self._stack.append(phase)
             try:
                 result = function(*args, **kwargs)
                 dr.eval(result)
@@ -88,10 +87,10 @@ class Phases:
                 self._stack.pop()
             return result
 
-        return told
+        return call
 
     def _collect(self) -> None:
-        """Give the kernels since the last call to the part that is at work."""
+        """Add the kernels since the last call to the current phase."""
         dr.sync_thread()
         self.kernels.setdefault(self._stack[-1], []).extend(dr.kernel_history())
         dr.kernel_history_clear()

@@ -1,4 +1,4 @@
-"""The least time that a training step could take on this machine, from rates measured on it."""
+"""A lower bound of the time of a training step, from measured rates of the machine."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ..transport.objective import requirements
 from ..transport.path_sample import Requirements
 from .phases import kernel_history, milliseconds
 
-#: A parameter, its gradient and both moments of Adam: read, and all but the gradient written.
+#: Adam reads a parameter, its gradient and both moments, and writes all but the gradient.
 _ADAM_FLOATS = 7
-#: A gradient costs one product for the inputs and one for the weights, beside the value's.
+#: A product for the value, and for the gradient one for the inputs and one for the weights.
 _WITH_GRADIENT = 3
-#: How often each rate is measured, after a warm-up, to take the median of.
+#: Measurements of each rate after a warm-up; the median counts.
 _TIMES = 5
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a step cannot do without."""
+    """The least work of a step, or of a part of it."""
 
     rays: float
     multiply_adds: float
@@ -42,13 +42,13 @@ class Work:
         )
 
     def times(self, factor: float) -> Work:
-        """The same so many times."""
+        """This work, so many times."""
         return Work(self.rays * factor, self.multiply_adds * factor, self.bytes * factor)
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What this machine does in a second."""
+    """Work that this machine does per second."""
 
     rays: float
     multiply_adds: float
@@ -56,15 +56,15 @@ class Rates:
 
 
 def roofline(problem: Problem, pixels: PixelSource, state: State, config: FitConfig) -> dict | None:
-    """The floor of a step: its rays, products and bytes, each at the machine's measured rate.
+    """The roofline of a step: its rays, multiply-adds and bytes at the machine's measured rates.
 
-    Rays are measured on the scene itself; multiply-adds as one large product of matrices; bytes as
-    the sum of two large arrays. What else a step does (BSDFs, emitter sampling, losses) counts as
-    free. The parts share the same cores, so that their times add up.
+    Rays are measured in the scene of the problem, multiply-adds with one large product of matrices,
+    bytes with the sum of two large arrays. The rest of a step (BSDFs, emitter sampling, losses)
+    counts as free. All three use the same cores, so that their times add up.
 
     Returns:
-        The amounts, the rates and the milliseconds; None for methods that follow paths to their
-        end, whose number of rays depends on the scene.
+        `work`, `rates` and `milliseconds`; None for methods that follow paths to their end, because
+        their number of rays depends on the scene.
     """
     if config.follows_paths:
         return None
@@ -81,46 +81,46 @@ def roofline(problem: Problem, pixels: PixelSource, state: State, config: FitCon
     }
 
 
-# ------------------------------------------------------------------------------------ What is done
+# -------------------------------------------------------------------------------------------- Work
 
 
 def _work(problem: Problem, state: State, config: FitConfig) -> Work:
-    wanted = requirements(config.chosen_method.terms, config.bounces)
+    needs = requirements(config.chosen_method.terms, config.bounces)
     arrays = [a for _, adam in state.optimizers() for a in adam.values()]
     adam = Work(0, 0, 4 * _ADAM_FLOATS * sum(dr.width(a) for a in arrays))
-    work = adam + _of_the_image(problem, wanted).times(config.samples_per_step)
-    if not wanted.radiance:
+    work = adam + _of_the_image(problem, needs).times(config.samples_per_step)
+    if not needs.radiance:
         return work
     each = config.radiance_samples
-    learning = _of_learning(problem, wanted, all_samples=each == config.spp)
+    learning = _of_learning(problem, needs, all_samples=each == config.spp)
     return work + learning.times(config.pixels * each)
 
 
-def _of_the_image(problem: Problem, wanted: Requirements) -> Work:
-    """Work of one camera sample that meets a surface at each of its vertices."""
-    # From the camera; then at each vertex one to an emitter and one by the BSDF.
-    work = Work(1 + 2 * wanted.bounces, 0, 0)
-    for _ in range(wanted.bounces):
+def _of_the_image(problem: Problem, needs: Requirements) -> Work:
+    """Work of one camera sample, if every vertex is on a surface."""
+    # A camera ray, then at each vertex a shadow ray and a BSDF sample.
+    work = Work(1 + 2 * needs.bounces, 0, 0)
+    for _ in range(needs.bounces):
         work += _materials(problem, gradient=True)
-    if wanted.radiance:
-        work += _albedo(problem) + _radiance(problem, gradient=wanted.image_attached)
+    if needs.radiance:
+        work += _albedo(problem) + _radiance(problem, gradient=needs.image_attached)
     return work
 
 
-def _of_learning(problem: Problem, wanted: Requirements, *, all_samples: bool) -> Work:
-    """What comes in addition where L_θ learns of the sample."""
-    bounces = max(0, wanted.residuals - wanted.bounces)
+def _of_learning(problem: Problem, needs: Requirements, *, all_samples: bool) -> Work:
+    """Further work of a camera sample that trains L_θ."""
+    bounces = max(0, needs.residuals - needs.bounces)
     work = Work(2 * bounces, 0, 0)
-    for number in range(wanted.bounces + 1, wanted.residuals + 1):
-        work += _materials(problem, gradient=number in wanted.differentiable)
-    learned, constant = wanted.attached, wanted.constant
+    for number in range(needs.bounces + 1, needs.residuals + 1):
+        work += _materials(problem, gradient=number in needs.differentiable)
+    learned, constant = needs.attached, needs.constant
     for number in learned | constant:
         work += _radiance(problem, gradient=number in learned)
     if not all_samples:
         return work + _albedo(problem) if bounces else work
-    # Where learning needs what the image asks at its end, it is asked once for both.
-    shared = wanted.bounces + 1 in learned | constant
-    image = _radiance(problem, gradient=wanted.image_attached)
+    # If training needs L_θ where the image does, it is evaluated once for both.
+    shared = needs.bounces + 1 in learned | constant
+    image = _radiance(problem, gradient=needs.image_attached)
     return work + image.times(-1) if shared else work
 
 
@@ -143,14 +143,14 @@ def _radiance(problem: Problem, *, gradient: bool) -> Work:
 
 
 def _evaluation(field: Field, *, gradient: bool) -> Work:
-    """Work of asking a field once, and of its gradient."""
+    """Work of one evaluation of a field, and of its gradient."""
     cost = field.cost()
-    # The gradient of a lookup reads and writes where the lookup read.
+    # The gradient of a lookup reads and writes the entries of the lookup.
     once = Work(0, cost.multiply_adds, cost.bytes)
     return once.times(_WITH_GRADIENT if gradient else 1)
 
 
-# ---------------------------------------------------------------------------------------- How fast
+# ------------------------------------------------------------------------------------------- Rates
 
 
 def _rates(problem: Problem, pixels: PixelSource, config: FitConfig) -> Rates:
@@ -158,14 +158,14 @@ def _rates(problem: Problem, pixels: PixelSource, config: FitConfig) -> Rates:
 
 
 def _ray_rate(scene: mi.Scene, pixels: PixelSource, config: FitConfig) -> float:
-    """Closest hits per second of rays that leave what the cameras see in all directions."""
+    """Closest hits per second, of diffusely scattered rays from the visible surfaces."""
     count = (1 << 18) // config.spp * config.spp
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, 0), count)
     with dr.suspend_grad():
-        drawn = pixels.draw(1, count // config.spp)
-        seen = drawn.batch(pixels.rays, sampler, config.spp).ray
-        si = scene.ray_intersect(seen)
+        pixel_batch = pixels.draw(1, count // config.spp)
+        camera = pixel_batch.batch(pixels.rays, sampler, config.spp).ray
+        si = scene.ray_intersect(camera)
         local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
         local.z = dr.copysign(local.z, si.wi.z)
         away = si.spawn_ray(si.to_world(local))
@@ -175,7 +175,7 @@ def _ray_rate(scene: mi.Scene, pixels: PixelSource, config: FitConfig) -> float:
         def trace() -> None:
             dr.eval(scene.ray_intersect_preliminary(away, False, valid).t)
 
-        # Lanes whose camera ray met nothing trace nothing.
+        # Lanes whose camera ray hits nothing trace nothing.
         return float(dr.count(valid)[0]) / _seconds(trace)
 
 
@@ -189,7 +189,7 @@ def _product_rate() -> float:
 
 
 def _bandwidth() -> float:
-    """Bytes per second read and written where arrays are far larger than caches."""
+    """Bytes per second of memory traffic, with arrays far larger than the caches."""
     count = 1 << 25
     a, b = dr.full(mi.Float, 1, count), dr.full(mi.Float, 2, count)
     dr.make_opaque(a, b)
@@ -197,7 +197,7 @@ def _bandwidth() -> float:
 
 
 def _seconds(work: Callable[[], None]) -> float:
-    """Median time of the kernels that some work launches."""
+    """Median time of the kernels of some work."""
     times = []
     for _ in range(_TIMES + 1):
         with kernel_history() as kernels:

@@ -1,0 +1,93 @@
+"""Tables of comparisons for the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ..quantities import QUANTITIES
+
+Row = dict[str, Any]
+
+
+def print_comparison(result: Row, console: Console) -> None:
+    """Print the content of `compare.json`: quality, speed, lighting and time to quality."""
+    rows = result["methods"]
+    _print_quality(rows, console)
+    _print_lighting(rows, console)
+    _print_time_to_quality(result["time_to_quality"], console)
+
+
+def print_step_times(rows: list[Row], console: Console) -> None:
+    """Print the rows of `unbake bench methods`."""
+    table = Table("method", "materials", "radiance", "estimator")
+    _add_numbers(table, "ms a step", "k samples/s", "times the first")
+    for row in rows:
+        names = (row["method"], row["representation"] or "known", row["radiance"] or "none")
+        if "error" in row:
+            table.add_row(*names, row["estimator"], "failed")
+            continue
+        time, rate = row["milliseconds_per_step"], row["samples_per_second"] / 1e3
+        ratio = _number(row["times_the_first"], 2)
+        table.add_row(*names, row["estimator"], f"{time:.1f}", f"{rate:.0f}", ratio)
+    console.print(table)
+
+
+def _print_quality(rows: dict[str, Row], console: Console) -> None:
+    evaluated = [row["heldout"] for row in rows.values() if "heldout" in row]
+    materials = [q for q in QUANTITIES if any(f"{q}_psnr" in means for means in evaluated)]
+    quantities = ("render", *materials)
+    table = Table("run", title="Held-out views, PSNR in dB", title_justify="left")
+    _add_numbers(table, *quantities, "steps", "time", "ms/step", "samples/s")
+    for name, row in rows.items():
+        if "error" in row:
+            table.add_row(name, "failed")
+            continue
+        table.add_row(
+            name,
+            *(_number(row["heldout"].get(f"{quantity}_psnr"), 2) for quantity in quantities),
+            str(row["steps"]),
+            f"{row['seconds']:.0f} s",
+            _number(row["milliseconds_per_step"], 1),
+            _number(row["samples_per_second"], 0),
+        )
+    console.print(table)
+
+
+def _print_lighting(rows: dict[str, Row], console: Console) -> None:
+    maps = {name: row["environment"] for name, row in rows.items() if row.get("environment")}
+    if maps:
+        table = Table("run", title="Environment map", title_justify="left")
+        _add_numbers(table, "SH error", "aligned", "relighting", "aligned")
+        for name, metrics in maps.items():
+            errors = [f"{100 * metrics[k]:.1f} %" for k in ("sh_error", "sh_error_aligned")]
+            relit = [f"{metrics[k]:.1f} dB" for k in ("relight_psnr", "relight_psnr_aligned")]
+            table.add_row(name, *errors, *relit)
+        console.print(table)
+    for name, row in rows.items():
+        known = [x for x in row.get("emission", ()) if x["emission_error"] is not None]
+        for emitter in known:
+            error = 100 * emitter["emission_error"]
+            console.print(f"{name}: {emitter['name']} {error:.2f} % off")
+
+
+def _print_time_to_quality(targets: list[Row], console: Console) -> None:
+    if len(targets) < 2:
+        return
+    table = Table("albedo PSNR of", "dB", title="Seconds to that quality", title_justify="left")
+    _add_numbers(table, *targets[0]["seconds"])
+    for target in targets:
+        times = [_number(seconds, 1) for seconds in target["seconds"].values()]
+        table.add_row(target["run"], _number(target["albedo_psnr"], 2), *times)
+    console.print(table)
+
+
+def _add_numbers(table: Table, *titles: str) -> None:
+    for title in titles:
+        table.add_column(title, justify="right")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "—" if value is None else f"{value:.{digits}f}"
