@@ -128,6 +128,14 @@ def test_a_file_name_outside_its_module_is_found(line, hits):
     assert len(list(spelled(ast.parse(line), *names))) == hits
 
 
+def test_every_file_tells_the_same_version(repository):
+    import unbake
+
+    cited = re.search(r"^version: (.+)$", (repository / "CITATION.cff").read_text("utf-8"), re.M)
+    newest = re.search(r"^## \[(.+?)\]", (repository / "CHANGELOG.md").read_text("utf-8"), re.M)
+    assert cited[1] == newest[1] == unbake.__version__
+
+
 def test_the_fast_tests_are_there(repository):
     text = (repository / "Makefile").read_text("utf-8").replace("\\\n", " ")
     paths = re.search(r"^FAST := (.*)$", text, flags=re.MULTILINE)[1].split()

@@ -177,6 +177,8 @@ def _cached(
                 f"They take {4 * columns * count / 1e9:.1f} GB. Make room, or the folder writable",
             ) from None
         found = _open_cache(data, key)
+    if found is None:
+        raise UserError("the decoded photographs cannot be read back", data.cache, "Remove it")
     return found
 
 

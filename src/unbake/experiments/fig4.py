@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import mitsuba as mi
 import numpy as np
@@ -99,7 +99,7 @@ class _Wood:
         )
 
 
-def _picture(parsed: ParsedScene, node: object) -> str:
+def _picture(parsed: ParsedScene, node: Any) -> str:
     """The image file of a material's albedo, or an empty string."""
     texture = referenced(parsed, node.props["base_color"])
     return "" if texture is None else str(texture.props.get("filename", ""))
@@ -180,7 +180,7 @@ def _at(context: ExperimentContext, value: float, shrunk: int, spp: int) -> Find
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     with open(path, "wb") as file:  # np.savez appends .npz to names
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from ..imaging.pictures import write_png
 from .experiment import Experiment, ExperimentContext, ExperimentResult
@@ -29,7 +30,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     scene_fits = _scene_fits(context)
     fits = findings[scene_fits.scene.folder]
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"step": title} | scene_fits.row(context, method, fits[method])
         for title, method in METHODS.items()
     ]

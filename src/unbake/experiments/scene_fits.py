@@ -145,13 +145,15 @@ class SceneFits:
             photograph, rendering = read_exr(view.image), read_exr(file)[..., :3]
             require_same_size(rendering, photograph, file)
             scale = exposure(photograph)
-            images = [block_means(p[..., :3], size) * scale for p in (rendering, photograph)]
-            images = [np.clip(image, 0, 1) for image in images]
+            ours, theirs = (
+                np.clip(block_means(p[..., :3], size) * scale, 0, 1)
+                for p in (rendering, photograph)
+            )
             whole = block_means(_foreground(photograph).astype(float), size) >= 1
             rows.append(
                 {"views": view.name}
                 | {key: metrics[key] for key in MATERIALS}
-                | {"render_psnr": psnr(*images, whole) if whole.any() else None}
+                | {"render_psnr": psnr(ours, theirs, whole) if whole.any() else None}
             )
         mean = {key: mean_psnr(r[key] for r in rows) for key in QUALITIES}
         return [*rows, {"views": "mean of held-out"} | mean]

@@ -131,8 +131,9 @@ class PaperScene:
             if self.albedo_power != 1.0:
                 _raise_albedo(parsed, self.albedo_power, changed)
             if not self.room:
-                map_ = self.environment
-                map_ = map_ and _unpacked(context, "envmaps_blender") / map_
+                map_ = None
+                if self.environment:
+                    map_ = _unpacked(context, "envmaps_blender") / self.environment
                 _set_environment(parsed, map_, changed)
             write(parsed, changed)
         return changed / "scene.xml"

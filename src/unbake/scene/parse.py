@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -90,7 +91,7 @@ def write(scene: ParsedScene, folder: Path) -> Path:
     return folder / "scene.xml"
 
 
-def referenced(scene: ParsedScene, value: object) -> object | None:
+def referenced(scene: ParsedScene, value: Any) -> Any | None:
     """The node that a property refers to; None if it is no reference."""
     return scene.state.nodes[value.index()] if is_reference(value) else None
 
@@ -139,7 +140,7 @@ def _require_finite(scene: ParsedScene) -> None:
                 )
 
 
-def _is_finite(value: object) -> bool:
+def _is_finite(value: Any) -> bool:
     if hasattr(value, "wavelengths"):  # a spectrum: its class has no name of its own
         value = value.values
     elif dr.is_array_v(value):

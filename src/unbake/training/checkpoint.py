@@ -100,7 +100,7 @@ def _checksum(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> int:
     crc = zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
     for key in sorted(arrays):
         crc = zlib.crc32(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode(), crc)
-        crc = zlib.crc32(np.ascontiguousarray(arrays[key]), crc)
+        crc = zlib.crc32(np.ascontiguousarray(arrays[key]).data, crc)
     return crc
 
 

@@ -23,7 +23,7 @@ class Monitor:
 
     def __init__(self, log: Path, console: Console, total: float) -> None:
         self._path = log
-        self._file: IO[str] | None = None
+        self._file: IO[str]  # opened by `__enter__`
         self._console = console
         self._total = total
         self._last_line = -QUIET_SECONDS

@@ -42,7 +42,7 @@ class State:
     def publish(self, problem: Problem) -> None:
         """Let the problem's fields look at the present parameters."""
         problem.assign(dict(self.phi.items()))
-        if problem.radiance is not None:
+        if problem.radiance is not None and self.theta is not None:
             problem.radiance.assign(dict(self.theta.items()))
 
 

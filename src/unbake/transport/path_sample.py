@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -118,6 +118,8 @@ def trace(
     for paths in (sample, learned):
         paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
     if requirements.radiance:
+        if radiance is None:
+            raise ValueError("the terms read a radiance field, and there is none")
         attached, constant = set(requirements.attached), set(requirements.constant)
         last = {requirements.bounces + 1}  # where the image ends
         if learned is sample:  # the image shares the look-ups
@@ -157,10 +159,10 @@ def _end(scene_view: SceneView, sample: PathSample) -> None:
 
 def _gather(piece: Piece, subset: SampleSubset) -> Piece:
     """Some lanes of a vertex or a bounce, and of all that it consists of."""
-    if not dataclasses.is_dataclass(piece):
+    if isinstance(piece, type) or not dataclasses.is_dataclass(piece):
         return dr.gather(type(piece), piece, subset.lanes)
     parts = {f.name: _gather(getattr(piece, f.name), subset) for f in dataclasses.fields(piece)}
-    return dataclasses.replace(piece, **parts)
+    return dataclasses.replace(cast(Any, piece), **parts)
 
 
 def _look_up(radiance: RadianceField, sample: PathSample, numbers: set[int]) -> None:

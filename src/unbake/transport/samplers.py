@@ -23,7 +23,7 @@ from .prb import materials_along_paths, path_radiance, path_replay
 from .vertex import SceneView
 
 #: What the scene's textures and emitters look into, by name.
-Arrays = Mapping[str, mi.Float | mi.TensorXf]
+Arrays = dict[str, mi.Float | mi.TensorXf]
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,11 @@ class PathSampler(Protocol):
 
     def prepared(self) -> AbstractContextManager:
         """A context that all else happens in, backpropagation too."""
+        ...
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Linear RGB radiance of camera samples."""
+        ...
 
     def terms(
         self,
@@ -87,6 +89,7 @@ class PathSampler(Protocol):
             target: the photographs' pixels, linear RGB, one lane a pixel.
             subset: the samples that L_θ learns of; None: all.
         """
+        ...
 
 
 class BounceSampler:

@@ -130,6 +130,7 @@ def find_vertex(
         weight = _emission_weight(scene_view, si, origin, active)
         valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
         direct_view = mi.Bool(valid)
+        passed, moved = mi.Color3f(0), mi.Bool(False)
         if scene_view.has_chains:
             chain = _follow_chain(scene_view, pi, ray, valid, sampler)
             pi, ray, β, passed, opacity, specular, moved = chain
