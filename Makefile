@@ -6,7 +6,7 @@ SHELL := /bin/bash
 BIN := .venv/bin
 STAMP := .venv/.setup-complete
 PYTEST := $(BIN)/python -m pytest
-FORMATTED := src tests benchmarks scripts
+FORMATTED := src tests benchmarks scripts examples
 # Dr.Jit compiles on one thread: two processes of tests take little more than half the time of one.
 WORKERS ?= 2
 PARALLEL := -n $(WORKERS) --dist worksteal

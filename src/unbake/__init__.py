@@ -24,12 +24,15 @@ if TYPE_CHECKING:
     from .acquisition.capture import capture as capture
     from .acquisition.settings import CaptureSettings as CaptureSettings
     from .backend import activate as activate
+    from .comparison.compare import compare as compare
+    from .comparison.method_variant import MethodVariant as MethodVariant
     from .config import FitConfig as FitConfig
     from .config import preset as preset
     from .config import read_toml as read_toml
     from .config import to_toml as to_toml
     from .dataset.camera import Camera as Camera
     from .dataset.data_folder import DataFolder as DataFolder
+    from .dataset.photographs import Photographs as Photographs
     from .dataset.pixels import CameraRays as CameraRays
     from .dataset.pixels import PixelBatch as PixelBatch
     from .dataset.pixels import PixelSource as PixelSource
@@ -100,9 +103,12 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "evaluation.settings": ("EvaluationSettings",),
     "evaluation.evaluate": ("evaluate",),
     "report.page": ("write_report",),
+    "comparison.compare": ("compare",),
+    "comparison.method_variant": ("MethodVariant",),
     # Data sets.
     "dataset.camera": ("Camera",),
     "dataset.data_folder": ("DataFolder",),
+    "dataset.photographs": ("Photographs",),
     "dataset.pixels": ("CameraRays", "PixelBatch", "PixelSource", "RayBatch"),
     "dataset.views": ("Dataset", "View"),
     # Unknowns: fields on surfaces.

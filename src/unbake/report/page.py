@@ -19,6 +19,7 @@ from unbake.io import write_text
 from unbake.report import charts, display
 from unbake.report.lighting import lighting_section
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
+from unbake.transport.terms import TERMS
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 SPLITS = ("heldout", "train")
@@ -43,12 +44,6 @@ LIGHT_DEFINED = {
         "aligned": "Aligned",
     },
     "emission": {"emission_error": "Error"},
-}
-LOSSES = {
-    "photometric": "Photometric loss",
-    "prior": "Prior loss",
-    "prior_extra": "Prior loss, extra bounce",
-    "lhs": "LHS loss",
 }
 SCORES = {"albedo_psnr": "Held-out albedo PSNR", "roughness_psnr": "Held-out roughness PSNR"}
 OPTIMIZED = {
@@ -337,8 +332,9 @@ def _setting(value: object) -> str:
 
 
 def _loss_charts(runs: list[Run]) -> list[dict[str, Any]]:
+    titles = {name: term.title or name for name, term in TERMS.items()}
     return _charts(
-        runs, [run.log for run in runs], LOSSES, "relative L2, no unit", logarithmic=True
+        runs, [run.log for run in runs], titles, "relative L2, no unit", logarithmic=True
     )
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
+from ..transport.terms import TERMS
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
@@ -58,8 +59,7 @@ class Monitor:
             entry: the line of the log; its loss terms are shown.
         """
         self._write(entry)
-        terms = ("photometric", "prior", "prior_extra", "lhs")
-        losses = "  ".join(f"{t} {entry[t]:.4f}" for t in terms if t in entry)
+        losses = "  ".join(f"{t} {entry[t]:.4f}" for t in TERMS if t in entry)
         speed = f"{entry['samples_per_second'] / 1e3:.0f} k samples/s"
         line = f"step {entry['step']}  {losses}  {speed}  {entry['memory_mb']:.0f} MB"
         self._bar.update(self._task, completed=done, description=line)

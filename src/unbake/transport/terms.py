@@ -63,6 +63,7 @@ class Term:
         rhs: vertices at which it reads L_θ for a right-hand side.
         of_image: whether it reads the image: all camera samples, of k bounces and L_θ at the vertex
             after those. All other terms read the samples that L_θ learns of.
+        title: of its curve in reports; empty: its name.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Term:
     lhs: tuple[int, ...] = ()
     rhs: tuple[int, ...] = ()
     of_image: bool = False
+    title: str = ""
 
     def __post_init__(self) -> None:
         if self.of_image and (self.scene or self.lhs or self.rhs):
@@ -152,7 +154,10 @@ def lhs_loss(x: TermInputs) -> mi.Float:
     return squared_error(pixels, x.target, x.spp, x.loss.weight(x.target))
 
 
-register_term(Term(PHOTOMETRIC, photometric, of_image=True))
-register_term(Term(PRIOR, prior, scene=(1,), lhs=(1,), rhs=(2,)))
-register_term(Term(EXTRA, prior_extra, scene=(2,), lhs=(2,), rhs=(3,)))
-register_term(Term(LHS, lhs_loss, lhs=(1,)))
+for _term in (
+    Term(PHOTOMETRIC, photometric, of_image=True, title="Photometric loss"),
+    Term(PRIOR, prior, scene=(1,), lhs=(1,), rhs=(2,), title="Prior loss"),
+    Term(EXTRA, prior_extra, scene=(2,), lhs=(2,), rhs=(3,), title="Prior loss, extra bounce"),
+    Term(LHS, lhs_loss, lhs=(1,), title="LHS loss"),
+):
+    register_term(_term)

@@ -1,0 +1,47 @@
+"""The examples run, at a size that takes seconds, and show what they say."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.fixture
+def example(repository):
+    """Run an example in a process of its own, and return what it prints."""
+
+    def run(name, *words):
+        done = subprocess.run(
+            [sys.executable, "-W", "error", str(repository / "examples" / name), *map(str, words)],
+            env=os.environ | {"PYTHONPATH": str(repository / "src")},
+            capture_output=True,
+            text=True,
+            timeout=250,
+        )
+        assert done.returncode == 0, done.stderr[-4000:]
+        return done.stdout
+
+    return run
+
+
+def test_a_method_of_ones_own_is_compared_with_ours(example, tmp_path):
+    out = example("custom_method.py", "--out", tmp_path, "--steps", 6, "--resolution", 12)
+    result = json.loads((tmp_path / "comparison" / "compare.json").read_text("utf-8"))
+    assert list(result["methods"]) == ["ours", "luminance-prior"]
+    for name, row in result["methods"].items():
+        assert "error" not in row and row["steps"] == 6
+        assert f"{name}: albedo {row['heldout']['albedo_psnr']:.1f} dB" in out
+        log = (tmp_path / "comparison" / name / "log.jsonl").read_text("utf-8").splitlines()
+        assert ("luminance_prior" in json.loads(log[0])) == (name == "luminance-prior")
+    report = (tmp_path / "comparison" / "report.html").read_text("utf-8")
+    assert "luminance-prior" in report and "Prior relative to luminance" in report
+    assert re.search(r"step \d+ .*luminance_prior 0\.\d{4}", out)  # the progress tells it, too
+
+
+def test_a_training_loop_of_ones_own_lowers_the_loss(example, cornell):
+    out = example("custom_training_loop.py", cornell, "--steps", 40)
+    found = re.search(r"mean loss (\S+) at first, (\S+) last", out)
+    assert found and float(found[2]) < 0.8 * float(found[1])
