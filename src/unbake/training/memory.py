@@ -75,9 +75,9 @@ def _peak_resident() -> int:
     return 1024 * int(next(x for x in lines if x.startswith("VmHWM:")).split()[1])
 
 
-#: Paths of the smaller one of two batches that tell how much memory a batch takes.
+#: Paths of the smaller of the two batches that a forecast measures.
 _PROBED_PATHS = 4096
-#: What helps where paths do not fit the memory.
+#: The remedy where paths do not fit the memory.
 SMALLER = "Lower --batch or --spp or path.max_depth, or use --method prb"
 
 
@@ -89,10 +89,10 @@ def lacks_memory(error: BaseException | None) -> bool:
 
 
 def forecast_bytes(probe: Callable[[int], None], pixels: int, spp: int) -> float | None:
-    """What a batch will need, judged by two smaller ones; None where memory cannot be measured.
+    """Memory that a batch will take, from two smaller ones; None where it cannot be measured.
 
     Args:
-        probe: computes a batch of so many pixels, and drops what comes of it.
+        probe: computes a batch of this number of pixels, and drops the results.
         pixels: of the batch.
         spp: samples a pixel.
     """
@@ -105,15 +105,15 @@ def forecast_bytes(probe: Callable[[int], None], pixels: int, spp: int) -> float
 
 
 def require_memory(need: float | None, method: str, paths: int) -> None:
-    """Raise an error if a step would need more memory than there is, rather than be killed.
+    """Raise an error if a step would need more memory than there is free.
 
     Args:
-        need: bytes; None: not known, and taken for little.
-        method: what to call the step by.
+        need: bytes; None where that is not known.
+        method: its name, for the message.
         paths: of the step.
 
     Raises:
-        UserError: it would.
+        UserError: the step would need more.
     """
     free = free_bytes()
     if need is not None and free is not None and need > free:

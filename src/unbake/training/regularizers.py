@@ -1,4 +1,4 @@
-"""Terms of the objective that photographs have no part in."""
+"""Terms of the objective that do not depend on photographs: regularizers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from .problem import Problem
 def regularization_terms(
     problem: Problem, config: FitConfig, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler
 ) -> dict[str, mi.Float]:
-    """Weighted terms, at the points of unknown material that camera rays meet.
+    """Weighted terms, at the points of optimized material that camera rays hit.
 
-    None where none is asked for. They are the same for all methods, and cost one more ray a sample.
+    No term where none has a weight. They are the same for all methods, and cost one more ray a
+    sample.
     """
     materials, r = problem.materials, config.regularization
     anchored = is_anchored(problem, config)
@@ -46,9 +47,9 @@ def regularization_terms(
 
 
 def is_anchored(problem: Problem, config: FitConfig) -> bool:
-    """Whether the scale between albedo and light is a convention, as photographs do not tell it.
+    """Whether the scale between albedo and light is set by convention.
 
-    They do where they see the environment itself, and where there is light that is known.
+    Photographs determine it where they show the environment itself, and where some light is known.
     """
     both = problem.environment is not None and "albedo" in (problem.materials or ())
     alone = len(problem.scene_view.scene.emitters()) == 1

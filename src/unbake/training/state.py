@@ -1,4 +1,4 @@
-"""All that a training step changes: the optimisers, which own φ and θ."""
+"""The state of a fit: the optimisers, which own φ and θ."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class State:
             self.theta.set_learning_rate({k: dr.opaque(mi.Float, rate) for k in self.theta})
 
     def publish(self, problem: Problem) -> None:
-        """Let the problem's fields look at the present parameters."""
+        """Assign the present parameters to the problem's fields."""
         problem.assign(dict(self.phi.items()))
         if problem.radiance is not None and self.theta is not None:
             problem.radiance.assign(dict(self.theta.items()))

@@ -1,8 +1,8 @@
 """One training step, recorded once and replayed.
 
-Tracing a step in Python takes longer than computing it. So it is a frozen function (`dr.freeze`)
-wherever it can be one: all that changes from step to step comes in as an argument, and after the
-first steps nothing is traced or compiled again.
+Tracing a step in Python takes longer than computing it. So the step is a frozen function
+(`dr.freeze`) where the path sampler allows it: everything that changes from step to step is an
+argument, and after the first steps nothing is traced or compiled again.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from .state import State
 
 @dataclass
 class Inputs:
-    """What a step works on; a PyTree, since a frozen function must be handed all that changes."""
+    """The arguments of a frozen step; a PyTree."""
 
     scene: mi.Scene
     rays: CameraRays
     pixels: PixelBatch
     sampler: mi.Sampler  # of all camera samples
-    second: mi.Sampler  # of those that L_θ learns of, if these are fewer
+    second: mi.Sampler  # of those that L_θ learns from, if these are fewer
     seed: mi.UInt32
 
 
@@ -51,7 +51,7 @@ class TrainingStep:
         smoothed = config.loss_reference == "smoothed"
         if smoothed and not pixels.photographs.smoothed:
             raise ValueError("the loss is relative to smoothed photographs, which were not made")
-        # What is left of earlier problems would be found, half gone, by the recording of this one.
+        # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
         self._problem = problem
         self._pixels = pixels
@@ -86,13 +86,13 @@ class TrainingStep:
             raise UserError(f"no memory for a step of {lanes} paths", None, SMALLER) from None
 
     def require_memory(self, state: State) -> None:
-        """Raise an error if a step would need more memory than there is, rather than be killed.
+        """Raise an error if a step would need more memory than there is free.
 
-        Only methods that keep whole paths in memory ask, and only once: smaller batches, whose
-        gradients are dropped, tell.
+        This is checked once, for methods that keep whole paths in memory. Two smaller batches are
+        measured, and their gradients dropped.
 
         Raises:
-            UserError: it would.
+            UserError: the step would need more.
         """
         if self._fits_memory:
             return
@@ -100,7 +100,7 @@ class TrainingStep:
         self._fits_memory = True
 
     def bytes_needed(self, state: State) -> float | None:
-        """What a step will need; None where memory cannot be measured."""
+        """Memory that a step will take; None where it cannot be measured."""
 
         def probe(pixels: int) -> None:
             terms = self._gradients(self._inputs(0, pixels), state)
@@ -119,7 +119,7 @@ class TrainingStep:
         return self._step(self._inputs(number, self._config.pixels), state)
 
     def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:
-        """All that is done in Python for a step that is replayed."""
+        """The part of a replayed step that runs in Python."""
         state.set_learning_rates(rates)
         return self._inputs(number, self._config.pixels)
 
@@ -150,7 +150,7 @@ class TrainingStep:
         return terms
 
     def _gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
-        """The loss terms on the pixels drawn; their gradients are left in the state."""
+        """The loss terms on random pixels; their gradients are accumulated in the state."""
         config, path_sampler = self._config, self._path_sampler
         scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
         state.publish(self._problem)
@@ -176,7 +176,7 @@ class TrainingStep:
 
 
 def _context(problem: Problem, config: FitConfig) -> SamplerContext:
-    """What the sampler of the method works on."""
+    """The inputs of the method's path sampler."""
     return SamplerContext(
         method=config.chosen_method,
         scene_view=problem.scene_view,
@@ -191,7 +191,7 @@ def _context(problem: Problem, config: FitConfig) -> SamplerContext:
 
 
 def _subset(config: FitConfig, inputs: Inputs) -> SampleSubset | None:
-    """The first camera samples of each pixel, if L_θ learns of them alone."""
+    """The first camera samples of each pixel, if L_θ learns from these alone."""
     each = config.radiance_samples
     if each == config.spp:
         return None
@@ -199,18 +199,17 @@ def _subset(config: FitConfig, inputs: Inputs) -> SampleSubset | None:
     inputs.second.seed(inputs.seed + 1, lanes)
     lane = dr.arange(mi.UInt32, lanes)
     chosen = lane // each * config.spp + lane % each
-    # As an array in memory: a replayed kernel takes its size from arrays that it reads, and would
-    # find none of this size.
+    # Evaluated, because a replayed kernel takes its size from arrays in memory that it reads.
     dr.eval(chosen)
     return SampleSubset(chosen, inputs.second)
 
 
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Put the garbage collector off.
+    """Disable the garbage collector.
 
-    Were it to free a scene or a step of an earlier fit while this one is recorded, Dr.Jit would
-    abort the process.
+    Dr.Jit 1.5 aborts the process if a scene or a step of an earlier fit is freed while a step is
+    recorded.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -224,7 +223,7 @@ def _no_garbage_collection() -> Iterator[None]:
 def _drop_broken_gradients(optimizer: mi.ad.Adam) -> None:
     """Replace gradients that are not finite by zero, which masks those entries' update.
 
-    A single NaN would stay in Adam's moments for good.
+    A single NaN would stay in Adam's moments for the rest of the fit.
     """
     for value in optimizer.values():
         gradient = dr.grad(value)

@@ -1,4 +1,4 @@
-"""Squared errors of pixels, whose gradients are unbiased, and what they are relative to."""
+"""The relative L2 loss on pixels, with unbiased gradients (Sec. 5.2, 5.4)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class RelativeL2:
     The paper divides by the photograph. A photograph that is too dark by chance then weighs more
     than one that is too bright, and the optimum is darker than the scene: with noisy photographs a
     few percent, which is as much as roughness does. A smoothed photograph has next to no such
-    noise. (The radiance field's own picture would have none, but its samples are the error's.)
+    noise.
 
     Args:
         epsilon: added to the squared reference.

@@ -31,11 +31,11 @@ BOUNCES, PATH_REPLAY = "bounces", "path-replay"
 
 @dataclass(frozen=True)
 class Method:
-    """What is minimised, what trains what, and how light is followed.
+    """The terms of an objective, what each trains, and how light is followed.
 
     Args:
         name: of settings, the command line and folders: letters, digits, `-`, `_` and `.`.
-        title: one line for people.
+        title: one line for help texts and reports.
         terms: what each term trains, by the term's name; a term that is absent is not part of the
             method.
         sampler: name of the path sampler (`samplers.py`).

@@ -14,10 +14,10 @@ from .terms import TermInputs, term_named
 
 
 def requirements(terms: Mapping[str, Attached], bounces: int = 1) -> Requirements:
-    """What a method's path samples must hold, with k bounces of the image.
+    """The pieces of path samples that a method's terms read, with k bounces of the image.
 
     Raises:
-        UserError: there is no such term, or it has not all the edges that are attached.
+        UserError: a term does not exist, or lacks an edge that is attached.
     """
     residuals, attached, constant = 0, set(), set()
     differentiable: set[int] = set()
@@ -51,14 +51,13 @@ def objective(
     primal: mi.Color3f | None = None,
     bounces: int = 1,
 ) -> dict[str, mi.Float]:
-    """Every term of the objective; their sum is what is minimised.
+    """The terms of the objective by name; a fit minimises their sum.
 
     Args:
         terms: of a `Method`.
-        sample: path samples, as many consecutive lanes for each pixel; those that L_θ learns of,
-            too.
-        target: the photographs' pixels, linear RGB.
-        loss: what errors are relative to.
+        sample: path samples, the same number of consecutive lanes for each pixel.
+        target: pixels of the photographs, linear RGB, one lane a pixel.
+        loss: the relative L2 loss.
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
             None: the split-halves estimator.
         bounces: k, after which the image takes L_θ.

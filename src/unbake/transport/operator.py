@@ -26,8 +26,8 @@ class Bounce:
 def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
     """Evaluate the material fields at a vertex, once, and put them on its surface interaction.
 
-    Gradients arrive in φ wherever the BSDF is evaluated afterwards. Without fields the scene's own
-    textures stay in charge and only the albedo is looked up.
+    BSDF evaluations at the vertex then pass gradients to φ. Without fields the scene's own textures
+    are used, and only the albedo is looked up.
     """
     if scene_view.materials is None:
         return attach_albedo(scene_view, vertex)
@@ -41,7 +41,7 @@ def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
 
 
 def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
-    """Look up the albedo alone, where light goes no further and only L_θ wants to know it."""
+    """Look up the albedo alone, for a vertex where L_θ is evaluated and no BSDF is."""
     if scene_view.materials is None or "albedo" not in scene_view.materials:
         albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
     else:
@@ -87,7 +87,7 @@ def bounce(scene_view: SceneView, vertex: Vertex, sampler: mi.Sampler) -> Bounce
     smooth = value * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
     weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
 
-    # Evaluated here, all together: reductions further on would each compute them again.
+    # Evaluated together here: each reduction further on would compute them again.
     evaluate(sampler, direct, weight, ray, goes_on, bs.pdf, delta)
     origin = Scattering(dr.detach(si), bs.pdf * solid, delta)
     return Bounce(direct, weight, find_vertex(scene_view, ray, goes_on, sampler, origin=origin))

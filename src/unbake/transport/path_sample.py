@@ -1,11 +1,10 @@
-"""What a pixel's samples see: the right-hand and the left-hand side of the rendering equation.
+"""Path samples, from which both sides of the rendering equation are estimated.
 
     L(x, ω) = E(x, ω) + T(L)(x, ω)
      LHS         RHS
 
-`trace` walks two surface vertices behind the camera and gathers all that every loss term needs,
-each piece evaluated once. Which of the pieces pass gradients is decided elsewhere, in
-`objective.py`.
+`trace` samples the vertices, bounces and look-ups of L_θ that the loss terms read, each once.
+`Requirements` lists them, and says which pass gradients.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class PathSample:
     """
 
     x1: Vertex
-    bounces: list[Bounce]  # from x₁, x₂, …; the next vertex of each is where the next one starts
+    bounces: list[Bounce]  # from x₁, x₂, …; each starts at the next vertex of the one before
     radiance: list[mi.Color3f]  # L_θ at x₁, x₂, …; zero where no term reads it
     learned: PathSample | None = None  # the samples that L_θ learns of; None: all of these
 
@@ -42,7 +41,7 @@ class PathSample:
         return self.x1 if number == 1 else self.bounces[number - 2].next
 
     def place(self, number: int, vertex: Vertex) -> None:
-        """Replace x₁, x₂, … by the same with more known about it."""
+        """Replace vertex x₁, x₂, …."""
         if number == 1:
             self.x1 = vertex
         else:
@@ -53,16 +52,16 @@ class PathSample:
 class Requirements:
     """Which pieces of a path sample a method uses, and which of them pass gradients.
 
-    Vertices are given by number: 1 is x₁. What is not listed is not computed. See
-    `objective.requirements`, which makes one from a method's terms.
+    Vertices are given by number: 1 is x₁. Only what is listed is computed. `requirements` in
+    `objective.py` makes the list from a method's terms.
     """
 
-    bounces: int  #: k, of the image: differentiable
-    residuals: int = 0  #: bounces of the samples that L_θ learns of
-    attached: frozenset[int] = frozenset()  #: where these ask L_θ, with gradients to θ
-    constant: frozenset[int] = frozenset()  #: where these ask L_θ without gradients
-    image_attached: bool = False  #: whether L_θ at the image's end passes gradients to θ
-    differentiable: frozenset[int] = frozenset()  #: where bounces pass gradients to φ, beyond k
+    bounces: int  #: k, of the image; they pass gradients to φ
+    residuals: int = 0  #: bounces of the samples that L_θ learns from
+    attached: frozenset[int] = frozenset()  #: vertices of these where L_θ passes gradients to θ
+    constant: frozenset[int] = frozenset()  #: vertices of these where L_θ is a constant
+    image_attached: bool = False  #: whether L_θ at the end of the image's paths passes gradients
+    differentiable: frozenset[int] = frozenset()  #: further vertices with gradients to φ
 
     @property
     def radiance(self) -> bool:
@@ -72,11 +71,11 @@ class Requirements:
 
 @dataclass
 class SampleSubset:
-    """Some of the camera samples: L_θ learns of them, and the others only make the image.
+    """The camera samples that L_θ learns from; the others are only part of the image.
 
     Args:
-        lanes: their numbers.
-        sampler: for as many lanes.
+        lanes: their lanes.
+        sampler: seeded for as many lanes.
     """
 
     lanes: mi.UInt32
@@ -95,10 +94,19 @@ def trace(
 ) -> PathSample:
     """Trace one path sample for each camera ray.
 
-    Materials are evaluated once a vertex, and L_θ once where the image and residuals both need it.
+    Materials are evaluated once a vertex, and L_θ once where the image and a residual share it.
 
     Args:
-        subset: the samples that L_θ learns of; None: all.
+        scene_view: the scene, with fields in the place of unknown materials.
+        radiance: L_θ; None where `requirements` does not read it.
+        ray: camera rays, world space, one a lane.
+        sampler: seeded for as many lanes; it is advanced.
+        requirements: what to compute.
+        hide_emitters: whether cameras see neither environment nor area emitters.
+        subset: the samples that L_θ learns from; None: all.
+
+    Raises:
+        ValueError: a radiance field is needed and there is none.
 
     Paper: Sec. 4.2, 6.3, Fig. 2.
     """
@@ -141,7 +149,7 @@ def _prolong(
     sampler: mi.Sampler,
     requirements: Requirements,
 ) -> None:
-    """Add bounces to a path until it has so many."""
+    """Extend a path to this number of bounces."""
     for number in range(len(sample.bounces) + 1, bounces + 1):
         passes = number <= requirements.bounces or number in requirements.differentiable
         with dr.suspend_grad(when=not passes):
@@ -151,14 +159,14 @@ def _prolong(
 
 
 def _end(scene_view: SceneView, sample: PathSample) -> None:
-    """Let L_θ know the albedo where a path ends: no more light is scattered there."""
+    """Look up the albedo at the last vertex, an input of L_θ."""
     last = len(sample.bounces) + 1
     with dr.suspend_grad():
         sample.place(last, attach_albedo(scene_view, sample.vertex(last)))
 
 
 def _gather(piece: Piece, subset: SampleSubset) -> Piece:
-    """Some lanes of a vertex or a bounce, and of all that it consists of."""
+    """The lanes of a subset, of an array or of all arrays of a dataclass."""
     if isinstance(piece, type) or not dataclasses.is_dataclass(piece):
         return dr.gather(type(piece), piece, subset.lanes)
     parts = {f.name: _gather(getattr(piece, f.name), subset) for f in dataclasses.fields(piece)}
@@ -172,7 +180,7 @@ def _look_up(radiance: RadianceField, sample: PathSample, numbers: set[int]) -> 
 
 
 def reflected_radiance(radiance: RadianceField, *vertices: Vertex) -> list[mi.Color3f]:
-    """L_θ at several vertices, towards where each was seen from, in one evaluation of it."""
+    """L_θ at vertices, back along the ray that found each, in one evaluation of the field."""
     v = vertices
     if not v:
         return []
@@ -188,16 +196,16 @@ def reflected_radiance(radiance: RadianceField, *vertices: Vertex) -> list[mi.Co
     parts, offset = [], 0
     for x in v:
         lanes = dr.arange(mi.UInt32, offset, offset + dr.width(x.valid))
-        # Dr.Jit 1.5 loses gradients now and then where several kernels add to a small array on
-        # LLVM (those of L_θ at x₁ and at x₂ were a third too small in one step of ten), unless it
-        # is told that no two lanes meet.
+        # Dr.Jit 1.5 on LLVM loses gradients now and then where several kernels add to a small array
+        # (those of L_θ at x₁ and at x₂ were a third too small in one step of ten). `NoConflicts`,
+        # which holds because all lanes differ, avoids the buffers in which they are lost.
         parts.append(dr.gather(mi.Color3f, together, lanes, mode=dr.ReduceMode.NoConflicts))
         offset += dr.width(x.valid)
     return parts
 
 
 def _join(vectors: list) -> object:
-    """Lanes of several vectors, one after the other."""
+    """Vectors, one after the other in one array."""
     columns = [dr.concat([v[i] for v in vectors]) for i in range(3)]
     return type(vectors[0])(columns)
 

@@ -1,4 +1,4 @@
-"""What is believed of materials where photographs say little. Not in the paper; off by default."""
+"""Regularizers of materials. They are not in the paper, and off by default."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole pictures of a world: its radiance and its materials."""
+"""Images of a scene view: radiance and materials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a method follows light: path samplers, which give the pixels of a step and its loss terms.
+"""Path samplers: how a method follows light, to the pixels of a step and its loss terms.
 
 A sampler of your own is a factory given to `register_sampler`, and named by a `Method`.
 """
@@ -22,18 +22,18 @@ from .path_sample import PathSample, SampleSubset, rhs, trace
 from .prb import materials_along_paths, path_radiance, path_replay
 from .vertex import SceneView
 
-#: What the scene's textures and emitters look into, by name.
+#: The arrays that the scene's textures and emitters read, by name.
 Arrays = dict[str, mi.Float | mi.TensorXf]
 
 
 @dataclass(frozen=True)
 class SamplerContext:
-    """What a sampler works on.
+    """The inputs of a path sampler.
 
     Args:
-        method: whose terms it computes.
+        method: the method, whose terms the sampler computes.
         scene_view: the scene, with fields in the place of unknown materials.
-        radiance: L_θ; None where no term asks for it.
+        radiance: L_θ; None where no term reads it.
         hide_emitters: whether cameras see neither environment nor area emitters.
         spp: camera samples a pixel.
         bounces: k, after which the image takes L_θ.
@@ -54,10 +54,10 @@ class SamplerContext:
 
 
 class PathSampler(Protocol):
-    """What a training step asks of a sampler.
+    """The interface between a training step and a way to follow light.
 
-    `scene` is always the handle to use: a frozen function brings its own. `ray` has `spp`
-    consecutive lanes a pixel, and `sampler` is seeded for as many.
+    `scene` is the handle to use: a frozen function brings its own. `ray` has `spp` consecutive
+    lanes a pixel, and `sampler` is seeded for as many.
     """
 
     #: Whether all paths are kept in memory, so that a step may need more than there is.
@@ -66,7 +66,7 @@ class PathSampler(Protocol):
     can_be_recorded: bool
 
     def prepared(self) -> AbstractContextManager:
-        """A context that all else happens in, backpropagation too."""
+        """A context around the other calls and backpropagation."""
         ...
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
@@ -87,7 +87,7 @@ class PathSampler(Protocol):
 
         Args:
             target: the photographs' pixels, linear RGB, one lane a pixel.
-            subset: the samples that L_θ learns of; None: all.
+            subset: the samples that L_θ learns from; None: all.
         """
         ...
 
@@ -110,7 +110,7 @@ class BounceSampler:
         self._requirements = requirements(context.method.terms, self._bounces)
 
     def prepared(self) -> AbstractContextManager:
-        """Nothing is needed."""
+        """A context without effect."""
         return nullcontext()
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
@@ -168,7 +168,7 @@ class PathReplaySampler:
         self.can_be_recorded = all(field.recordable for field in (materials or {}).values())
 
     def prepared(self) -> AbstractContextManager:
-        """Paths find the fields' materials."""
+        """A context in which paths evaluate the material fields."""
         return materials_along_paths(self._context.scene_view.materials)
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:

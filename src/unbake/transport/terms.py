@@ -21,14 +21,14 @@ from .prior import residual, residual_norm
 
 @dataclass(frozen=True)
 class TermInputs:
-    """What the value of a term is made of; what the method does not attach is a constant.
+    """The inputs of a term's value; those that the method does not attach are constants.
 
     Args:
-        sample: path samples, as many consecutive lanes for each pixel.
+        sample: path samples, `spp` consecutive lanes a pixel.
         lhs: L_θ at x₁, x₂, … on left-hand sides, linear RGB; zero where no term reads it.
         rhs: the same on right-hand sides.
-        target: the photographs' pixels, linear RGB, one lane a pixel.
-        loss: what errors are relative to.
+        target: pixels of the photographs, linear RGB, one lane a pixel.
+        loss: the relative L2 loss.
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
             None: the split-halves estimator. For terms of the image alone.
         bounces: k, after which the image takes L_θ.
@@ -52,8 +52,8 @@ class TermInputs:
 class Term:
     """A term of the objective.
 
-    Vertices are given by number: 1 is x₁. Only what a term says here is computed for it, and only
-    that can be attached.
+    Vertices are given by number: 1 is x₁. Only the pieces that a term lists are computed for it and
+    can be attached.
 
     Args:
         name: of methods' tables and of the log.
@@ -62,7 +62,7 @@ class Term:
         lhs: vertices at which it reads L_θ for a left-hand side.
         rhs: vertices at which it reads L_θ for a right-hand side.
         of_image: whether it reads the image: all camera samples, of k bounces and L_θ at the vertex
-            after those. All other terms read the samples that L_θ learns of.
+            after those. All other terms read the samples that L_θ learns from.
         title: of its curve in reports; empty: its name.
     """
 
@@ -81,10 +81,10 @@ class Term:
             raise ValueError(f"{self.name}: vertices are numbered from 1")
 
     def check(self, attached: Attached) -> None:
-        """Refuse edges that the term does not have: they would train nothing.
+        """Check that the term has the edges that are attached; others would train nothing.
 
         Raises:
-            UserError: there is one.
+            UserError: it lacks one.
         """
         for flag in ("scene", "lhs", "rhs"):
             has = flag != "lhs" if self.of_image else getattr(self, flag)

@@ -17,7 +17,7 @@ from .optimized import optimized_shapes
 
 @dataclass(frozen=True)
 class SceneView:
-    """What light travels through.
+    """A scene, with fields in the place of its unknown materials.
 
     Args:
         scene: geometry, emitters and BSDFs.
@@ -57,15 +57,15 @@ class SceneView:
 
 @dataclass
 class Vertex:
-    """A point on a surface that is not specular, and what was met on the way to it.
+    """A point on a surface that is not specular, with the specular chain that leads to it.
 
     All colours are linear RGB radiance, W·sr⁻¹·m⁻².
     """
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
-    valid: mi.Bool  # there is such a point
-    emitted: mi.Color3f  # emission met on the way, weighted
+    valid: mi.Bool  # whether there is such a point
+    emitted: mi.Color3f  # emission on the way, weighted
     throughput: mi.Color3f  # of the specular chain
     opacity: mi.Float  # probability with which a cut-out stopped the ray here
     direct_view: mi.Bool  # no mirror or glass on the way
@@ -151,12 +151,12 @@ def find_vertex(
 def _behind_area_emitters(
     scene: mi.Scene, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
-    """Where rays go that pass surfaces which emit light, and the rays from behind those."""
+    """The first hits behind area emitters, and the rays that start there."""
     pi = mi.PreliminaryIntersection3f(pi)
     on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_emitter)
     ray = dr.select(on_emitter, si.spawn_ray(ray.d), ray)
-    # The helper of Mitsuba's integrators; which one it is makes no difference.
+    # Every integrator of Mitsuba has this helper.
     integrator = mi.load_dict({"type": "path"})
     pi[on_emitter] = integrator.skip_area_emitters(scene, ray, True, on_emitter)
     return pi, ray
