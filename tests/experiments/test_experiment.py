@@ -20,7 +20,7 @@ from unbake.experiments.experiment import (
     reproduce,
 )
 from unbake.experiments.fig4 import agreement, published_tables, smoothed
-from unbake.experiments.jobs import Job
+from unbake.experiments.jobs import Job, Unfinished
 from unbake.experiments.scene_fits import SceneFits, at_equal_samples
 from unbake.experiments.scenes import SCENES, STAIRCASE
 from unbake.experiments.tables import markdown
@@ -103,6 +103,16 @@ def test_what_was_done_before_it_was_stopped_is_kept(tmp_path):
     assert not (tmp_path / "squares").exists()
     reproduce(squares(done), context(tmp_path))
     assert done == [2, 3]
+
+
+def test_without_all_findings_there_is_no_result(tmp_path):
+    def stop():
+        raise Unfinished
+
+    jobs = [Job("first", {}, stop, 1.0), *squares([]).jobs(None)]
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(Experiment("squares", "", lambda _: jobs, squares([]).result), context(tmp_path))
+    assert not (tmp_path / "squares").exists()
 
 
 def test_a_job_that_fails_does_not_keep_others_from_being_done(tmp_path):

@@ -97,7 +97,7 @@ def _copy(process: subprocess.Popen, log: Path | None) -> None:
     """Copy what a process prints to the standard output and to a file."""
     if log is None or process.stdout is None:
         return
-    with open(log, "wb") as file:
+    with process.stdout, open(log, "wb") as file:
         for line in process.stdout:
             file.write(line)
             file.flush()

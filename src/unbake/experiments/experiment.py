@@ -120,6 +120,8 @@ def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool 
     outcome = runner.run(jobs)
     for name, error in outcome.failed.items():
         raise UserError(f"{experiment.name}, {name}: {error.what}", error.where, error.remedy)
+    if outcome.left:
+        raise KeyboardInterrupt  # a job was stopped
     result = experiment.result(context, outcome.findings)
     _write(experiment, context, result, outcome.records)
     context.tell(result.tables)

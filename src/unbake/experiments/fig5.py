@@ -151,7 +151,7 @@ def _steps(
     dr.flush_malloc_cache()
     fit = begin_fit(dataset, config)
     _paint(fit, albedo)
-    constant: dict[str, float] = dict.fromkeys(("albedo", "roughness", "radiance"), 0.0)
+    constant = dict.fromkeys((*config.quantities, "radiance"), 0.0)
 
     def step(number: int) -> None:
         if frozen:

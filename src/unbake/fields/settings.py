@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
 from ..errors import require
 
@@ -16,6 +16,8 @@ _FINEST = "base_resolution * growth^(levels - 1) is 2^24 or less"
 
 class FieldSettings(Protocol):
     """Settings of any representation: a frozen dataclass, with a learning rate at least."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def learning_rate(self) -> float:

@@ -139,6 +139,8 @@ def _albedo(problem: Problem) -> Work:
 
 
 def _radiance(problem: Problem, *, gradient: bool) -> Work:
+    if problem.radiance is None:
+        return Work(0, 0, 0)
     return _evaluation(problem.radiance.function, gradient=gradient)
 
 

@@ -1,0 +1,45 @@
+"""Tables of comparisons for the terminal."""
+
+import io
+
+from rich.console import Console
+
+from unbake.comparison import tables
+from unbake.comparison.tables import print_comparison, print_step_times
+
+LENGTH = {"steps": 5, "seconds": 2.0, "milliseconds_per_step": None, "samples_per_second": 1e3}
+
+
+def printed(show, content):
+    console = Console(file=io.StringIO(), width=200)
+    show(content, console)
+    return console.file.getvalue()
+
+
+def test_a_comparison_has_a_column_for_each_quantity(monkeypatch):
+    monkeypatch.setattr(tables, "QUANTITIES", (*tables.QUANTITIES, "gloss"))
+    means = {"render_psnr": 20.0, "albedo_psnr": 30.125, "roughness_psnr": None}
+    methods = {"ours": LENGTH | {"heldout": means}, "prb": {"error": "no memory"}}
+    text = printed(print_comparison, {"methods": methods, "time_to_quality": []})
+    assert "albedo" in text and "roughness" in text and "gloss" not in text
+    assert "30.12" in text and "—" in text and "failed" in text
+    methods["ours"]["heldout"] = means | {"gloss_psnr": 17.0}
+    text = printed(print_comparison, {"methods": methods, "time_to_quality": []})
+    assert "gloss" in text and "17.00" in text
+
+
+def test_what_is_known_of_lighting_is_printed():
+    light = {"sh_error": 0.125, "sh_error_aligned": 0.5}
+    light |= {"relight_psnr": 31.0, "relight_psnr_aligned": 32.0}
+    emission = [{"name": "lamp", "emission_error": 0.25}, {"name": "dark", "emission_error": None}]
+    row = LENGTH | {"heldout": {}, "environment": light, "emission": emission}
+    text = printed(print_comparison, {"methods": {"ours": row}, "time_to_quality": []})
+    assert "12.5 %" in text and "32.0 dB" in text
+    assert "ours: lamp 25.00 % off" in text and "dark" not in text
+
+
+def test_a_method_that_failed_has_no_step_time():
+    names = {"method": "ours", "representation": None, "radiance": None, "estimator": "auto"}
+    times = {"milliseconds_per_step": 12.5, "samples_per_second": 2e3, "times_the_first": None}
+    text = printed(print_step_times, [names | times, names | {"method": "prb", "error": "no"}])
+    assert "12.5" in text and "—" in text and "known" in text and "failed" in text
