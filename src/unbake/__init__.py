@@ -42,9 +42,21 @@ if TYPE_CHECKING:
     from .evaluation.evaluate import evaluate as evaluate
     from .evaluation.settings import EvaluationSettings as EvaluationSettings
     from .fields.domain import SurfacePoint as SurfacePoint
+    from .fields.field import Cost as Cost
+    from .fields.field import Field as Field
+    from .fields.field import FieldSpec as FieldSpec
     from .fields.materials import Material as Material
     from .fields.materials import Materials as Materials
     from .fields.radiance import RadianceField as RadianceField
+    from .fields.registry import Representation as Representation
+    from .fields.registry import register_representation as register_representation
+    from .fields.settings import BitmapConfig as BitmapConfig
+    from .fields.settings import DenseGridConfig as DenseGridConfig
+    from .fields.settings import GridConfig as GridConfig
+    from .fields.settings import NetworkConfig as NetworkConfig
+    from .quantities import DEFAULT_QUANTITIES as DEFAULT_QUANTITIES
+    from .quantities import QUANTITIES as QUANTITIES
+    from .quantities import Quantity as Quantity
     from .report.page import write_report as write_report
     from .training.checkpoint import Progress as Progress
     from .training.checkpoint import load_checkpoint as load_checkpoint
@@ -113,8 +125,12 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "dataset.views": ("Dataset", "View"),
     # Unknowns: fields on surfaces.
     "fields.domain": ("SurfacePoint",),
+    "fields.field": ("Cost", "Field", "FieldSpec"),
     "fields.materials": ("Material", "Materials"),
     "fields.radiance": ("RadianceField",),
+    "fields.registry": ("Representation", "register_representation"),
+    "fields.settings": ("BitmapConfig", "DenseGridConfig", "GridConfig", "NetworkConfig"),
+    "quantities": ("DEFAULT_QUANTITIES", "QUANTITIES", "Quantity"),
     # Light transport and the objective.
     "transport.loss": ("RelativeL2", "pixel_means", "squared_error"),
     "transport.methods": ("METHODS", "Attached", "Method", "register_method"),
@@ -144,6 +160,10 @@ _PURE = frozenset(
         "backend",
         "config",
         "errors",
+        "fields.field",
+        "fields.registry",
+        "fields.settings",
+        "quantities",
         "transport.methods",
     }
 )

@@ -24,7 +24,8 @@ class Quantity:
         title: on pages and in tables.
         channels: 3 (linear RGB) or 1.
         slot: the parameter of `principled`.
-        lower, upper: its values lie between.
+        lower: least value.
+        upper: greatest value.
         initial: value of an untrained field, strictly between the bounds.
         default: what `principled` takes where a scene does not say.
         display: how pictures show it: a colour through the sRGB curve, or data without one.
