@@ -7,7 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, grey_photographs
+from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
 
 from unbake import config
 from unbake.comparison.method_variant import MethodVariant
@@ -190,6 +190,23 @@ def test_a_term_of_ones_own_trains_in_a_method_of_ones_own(built_in):
     assert MethodVariant.of("mine:grid").settings(config.FitConfig()).method == "mine"
     assert "mine" in config.to_toml(settings)
     assert config.from_toml(config.to_toml(settings)) == settings
+
+
+@pytest.mark.parametrize("radiance_spp", [0, 2])
+def test_a_method_that_attaches_every_edge_is_recorded_and_replayed(built_in, radiance_spp):
+    row = {
+        PHOTOMETRIC: Attached(scene=True, rhs=True),
+        PRIOR: Attached(scene=True, lhs=True, rhs=True),
+        EXTRA: Attached(scene=True, lhs=True, rhs=True),
+        LHS: LIGHT,
+    }
+    register_method(Method("all", "every edge", row, takes_options=True))
+    settings = replace(TINY_FIT, method="all", bounces=2, radiance_spp=radiance_spp)
+    step, state = start(built_in, settings)
+    before = {k: np.array(v).copy() for _, adam in state.optimizers() for k, v in adam.items()}
+    assert_only_replayed(step, state, lambda i: RATES)
+    after = {k: np.array(v) for _, adam in state.optimizers() for k, v in adam.items()}
+    assert all((after[k] != before[k]).any() for k in before)
 
 
 def test_a_sampler_of_ones_own_makes_the_step(built_in):
