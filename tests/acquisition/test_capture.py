@@ -74,7 +74,9 @@ def test_an_object_stands_before_a_hidden_background(objects, told):
 
 
 def test_only_what_is_sought_has_truth(objects):
-    albedo, roughness = (read_exr(p) for p in (objects.train[0].albedo, objects.train[0].roughness))
+    albedo, roughness = (
+        read_exr(p) for p in (objects.train[0].truth["albedo"], objects.train[0].truth["roughness"])
+    )
     assert np.allclose(albedo[12, 6], [0.6, 0.3, 0.1, 1], atol=1e-3)
     assert np.allclose(roughness[12, 6], [0.3, 0.3, 0.3, 1], atol=1e-3)
     assert (albedo[12, 17] == 0).all() and (roughness[12, 17] == 0).all()
@@ -103,7 +105,9 @@ def test_bitmap_textures_are_the_truth_pixel_by_pixel(tmp_path):
     # The wall fills the image, so that each texel covers 3 x 3 pixels; the middle one is pure.
     # v runs upwards, rows run downwards.
     paint, rough = paint[::-1], rough[::-1]
-    albedo, roughness = (read_exr(p) for p in (data.train[0].albedo, data.train[0].roughness))
+    albedo, roughness = (
+        read_exr(p) for p in (data.train[0].truth["albedo"], data.train[0].truth["roughness"])
+    )
     assert (albedo[..., 3] == 1).all() and (roughness[..., 3] == 1).all()
     assert np.allclose(albedo[1::3, 1::3, :3], paint, atol=1e-3)
     assert np.allclose(roughness[1::3, 1::3, 0], rough, atol=1e-3)
@@ -123,7 +127,7 @@ def test_a_capture_is_the_same_twice_and_another_with_another_seed(tmp_path):
 def test_what_is_captured_can_be_loaded_from_anywhere(cornell, tmp_path):
     data = Dataset.load(cornell)
     assert [v.name for v in data.views] == ["train_000", "train_001", "heldout_000"]
-    assert all(v.albedo and v.roughness for v in data.views)
+    assert all(v.truth["albedo"] and v.truth["roughness"] for v in data.views)
     text = (cornell / "transforms.json").read_text() + data.scene.read_text()
     assert str(cornell.parent) not in text
 

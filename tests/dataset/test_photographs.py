@@ -30,7 +30,7 @@ def dataset(tmp_path):
             image = tmp_path / f"{i}.exr"
             mi.Bitmap(rgba).write(str(image))
             split = "heldout" if i == 3 else "train"
-            views.append(View(f"{i}", split, camera, image, None, None))
+            views.append(View(f"{i}", split, camera, image, {}))
         return Dataset(tmp_path, tmp_path / "s.xml", background, views, {}, None)
 
     return make

@@ -38,7 +38,7 @@ def folder(tmp_path):
         image = data / "images" / f"{name}.exr"
         write_exr(image, picture(index))
         camera = Camera.look_at((index, 1, 2), (0, 0, 0), (0, 1, 0), 50.0, WIDTH, HEIGHT)
-        views.append(View(name, split, camera, image, None, None))
+        views.append(View(name, split, camera, image, {}))
     for kind in ("albedo", "roughness"):
         write_exr(data / "truth" / kind / "train_000.exr", picture(0))
     scene, render = data / "scene" / "scene.xml", {"spp": 16, "integrator": "path"}
@@ -81,8 +81,8 @@ def test_a_saved_data_set_is_loaded_again(folder):
     assert [v.name for v in data.train] == ["train_000", "train_001"]
     assert [v.name for v in data.heldout] == ["heldout_000"]
     first, second = data.train
-    assert first.albedo == folder / "truth" / "albedo" / "train_000.exr"
-    assert first.roughness.is_file() and second.albedo is None and second.roughness is None
+    assert first.truth["albedo"] == folder / "truth" / "albedo" / "train_000.exr"
+    assert first.truth["roughness"].is_file() and second.truth == {}
     expected = Camera.look_at((1, 1, 2), (0, 0, 0), (0, 1, 0), 50.0, WIDTH, HEIGHT)
     assert np.array_equal(second.camera.to_world, expected.to_world)
     assert second.camera.fl_x == expected.fl_x

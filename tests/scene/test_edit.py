@@ -142,5 +142,5 @@ def test_nothing_to_fit_is_an_error(parse):
 def test_roughness_is_shown_in_place_of_albedo(parse):
     content = '<bsdf type="principled"><float name="roughness" value="0.3"/></bsdf>'
     parsed = parse(BALL.format(content) + BALL.format('<bsdf type="principled"/>'))
-    edit.show_roughness_as_albedo(parsed)
+    edit.show_as_albedo(parsed, "roughness", 0.5)
     assert [n.props["base_color"] for n in parsed.principled_nodes()] == [pytest.approx(0.3), 0.5]

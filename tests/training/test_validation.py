@@ -66,25 +66,28 @@ def test_every_view_gets_its_own_pixels(scored, monkeypatch):
 
     def numbered(scene_view, through, pixels, spp, *, seed):
         number = np.arange(pixels, dtype=np.float32)
-        return np.stack([number] * 3, -1), number + 0.25, number + 0.5
+        values = {"albedo": np.stack([number] * 3, -1), "roughness": number[:, None] + 0.25}
+        return values, number + 0.5
 
     monkeypatch.setattr("unbake.training.validation.render_materials", numbered)
     seen = MaterialBuffers.of(recovered.problem, views, 4, seed=0)
     assert [s.coverage.shape for s in seen] == [(2, 3), (2, 4), (2, 5)]
     for part, first in zip(seen, (0, 6, 14), strict=True):
         expected = first + np.arange(part.coverage.size).reshape(part.coverage.shape)
-        assert np.array_equal(part.albedo[..., 2], expected)
-        assert np.array_equal(part.roughness, expected + 0.25)
+        assert np.array_equal(part.values["albedo"][..., 2], expected)
+        assert np.array_equal(part.values["roughness"][..., 0], expected + 0.25)
         assert np.array_equal(part.coverage, expected + 0.5)
 
 
 def test_pixels_that_see_other_things_do_not_count():
     known = np.array([[True, True, True, False]])
-    truth = GroundTruth(np.full((1, 4, 3), 0.5), np.full((1, 4), 0.5), known)
-    albedo, roughness = np.full((1, 4, 3), 0.5), np.full((1, 4), 0.5)
+    half = {"albedo": np.full((1, 4, 3), 0.5), "roughness": np.full((1, 4, 1), 0.5)}
+    truth = GroundTruth(half, known)
+    albedo, roughness = np.full((1, 4, 3), 0.5), np.full((1, 4, 1), 0.5)
     albedo[0, 0], roughness[0, 0] = 0.6, 0.4
     albedo[0, 2:], roughness[0, 2:] = 1e6, np.nan
-    seen = MaterialBuffers(albedo, roughness, np.array([[1, 1, 0.75, 1]]))
+    found = {"albedo": albedo, "roughness": roughness}
+    seen = MaterialBuffers(found, np.array([[1, 1, 0.75, 1]]))
     assert seen.mask(truth).tolist() == [[True, True, False, False]]
     expected = 10 * np.log10(2 / 0.1**2)
     assert seen.psnr(truth) == pytest.approx({"albedo_psnr": expected, "roughness_psnr": expected})
@@ -93,15 +96,25 @@ def test_pixels_that_see_other_things_do_not_count():
 def test_what_cannot_be_compared_has_no_number(scored):
     recovered = load_run(scored)
     view = recovered.dataset.heldout[0]
-    nameless = dataclasses.replace(view, albedo=None)
+    nameless = dataclasses.replace(view, truth={})
     assert GroundTruth.of(nameless) is None
     empty = {"views": 0, "albedo_psnr": None, "roughness_psnr": None}
     assert Score(recovered.problem, [nameless]).measure() == empty
     truth, (seen,) = GroundTruth.of(view), MaterialBuffers.of(recovered.problem, [view], 4, seed=0)
     nothing = dataclasses.replace(truth, known=np.zeros_like(truth.known))
     assert seen.psnr(nothing) == {"albedo_psnr": None, "roughness_psnr": None}
-    equal = dataclasses.replace(truth, albedo=seen.albedo)
+    equal = dataclasses.replace(truth, values={**truth.values, "albedo": seen.values["albedo"]})
     assert seen.psnr(equal)["albedo_psnr"] is None
+    assert seen.psnr(equal)["roughness_psnr"] is not None
+
+
+def test_a_quantity_whose_truth_is_not_known_has_no_number(scored):
+    recovered = load_run(scored)
+    view = recovered.dataset.heldout[0]
+    partly = dataclasses.replace(view, truth={"roughness": view.truth["roughness"]})
+    scores = Score(recovered.problem, [partly]).measure()
+    whole = Score(recovered.problem, [view]).measure()
+    assert scores == {**whole, "albedo_psnr": None} and whole["albedo_psnr"] is not None
 
 
 @pytest.mark.parametrize(("seconds", "count"), [(0.0, 0), (1e9, 2)])

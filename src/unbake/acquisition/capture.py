@@ -17,6 +17,7 @@ from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..imaging.pictures import write_exr
+from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import parse, write
 from ..transport.render import parts_of, render_materials
@@ -87,7 +88,7 @@ def _capture(
     # sampler rounds their number up to a grid.
     sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
-    albedo, roughness, mask = _truth(path, scene, rays)
+    truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
@@ -101,13 +102,11 @@ def _capture(
             split=split,
             camera=camera,
             image=data.image(view_name),
-            albedo=data.truth("albedo", view_name),
-            roughness=data.truth("roughness", view_name),
+            truth={name: data.truth(name, view_name) for name in truth},
         )
-        grey = np.repeat(roughness[part, None], 3, 1)
         write_exr(view.image, _rgba(rgb[part], alpha[part], shape))
-        write_exr(view.albedo, _rgba(albedo[part], mask[part], shape))
-        write_exr(view.roughness, _rgba(grey, mask[part], shape))
+        for name, file in view.truth.items():
+            write_exr(file, _rgba(truth[name][part], mask[part], shape))
         views.append(view)
     return Dataset(
         folder=data.path,
@@ -217,19 +216,21 @@ def _photographs(
 
 def _truth(
     path: Path, scene: mi.Scene, rays: CameraRays
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Albedo, roughness and mask of all pixels."""
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Pictures of all quantities, each (pixels, 3), and the mask of all pixels."""
     specular = 32  # for cut-outs (null interactions): pixels behind mirrors are masked out
-    images = []
-    parsed = parse(path)
-    edit.show_roughness_as_albedo(parsed)
-    for shown in (scene, parsed.instantiate()):
-        scene_view = SceneView.of(shown, None, specular)
-        images.append(
-            render_materials(scene_view, rays.through, rays.pixels, TRUTH_SAMPLES, seed=1)
+    pictures, mask = {}, np.zeros(0)
+    for name, quantity in QUANTITIES.items():
+        shown = scene
+        if name != "albedo":
+            parsed = parse(path)
+            edit.show_as_albedo(parsed, quantity.slot, quantity.default)
+            shown = parsed.instantiate()
+        values, mask = render_materials(
+            SceneView.of(shown, None, specular), rays.through, rays.pixels, TRUTH_SAMPLES, seed=1
         )
-    (albedo, _, coverage_), (roughness, _, _) = images
-    return albedo, roughness[:, 0], coverage_
+        pictures[name] = values["albedo"]
+    return pictures, mask
 
 
 def _rgba(rgb: np.ndarray, alpha: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

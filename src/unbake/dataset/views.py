@@ -16,6 +16,7 @@ from unbake.dataset.camera import Camera, camera_from_frame, read_split
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.errors import UserError
 from unbake.io import text
+from unbake.quantities import QUANTITIES
 from unbake.scene import free_space
 
 BACKGROUNDS = ("visible", "hidden")
@@ -38,16 +39,14 @@ class View:
         split: "train" or "heldout".
         camera: pose and intrinsics, in the image's pixels.
         image: linear RGB radiance, alpha 1 where a surface is seen; inside the data folder.
-        albedo: its true picture; None where the data set has none.
-        roughness: likewise.
+        truth: true pictures by quantity, of those that the data set has.
     """
 
     name: str
     split: str
     camera: Camera
     image: Path
-    albedo: Path | None
-    roughness: Path | None
+    truth: Mapping[str, Path]
 
 
 @final
@@ -100,9 +99,8 @@ class Dataset:
             raise UserError("the scene file does not exist", scene, f"Set 'scene' in {file}")
         views = _read_views(data, file, top)
         for view in views:
-            for image in (view.image, view.albedo, view.roughness):
-                if image is not None:
-                    _check_header(image, view.camera.width, view.camera.height)
+            for image in (view.image, *view.truth.values()):
+                _check_header(image, view.camera.width, view.camera.height)
         return cls(data.path, scene, _background(top, file), views, *_provenance(top, file))
 
     def save(self, folder: Path) -> None:
@@ -198,14 +196,13 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
     where = f"{where} ({image.name})"
     split = read_split(frame, where)
     camera = camera_from_frame(frame, top, where)
-    albedo, roughness = (data.truth(kind, image.stem) for kind in ("albedo", "roughness"))
+    known = {name: data.truth(name, image.stem) for name in QUANTITIES}
     return View(
         image.stem,
         split,
         camera,
         image,
-        albedo if albedo.is_file() else None,
-        roughness if roughness.is_file() else None,
+        {name: file for name, file in known.items() if file.is_file()},
     )
 
 

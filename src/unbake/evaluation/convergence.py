@@ -10,9 +10,10 @@ from typing import Any, final
 
 import numpy as np
 
+from ..quantities import DEFAULT_QUANTITIES
+
 #: The first steps trace and compile; intervals of the log that begin before are left out.
 WARM_UP = 4
-SCORES = ("albedo_psnr", "roughness_psnr")
 
 Log = Sequence[Mapping[str, Any]]
 
@@ -41,10 +42,12 @@ def milliseconds_per_step(log: Log) -> float | None:
 
 
 def score_curve(log: Log) -> list[dict[str, float | None]]:
-    """The scores of a log in order: `seconds`, `step`, `albedo_psnr` and `roughness_psnr` in dB."""
+    """The scores of a log in order: `seconds`, `step`, and PSNRs such as `albedo_psnr` in dB."""
     found = {r["step"]: r for r in log if _timed(r) and isinstance(r.get("score"), Mapping)}
+    scored = [key for r in found.values() for key in r["score"] if key.endswith("_psnr")]
+    keys = dict.fromkeys([*(f"{name}_psnr" for name in DEFAULT_QUANTITIES), *scored])
     return [
-        {"seconds": r["seconds"], "step": step} | {key: r["score"].get(key) for key in SCORES}
+        {"seconds": r["seconds"], "step": step} | {key: r["score"].get(key) for key in keys}
         for step, r in sorted(found.items())
     ]
 
@@ -85,7 +88,7 @@ def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[T
 
 
 def _points(curve: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    scored = [(point["seconds"], point["albedo_psnr"]) for point in curve]
+    scored = [(point["seconds"], point.get("albedo_psnr")) for point in curve]
     return [(t, v) for t, v in scored if isinstance(v, int | float) and math.isfinite(v)]
 
 

@@ -14,10 +14,11 @@ from ..dataset.lighting import ROWS, true_environment
 from ..dataset.pixels import CameraRays
 from ..dataset.views import View
 from ..imaging.metrics import mean_psnr, psnr
-from ..imaging.pictures import montage, to_bytes, tonemap, write_exr, write_png
+from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
+from ..quantities import QUANTITIES
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
-from ..training.validation import GroundTruth, MaterialBuffers, finite, read_view
+from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
 from ..transport.objective import requirements
 from ..transport.render import render_radiance
 from . import lighting
@@ -27,7 +28,7 @@ DEFINITIONS = {
     "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
     "value of a split is the mean over its views. Renderings: both pictures clipped to [0,1], "
     "because one caustic pixel of a photograph would decide all; render_psnr_unclamped does not. "
-    "Albedo and roughness are not clipped",
+    "Quantities of materials are not clipped",
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
@@ -36,7 +37,8 @@ DEFINITIONS = {
 }
 
 
-METRICS = ("render_psnr", "render_psnr_unclamped", "albedo_psnr", "roughness_psnr")
+#: Of renderings; those of materials come after them.
+METRICS = ("render_psnr", "render_psnr_unclamped")
 
 
 def evaluate(
@@ -75,7 +77,8 @@ def evaluate(
         values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in row if k.endswith("_psnr"))
         tell(f"{view.name}: {', '.join(values)}")
     recovered_lighting = _evaluate_lighting(recovered, folder, tell)
-    if recovered.config.unknown == "materials+lighting":
+    both = recovered.config.unknown == "materials+lighting"
+    if both and "albedo" in recovered.config.quantities:
         recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
@@ -95,7 +98,7 @@ def evaluate(
 
 
 def description(config: FitConfig) -> dict:
-    """What distinguishes runs: unknown, method, representations and estimator.
+    """What distinguishes runs: unknown, quantities, method, representations and estimator.
 
     `representation` is that of the materials, None if they are known; `radiance` is that of L_θ,
     None if the method has no radiance field.
@@ -103,6 +106,7 @@ def description(config: FitConfig) -> dict:
     cached = requirements(config.chosen_method.terms).radiance
     return {
         "unknown": config.unknown,
+        "quantities": list(config.quantities) if config.learns_materials else [],
         "method": config.method,
         "bounces": config.bounces,
         "prior": config.prior,
@@ -138,14 +142,15 @@ def _evaluate_view(
 
     pictures = {"render": (radiance, tonemap(radiance))}
     if seen is not None:
-        grey = np.repeat(seen.roughness[..., None], 3, -1)
-        pictures["albedo"] = seen.albedo, tonemap(seen.albedo)
-        pictures["roughness"] = grey, to_bytes(grey)
-    for name, (linear, shown) in pictures.items():
+        for name, value in seen.values.items():
+            rgb = np.repeat(value, 3 // value.shape[-1], -1)
+            pictures[name] = rgb, shown(value, QUANTITIES[name].display)
+    for name, (linear, picture) in pictures.items():
         write_exr(folder.picture(view.split, view.name, name), np.dstack([linear, alpha]))
-        write_png(folder.picture(view.split, view.name, name, ".png"), shown)
+        write_png(folder.picture(view.split, view.name, name, ".png"), picture)
 
-    row = {"name": view.name, "split": view.split} | dict.fromkeys(METRICS)
+    keys = (*METRICS, *psnr_keys(recovered.config.quantities))
+    row = {"name": view.name, "split": view.split} | dict.fromkeys(keys)
     if mask.any():
         row |= _render_psnr(radiance, photograph[..., :3], mask)
     if seen is not None and truth is not None:
@@ -163,8 +168,8 @@ def _evaluate_lighting(
         map_ = problem.environment.to_latlong(ROWS)
         truth = true_environment(data)
         write_exr(folder.environment(), map_)
-        shown = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
-        write_png(folder.environment(".png"), montage(shown))
+        tiles = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
+        write_png(folder.environment(".png"), montage(tiles))
         found["environment"] = None
         if truth is not None:
             found["environment"] = numbers = lighting.compare_environments(map_, truth)
@@ -185,8 +190,11 @@ def _align_albedo(
 
     Photographs may determine albedo and lighting only up to a common factor.
     """
-    known = [(s, t, s.mask(t)) if s and t else None for s, t in materials]
-    counted = [(s.albedo[m], t.albedo[m]) for s, t, m in filter(None, known)]
+    known = [
+        (s.values["albedo"], t.values["albedo"], s.mask(t)) if t and "albedo" in t.values else None
+        for s, t in materials
+    ]
+    counted = [(s[m], t[m]) for s, t, m in filter(None, known)]
     for row in rows:
         row["albedo_psnr_aligned"] = None
     if not any(len(found) for found, _ in counted):
@@ -196,7 +204,7 @@ def _align_albedo(
     for row, view in zip(rows, known, strict=True):
         if view is not None and view[2].any():
             seen, truth, mask = view
-            row["albedo_psnr_aligned"] = finite(psnr(seen.albedo * scale, truth.albedo, mask))
+            row["albedo_psnr_aligned"] = finite(psnr(seen * scale, truth, mask))
     return [float(x) for x in scale]
 
 
@@ -209,8 +217,8 @@ def _render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray)
 
 def _summary(rows: list[dict], split: str) -> dict:
     chosen = [row for row in rows if row["split"] == split]
-    metrics = [*METRICS, *(["albedo_psnr_aligned"] if "albedo_psnr_aligned" in rows[0] else [])]
-    return {"views": len(chosen)} | {k: mean_psnr(row[k] for row in chosen) for k in metrics}
+    keys = [key for key in rows[0] if key not in ("name", "split")]
+    return {"views": len(chosen)} | {k: mean_psnr(row[k] for row in chosen) for k in keys}
 
 
 def _db(value: float | None) -> str:

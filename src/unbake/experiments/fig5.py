@@ -151,7 +151,7 @@ def _steps(
     dr.flush_malloc_cache()
     fit = begin_fit(dataset, config)
     _paint(fit, albedo)
-    constant = dict.fromkeys((*config.quantities, "radiance"), 0.0)
+    constant: dict[str, float] = dict.fromkeys((*config.quantities, "radiance"), 0.0)
 
     def step(number: int) -> None:
         if frozen:

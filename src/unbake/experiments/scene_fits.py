@@ -18,9 +18,11 @@ from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..evaluation.settings import EvaluationSettings
 from ..imaging.metrics import mean_psnr, psnr
-from ..imaging.pictures import block_means, montage, read_exr, to_bytes, tonemap
+from ..imaging.pictures import block_means, montage, read_exr, shown
+from ..quantities import DEFAULT_QUANTITIES, QUANTITIES
 from ..report.display import require_same_size, rgb
 from ..training.run_folder import RunFolder
+from ..training.validation import psnr_keys
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
 from .scenes import PaperScene
@@ -34,8 +36,8 @@ ABLATION = {
     "+ LHS (ours)": "ours",
 }
 #: Rows of a picture, for each view.
-ROWS = ("render", "albedo", "roughness")
-MATERIALS = ("albedo_psnr", "roughness_psnr")
+ROWS = ("render", *DEFAULT_QUANTITIES)
+MATERIALS = tuple(psnr_keys(DEFAULT_QUANTITIES))
 QUALITIES = (*MATERIALS, "render_psnr")
 
 
@@ -167,13 +169,13 @@ class SceneFits:
         sheet = []
         for view in (self.heldout(context)[number] for number in views):
             scale = exposure(read_exr(view.image))
-            truth = {"render": view.image, "albedo": view.albedo, "roughness": view.roughness}
+            truth = {"render": view.image, **view.truth}
             for quantity in ROWS:
                 runs = (self.run(context, method) for method in self.methods)
                 files = [run.picture(view.split, view.name, quantity) for run in runs]
                 factor = scale if quantity == "render" else 1.0
-                files.append(truth[quantity])
-                sheet.append([_cell(file, quantity, factor, view) for file in files])
+                columns = (*files, truth.get(quantity))
+                sheet.append([_cell(file, quantity, factor, view) for file in columns])
         return montage(sheet)
 
 
@@ -198,11 +200,12 @@ def at_equal_samples(fits: Mapping[str, Findings]) -> dict[str, dict[str, float 
 
 
 def _cell(file: Path | None, quantity: str, factor: float, view: View) -> np.ndarray:
-    """A picture times a factor, in sRGB unless it is roughness; grey if there is none."""
+    """A picture times a factor, as its quantity is displayed; grey if there is none."""
     if file is None or not file.is_file():
         return np.full((view.camera.height, view.camera.width, 3), 128, np.uint8)
     pixels, _ = rgb(file)
-    return to_bytes(pixels) if quantity == "roughness" else tonemap(factor * pixels)
+    display = QUANTITIES[quantity].display if quantity in QUANTITIES else "colour"
+    return shown(factor * pixels, display)
 
 
 def exposure(photograph: np.ndarray) -> float:

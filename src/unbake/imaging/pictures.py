@@ -5,12 +5,16 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
 from ..io import write_atomically
+
+#: How values become a picture: colours through the sRGB curve, other data without a curve.
+Display = Literal["colour", "data"]
 
 MAGMA = (
     (0, 0, 4), (10, 8, 34), (29, 17, 71), (54, 16, 107), (81, 18, 124), (106, 28, 129),
@@ -94,6 +98,16 @@ def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     return to_bytes(
         np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
     )
+
+
+def shown(values: np.ndarray, display: Display) -> np.ndarray:
+    """Values (H, W, 1 or 3) as a picture: colours through the sRGB curve, data as they are.
+
+    Returns:
+        uint8, (H, W, 3).
+    """
+    rgb = np.repeat(values, 3, -1) if values.shape[-1] == 1 else values
+    return tonemap(rgb) if display == "colour" else to_bytes(rgb)
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:

@@ -14,8 +14,10 @@ import numpy as np
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.convergence import score_curve, time_to_quality
+from unbake.fields.registry import representation, representations
 from unbake.imaging import pictures
 from unbake.io import write_text
+from unbake.quantities import QUANTITIES
 from unbake.report import charts, display
 from unbake.report.lighting import lighting_section
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
@@ -23,12 +25,18 @@ from unbake.transport.terms import TERMS
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 SPLITS = ("heldout", "train")
-QUANTITIES = ("render", "albedo", "roughness")
-PSNRS = {
-    "render_psnr": "Rendering",
-    "albedo_psnr": "Albedo",
-    "albedo_psnr_aligned": "Aligned albedo",
-    "roughness_psnr": "Roughness",
+#: What has pictures, and its name.
+NAMES = {"render": "Rendering"} | {name: row.title for name, row in QUANTITIES.items()}
+#: PSNRs: the key, what it is of, and the heading.
+PSNRS = [("render_psnr", "render", "Rendering")]
+for _name, _row in QUANTITIES.items():
+    PSNRS.append((f"{_name}_psnr", _name, _row.title))
+    if _name == "albedo":
+        PSNRS.append(("albedo_psnr_aligned", _name, "Aligned albedo"))
+#: What is above the scale of a picture.
+UNITS = {"render": "linear radiance", "environment": "linear radiance"} | {
+    name: f"{row.title.lower()}, {row.lower:.0f} to {row.upper:.0f}"
+    for name, row in QUANTITIES.items()
 }
 #: Names on the page of what an evaluation defines.
 DEFINED = {
@@ -45,15 +53,14 @@ LIGHT_DEFINED = {
     },
     "emission": {"emission_error": "Error"},
 }
-SCORES = {"albedo_psnr": "Held-out albedo PSNR", "roughness_psnr": "Held-out roughness PSNR"}
+SCORES = {f"{n}_psnr": f"Held-out {row.title.lower()} PSNR" for n, row in QUANTITIES.items()}
 OPTIMIZED = {
     "materials": "Materials",
     "lighting": "Lighting",
     "materials+lighting": "Materials and lighting",
     "emission": "Lights",
 }
-FORMS = {"neural": "network", "grid": "3D grid", "bitmap": "bitmaps"}
-VALIDATION = {"albedo_psnr": "Albedo PSNR", "roughness_psnr": "Roughness PSNR"}
+VALIDATION = {f"{name}_psnr": f"{row.title} PSNR" for name, row in QUANTITIES.items()}
 AXES = {"step": "step", "seconds": "training time, seconds"}  # key in the log: title of the axis
 
 
@@ -70,8 +77,8 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
     """Write one HTML page that compares evaluated runs with the ground truth and each other.
 
     The page contains its images, styles and script and loads nothing from elsewhere.
-    Pictures of renderings and albedo are linear RGB seen through the sRGB curve; roughness is shown
-    without a curve. Larger pictures than 640 pixels are averaged down; PSNRs are those of
+    Pictures of renderings and colours are linear RGB seen through the sRGB curve; other quantities
+    are shown without a curve. Larger pictures than 640 pixels are averaged down; PSNRs are those of
     the evaluation, from full resolution.
 
     Args:
@@ -100,6 +107,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
         }
         for split in SPLITS
     ]
+    lighting, materials = lighting_section(loaded, data), _materials(loaded)
     page = (
         _environment()
         .from_string(TEMPLATE.read_text(encoding="utf-8"))
@@ -109,9 +117,15 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             runs=loaded,
             psnrs=_psnrs(loaded).values(),
             rows=_table(loaded),
-            light=lighting_section(loaded, data),
+            light=lighting,
             optimized=_optimized(loaded),
-            materials=any(run.optimizes("albedo") for run in loaded),
+            materials=bool(materials),
+            recovered=_listed([*_words(materials), *(["light"] if lighting else [])]),
+            colours=_listed(["renderings", *_words(materials, "colour")]).capitalize(),
+            data=_words(materials, "data"),
+            listed=_listed,
+            names=NAMES | {"environment": "Environment map"},
+            units=UNITS,
             failed=failed or {},
             groups=groups,
             scales=scales,
@@ -147,7 +161,7 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
 def _scales(runs: list[Run], views: list[View]) -> Scales:
     """Exposure and error scales from all pictures of the page."""
     radiance: list[np.ndarray] = []
-    errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in QUANTITIES}
+    errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in NAMES}
     for view in views:
         for quantity, path in view.truth.items():
             reference, mask = display.rgb(path)
@@ -158,21 +172,21 @@ def _scales(runs: list[Run], views: list[View]) -> Scales:
                 if recovered is not None:
                     error = display.error(display.rgb(recovered)[0], reference, recovered)
                     parts.append(display.sample(error[mask]))
-    error_scales = {q: display.error_scale(errors[q]) for q in QUANTITIES}
+    error_scales = {q: display.error_scale(errors[q]) for q in NAMES}
     return Scales(display.exposure(radiance), error_scales)
 
 
 def _view_block(view: View, runs: list[Run], scales: Scales) -> dict[str, Any]:
     """A view's images for the template: a column a quantity with truth and runs."""
     height, width = display.rgb(view.truth["render"])[0].shape[:2]
-    quantities = [q for q in QUANTITIES if any(run.optimizes(q) for run in runs)]
+    quantities = [q for q in NAMES if any(run.optimizes(q) for run in runs)]
     columns = [_column(view, runs, quantity, scales) for quantity in quantities]
     return {"name": view.name, "width": width, "height": height, "columns": columns}
 
 
 def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[str, Any]:
     def paint(linear: np.ndarray) -> str:
-        if quantity == "roughness":
+        if quantity in QUANTITIES and QUANTITIES[quantity].display == "data":
             small = pictures.shrink(linear, display.LONGEST_SIDE)
             return pictures.png_data_uri(pictures.to_bytes(small))
         return display.tonemapped(linear, scales.exposure if quantity == "render" else 0.0)
@@ -202,11 +216,11 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
 def _psnrs(runs: list[Run]) -> dict[str, str]:
     """Keys and headings of the columns: quantities that some run optimized, and aligned albedo."""
     aligned = any("albedo_psnr_aligned" in (run.metrics.get("heldout") or {}) for run in runs)
-    optimized = {key for key in PSNRS if any(run.optimizes(key.split("_")[0]) for run in runs)}
     return {
-        key: name
-        for key, name in PSNRS.items()
-        if key in optimized and (aligned or key != "albedo_psnr_aligned")
+        key: heading
+        for key, quantity, heading in PSNRS
+        if any(run.optimizes(quantity) for run in runs)
+        and (aligned or key != "albedo_psnr_aligned")
     }
 
 
@@ -233,9 +247,9 @@ def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Representations, unknown and estimator of a run as text, symbol and subscript."""
     if "estimator" not in metrics:
         return []
-    said = {key: str(metrics.get(key)) for key in ("representation", "radiance", "estimator")}
-    details = [(form, "φ", "")] if (form := FORMS.get(said["representation"])) else []
-    details.append((FORMS.get(said["radiance"], "no"), "L", "θ"))
+    estimator = str(metrics["estimator"])
+    details = [(form, "φ", "")] if (form := _form(metrics.get("representation"))) else []
+    details.append((_form(metrics.get("radiance")) or "no", "L", "θ"))
     if _unknown(metrics) != "materials":
         details.append(
             (f"{OPTIMIZED.get(_unknown(metrics), 'something').lower()} optimized", "", "")
@@ -245,7 +259,30 @@ def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     if metrics.get("prior", "extra-bounce") != "extra-bounce":
         details.append((f"{metrics['prior']} prior".replace("-", " "), "", ""))
     passes = {"split-halves": "split halves", "two-pass": "two passes"}
-    return [*details, (passes.get(said["estimator"], said["estimator"]), "", "")]
+    return [*details, (passes.get(estimator, estimator), "", "")]
+
+
+def _form(name: object) -> str | None:
+    """What a representation is called on the page; the name of one that is not registered."""
+    if not isinstance(name, str):
+        return None
+    return representation(name).title if name in representations() else name
+
+
+def _materials(runs: list[Run]) -> list[str]:
+    """Quantities of materials that some run optimized."""
+    return [name for name in QUANTITIES if any(run.optimizes(name) for run in runs)]
+
+
+def _listed(words: Sequence[str]) -> str:
+    """Words as a sentence lists them."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def _words(names: Sequence[str], display: str | None = None) -> list[str]:
+    """Quantities in a sentence: all, or those that are displayed so."""
+    rows = [QUANTITIES[name] for name in names]
+    return [row.title.lower() for row in rows if display in (None, row.display)]
 
 
 def _unknown(metrics: dict[str, Any]) -> str:
@@ -280,7 +317,7 @@ def _seconds(value: object) -> str:
 def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
     """Definitions of the numbers in each part of the page, from the evaluations."""
     psnrs = _psnrs(runs)
-    told = {k: v for k, v in DEFINED.items() if k in psnrs or k not in PSNRS}
+    told = {k: v for k, v in DEFINED.items() if k in psnrs or k != "albedo_psnr_aligned"}
     numbers = [_told(run, told) | _rendering(run) for run in runs]
     lighting = {
         kind: [_told(run, words) if run.optimizes(kind) else {} for run in runs]

@@ -12,6 +12,7 @@ import numpy as np
 from unbake.dataset import views
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
+from unbake.quantities import DEFAULT_QUANTITIES
 from unbake.training.run_folder import RunFolder
 
 TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
@@ -39,7 +40,8 @@ class Run:
             case "emission":
                 return unknown == "emission"
             case _:
-                return "materials" in unknown
+                known = self.metrics.get("quantities", DEFAULT_QUANTITIES)
+                return "materials" in unknown and quantity in known
 
     def view(self, name: str) -> dict[str, Any]:
         """The numbers of one view; empty where this run was not evaluated on it."""
@@ -140,9 +142,7 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
 
 
 def _view(view: views.View) -> View:
-    known = {"albedo": view.albedo, "roughness": view.roughness}
-    truth = {kind: path for kind, path in known.items() if path is not None}
-    return View(view.name, view.split, {"render": view.image, **truth})
+    return View(view.name, view.split, {"render": view.image, **view.truth})
 
 
 def _flatten(table: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:

@@ -81,11 +81,16 @@ def set_own_textures(scene: ParsedScene, textures: Sequence[Mapping[str, object]
             node.props[slot] = texture
 
 
-def show_roughness_as_albedo(scene: ParsedScene) -> None:
-    """Replace each base colour by the roughness, so that an albedo integrator renders it."""
+def show_as_albedo(scene: ParsedScene, slot: str, default: float) -> None:
+    """Replace each base colour by another parameter, so that an albedo integrator renders it.
+
+    Args:
+        slot: the parameter of `principled`.
+        default: what stands for it where the scene does not say.
+    """
     for node in scene.principled_nodes():
         props = node.props
-        props["base_color"] = props.get("roughness", 0.5)
+        props["base_color"] = props.get(slot, default)
 
 
 def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:

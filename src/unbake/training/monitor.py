@@ -76,10 +76,9 @@ class Monitor:
             strengths = ((name, *(f"{x:.4g}" for x in rgb)) for name, rgb in v["emission"].items())
             text = ", ".join(" ".join(words) for words in strengths)
         else:
-            text = (
-                f"{v['split']} view, albedo {v['albedo_psnr']:.1f} dB, "
-                f"roughness {v['roughness_psnr']:.1f} dB"
-            )
+            scores = {k.removesuffix("_psnr"): x for k, x in v.items() if k.endswith("_psnr")}
+            told = ", ".join(f"{name} {score:.1f} dB" for name, score in scores.items())
+            text = f"{v['split']} view, {told}"
         self.say(f"step {entry['step']}, {entry['seconds']:.0f} s: {text}")
 
     def _write(self, entry: dict) -> None:

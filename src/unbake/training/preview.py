@@ -9,7 +9,8 @@ import numpy as np
 
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.views import Dataset, View
-from ..imaging.pictures import montage, to_bytes, tonemap, write_png
+from ..imaging.pictures import montage, shown, tonemap, write_png
+from ..quantities import QUANTITIES
 from .checkpoint import Progress
 from .problem import Problem
 from .run_folder import RunFolder
@@ -34,8 +35,8 @@ class Preview:
     def show(self, progress: Progress) -> list[dict]:
         """Show what the fields say now.
 
-        Albedo and roughness, and the environment map, go to one picture, above the truth where
-        that is known. Lights have no picture.
+        Materials and the environment map go to one picture, above the truth where that is known.
+        Lights have no picture.
 
         Returns:
             Lines for the log: materials against the truth, and the strength of lights.
@@ -60,13 +61,11 @@ class Preview:
     def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:
         """Pictures of them and of the truth; PSNRs where there is truth."""
         (seen,) = MaterialBuffers.of(self._problem, [self._view], SAMPLES, seed=0)
-        tiles = [[tonemap(seen.albedo), _grey(seen.roughness)]]
+        tiles = [[shown(value, QUANTITIES[name].display) for name, value in seen.values.items()]]
         if self._truth is None:
             return tiles, {}
-        tiles.append([tonemap(self._truth.albedo), _grey(self._truth.roughness)])
-        values = seen.psnr(self._truth)
-        return tiles, {} if None in values.values() else {"split": self._view.split} | values
-
-
-def _grey(values: np.ndarray) -> np.ndarray:
-    return to_bytes(np.repeat(values[..., None], 3, -1))
+        nothing = np.full((*seen.coverage.shape, 3), 128, np.uint8)
+        true = {n: shown(v, QUANTITIES[n].display) for n, v in self._truth.values.items()}
+        tiles.append([true.get(name, nothing) for name in seen.values])
+        scores = {k: v for k, v in seen.psnr(self._truth).items() if v is not None}
+        return tiles, {"split": self._view.split} | scores if scores else {}

@@ -29,7 +29,7 @@ def load_run(run: Path) -> Recovered:
     """Read a run's newest checkpoint.
 
     `problem.scene_view.scene` is a Mitsuba scene with the recovered fields in the place of its
-    albedo and roughness, its environment or its lights' strengths. Where materials were recovered,
+    unknown quantities, its environment or its lights' strengths. Where materials were recovered,
     any integrator of Mitsuba renders it after `problem.materials.stand_alone()`, and else at once.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from ..dataset.pixels import CameraRays
 from ..dataset.views import View, read_image
 from ..imaging.metrics import mean_psnr, psnr
+from ..quantities import QUANTITIES
 from ..transport.render import render_materials
 from .problem import Problem
 
@@ -23,36 +24,36 @@ SAMPLES = 4
 class GroundTruth:
     """The true materials that a view sees."""
 
-    albedo: np.ndarray  # linear RGB, (H, W, 3)
-    roughness: np.ndarray  # perceptual, (H, W)
-    known: np.ndarray  # (H, W) bool: the whole pixel sees a material that is sought
+    values: Mapping[str, np.ndarray]  # by quantity, (H, W, channels)
+    known: np.ndarray  # (H, W) bool: the whole pixel sees a material that is optimized
 
     @staticmethod
     def of(view: View) -> GroundTruth | None:
-        """The truth images of a view; None where it lacks one.
+        """The truth images of a view; None where it has none.
 
         Raises:
             UserError: an image cannot be read.
         """
-        if view.albedo is None or view.roughness is None:
+        images = {name: read_view(file, view) for name, file in view.truth.items()}
+        if not images:
             return None
-        albedo, roughness = read_view(view.albedo, view), read_view(view.roughness, view)
-        return GroundTruth(albedo[..., :3], roughness[..., 0], albedo[..., 3] >= 1)
+        values = {name: x[..., : QUANTITIES[name].channels] for name, x in images.items()}
+        known = np.all([x[..., 3] >= 1 for x in images.values()], axis=0)
+        return GroundTruth(values, known)
 
 
 @dataclass(frozen=True)
 class MaterialBuffers:
     """The recovered materials that a view sees."""
 
-    albedo: np.ndarray  # linear RGB, (H, W, 3)
-    roughness: np.ndarray  # perceptual, (H, W)
-    coverage: np.ndarray  # (H, W): fraction of samples that see a material which is sought
+    values: Mapping[str, np.ndarray]  # by quantity, (H, W, channels)
+    coverage: np.ndarray  # (H, W): fraction of samples that see a material that is optimized
 
     @staticmethod
     def of(problem: Problem, views: Sequence[View], spp: int, seed: int) -> list[MaterialBuffers]:
         """What the fields say now, view by view, from `spp` camera samples a pixel."""
         rays = CameraRays.of([view.camera for view in views])
-        albedo, roughness, coverage = render_materials(
+        values, coverage = render_materials(
             problem.scene_view, rays.through, rays.pixels, spp, seed=seed
         )
         seen, first = [], 0
@@ -60,18 +61,19 @@ class MaterialBuffers:
             h, w = view.camera.height, view.camera.width
             part = slice(first, first + h * w)
             first += h * w
-            shaped = albedo[part].reshape(h, w, 3), roughness[part].reshape(h, w)
-            seen.append(MaterialBuffers(*shaped, coverage[part].reshape(h, w)))
+            own = {name: value[part].reshape(h, w, -1) for name, value in values.items()}
+            seen.append(MaterialBuffers(own, coverage[part].reshape(h, w)))
         return seen
 
     def mask(self, truth: GroundTruth) -> np.ndarray:
-        """The pixels that count, (H, W) bool: what they see is sought and known throughout."""
+        """The pixels that count, (H, W) bool: what they see is optimized and known throughout."""
         return truth.known & (self.coverage >= 1)
 
     def psnr(self, truth: GroundTruth) -> dict[str, float | None]:
-        """`albedo_psnr` and `roughness_psnr` in dB, linear and not clipped.
+        """PSNR in dB, linear and not clipped; keys such as `albedo_psnr`.
 
-        None where no pixel counts, and where two pictures are equal: JSON has no infinity.
+        None where no pixel counts, where the truth is not known, and where two pictures are equal:
+        JSON has no infinity.
 
         Raises:
             UserError: a value is not finite.
@@ -79,12 +81,16 @@ class MaterialBuffers:
         Paper: Sec. 6, Fig. 6.
         """
         mask = self.mask(truth)
-        if not mask.any():
-            return {"albedo_psnr": None, "roughness_psnr": None}
-        return {
-            "albedo_psnr": finite(psnr(self.albedo, truth.albedo, mask)),
-            "roughness_psnr": finite(psnr(self.roughness, truth.roughness, mask)),
-        }
+        scores = dict.fromkeys(psnr_keys(self.values))
+        for name, value in self.values.items():
+            if name in truth.values and mask.any():
+                scores[f"{name}_psnr"] = finite(psnr(value, truth.values[name], mask))
+        return scores
+
+
+def psnr_keys(quantities: Iterable[str]) -> list[str]:
+    """Names of the PSNRs of quantities, in metrics and logs."""
+    return [f"{name}_psnr" for name in quantities]
 
 
 class Score:
@@ -101,13 +107,14 @@ class Score:
         self._truths = [truth for _, truth in pairs if truth is not None]
 
     def measure(self, spp: int = SAMPLES, seed: int = 0) -> dict[str, float | int | None]:
-        """Means over the views: `views`, `albedo_psnr` and `roughness_psnr` in dB.
+        """Means over the views: `views`, and PSNRs of the unknown quantities in dB.
 
         With the same seed every score has the same samples: scores differ by what was learned.
         """
         seen = MaterialBuffers.of(self._problem, self._views, spp, seed) if self._views else []
         rows = [s.psnr(truth) for s, truth in zip(seen, self._truths, strict=True)]
-        means = {k: mean_psnr(r[k] for r in rows) for k in ("albedo_psnr", "roughness_psnr")}
+        keys = psnr_keys(self._problem.materials or ())
+        means = {key: mean_psnr(row[key] for row in rows) for key in keys}
         return {"views": len(rows)} | means
 
 

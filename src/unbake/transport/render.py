@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..fields.materials import read_carried
 from .operator import attach_material
 from .path_tracer import path_traced
 from .vertex import SceneView, find_vertex
@@ -53,30 +54,41 @@ def render_radiance(
 
 def render_materials(
     scene_view: SceneView, through: RayGenerator, pixels: int, spp: int, *, seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """What the materials are at the surfaces that pixels see (cut-outs let rays pass).
 
     Returns:
-        Albedo (pixels, 3), linear RGB; roughness (pixels,), perceptual; and coverage (pixels,), the
-        fraction of samples that see a material that is optimized: not an emitter, nor any other
-        BSDF, nor background. Materials are means over those samples, zero where there are none.
+        The unknown quantities by name, each (pixels, channels), or where no material is unknown the
+        scene's own albedo; and coverage (pixels,), the fraction of samples that see a material that
+        is optimized: not an emitter, nor any other BSDF, nor background. Quantities are means over
+        those samples, zero where there are none.
     """
-    albedo = np.zeros((pixels, 3), np.float32)
-    roughness, coverage = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
+    values: dict[str, np.ndarray] = {}
+    coverage = np.zeros(pixels, np.float32)
     sampler = mi.load_dict({"type": "independent"})
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
         sampler.seed(dr.opaque(mi.UInt32, part_seed), dr.width(ray))
         with dr.suspend_grad():
             v = attach_material(scene_view, find_vertex(scene_view, ray, mi.Bool(True), sampler))
             counted = v.valid & v.direct_view & scene_view.is_optimized(v.si.shape)
-            rough = v.si.dn_dv.x if scene_view.materials is not None else mi.Float(0)
-            weighted = [dr.select(counted, x, 0) for x in (*v.albedo, rough, mi.Float(1))]
-            dr.eval(weighted)
-        *colour, rough, weight = [_pixel_means(x, spp) for x in weighted]
-        share = np.maximum(weight, 1e-6)
-        albedo[part] = np.stack(colour, -1) / share[:, None]
-        roughness[part], coverage[part] = rough / share, weight
-    return albedo, roughness, coverage
+            material = {"albedo": v.albedo}
+            if scene_view.materials is not None:
+                material = read_carried(v.si, scene_view.materials)
+            weighted = {
+                name: [
+                    dr.select(counted, x, 0) for x in ([value] if dr.depth_v(value) == 1 else value)
+                ]
+                for name, value in material.items()
+            }
+            weight = dr.select(counted, mi.Float(1), 0)
+            dr.eval(weighted, weight)
+        coverage[part] = _pixel_means(weight, spp)
+        share = np.maximum(coverage[part], 1e-6)
+        for name, channels in weighted.items():
+            shape = (pixels, len(channels))
+            whole = values.setdefault(name, np.zeros(shape, np.float32))
+            whole[part] = np.stack([_pixel_means(x, spp) / share for x in channels], -1)
+    return values, coverage
 
 
 def parts_of(
