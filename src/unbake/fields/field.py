@@ -56,8 +56,12 @@ class Field(Protocol):
     Representations may inherit from it for the members that have a value here.
     """
 
-    #: Whether `dr.freeze` can record `prepare`.
+    #: Whether `dr.freeze` can record `evaluate`; where it cannot, steps are traced each time.
     recordable: bool = True
+    #: Whether it can record `prepare`, too, which methods need that ask fields inside of loops.
+    prepare_recordable: bool = True
+    #: Whether fields can be evaluated inside of virtual calls and loops.
+    symbolic: bool = True
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays by name; `assign` takes them back."""

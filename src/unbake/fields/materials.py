@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UserError
 from ..quantities import CARRIED, QUANTITIES, Quantity, channels_of, in_order
 from . import registry
 from .domain import Domain, SurfacePoint
@@ -62,7 +63,18 @@ class Materials(Mapping[str, Field]):
             field.assign({k: parameters[f"{name}.{k}"] for k in field.parameters()})
 
     def stand_alone(self) -> None:
-        """From now on, textures evaluate the fields themselves, as stock integrators need it."""
+        """From now on, textures evaluate the fields themselves, as stock integrators need it.
+
+        Raises:
+            UserError: a field cannot be evaluated inside of loops.
+        """
+        for name, field in self.items():
+            if not field.symbolic:
+                what = (
+                    f"the field of {name} cannot be evaluated inside of loops, as it must be here"
+                )
+                remedy = "Choose another representation, or a method that does not follow paths"
+                raise UserError(what, remedy=remedy)
         for field in self.values():
             field.prepare()
         self.carried = False

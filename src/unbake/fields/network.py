@@ -38,7 +38,7 @@ class Network(Field):
         self.perceptron = Perceptron(inputs, settings.width, settings.hidden, spec, rng)
 
     @property
-    def recordable(self) -> bool:
+    def prepare_recordable(self) -> bool:
         """Whether layers can be laid out while `dr.freeze` records."""
         return can_record_layout()
 

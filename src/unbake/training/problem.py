@@ -19,6 +19,7 @@ from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.emission import Emission, emission_textures
 from ..fields.envmap import EnvironmentMap, environment_emitter
+from ..fields.field import Field
 from ..fields.materials import Materials, make_materials
 from ..fields.radiance import RadianceField, make_radiance
 from ..fields.registry import representation
@@ -46,6 +47,11 @@ class Problem:
     radiance: RadianceField | None
     hide_emitters: bool
     half_precision: bool  #: in products of its networks
+
+    def fields(self) -> list[Field]:
+        """The fields of the materials, and the one of L_θ."""
+        found = [] if self.materials is None else list(self.materials.values())
+        return found if self.radiance is None else [*found, self.radiance.function]
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays φ by name; the first word tells of which unknown."""

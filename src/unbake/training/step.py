@@ -59,7 +59,10 @@ class TrainingStep:
         self._path_sampler = make_sampler(_context(problem, config))
         self._sampler = mi.load_dict({"type": "independent"})
         self._second = mi.load_dict({"type": "independent"})
-        self._frozen = dr.freeze(self._step) if self._path_sampler.can_be_recorded else None
+        recordable = self._path_sampler.can_be_recorded and all(
+            field.recordable for field in problem.fields()
+        )
+        self._frozen = dr.freeze(self._step) if recordable else None
         self._fits_memory = not self._path_sampler.keeps_paths
 
     def __call__(

@@ -165,7 +165,7 @@ class PathReplaySampler:
         self._integrator = path_replay(context.max_depth, context.rr_depth, context.hide_emitters)
         materials = context.scene_view.materials
         # Inside Mitsuba's loop, fields are evaluated as they were prepared.
-        self.can_be_recorded = all(field.recordable for field in (materials or {}).values())
+        self.can_be_recorded = all(field.prepare_recordable for field in (materials or {}).values())
 
     def prepared(self) -> AbstractContextManager:
         """A context in which paths evaluate the material fields."""
