@@ -264,7 +264,10 @@ def test_a_mistake_in_an_old_file_is_named(text, message):
         ("[materials.albedo.bitmap]\ncells = 1", "materials.albedo.bitmap.cells: unknown key"),
         ("[radiance.bitmap]\nresolution = 1", "radiance.bitmap: unknown key. Known keys: neural"),
         ("[radiance.grid]\nlearning_rate = nan", "radiance.grid.learning_rate: must be a finite"),
-        ('representation = "mesh"', "representation: must be one of neural, grid, bitmap, not 'm"),
+        (
+            'representation = "mesh"',
+            "representation: must be one of neural, grid, bitmap, triplane, not 'm",
+        ),
         ('radiance_representation = "bitmap"', "radiance_representation: must be one of neural, g"),
         (
             'quantities = ["albedo"]\n[regularization]\nroughness_smoothness = 1.0',

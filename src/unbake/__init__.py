@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from .fields.field import FieldSpec as FieldSpec
     from .fields.materials import Material as Material
     from .fields.materials import Materials as Materials
+    from .fields.perceptron import Perceptron as Perceptron
     from .fields.radiance import RadianceField as RadianceField
     from .fields.registry import Representation as Representation
     from .fields.registry import register_representation as register_representation
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
     from .fields.settings import DenseGridConfig as DenseGridConfig
     from .fields.settings import GridConfig as GridConfig
     from .fields.settings import NetworkConfig as NetworkConfig
+    from .fields.settings import TriPlaneConfig as TriPlaneConfig
+    from .fields.torch import TorchField as TorchField
     from .quantities import DEFAULT_QUANTITIES as DEFAULT_QUANTITIES
     from .quantities import QUANTITIES as QUANTITIES
     from .quantities import Quantity as Quantity
@@ -127,9 +130,17 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "fields.domain": ("SurfacePoint",),
     "fields.field": ("Cost", "Field", "FieldSpec"),
     "fields.materials": ("Material", "Materials"),
+    "fields.perceptron": ("Perceptron",),
     "fields.radiance": ("RadianceField",),
     "fields.registry": ("Representation", "register_representation"),
-    "fields.settings": ("BitmapConfig", "DenseGridConfig", "GridConfig", "NetworkConfig"),
+    "fields.settings": (
+        "BitmapConfig",
+        "DenseGridConfig",
+        "GridConfig",
+        "NetworkConfig",
+        "TriPlaneConfig",
+    ),
+    "fields.torch": ("TorchField",),
     "quantities": ("DEFAULT_QUANTITIES", "QUANTITIES", "Quantity"),
     # Light transport and the objective.
     "transport.loss": ("RelativeL2", "pixel_means", "squared_error"),

@@ -66,6 +66,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 settings={
                     "neural": {"grid": {"levels": 7}, "hidden": 1, "learning_rate": 0.015},
                     "grid": {"cells": 64, "learning_rate": 0.1},
+                    "triplane": {"learning_rate": 0.06},
                     "bitmap": {"resolution": 128, "learning_rate": 0.15},
                 },
             ),
@@ -89,6 +90,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                         "learning_rate": 0.004,
                     },
                     "grid": {"cells": 16, "learning_rate": 0.025},
+                    "triplane": {"base_resolution": 16, "width": 16, "learning_rate": 0.008},
                     "bitmap": {"resolution": 32, "learning_rate": 0.04},
                 },
             ),

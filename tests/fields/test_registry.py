@@ -113,7 +113,7 @@ def test_the_command_line_takes_it(strips, unbake, cornell, tiny, tmp_path):
     assert unbake("evaluate", run, "--spp", 4, "--train-views", 0).status == 0
     done = unbake("fit", cornell, "--out", tmp_path / "other", "--representation", "wave")
     assert done.status == 2
-    assert "must be one of neural, grid, bitmap, strips, not 'wave'" in done.err
+    assert "must be one of neural, grid, bitmap, triplane, strips, not 'wave'" in done.err
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_no_representation_of_that_name():
         registry.representation("mesh")
 
 
-@pytest.mark.parametrize("name", ["neural", "grid", "bitmap"])
+@pytest.mark.parametrize("name", ["neural", "grid", "bitmap", "triplane"])
 @pytest.mark.parametrize("initial", [0.1, 0.5, 0.9])
 def test_an_untrained_field_has_its_initial_value(name, initial):
     from unbake.fields.domain import SurfacePoint

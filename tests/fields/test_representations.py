@@ -17,9 +17,12 @@ from unbake.fields.grid import DenseGrid
 from unbake.fields.materials import make_materials
 from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField, make_radiance
+from unbake.fields.settings import TriPlaneConfig
+from unbake.fields.triplane import TriPlane
 
 LANES = 300
-REPRESENTATIONS = ["neural", "grid", "bitmap"]
+REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
+TRIPLANE = {"levels": 2, "features": 2, "base_resolution": 3, "width": 8}
 
 
 def settings(representation="neural", radiance="neural"):
@@ -27,10 +30,14 @@ def settings(representation="neural", radiance="neural"):
         TINY_FIT,
         {
             "materials": {
-                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}},
-                "roughness": {"grid": {"cells": 3}, "bitmap": {"resolution": 4}},
+                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}, "triplane": TRIPLANE},
+                "roughness": {
+                    "grid": {"cells": 3},
+                    "bitmap": {"resolution": 4},
+                    "triplane": TRIPLANE,
+                },
             },
-            "radiance": {"grid": {"cells": 4}},
+            "radiance": {"grid": {"cells": 4}, "triplane": TRIPLANE},
         },
     )
     return dataclasses.replace(
@@ -256,9 +263,66 @@ def test_both_representations_of_radiance_are_made():
     kinds = {
         "neural": radiance_field("neural", Domain.unit(), scale=1.0, seed=1).function,
         "grid": radiance_field("grid", Domain.unit(), scale=1.0, seed=1).function,
+        "triplane": radiance_field("triplane", Domain.unit(), scale=1.0, seed=1).function,
     }
     assert isinstance(kinds["neural"], Network) and isinstance(kinds["grid"], DenseGrid)
+    assert isinstance(kinds["triplane"], TriPlane)
     assert isinstance(RadianceField(kinds["grid"], Domain.unit(), scale=1.0), RadianceField)
+
+
+# ----------------------------------------------------------------------------------- feature planes
+
+
+def test_features_are_sums_of_bilinear_planes():
+    """Linear functions of two coordinates each come back exactly, from edge to edge."""
+    corners = 5
+    settings = TriPlaneConfig(levels=1, features=2, base_resolution=corners, width=4)
+    field, seen = TriPlane(settings, FieldSpec(outputs=1)), []
+    field.perceptron.evaluate = lambda features, engine: seen.extend(features)
+    second, first = np.meshgrid(*2 * [np.linspace(0, 1, corners)], indexing="ij")
+    planes = {"xy": (2, -1), "yz": (3, 0.5), "zx": (-1, 4)}
+    filled = {
+        name: np.stack([a * first + b * second, first * 0 + a], -1).ravel()
+        for name, (a, b) in planes.items()
+    }
+    given = field.parameters()
+    for name, values in filled.items():
+        room = np.zeros(given[name].shape, np.float32)
+        room[: values.size] = values
+        given[name] = mi.Float(room)
+    field.assign(given)
+    x, y, z = np.array(uniform(3)).reshape(3, -1)
+    x[:3], y[:3], z[:3] = [0, 1, 1], [0, 1, 0], [0, 1, 1]
+    field.evaluate(SurfacePoint(mi.Point3f(*(mi.Float(c) for c in (x, y, z)))))
+    expected = [2 * x - y + 3 * y + 0.5 * z - z + 4 * x, np.full(LANES, 4)]
+    np.testing.assert_allclose(np.array(seen), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("settings", [TriPlaneConfig(), TriPlaneConfig(4, 2, 7)])
+def test_planes_have_a_value_of_their_own_at_every_corner(settings):
+    field = TriPlane(settings, FieldSpec(outputs=1))
+    corners = sum((settings.base_resolution * 2**level) ** 2 for level in range(settings.levels))
+    for plane in field.planes.values():
+        assert (
+            corners * settings.features <= dr.width(plane.data) < 1.01 * corners * settings.features
+        )
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"levels": 0}, "levels: must be 1 or more, not 0"),
+        ({"features": 3}, "features: must be 2, 4 or 8, not 3"),
+        ({"base_resolution": 1}, "base_resolution: must be 2 or more, not 1"),
+        ({"levels": 10}, r"levels: must be such that base_resolution \* 2\^\(levels - 1\) is 81"),
+        ({"levels": 99999}, "levels: must be such that"),
+        ({"width": 0}, "width: must be 1 or more"),
+        ({"learning_rate": 0.0}, "learning_rate: must be positive"),
+    ],
+)
+def test_settings_of_planes_are_checked(bad, message):
+    with pytest.raises(UserError, match=message):
+        TriPlaneConfig(**bad)
 
 
 # --------------------------------------------------------------------------------------- bitmaps

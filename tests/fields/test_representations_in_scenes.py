@@ -28,7 +28,8 @@ from unbake.training.step import TrainingStep
 from unbake.transport.operator import attach_albedo, attach_material
 from unbake.transport.vertex import SceneView, find_vertex
 
-REPRESENTATIONS = ["neural", "grid", "bitmap"]
+REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
+TRIPLANE = {"levels": 2, "features": 2, "base_resolution": 3, "width": 8}
 
 
 def settings(representation="neural", radiance="neural"):
@@ -36,10 +37,14 @@ def settings(representation="neural", radiance="neural"):
         TINY_FIT,
         {
             "materials": {
-                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}},
-                "roughness": {"grid": {"cells": 3}, "bitmap": {"resolution": 4}},
+                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}, "triplane": TRIPLANE},
+                "roughness": {
+                    "grid": {"cells": 3},
+                    "bitmap": {"resolution": 4},
+                    "triplane": TRIPLANE,
+                },
             },
-            "radiance": {"grid": {"cells": 4}},
+            "radiance": {"grid": {"cells": 4}, "triplane": TRIPLANE},
         },
     )
     return dataclasses.replace(

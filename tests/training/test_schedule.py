@@ -81,10 +81,10 @@ def test_each_representation_has_its_rates(settings, albedo, roughness, radiance
     assert learning_rates(changed(**settings), 0, 0) == expected
 
 
-@pytest.mark.parametrize("representation", ["neural", "grid", "bitmap"])
+@pytest.mark.parametrize("representation", ["neural", "grid", "bitmap", "triplane"])
 @pytest.mark.parametrize("unknown", ["materials", "lighting", "materials+lighting", "emission"])
 def test_every_parameter_has_a_rate(unknown, representation, built_in):
-    small = {"grid": {"cells": 4}, "bitmap": {"resolution": 4}}
+    small = {"grid": {"cells": 4}, "bitmap": {"resolution": 4}, "triplane": {"levels": 1}}
     config = dataclasses.replace(TINY_FIT, unknown=unknown, representation=representation)
     config = update(config, {"materials": {"albedo": small, "roughness": small}})
     scene = "cornell" if unknown in ("materials", "emission") else "still"

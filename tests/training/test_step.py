@@ -81,6 +81,8 @@ def one_thread():
         {"method": "prb"},
         {"method": "prb", "representation": "grid"},
         {"method": "prb", "representation": "bitmap"},
+        {"method": "prb", "representation": "triplane"},
+        {"representation": "triplane", "radiance_representation": "triplane"},
     ],
     ids=lambda settings: ", ".join(map(str, settings.values())),
 )
@@ -111,7 +113,12 @@ def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, settings, 
 
 @pytest.mark.parametrize(
     "settings",
-    [{"method": "ours"}, {"method": "prb"}, {"method": "prb", "representation": "grid"}],
+    [
+        {"method": "ours"},
+        {"method": "prb"},
+        {"method": "prb", "representation": "grid"},
+        {"representation": "triplane", "radiance_representation": "triplane"},
+    ],
     ids=lambda settings: ", ".join(settings.values()),
 )
 def test_nothing_is_compiled_or_traced_after_the_third_step(built_in, settings):

@@ -211,7 +211,7 @@ def compare(
     Args:
         data: Folder of the data set, with its transforms.json.
         methods: Methods of `unbake fit`, such as: ours prb direct. METHOD:REPRESENTATION, such as
-            prb:bitmap, also says how materials are represented (neural, grid or bitmap).
+            prb:bitmap, also says how materials are represented (neural, grid, ...).
         out: Folder to write to.
         preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.

@@ -15,7 +15,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
-from .settings import BitmapConfig, DenseGridConfig, FieldSettings, GridConfig, NetworkConfig
+from .settings import (
+    BitmapConfig,
+    DenseGridConfig,
+    FieldSettings,
+    GridConfig,
+    NetworkConfig,
+    TriPlaneConfig,
+)
 
 if TYPE_CHECKING:
     from .field import Field, FieldSpec
@@ -125,5 +132,14 @@ register_representation(
         BitmapConfig(),
         make="unbake.fields.bitmap:Bitmaps",
         unwrapped=True,
+    )
+)
+register_representation(
+    Representation(
+        "triplane",
+        "tri-plane",
+        TriPlaneConfig(),
+        make="unbake.fields.triplane:TriPlane",
+        radiance=TriPlaneConfig(hidden=2),
     )
 )

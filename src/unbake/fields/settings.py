@@ -73,6 +73,36 @@ class DenseGridConfig:
 
 
 @dataclass(frozen=True)
+class TriPlaneConfig:
+    """A multilayer perceptron on top of three feature planes (Chan et al. 2022).
+
+    Resolutions double from level to level.
+    """
+
+    levels: int = 3  #: number of resolutions
+    features: int = 4  #: features of each level
+    base_resolution: int = 32  #: corners along an edge of the coarsest level
+    width: int = 32  #: neurons of a hidden layer
+    hidden: int = 1  #: number of hidden layers
+    learning_rate: float = 0.03  #: Adam
+
+    def __post_init__(self) -> None:
+        for name in ("levels", "width", "hidden"):
+            require(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+        require(self.features in (2, 4, 8), "features", "2, 4 or 8", self.features)
+        require(self.base_resolution >= 2, "base_resolution", "2 or more", self.base_resolution)
+        fits = self.levels <= 13 and self.finest <= 8192
+        bound = "such that base_resolution * 2^(levels - 1) is 8192 or less"
+        require(fits, "levels", bound, self.levels)
+        require_rate(self.learning_rate)
+
+    @property
+    def finest(self) -> int:
+        """Corners along an edge of the finest level."""
+        return self.base_resolution * 2 ** (self.levels - 1)
+
+
+@dataclass(frozen=True)
 class BitmapConfig:
     """A square bitmap in the UV coordinates of each material (Sec. 8)."""
 
