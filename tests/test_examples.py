@@ -45,3 +45,13 @@ def test_a_training_loop_of_ones_own_lowers_the_loss(example, cornell):
     out = example("custom_training_loop.py", cornell, "--steps", 40)
     found = re.search(r"mean loss (\S+) at first, (\S+) last", out)
     assert found and float(found[2]) < 0.8 * float(found[1])
+
+
+def test_a_representation_of_ones_own_is_fitted(example, cornell, tmp_path):
+    run = tmp_path / "run"
+    out = example("custom_field.py", cornell, "--out", run, "--steps", 6, "--pixels", 64)
+    assert re.search(r"Fourier features: albedo \d+\.\d dB", out)
+    settings = (run / "config.toml").read_text("utf-8")
+    assert 'representation = "fourier"' in settings
+    assert "[materials.albedo.fourier]\ncount = 32" in settings
+    assert "[materials.roughness.fourier]\ncount = 16" in settings
