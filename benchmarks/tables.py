@@ -58,8 +58,8 @@ def quality(result: dict) -> str:
             rows.append([f"`{name}`", "", "", row["error"], "", ""])
             continue
         psnr = [f"{row[f'{k}_psnr']:.1f}" for k in ("albedo", "roughness", "render")]
-        told = f"`{name}`", str(row["steps"]), f"{row['milliseconds_per_step']:.0f}"
-        rows.append([*told, *psnr])
+        cells = f"`{name}`", str(row["steps"]), f"{row['milliseconds_per_step']:.0f}"
+        rows.append([*cells, *psnr])
     return markdown(["run", "steps", "ms a step", "albedo", "roughness", "rendering"], rows)
 
 
@@ -68,13 +68,13 @@ def time_to_quality(end: dict, runs: dict) -> str:
     (name, row), ours = next(iter(end["methods"].items())), runs["methods"]["ours"]["score"]
     last = row["score"][-1]
     seconds = seconds_to(ours, last["albedo_psnr"])
-    told = [f"`{name}`", f"{last['seconds']:.0f} s", f"{last['albedo_psnr']:.2f} dB"]
+    cells = [f"`{name}`", f"{last['seconds']:.0f} s", f"{last['albedo_psnr']:.2f} dB"]
     if seconds is None:
-        told += ["not in this run", ""]
+        cells += ["not in this run", ""]
     else:
-        told += [f"{seconds:.0f} s", f"{last['seconds'] / seconds:.0f}"]
+        cells += [f"{seconds:.0f} s", f"{last['seconds'] / seconds:.0f}"]
     titles = ["method", "ends after", "with albedo", "`ours` has it after", "times"]
-    return markdown(titles, [told])
+    return markdown(titles, [cells])
 
 
 def phases(result: dict) -> str:

@@ -131,10 +131,10 @@ class JobRunner:
         if not known:
             return f"{done}; no estimate for the others at this scale"
         seconds = sum(job.seconds or 0.0 for job in known) * self.slowness()
-        told = f"about {duration(seconds + sum(job.waits for job in known))} on this machine"
+        takes = f"about {duration(seconds + sum(job.waits for job in known))} on this machine"
         if len(known) == len(left):
-            return f"{done}, the others take {told}"
-        return f"{done}, {len(known)} of the others take {told}; no estimate for the rest"
+            return f"{done}, the others take {takes}"
+        return f"{done}, {len(known)} of the others take {takes}; no estimate for the rest"
 
     def run(self, jobs: Sequence[Job], *, until: float | None = None) -> Outcome:
         """Run the jobs that are not done.
