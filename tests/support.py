@@ -151,15 +151,22 @@ def pieces(bounces: int, residuals: int) -> Requirements:
 
 
 class ConstantMaterials:
-    """The same albedo and roughness everywhere, as parameters: a stand-in for `Materials`."""
+    """The same material everywhere, as parameters: a stand-in for `Materials`."""
 
     carried = True
 
-    def __init__(self, albedo: float | mi.Color3f, roughness: float | mi.Float = 0.5) -> None:
+    def __init__(
+        self,
+        albedo: float | mi.Color3f,
+        roughness: float | mi.Float = 0.5,
+        metallic: float | None = None,
+    ) -> None:
         self.albedo, self.roughness = mi.Color3f(albedo), mi.Float(roughness)
+        self.metallic = None if metallic is None else mi.Float(metallic)
 
     def __iter__(self):
-        return iter(("albedo", "roughness"))
+        names = ("albedo", "roughness", "metallic")
+        return iter(names if self.metallic is not None else names[:2])
 
     def evaluate_one(self, name: str, si: mi.SurfaceInteraction3f, valid: mi.Bool):
         return self.evaluate(si, valid)[name]
@@ -168,7 +175,7 @@ class ConstantMaterials:
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: str | None = None
     ) -> Material:
         lanes = dr.zeros(mi.Float, dr.width(si.p))
-        return {"albedo": self.albedo + lanes, "roughness": self.roughness + lanes}
+        return {name: getattr(self, name) + lanes for name in self}
 
 
 class ConstantRadiance:

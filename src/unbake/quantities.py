@@ -94,6 +94,30 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                     "bitmap": {"resolution": 32, "learning_rate": 0.04},
                 },
             ),
+            # Most surfaces are no metals; halfway between, a surface is like neither.
+            Quantity(
+                name="metallic",
+                title="Metallic",
+                channels=1,
+                slot="metallic",
+                lower=0.0,
+                upper=1.0,
+                initial=0.1,
+                default=0.0,
+                display="data",
+                gltf="metallicRoughnessTexture.b",
+                settings={
+                    "neural": {
+                        "grid": {"levels": 4},
+                        "width": 16,
+                        "hidden": 1,
+                        "learning_rate": 0.004,
+                    },
+                    "grid": {"cells": 16, "learning_rate": 0.025},
+                    "triplane": {"base_resolution": 16, "width": 16, "learning_rate": 0.008},
+                    "bitmap": {"resolution": 32, "learning_rate": 0.04},
+                },
+            ),
         )
     }
 )

@@ -15,7 +15,7 @@ from unbake.fields.texture import material_textures
 from unbake.transport.path_sample import rhs, trace
 from unbake.transport.vertex import SceneView
 
-ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
+ALBEDO, ROUGHNESS, METALLIC = (0.6, 0.3, 0.45), 0.35, 0.4
 SPP = 64
 
 
@@ -49,10 +49,11 @@ def held_plugin():
     mi.register_bsdf("held_sampling", lambda props: Held(props))
 
 
-def principled(colour, roughness):
+def principled(colour, roughness, metallic=None):
     if not isinstance(colour, mi.Texture):
         colour = {"type": "rgb", "value": [float(c) for c in colour]}
-    return {"type": "principled", "base_color": colour, "roughness": roughness}
+    bsdf = {"type": "principled", "base_color": colour, "roughness": roughness}
+    return bsdf if metallic is None else bsdf | {"metallic": metallic}
 
 
 def room(bsdf):
@@ -119,27 +120,33 @@ def cut_out(bsdf):
     return {"type": "mask", "opacity": 0.6, "bsdf": bsdf}
 
 
+PARAMETERS = ["red", "green", "blue", "roughness", "metallic"]
+#: What is differentiated, and the metallic of the material, if that is a parameter.
+CASES = [*((name, None) for name in PARAMETERS[:4]), *((name, METALLIC) for name in PARAMETERS)]
+
+
 @pytest.mark.parametrize("wrap", [solid, cut_out])
-@pytest.mark.parametrize("parameter", ["red", "green", "blue", "roughness"])
-def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, parameter):
-    materials = ConstantMaterials(mi.Color3f(*ALBEDO), ROUGHNESS)
+@pytest.mark.parametrize(("parameter", "metallic"), CASES)
+def test_gradient_is_the_derivative_of_the_estimator(held_plugin, wrap, parameter, metallic):
+    materials = ConstantMaterials(mi.Color3f(*ALBEDO), ROUGHNESS, metallic)
     textures = material_textures(materials)
-    bsdf = principled(textures["base_color"], textures["roughness"])
+    bsdf = principled(textures["base_color"], textures["roughness"], textures.get("metallic"))
     live = SceneView.of(room(wrap(bsdf)), materials, 8)
-    dr.enable_grad(materials.albedo, materials.roughness)
+    optimized = [getattr(materials, name) for name in materials]
+    dr.enable_grad(optimized)
     image = objective(live)
     dr.backward(dr.mean(dr.mean(image)))
-    gradients = [*dr.grad(materials.albedo), dr.grad(materials.roughness)]
-    index = ["red", "green", "blue", "roughness"].index(parameter)
-    gradient = float(gradients[index][0])
+    albedo, *others = dr.grad(optimized)
+    index = PARAMETERS.index(parameter)
+    gradient = float([*albedo, *others][index][0])
 
     def moved(offset):
-        values = [*ALBEDO, ROUGHNESS]
+        values = [*ALBEDO, ROUGHNESS, metallic]
         values[index] += offset
         bsdf = {
             "type": "held_sampling",
-            "sampled": principled(ALBEDO, ROUGHNESS),
-            "evaluated": principled(values[:3], values[3]),
+            "sampled": principled(ALBEDO, ROUGHNESS, metallic),
+            "evaluated": principled(values[:3], *values[3:]),
         }
         return total(objective(SceneView.of(room(wrap(bsdf)), None, 8)))
 
