@@ -57,6 +57,8 @@ class Bitmaps(Field):
         engine: Engine | None = None,
     ) -> list[mi.Float]:
         """Look the bitmaps up."""
+        if point.uv is None:
+            raise ValueError("bitmaps need texture coordinates")
         # As in Mitsuba, texels are centred at (i + 1/2) / size and v grows with the row.
         left, right, u = self._neighbours(point.uv.x)
         above, below, v = self._neighbours(point.uv.y)

@@ -36,11 +36,7 @@ class Network(Field):
         self.grid.data = from_numpy(mi.Float, rng.uniform(-1e-4, 1e-4, self.grid.n_params))
         inputs = self.grid.n_output_features + spec.extra
         self.perceptron = Perceptron(inputs, settings.width, settings.hidden, spec, rng)
-
-    @property
-    def prepare_recordable(self) -> bool:
-        """Whether layers can be laid out while `dr.freeze` records."""
-        return can_record_layout()
+        self.prepare_recordable = can_record_layout()
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """Names: `grid`, and those of the perceptron."""

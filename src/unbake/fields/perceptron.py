@@ -77,8 +77,8 @@ class Perceptron:
         ]
         self._packed = None
 
-    def prepare(self) -> None:
-        """Lay the layers out for cooperative vectors; see `Field.prepare`."""
+    def prepare(self) -> list:
+        """Lay the layers out for cooperative vectors, and return them; see `Field.prepare`."""
         kind = mi.TensorXf16 if self.half else mi.TensorXf
         flat = [kind(a) for weights, bias in self.layers for a in (weights, _flat(bias))]
         if can_record_layout():
@@ -86,6 +86,7 @@ class Perceptron:
         else:
             views = nn.pack(*flat, layout="training")
         self._packed = list(zip(views[::2], views[1::2], strict=True))
+        return self._packed
 
     def evaluate(self, features: list[mi.Float], engine: Engine | None = None) -> list[mi.Float]:
         """Evaluate the perceptron.
@@ -130,13 +131,12 @@ class Perceptron:
         return [dr.gather(mi.Float, x.array, lane + i * width) for i in range(self.outputs)]
 
     def _coopvec(self, features: list[mi.Float]) -> list[mi.Float]:
-        if self._packed is None:
-            self.prepare()
+        packed = self._packed or self.prepare()
         number = mi.Float16 if self.half else mi.Float
         x = nn.CoopVec([number(f) for f in features])
-        for weights, bias in self._packed[:-1]:
+        for weights, bias in packed[:-1]:
             x = dr.maximum(nn.matvec(weights, x, bias), 0)
-        weights, bias = self._packed[-1]
+        weights, bias = packed[-1]
         return [mi.Float(y) for y in nn.matvec(weights, x, bias)]
 
 

@@ -22,6 +22,7 @@ class FieldSettings(Protocol):
     @property
     def learning_rate(self) -> float:
         """Adam's rate for the field's parameters."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,7 @@ class TriPlane(Field):
             self.planes[name] = plane
         inputs = settings.levels * settings.features + spec.extra
         self.perceptron = Perceptron(inputs, settings.width, settings.hidden, spec, rng)
-
-    @property
-    def prepare_recordable(self) -> bool:
-        """Whether layers can be laid out while `dr.freeze` records."""
-        return can_record_layout()
+        self.prepare_recordable = can_record_layout()
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """Names: `xy`, `yz` and `zx`, and those of the perceptron."""
