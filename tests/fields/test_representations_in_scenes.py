@@ -19,7 +19,7 @@ from support import (
 from unbake.config import BitmapConfig, update
 from unbake.errors import UserError
 from unbake.fields.materials import make_materials
-from unbake.fields.texture import material_textures, slots_of
+from unbake.fields.texture import material_numbers, material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
@@ -70,7 +70,7 @@ def assign_values(bitmaps, values):
     bitmaps.assign({"texels": mi.Float(logits.astype(np.float32).ravel())})
 
 
-# ---------------------------------------------------------------------------- slots in a scene
+# ---------------------------------------------------------------------------- bitmaps in a scene
 
 SCENE = """<scene version="3.0.0">
   <bsdf type="twosided" id="Wall"><bsdf type="principled" id="wall"/></bsdf>
@@ -100,7 +100,7 @@ STANDING = ["wall", "wall", "red", None, "red", "copper", "masked", "red"]
 
 
 @pytest.fixture
-def with_slots(tmp_path):
+def with_numbers(tmp_path):
     """A world of several materials with bitmaps of one texel; its materials have the colours."""
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
@@ -112,7 +112,7 @@ def with_slots(tmp_path):
     each = [material_textures(fields, number) for number in range(len(names))]
     edit.set_own_textures(parsed, each)
     scene = parsed.instantiate()
-    fields.slots = slots_of(scene)
+    fields.numbers = material_numbers(scene)
     colours = {name: 0.2 + 0.15 * i for i, name in enumerate(names)}
     assign_values(
         fields["albedo"],
@@ -128,8 +128,8 @@ def rays_from_above():
     return ray
 
 
-def test_every_shape_has_the_bitmap_of_its_material(with_slots):
-    scene_view, colours = with_slots
+def test_every_shape_has_the_bitmap_of_its_material(with_numbers):
+    scene_view, colours = with_numbers
     assert set(colours) == {"wall", "red", "copper", "masked"}
     expected = [colours.get(name) for name in STANDING]
     optimized = np.array([e is not None for e in expected])
@@ -139,8 +139,8 @@ def test_every_shape_has_the_bitmap_of_its_material(with_slots):
         np.testing.assert_allclose(found, [[e for e in expected if e]] * 3, atol=1e-5)
 
 
-def test_textures_find_their_bitmap_inside_virtual_calls(with_slots):
-    scene_view, colours = with_slots
+def test_textures_find_their_bitmap_inside_virtual_calls(with_numbers):
+    scene_view, colours = with_numbers
     scene_view.materials.stand_alone()
     si = scene_view.scene.ray_intersect(rays_from_above())
     found = np.array(si.bsdf().eval_diffuse_reflectance(si))
@@ -149,8 +149,8 @@ def test_textures_find_their_bitmap_inside_virtual_calls(with_slots):
             np.testing.assert_allclose(found[:, i], colours[name], atol=1e-5)
 
 
-def test_meshes_are_merged_within_a_material_alone(with_slots):
-    scene_view, _ = with_slots
+def test_meshes_are_merged_within_a_material_alone(with_numbers):
+    scene_view, _ = with_numbers
     assert (
         sum(shape.is_mesh() for shape in scene_view.scene.shapes()) == 3
     )  # wall, red twice, masked

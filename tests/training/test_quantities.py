@@ -1,12 +1,14 @@
 """A third unknown quantity, from the scene file to the page, and with the truth as its goal."""
 
+import gc
 import json
 import shutil
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
-from support import TINY_FIT
+from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
@@ -16,7 +18,11 @@ from unbake.fields.materials import carry, read_carried
 from unbake.imaging.pictures import read_exr
 from unbake.quantities import QUANTITIES
 from unbake.training.loop import fit
+from unbake.training.problem import make_problem
 from unbake.training.recovered import load_run
+from unbake.training.schedule import learning_rates
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 from unbake.training.validation import GroundTruth, MaterialBuffers
 
 THREE = ("albedo", "roughness", "metallic")
@@ -165,3 +171,19 @@ def test_a_data_set_without_that_truth_gives_no_score(unbake, cornell, tiny, tmp
     heldout = json.loads((run / "evaluation" / "metrics.json").read_text())["heldout"]
     assert heldout["metallic_psnr"] is None and np.isfinite(heldout["albedo_psnr"])
     assert unbake("report", run, "--out", tmp_path / "report.html").status == 0
+
+
+@pytest.mark.parametrize("method", ["ours", "prb"])
+@pytest.mark.parametrize("chosen", [("roughness",), ("albedo", "metallic")], ids="+".join)
+def test_any_choice_of_quantities_trains_and_is_replayed(built_in, method, chosen):
+    """Without an unknown albedo, L_θ takes that of the scene."""
+    gc.collect()
+    config = replace(TINY_FIT, quantities=chosen, method=method, representation="grid")
+    problem = make_problem(built_in("cornell"), "visible", config, 0.2)
+    pixels = grey_photographs(built_in_cameras("cornell", 8, views=2))
+    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    before = {key: np.array(value) for key, value in state.phi.items()}
+    assert {key.partition(".")[0] for key in before} == set(chosen)
+    assert_only_replayed(step, state, lambda i: learning_rates(config, i, 0.0))
+    for key, old in before.items():
+        assert (np.array(state.phi[key]) != old).any(), key

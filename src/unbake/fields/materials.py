@@ -34,7 +34,7 @@ class Materials(Mapping[str, Field]):
         self.domain = Domain.unit()
         #: The number of each shape's material, by `registry_number`. It is needed where materials
         #: have fields of their own, and then set together with the domain.
-        self.slots: dict[int, int] = {}
+        self.numbers: dict[int, int] = {}
         #: Whether textures read the values put on the surface interaction by `carry`. It must not
         #: change between an evaluation and its differentiation, which calls the textures again.
         self.carried = True
@@ -114,13 +114,13 @@ class Materials(Mapping[str, Field]):
 
     def _locate(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> SurfacePoint:
         position = self.domain.to_unit(si.p, valid)
-        number = self._number(si.shape) if self.slots else mi.UInt32(0)
+        number = self._number(si.shape) if self.numbers else mi.UInt32(0)
         return SurfacePoint(position, si.uv, number)
 
     def _number(self, shape: mi.ShapePtr) -> mi.UInt32:
         # Each shape is asked once, while this is recorded. (A table would be an array that comes
         # from outside of a frozen function.)
-        return dr.dispatch(shape, lambda s: mi.UInt32(self.slots.get(registry_number(s), 0)))
+        return dr.dispatch(shape, lambda s: mi.UInt32(self.numbers.get(registry_number(s), 0)))
 
 
 def _bounded(quantity: Quantity, values: list[mi.Float]) -> mi.Color3f | mi.Float:

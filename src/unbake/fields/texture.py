@@ -21,7 +21,7 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
     of Mitsuba can render the recovered scene.
 
     Args:
-        number: of the material, where materials have fields of their own; see `slots_of`.
+        number: of the material, where materials have fields of their own; see `material_numbers`.
 
     Paper: Sec. 5.1.
     """
@@ -72,7 +72,7 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
     return textures
 
 
-def slots_of(scene: mi.Scene) -> dict[int, int]:
+def material_numbers(scene: mi.Scene) -> dict[int, int]:
     """The number of the material of each shape, as the textures of its BSDF were told.
 
     A shape whose BSDF holds several materials, as a blend does, has the first. Shapes without such
@@ -81,13 +81,15 @@ def slots_of(scene: mi.Scene) -> dict[int, int]:
     Returns:
         Numbers of materials by the shapes' numbers in Dr.Jit's registry.
     """
-    slots = {registry_number(shape): _slot_of(shape) for shape in _shapes(scene)}
-    return {shape: slot for shape, slot in slots.items() if slot is not None}
+    numbers = {registry_number(shape): _number_of(shape) for shape in _shapes(scene)}
+    return {shape: number for shape, number in numbers.items() if number is not None}
 
 
 def painted_meshes_without_uv(scene: mi.Scene) -> list[str]:
     """The names of meshes that have textures of fields, but no texture coordinates."""
-    meshes = [shape for shape in _shapes(scene) if shape.is_mesh() and _slot_of(shape) is not None]
+    meshes = [
+        shape for shape in _shapes(scene) if shape.is_mesh() and _number_of(shape) is not None
+    ]
     bare = [mesh for mesh in meshes if not mesh.has_vertex_texcoords()]
     # Mitsuba tells the names of meshes in their printed form alone.
     names = [re.search(r'^  name = "(.*)"', str(mesh), re.MULTILINE) for mesh in bare]
@@ -99,7 +101,7 @@ def _shapes(scene: mi.Scene) -> list[mi.Shape]:
     return [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
 
 
-def _slot_of(shape: mi.Shape) -> int | None:
+def _number_of(shape: mi.Shape) -> int | None:
     bsdf = shape.bsdf()
     found = [] if bsdf is None else mi.traverse(bsdf).items()
     return next((value for key, value in found if key.endswith(_NUMBER)), None)

@@ -23,7 +23,7 @@ from ..fields.field import Field
 from ..fields.materials import Materials, make_materials
 from ..fields.radiance import RadianceField, make_radiance
 from ..fields.registry import representation
-from ..fields.texture import material_textures, slots_of
+from ..fields.texture import material_numbers, material_textures
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
 from ..transport.objective import requirements
@@ -117,7 +117,7 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
         materials.domain = domain
         if representation(config.representation).unwrapped:
             edit.require_unwrapped(loaded, scene)
-            materials.slots = slots_of(loaded)
+            materials.numbers = material_numbers(loaded)
 
     radiance = None
     if requirements(config.chosen_method.terms).radiance:
