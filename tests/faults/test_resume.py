@@ -133,13 +133,23 @@ def test_a_killed_fit_goes_on(started, fit, tmp_path):
     assert all(p.suffix == ".safetensors" for p in checkpoints(run))
 
 
-@pytest.mark.parametrize("method", ["direct", "ours"])
-def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(method, fit, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("direct", ()),
+        ("ours", ()),
+        ("ours", ("--representation", "triplane", "--radiance", "triplane")),
+    ],
+    ids=["direct", "ours", "triplane"],
+)
+def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(
+    method, words, fit, tmp_path, monkeypatch
+):
     with one_thread(monkeypatch):
-        assert fit("--steps", 12, name="whole", method=method).status == 0
+        assert fit("--steps", 12, *words, name="whole", method=method).status == 0
     interrupt_at(monkeypatch, 6)
     with one_thread(monkeypatch):
-        outcome = fit("--steps", 12, name="parts", method=method)
+        outcome = fit("--steps", 12, *words, name="parts", method=method)
     assert outcome.status == 130 and "stopped at step 7" in outcome.out
     with one_thread(monkeypatch):
         assert fit("--resume", name="parts").status == 0
