@@ -140,3 +140,13 @@ def test_the_fast_tests_are_there(repository):
     text = (repository / "Makefile").read_text("utf-8").replace("\\\n", " ")
     paths = re.search(r"^FAST := (.*)$", text, flags=re.MULTILINE)[1].split()
     assert len(paths) > 5 and [p for p in paths if not (repository / p).exists()] == []
+
+
+def test_contributors_read_the_layers_that_are_held(repository):
+    text = (repository / "pyproject.toml").read_text("utf-8")
+    held = re.search(r"^layers = \[(.*?)^\]", text, re.M | re.S)[1]
+    layers = [name for name in re.findall(r"\w+", held) if not name.startswith(("__", "probe"))]
+    told = re.search(
+        r"```text\n(cli >.*?)```", (repository / "CONTRIBUTING.md").read_text("utf-8"), re.S
+    )
+    assert re.findall(r"\w+", told[1]) == layers

@@ -37,7 +37,7 @@ TIME_EVERY = 4
 GIVE_UP_AFTER = 100
 
 
-def fit(
+def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     data: Path,
     run: Path,
     config: FitConfig,
