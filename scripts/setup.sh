@@ -125,7 +125,7 @@ ensure_llvm() {
 if ! "$VENV_PYTHON" -m pip --version >/dev/null 2>&1; then
   make_venv
 fi
-say "installing unbake and what it needs into .venv (about 200 MB the first time)"
+say "installing unbake and what it needs into .venv (about 850 MB on disk)"
 "$VENV_PYTHON" -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 ensure_llvm
 say "done: .venv/bin/unbake --help"
