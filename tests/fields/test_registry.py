@@ -2,6 +2,7 @@
 
 import gc
 from dataclasses import asdict, dataclass, replace
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -83,6 +84,36 @@ def test_it_has_settings_that_are_read_and_checked_like_others(strips):
     ):
         with pytest.raises(UserError, match=message):
             from_toml(f"[materials.albedo.strips]\n{line}")
+
+
+def test_settings_may_be_choices_of_numbers_and_may_be_absent(monkeypatch):
+    @dataclass(frozen=True)
+    class ChoiceConfig:
+        order: Literal[1, 2] = 1
+        cells: int | None = None
+        cut: float | None = None
+        learning_rate: float = 0.1
+
+    monkeypatch.setattr(registry, "_REPRESENTATIONS", dict(registry._REPRESENTATIONS))
+    register_representation(Representation("choice", "choice", ChoiceConfig(), Strips))
+    config = from_toml('representation = "choice"\n[materials.albedo.choice]\norder = 2\ncut = 3\n')
+    assert config.material_settings["albedo"] == ChoiceConfig(order=2, cut=3.0)
+    assert "cells" not in to_toml(config) and from_toml(to_toml(config)) == config
+    with pytest.raises(UserError, match=r"order: must be one of 1, 2, not 3"):
+        from_toml("[materials.albedo.choice]\norder = 3")
+    with pytest.raises(UserError, match=r"cells: must be int, not str"):
+        from_toml('[materials.albedo.choice]\ncells = "x"')
+
+
+@pytest.mark.parametrize("key", ["representation", "radiance_representation"])
+def test_settings_of_one_that_is_not_registered_are_refused_by_its_name(strips, key, monkeypatch):
+    text = to_toml(from_toml(f'{key} = "strips"\n[materials.albedo.strips]\ncount = 9\n'))
+    assert "strips]" in text
+    monkeypatch.delitem(registry._REPRESENTATIONS, "strips")
+    said = rf"^settings: {key}: must be one of neural, .*, not 'strips'. A name of your own must be"
+    with pytest.raises(UserError, match=said) as error:
+        from_toml(text)
+    assert "\n" not in str(error.value)
 
 
 def test_a_settings_file_does_not_name_it_without_need(strips):

@@ -57,13 +57,17 @@ def update(settings: Settings, table: Mapping[str, Any], path: tuple[str, ...] =
 
 def typed(value: object, hint: Any, where: str) -> Any:
     """The value as the type that an annotation asks for; raises a `UserError` otherwise."""
-    if typing.get_origin(hint) in (Literal, types.UnionType):
-        choices = typing.get_args(hint)
-        if value not in choices:
-            raise UserError(f"must be one of {', '.join(choices)}, not {value!r}", where=where)
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        if value not in inner:
+            told = ", ".join(map(str, inner))
+            raise UserError(f"must be one of {told}, not {value!r}", where=where)
         return value
-    if typing.get_origin(hint) is tuple:
-        (item, _) = typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):  # such as `int | None`: TOML has no None
+        (kind,) = (kind for kind in inner if kind is not types.NoneType)
+        return typed(value, kind, where)
+    if origin is tuple:
+        item = inner[0]
         if not isinstance(value, list | tuple):
             raise UserError(f"must be a list, not {type(value).__name__}", where=where)
         return tuple(typed(x, item, where) for x in value)

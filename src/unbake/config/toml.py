@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..fields.registry import representations
+from ..transport.methods import METHODS
 from .fit import FitConfig, PresetName
 from .migration import FORMAT, migrated
 from .presets import preset
@@ -45,8 +47,10 @@ def _kept(forms: Mapping[str, Any], base: Mapping[str, Any], used: str | None) -
 
 
 def _write_table(table: dict, path: tuple[str, ...], lines: list[str]) -> None:
-    values = {key: value for key, value in table.items() if not isinstance(value, dict)}
-    if path and values:
+    # What is None is left out: TOML has no word for it.
+    scalars = {k: v for k, v in table.items() if not isinstance(v, dict)}
+    values = {key: value for key, value in scalars.items() if value is not None}
+    if path and scalars:
         lines += ["", f"[{'.'.join(path)}]"]
     lines += [f"{key} = {json.dumps(value)}" for key, value in values.items()]
     for key, value in table.items():
@@ -68,10 +72,24 @@ def from_toml(text: str, where: str = "settings") -> FitConfig:
         raise UserError(f"not valid TOML ({error})", where=where) from None
     try:
         table = migrated(table)
+        _require_registered(table)
         name = typed(table.get("preset", "cpu"), PresetName, "preset")
         return update(preset(name), table)
     except UserError as error:
         raise UserError(error.what, where=f"{where}: {error.where}", remedy=error.remedy) from None
+
+
+def _require_registered(table: Mapping[str, Any]) -> None:
+    """Refuse unknown methods and representations, before their own tables are unknown keys."""
+    for key, names in (
+        ("method", tuple(METHODS)),
+        ("representation", representations()),
+        ("radiance_representation", representations(radiance=True)),
+    ):
+        value = table.get(key)
+        if isinstance(value, str) and value not in names:
+            what = f"must be one of {', '.join(names)}, not {value!r}"
+            raise UserError(what, key, "A name of your own must be registered first")
 
 
 def read_toml(path: Path) -> FitConfig:
