@@ -10,8 +10,8 @@ from unbake.comparison.tables import print_comparison, print_step_times
 LENGTH = {"steps": 5, "seconds": 2.0, "milliseconds_per_step": None, "samples_per_second": 1e3}
 
 
-def printed(show, content):
-    console = Console(file=io.StringIO(), width=200)
+def printed(show, content, width=200):
+    console = Console(file=io.StringIO(), width=width)
     show(content, console)
     return console.file.getvalue()
 
@@ -43,3 +43,14 @@ def test_a_method_that_failed_has_no_step_time():
     times = {"milliseconds_per_step": 12.5, "samples_per_second": 2e3, "times_the_first": None}
     text = printed(print_step_times, [names | times, names | {"method": "prb", "error": "no"}])
     assert "12.5" in text and "—" in text and "known" in text and "failed" in text
+
+
+def test_long_names_are_folded_rather_than_cut():
+    names = {"method": "with-second-bounce", "representation": "Fourier-features"}
+    names |= {"radiance": "neural", "estimator": "split-halves"}
+    times = {"milliseconds_per_step": 12.5, "samples_per_second": 2e3, "times_the_first": 1.0}
+    text = printed(print_step_times, [names | times], width=80)
+    rows = [line.split("│")[1:5] for line in text.splitlines() if line.startswith("│")]
+    assert ["".join(cell.strip() for cell in column) for column in zip(*rows, strict=True)] == [
+        *names.values()
+    ]

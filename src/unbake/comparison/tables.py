@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from ..quantities import QUANTITIES
 
@@ -22,7 +22,7 @@ def print_comparison(result: Row, console: Console) -> None:
 
 def print_step_times(rows: list[Row], console: Console) -> None:
     """Print the rows of `unbake bench methods`."""
-    table = Table("method", "materials", "radiance", "estimator")
+    table = _table("method", "materials", "radiance", "estimator")
     _add_numbers(table, "ms a step", "k samples/s", "times the first")
     for row in rows:
         names = (row["method"], row["representation"] or "known", row["radiance"] or "none")
@@ -39,7 +39,7 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
     evaluated = [row["heldout"] for row in rows.values() if "heldout" in row]
     materials = [q for q in QUANTITIES if any(f"{q}_psnr" in means for means in evaluated)]
     quantities = ("render", *materials)
-    table = Table("run", title="Held-out views, PSNR in dB", title_justify="left")
+    table = _table("run", title="Held-out views, PSNR in dB")
     _add_numbers(table, *quantities, "steps", "time", "ms/step", "samples/s")
     for name, row in rows.items():
         if "error" in row:
@@ -59,7 +59,7 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
 def _print_lighting(rows: dict[str, Row], console: Console) -> None:
     maps = {name: row["environment"] for name, row in rows.items() if row.get("environment")}
     if maps:
-        table = Table("run", title="Environment map", title_justify="left")
+        table = _table("run", title="Environment map")
         _add_numbers(table, "SH error", "aligned", "relighting", "aligned")
         for name, metrics in maps.items():
             errors = [f"{100 * metrics[k]:.1f} %" for k in ("sh_error", "sh_error_aligned")]
@@ -76,12 +76,18 @@ def _print_lighting(rows: dict[str, Row], console: Console) -> None:
 def _print_time_to_quality(targets: list[Row], console: Console) -> None:
     if len(targets) < 2:
         return
-    table = Table("albedo PSNR of", "dB", title="Seconds to that quality", title_justify="left")
-    _add_numbers(table, *targets[0]["seconds"])
+    table = _table("albedo PSNR of", title="Seconds to that quality")
+    _add_numbers(table, "dB", *targets[0]["seconds"])
     for target in targets:
         times = [_number(seconds, 1) for seconds in target["seconds"].values()]
         table.add_row(target["run"], _number(target["albedo_psnr"], 2), *times)
     console.print(table)
+
+
+def _table(*names: str, title: str | None = None) -> Table:
+    """A table whose first columns are names, which are folded where they are long, not cut."""
+    columns = (Column(name, overflow="fold") for name in names)
+    return Table(*columns, title=title, title_justify="left")
 
 
 def _add_numbers(table: Table, *titles: str) -> None:
