@@ -104,7 +104,9 @@ def _help(option: Option, presets: bool) -> str:
     return f"{text} ({default})."
 
 
-def _metavar(kind: Any) -> str:
+def _metavar(kind: Any) -> str | None:
+    if kind is bool:
+        return None
     choices = typing.get_args(kind)
     if choices:
         return "{" + ",".join(map(str, choices)) + "}"
