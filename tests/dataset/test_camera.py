@@ -49,14 +49,14 @@ def test_the_sensor_casts_the_rays_of_the_formula(camera):
             -np.ones_like(px),
         ]
     )
-    scene_view = (camera.to_world[:3, :3] @ local).T
-    scene_view /= np.linalg.norm(scene_view, axis=1, keepdims=True)
+    in_world = (camera.to_world[:3, :3] @ local).T
+    in_world /= np.linalg.norm(in_world, axis=1, keepdims=True)
     origins, directions = sensor_directions(camera)
-    assert np.abs(directions - scene_view).max() < 1e-5
+    assert np.abs(directions - in_world).max() < 1e-5
     # Mitsuba starts its rays on the near plane, which is 1e-4 away
     assert np.linalg.norm(origins - camera.origin, axis=1).max() < 2e-4
     own_origins, own_directions = camera.rays(px, py)
-    assert np.allclose(own_directions, scene_view, atol=1e-12)
+    assert np.allclose(own_directions, in_world, atol=1e-12)
     assert np.array_equal(own_origins[3], ORIGIN)
 
 

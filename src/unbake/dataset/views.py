@@ -149,8 +149,8 @@ def read_image(path: Path, width: int, height: int, clip_negative: bool = False)
 def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
     """The names of the cameras that stand inside geometry or with their nose on it.
 
-    A camera is named when its position is inside an object (the rule is told in
-    `freespace.inside_geometry`), or when over half of 256 rays spread over its image hit something
+    A camera is named when its position is inside an object (the rule is that of
+    `free_space.inside_geometry`), or when over half of 256 rays spread over its image hit something
     nearer than 0.1 % of the scene's diagonal. Both are signs of a wrong pose, not proof of one.
 
     Args:
