@@ -1,8 +1,8 @@
 """A PyTorch module as a field. Needs PyTorch: `pip install "unbake[torch]"`.
 
-For experiments with what PyTorch has and Dr.Jit has not. The module is evaluated and differentiated
-by PyTorch, which costs a copy each way and has kernels of its own; nothing of it can be recorded,
-so that steps are traced anew each time.
+For experiments with what PyTorch has and Dr.Jit has not. PyTorch evaluates and differentiates the
+module, with kernels of its own, and nothing of it can be recorded: steps are traced anew each time,
+and take several times as long (`benchmarks/torch_field.py` measures it).
 """
 
 from __future__ import annotations
