@@ -168,7 +168,7 @@ def _keep_two_threads() -> None:
 
 
 def _wanted(variant: str | None) -> str | None:
-    """Resolve what was asked for and what is set; None leaves the choice to the machine."""
+    """The variant that was asked for or is set; None leaves the choice to the machine."""
     if variant is None and "mitsuba" in sys.modules:
         current = sys.modules["mitsuba"].variant()
         if current in VARIANTS:

@@ -1,4 +1,4 @@
-"""What `unbake doctor` tells: what this machine offers, whether it runs, what to do where not."""
+"""`unbake doctor`: the libraries of this machine, whether kernels run, and remedies."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _last_json(output: str) -> dict:
 
 
 def _death(run: subprocess.CompletedProcess[str]) -> str:
-    """Tell how the probe ended when it could not tell itself."""
+    """How the probe ended, where it printed no result."""
     lines = [line for line in run.stderr.splitlines() if line.strip()]
     last = f": {lines[-1].strip()}" if lines else ""
     if run.returncode < 0:

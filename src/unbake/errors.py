@@ -1,4 +1,4 @@
-"""The one exception that reaches a user: what is wrong, where, and the remedy."""
+"""The exception for mistakes of a user: what is wrong, where, and the remedy."""
 
 from __future__ import annotations
 
@@ -26,6 +26,6 @@ class UserError(Exception):
 
 
 def require(good: bool, key: str, wanted: str, value: object) -> None:
-    """Raise a `UserError` unless a setting is good, which says what it must be."""
+    """Raise a `UserError` that says what a setting must be, unless it is good."""
     if not good:
         raise UserError(f"must be {wanted}, not {value!r}", where=key)

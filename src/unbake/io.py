@@ -186,7 +186,7 @@ def array(keys: dict[str, Any], key: str, shape: tuple[int, ...], where: str) ->
     """The nested list of numbers at a key as a float64 array of that shape."""
     value = _value(keys, key, where)
     try:
-        # Texts such as "1" would convert, but whoever wrote them meant something else
+        # Texts such as "1" would convert, but are a mistake
         result = np.array(value)
         numeric = np.issubdtype(result.dtype, np.number)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""What numbers were measured on."""
+"""A description of the machine, to go with measurements."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mitsuba as mi
 
 
 def machine() -> dict:
-    """What numbers were measured on: processor, variant, versions."""
+    """Processor, number of cores, Mitsuba's variant, and versions."""
     model = platform.processor()
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -1,4 +1,4 @@
-"""What can be unknown of a surface: the parameters of Mitsuba's `principled` that are learned.
+"""Quantities: the parameters of Mitsuba's `principled` that can be unknown on surfaces.
 
 A quantity is a row of the table `QUANTITIES`, and all that the package does with materials follows
 from it: fields and their settings, textures, truth images, scores, pages. Needs neither Mitsuba nor

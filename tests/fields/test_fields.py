@@ -96,7 +96,7 @@ def test_half_precision_is_near_single(engine):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_gradient_of_one_output_of_several(engine):
-    """The other outputs, which nobody uses, have none."""
+    """The other outputs, which are not used, have none."""
     network = Network(WIDE, FieldSpec(outputs=3, seed=3))
     parameters = randomised(network)
     weight = points(seed=8).x

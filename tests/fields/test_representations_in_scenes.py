@@ -95,13 +95,13 @@ SCENE = """<scene version="3.0.0">
     <transform name="to_world"><translate x="21"/></transform></shape>
   <emitter type="constant"/>
 </scene>"""
-#: Material of what stands at x = 0, 3, 6, …; None: not a material that is sought.
+#: Material of what stands at x = 0, 3, 6, …; None: not a material that is optimized.
 STANDING = ["wall", "wall", "red", None, "red", "copper", "masked", "red"]
 
 
 @pytest.fixture
 def with_numbers(tmp_path):
-    """A world of several materials with bitmaps of one texel; its materials have the colours."""
+    """A scene of several materials with bitmaps of one texel; its materials have the colours."""
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
     parsed = parse(path)

@@ -111,7 +111,7 @@ def test_the_deviation_of_the_mean_is_exact():
     )
 
 
-# ------------------------------------------------------------------------------------- beliefs
+# --------------------------------------------------------------------------------- regularizers
 
 
 def settings(**changes):
@@ -142,7 +142,7 @@ def terms_of(problem, config, cameras):
     return found
 
 
-def test_nothing_is_believed_by_default(cornell_problem):
+def test_no_regularizer_is_on_by_default(cornell_problem):
     assert terms_of(cornell_problem, TINY_FIT, built_in_cameras("cornell", 4)) == {}
 
 
@@ -207,7 +207,7 @@ def test_the_scale_is_a_convention_where_photographs_do_not_tell_it(
 
 
 def test_known_materials_do_not_count(tmp_path):
-    """What is seen of them says nothing about the albedo that is sought."""
+    """What is seen of them says nothing about the albedo that is optimized."""
     path = tmp_path / "scene.xml"
     wrapped = '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>'
     metal = '<bsdf type="roughconductor"/>'
@@ -242,8 +242,8 @@ def test_a_fit_with_a_term_logs_it_and_is_smoother(built_in, method, term, weigh
     cameras = built_in_cameras("cornell", 16, views=2)
 
     def fitted(weight):
-        believed = RegularizationConfig(radius=0.1, **{term: weight})
-        config = settings(method=method, regularization=believed)
+        chosen = RegularizationConfig(radius=0.1, **{term: weight})
+        config = settings(method=method, regularization=chosen)
         problem = make_problem(built_in("cornell"), "visible", config, 0.2)
         step = TrainingStep(problem, grey_photographs(cameras), config)
         state = initial_state(problem)

@@ -180,7 +180,7 @@ def test_the_estimate_of_memory_is_what_a_step_then_takes(built_in):
     step, state = start(built_in, config)
     estimate = step.bytes_needed(state)
     if estimate is None:
-        pytest.skip("nobody tells here how much memory was taken")
+        pytest.skip("the memory of a step cannot be measured here")
     state.set_learning_rates(rates(0))
     step.unfrozen(state, 1)
     taken = peak_bytes(lambda: step.unfrozen(state, 1))

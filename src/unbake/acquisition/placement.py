@@ -263,7 +263,7 @@ def _importance(
 
 
 def _worth(eye: np.ndarray, points: free_space.SurfacePoints, usual: float) -> np.ndarray:
-    """What an unobstructed view of points is worth, by angle and pixels per area, in [0, 1]."""
+    """The value of an unobstructed view of points, by angle and pixels per area, in [0, 1]."""
     to_eye = eye - points.position
     distance = np.linalg.norm(to_eye, axis=1)
     cosine = np.abs(np.einsum("ij,ij->i", to_eye, points.normal)) / distance

@@ -124,7 +124,7 @@ def _value(settings: object, path: tuple[str, ...]) -> object:
 
 
 def given(chosen: Any) -> dict[str, Any]:
-    """By option, what was given of flags whose default is None."""
+    """The values that were given, by option; options that were not are None and left out."""
     named = {f.name.replace("_", "-"): getattr(chosen, f.name) for f in dataclasses.fields(chosen)}
     return {name: value for name, value in named.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""What the commands share: their options, and how what was given is checked."""
+"""Options that several commands share, and checks of their values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hi
 Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint="(required)")]
 Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
-#: Where None stands for what preset or settings file say, "default: None" would tell nothing.
+#: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
 Preset = Annotated[

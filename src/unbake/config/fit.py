@@ -38,10 +38,12 @@ class TransportConfig:
 
 @dataclass(frozen=True)
 class PathConfig:
-    """Paths of the methods that follow them to their end, `ad-pt` and `prb` (Sec. 6)."""
+    """Paths of the methods that follow them to their end, such as `prb` (Sec. 6)."""
 
     #: Longest path in bounces, plus one (Mitsuba's meaning).
-    max_depth: Annotated[int, Flag("Longest path of ad-pt and prb")] = 15
+    max_depth: Annotated[
+        int, Flag("Longest path of methods that follow whole paths, such as prb")
+    ] = 15
     rr_depth: int = 5  #: bounces before Russian roulette, which goes on with 0.95 at most
 
     def __post_init__(self) -> None:
@@ -74,7 +76,7 @@ class LightingConfig:
 
 @dataclass(frozen=True)
 class RegularizationConfig:
-    """What is believed of materials where photographs say little; all off by default (ours)."""
+    """Regularizers of materials, for few or noisy photographs; all off by default (ours)."""
 
     roughness_smoothness: float = 0.0  #: weight of differences between near points
     radius: float = 0.02  #: how near, as a fraction of the scene's (or the bitmap's) edge
@@ -94,7 +96,7 @@ class RegularizationConfig:
 MOST_BOUNCES = 16
 
 
-# What the command line tells of the tables whose rows settings name.
+# Choices for the help of the command line, from the tables that settings name rows of.
 
 
 def _quantities() -> dict[str, str]:
@@ -243,7 +245,7 @@ class FitConfig:
         self._complete_fields()
 
     def _complete_fields(self) -> None:
-        """Check what fields there are, and fill in the settings that were not given."""
+        """Check quantities and representations, and fill in the field settings not given."""
         try:
             chosen = in_order(self.quantities)
         except UserError as error:
@@ -337,7 +339,7 @@ class FitConfig:
 
 
 def default_settings(name: str, form: str) -> FieldSettings:
-    """What a quantity's field is like unless settings say otherwise.
+    """The default settings of a quantity's field.
 
     Args:
         name: of the quantity.

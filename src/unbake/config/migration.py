@@ -82,7 +82,7 @@ def _is_network(radiance: object) -> bool:
 
 
 def _put(table: dict[str, Any], dotted: str, value: Any, key: str) -> None:
-    """Put a value where a dotted key says, beside what is there already."""
+    """Put a value at a dotted key, and keep the values that are there already."""
     *outer, last = dotted.split(".")
     for name in outer:
         table = table.setdefault(name, {})

@@ -79,7 +79,7 @@ class DataFolder:
 
     @property
     def cache_key(self) -> Path:
-        """What the cache was made from; it is written last."""
+        """The input of the cache; it is written last."""
         return self.cache / "key.json"
 
     @property

@@ -183,7 +183,7 @@ def _cached(
 
 
 def _open_cache(data: DataFolder, key: dict) -> Photographs | None:
-    """What is in the files, if they are whole and of these photographs."""
+    """The cached photographs, if the files are complete and of these images."""
     try:
         stored = read_object(data.cache_key)
         if stored != {"key": key, "mean": stored["mean"]}:

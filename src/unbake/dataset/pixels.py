@@ -72,7 +72,7 @@ class CameraRays:
 
 @dataclass
 class PixelBatch:
-    """Some pixels: which ones they are, and what the photographs show there; a PyTree."""
+    """Pixels by number, with their colours in the photographs; a PyTree."""
 
     count: int
     smoothed: bool  # whether blurred photographs are with them

@@ -98,7 +98,7 @@ def evaluate(
 
 
 def description(config: FitConfig) -> dict:
-    """What distinguishes runs: unknown, quantities, method, representations and estimator.
+    """The settings that tell runs apart: unknown, quantities, method, fields and estimator.
 
     `representation` is that of the materials, None if they are known; `radiance` is that of L_θ,
     None if the method has no radiance field.

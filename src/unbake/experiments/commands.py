@@ -109,13 +109,12 @@ def _copy(process: subprocess.Popen, log: Path | None) -> None:
 
 def call_settings(parser: argparse.ArgumentParser) -> None:
     """Add the options that scripts which run jobs have in common."""
-    minutes = os.environ.get("MINUTES")
     parser.add_argument("--plan", action="store_true", help="only show what is left to do")
     parser.add_argument("--again", action="store_true", help="repeat the jobs, also those done")
     parser.add_argument(
         "--minutes",
         type=float,
-        default=float(minutes) if minutes else None,
+        default=os.environ.get("MINUTES") or None,
         help="time after which no further job starts, and fits, tables and figures stop; the "
         "same command continues (default: MINUTES of the environment)",
     )

@@ -1,1 +1,1 @@
-"""What is learned: fields over the scene's volume, and their dress as Mitsuba textures."""
+"""Trainable fields over the scene, and the Mitsuba textures that evaluate them."""

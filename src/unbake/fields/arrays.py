@@ -17,7 +17,7 @@ def sigmoid(x: mi.Float) -> mi.Float:
 
 
 def first_value(spec: FieldSpec) -> float:
-    """What a field holds, before it is bounded by `sigmoid`, for its outputs to start as wanted."""
+    """The value before `sigmoid` at which the outputs of an untrained field start."""
     return math.log(spec.initial / (1 - spec.initial)) if spec.bounded else 0.0
 
 

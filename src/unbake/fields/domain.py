@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass
 class SurfacePoint:
-    """Where a field is asked, in every kind of coordinates that a representation may want."""
+    """Where a field is evaluated, in all coordinates that a representation may use."""
 
     position: mi.Point3f  # [0,1]³
     uv: mi.Point2f | None = None  # texture coordinates: without bounds, maybe not finite
@@ -43,8 +43,8 @@ class Domain:
     def to_unit(self, p: mi.Point3f, valid: mi.Bool) -> mi.Point3f:
         """World positions to [0,1]³; lanes that are not valid get the centre.
 
-        A single position at infinity, as a ray that hit nothing has, would poison the grid for
-        good.
+        The position of a ray that hit nothing is infinite: its gradient would fill the grid with
+        NaN.
         """
         unit = (mi.Point3f(p) - mi.Point3f(*self.centre)) / self.extent + 0.5
         return bounded(dr.select(valid, unit, 0.5), 0, 1)

@@ -103,7 +103,7 @@ class EnvironmentMap:
 
     @property
     def texels(self) -> mi.Float:
-        """What lookups read; it passes gradients to the parameters."""
+        """The texels that lookups read; they pass gradients to the parameters."""
         return self.tables["texels"]
 
     def radiance(self, d: mi.Vector3f, active: mi.Bool = True) -> mi.Color3f:

@@ -1,4 +1,4 @@
-"""What every representation implements."""
+"""The interface of fields, which every representation implements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Engine = Literal["fused", "tensor", "coopvec"]
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """What a field is asked to be, whatever its representation.
+    """The function that a field has to represent, whatever its representation.
 
     Args:
         outputs: numbers at a point.
@@ -58,7 +58,7 @@ class Field(Protocol):
 
     #: Whether `dr.freeze` can record `evaluate`; where it cannot, steps are traced each time.
     recordable: bool = True
-    #: Whether it can record `prepare`, too, which methods need that ask fields inside of loops.
+    #: Whether it can record `prepare`, too; methods that evaluate fields in loops need it.
     prepare_recordable: bool = True
     #: Whether fields can be evaluated inside of virtual calls and loops.
     symbolic: bool = True
@@ -72,7 +72,7 @@ class Field(Protocol):
         ...
 
     def prepare(self) -> None:
-        """Do what evaluations inside virtual calls and loops cannot do; needed after `assign`."""
+        """Prepare evaluations inside virtual calls and loops; needed after each `assign`."""
 
     def evaluate(
         self,

@@ -92,7 +92,7 @@ class Materials(Mapping[str, Field]):
     def evaluate_one(
         self, name: str, si: mi.SurfaceInteraction3f, valid: mi.Bool
     ) -> mi.Color3f | mi.Float:
-        """One quantity alone, where no BSDF will be asked."""
+        """One quantity alone, for points where no BSDF is evaluated."""
         return _bounded(QUANTITIES[name], self[name].evaluate(self._locate(si, valid)))
 
     def evaluate_near(
@@ -216,7 +216,7 @@ def carry(si: mi.SurfaceInteraction3f, material: Material) -> None:
 
 
 def read_carried(si: mi.SurfaceInteraction3f, names: Iterable[str]) -> Material:
-    """What `carry` put on a surface interaction."""
+    """The materials that `carry` put on a surface interaction."""
     numbers = [*si.dn_du, *si.dn_dv]
     found: Material = {}
     for name, part in channels_of(names).items():

@@ -162,7 +162,7 @@ class _Fused(dr.CustomOp):
 
     def backward(self):
         lanes = self.inputs[0].shape[0]
-        # An output that nobody used has a gradient of a single zero.
+        # An output that was not used has a gradient of a single zero.
         gradient = [g + dr.zeros(mi.Float, lanes) for g in self.grad_out()]
         dr.eval(gradient)
         kept: list[mi.TensorXf] = []

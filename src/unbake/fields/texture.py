@@ -73,7 +73,7 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
 
 
 def material_numbers(scene: mi.Scene) -> dict[int, int]:
-    """The number of the material of each shape, as the textures of its BSDF were told.
+    """The number of the material of each shape, from the textures of its BSDF.
 
     A shape whose BSDF holds several materials, as a blend does, has the first. Shapes without such
     textures are left out.

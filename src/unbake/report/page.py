@@ -25,20 +25,20 @@ from unbake.transport.terms import TERMS
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 SPLITS = ("heldout", "train")
-#: What has pictures, and its name.
+#: Names of the quantities that have pictures.
 NAMES = {"render": "Rendering"} | {name: row.title for name, row in QUANTITIES.items()}
-#: PSNRs: the key, what it is of, and the heading.
+#: PSNRs: key, quantity and heading.
 PSNRS = [("render_psnr", "render", "Rendering")]
 for _name, _row in QUANTITIES.items():
     PSNRS.append((f"{_name}_psnr", _name, _row.title))
     if _name == "albedo":
         PSNRS.append(("albedo_psnr_aligned", _name, "Aligned albedo"))
-#: What is above the scale of a picture.
+#: Captions of the scales beside pictures.
 UNITS = {"render": "linear radiance", "environment": "linear radiance"} | {
     name: f"{row.title.lower()}, {row.lower:.0f} to {row.upper:.0f}"
     for name, row in QUANTITIES.items()
 }
-#: Names on the page of what an evaluation defines.
+#: Headings of the definitions of an evaluation.
 DEFINED = {
     "psnr": "PSNR",
     "albedo_psnr_aligned": "Aligned albedo",

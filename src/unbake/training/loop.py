@@ -188,7 +188,7 @@ def _resumed_config(run: RunFolder, config: FitConfig) -> FitConfig:
 
 
 def _require_same_photographs(run: RunFolder, data: Path, mean_radiance: float) -> None:
-    """A data set may have moved; another one would ruin what was learned without a word."""
+    """Refuse other photographs than those of the run; the data set may have moved."""
     origin = run.origin()
     if not math.isclose(origin.mean_radiance, mean_radiance, rel_tol=1e-4):
         raise UserError(

@@ -1,4 +1,4 @@
-"""What a fit tells while it runs: a progress display and a JSONL log."""
+"""The output of a running fit: a progress display and a JSONL log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is learned so far: pictures, and how far materials are from the truth."""
+"""Previews of a running fit: pictures, and errors of the materials against the truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Preview:
         self._environment = [] if known is None else [[tonemap(known)]]
 
     def show(self, progress: Progress) -> list[dict]:
-        """Show what the fields say now.
+        """Show the present values of the fields.
 
         Materials and the environment map go to one picture, above the truth where that is known.
         Lights have no picture.

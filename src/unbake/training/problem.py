@@ -54,7 +54,7 @@ class Problem:
         return found if self.radiance is None else [*found, self.radiance.function]
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
-        """The trainable arrays φ by name; the first word tells of which unknown."""
+        """The trainable arrays φ by name; the first word is the unknown's."""
         named: dict[str, mi.Float | mi.TensorXf] = {}
         if self.materials is not None:
             named |= self.materials.parameters()
@@ -63,7 +63,7 @@ class Problem:
         return named
 
     def assign(self, parameters: Parameters) -> None:
-        """Use these arrays, and derive again what depends on them."""
+        """Use these arrays, and update the tables that are derived from them."""
         if self.materials is not None:
             self.materials.assign(parameters)
         for word, light in self._lighting():

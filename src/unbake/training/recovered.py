@@ -16,7 +16,7 @@ from .state import initial_state
 
 @dataclass
 class Recovered:
-    """A run: what was recovered, with which settings, from which data."""
+    """A run read back: the recovered scene, its settings and its data set."""
 
     problem: Problem
     dataset: Dataset

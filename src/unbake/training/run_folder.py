@@ -44,7 +44,7 @@ _GIVE_RUN = "Give the folder of a run"
 @final
 @dataclass(frozen=True)
 class Origin:
-    """What a run was made from, beside its settings."""
+    """The input of a run, beside its settings."""
 
     data: str  # the data set's folder; a relative path starts at the run folder
     mean_radiance: float  # of its training pixels; the scale of the radiance field
@@ -161,11 +161,11 @@ class RunFolder:
             raise UserError(what, self.config_file, _GIVE_RUN) from None
 
     def write_settings(self, config: FitConfig) -> None:
-        """Write the settings; from then on there is a run in this folder."""
+        """Write the settings; this makes the folder that of a run."""
         write_text(self.config_file, to_toml(config))
 
     def origin(self) -> Origin:
-        """What the run was made from.
+        """The input of the run.
 
         Raises:
             UserError: the file is missing, damaged, or of a newer version.
@@ -183,7 +183,7 @@ class RunFolder:
             raise UserError("cannot be read", self.origin_file, again) from None
 
     def write_origin(self, origin: Origin) -> None:
-        """Write what the run was made from."""
+        """Write the input of the run."""
         write_json(self.origin_file, {"format": ORIGIN_FORMAT} | asdict(origin))
 
     def data(self, named: str) -> Path:
@@ -212,7 +212,7 @@ class RunFolder:
         return [line for line in lines if isinstance(line, dict)]
 
     def forget_after(self, step: int) -> None:
-        """Drop the lines of the log after a step, and what a killed fit left half-written.
+        """Drop the lines of the log after a step, and lines that a killed fit left half-written.
 
         A resumed fit takes those steps again.
         """
@@ -231,18 +231,18 @@ class RunFolder:
         return self.checkpoints / f"step-{step:07d}.safetensors"
 
     def written_checkpoints(self) -> list[Path]:
-        """The checkpoints that there are, the newest first."""
+        """The existing checkpoints, the newest first."""
         return sorted(self.checkpoints.glob("step-*.safetensors"), reverse=True)
 
     def tidy_checkpoints(self) -> None:
-        """Delete all but the newest checkpoints, and what a fit left that was killed in writing."""
+        """Delete all but the newest checkpoints, and files that a killed fit left unfinished."""
         remove_unfinished(self.checkpoints)
         # Version 0.1 wrote checkpoints under this name before it renamed them.
         for old in [*self.written_checkpoints()[KEEP:], *self.checkpoints.glob("step-*.partial")]:
             old.unlink(missing_ok=True)
 
     def preview(self, step: int) -> Path:
-        """The picture of what is known after a number of steps."""
+        """The preview after a number of steps."""
         return self.previews / f"step-{step:06d}.png"
 
     # -------------------------------------------------------------------------- evaluation

@@ -1,4 +1,4 @@
-"""How fast each kind of unknown is learned, and how that changes over a fit."""
+"""Learning rates of the unknowns over a fit."""
 
 from __future__ import annotations
 

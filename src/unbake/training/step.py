@@ -224,7 +224,7 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def _drop_broken_gradients(optimizer: mi.ad.Adam) -> None:
-    """Replace gradients that are not finite by zero, which masks those entries' update.
+    """Replace gradients that are not finite by zero, so that Adam does not update those entries.
 
     A single NaN would stay in Adam's moments for the rest of the fit.
     """

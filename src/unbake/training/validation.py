@@ -51,7 +51,7 @@ class MaterialBuffers:
 
     @staticmethod
     def of(problem: Problem, views: Sequence[View], spp: int, seed: int) -> list[MaterialBuffers]:
-        """What the fields say now, view by view, from `spp` camera samples a pixel."""
+        """The present values of the fields, view by view, from `spp` camera samples a pixel."""
         rays = CameraRays.of([view.camera for view in views])
         values, coverage = render_materials(
             problem.scene_view, rays.through, rays.pixels, spp, seed=seed
@@ -66,7 +66,7 @@ class MaterialBuffers:
         return seen
 
     def mask(self, truth: GroundTruth) -> np.ndarray:
-        """The pixels that count, (H, W) bool: what they see is optimized and known throughout."""
+        """The pixels that count, (H, W) bool: the whole pixel sees an optimized, known material."""
         return truth.known & (self.coverage >= 1)
 
     def psnr(self, truth: GroundTruth) -> dict[str, float | None]:

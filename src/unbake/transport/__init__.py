@@ -1,4 +1,4 @@
 """The paper, in reading order: vertex, operator, path_sample, prior, terms, methods, objective.
 
-Nothing here knows files, settings or the training loop; all that is needed comes in as values.
+Nothing here reads files or settings or depends on the training loop: inputs are values.
 """

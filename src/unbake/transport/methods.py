@@ -1,4 +1,4 @@
-"""Methods: THE table of which term of the objective trains what (Sec. 4.1).
+"""Methods: the table of which term of the objective trains what (Sec. 4.1).
 
 Pure Python, so that settings and the command line can read it without Mitsuba. A method of your own
 is a `Method` given to `register_method`.

@@ -1,4 +1,4 @@
-"""Which surfaces have a material that is optimized, or could be: THE definition of it."""
+"""Which surfaces have a material that is optimized, or could be: its only definition."""
 
 from __future__ import annotations
 

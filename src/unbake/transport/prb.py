@@ -1,4 +1,4 @@
-"""Path replay backpropagation: Mitsuba's own `prb`, asked for samples (Sec. 6).
+"""Path replay backpropagation: Mitsuba's own `prb`, used for samples (Sec. 6).
 
 All but the light transport it shares with the method of the paper: scene, unknowns, batches,
 losses, optimiser.
@@ -96,10 +96,10 @@ def path_radiance(
 
 
 class _ReplayedPaths(dr.CustomOp):
-    """Path replay as one operation: what Mitsuba does for an image's gradient, for samples.
+    """Path replay as one operation: Mitsuba does so for images, this for samples.
 
-    The arrays are an input so that Dr.Jit expects gradients from here. They arrive without further
-    ado, because the replay asks textures and emitters, which read the very arrays.
+    The arrays are an input so that Dr.Jit expects gradients from here. The replay
+    itself adds them up there, because textures and emitters read these very arrays.
     """
 
     def eval(self, arrays, integrator, scene, sampler, ray):
@@ -121,7 +121,7 @@ class _ReplayedPaths(dr.CustomOp):
             self.integrator.sample(
                 mode, self.scene, self.sampler, self.ray, δL=δL, state_in=state, active=everywhere
             )
-        dr.eval()  # gradients are the replay's side effects; nobody needs its results
+        dr.eval()  # gradients are side effects of the replay, whose results are not used
 
     def name(self) -> str:
         return "path replay"

@@ -55,7 +55,7 @@ def render_radiance(
 def render_materials(
     scene_view: SceneView, through: RayGenerator, pixels: int, spp: int, *, seed: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """What the materials are at the surfaces that pixels see (cut-outs let rays pass).
+    """The materials of the surfaces that pixels see (cut-outs let rays pass).
 
     Returns:
         The unknown quantities by name, each (pixels, channels), or where no material is unknown the

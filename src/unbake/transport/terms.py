@@ -1,4 +1,4 @@
-"""The terms of the objective: what each reads of a path sample, and its value.
+"""The terms of the objective: the parts of a path sample that each reads, and its value.
 
 A term of your own is a `Term` given to `register_term`.
 """
@@ -81,7 +81,7 @@ class Term:
             raise ValueError(f"{self.name}: vertices are numbered from 1")
 
     def check(self, attached: Attached) -> None:
-        """Check that the term has the edges that are attached; others would train nothing.
+        """Check that the term has the edges that are attached: an edge it lacks trains nothing.
 
         Raises:
             UserError: it lacks one.

@@ -1,4 +1,4 @@
-"""From a ray to the first surface that is not specular, where L_θ can be asked (Sec. 7).
+"""From a ray to the first surface that is not specular, where L_θ is defined (Sec. 7).
 
 Symbols follow Mitsuba: `si` surface interaction, `pi` its preliminary form, `ds` a direction
 sample, β throughput. Directions point away from the surface.
@@ -49,7 +49,7 @@ class SceneView:
         return replace(self, scene=scene)
 
     def is_optimized(self, shape: mi.ShapePtr) -> mi.Bool:
-        """Whether the material of shapes is optimized; not where there is no shape."""
+        """Whether the material of shapes is optimized; False where there is no shape."""
         # Each shape is asked once, while this is traced. (A table would be an array that comes
         # from outside of a frozen function.)
         return dr.dispatch(shape, lambda s: mi.Bool(registry_number(s) in self.optimized))
