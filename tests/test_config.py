@@ -280,6 +280,11 @@ def test_a_field_that_there_is_not_is_named(text, message):
         from_toml("format = 2\n" + text, "here.toml")
 
 
+def test_quantities_are_no_text():
+    with pytest.raises(TypeError, match="a tuple of names, not the text 'albedo'"):
+        FitConfig(quantities="albedo")
+
+
 def test_quantities_stand_in_the_order_of_the_table():
     config = FitConfig(quantities=("roughness", "albedo"))
     assert config.quantities == ("albedo", "roughness") == tuple(config.material_settings)

@@ -339,6 +339,7 @@ def test_bounces_that_would_not_fit_are_refused(bounces, unbake, tmp_path):
     [
         ("resolution = 12", "lighting.resolution: must be 8, 16, 32"),
         ("learning_rate = 0.0", "lighting.learning_rate: must be positive"),
+        ("learning_rate = inf", "lighting.learning_rate: must be a finite number, not inf"),
         ("mean_albedo = 1.0", "lighting.mean_albedo: must be between 0 and 1"),
         ("anchor = -1.0", "lighting.anchor: must be 0 or more"),
     ],

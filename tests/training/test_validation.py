@@ -161,7 +161,9 @@ def test_known_materials_are_not_evaluated(scored, tmp_path, monkeypatch):
     recovered = load_run(run)
     recovered.config = dataclasses.replace(recovered.config, unknown="lighting")
     monkeypatch.setattr("unbake.evaluation.evaluate.load_run", lambda folder: recovered)
-    metrics = evaluate(run, FEW, tell=lambda line: None)
+    lines: list[str] = []
+    metrics = evaluate(run, FEW, tell=lines.append)
+    assert lines[0].startswith("heldout_000: render ") and "albedo" not in "".join(lines)
     assert metrics["unknown"] == "lighting" and metrics["representation"] is None
     heldout = metrics["heldout"]
     assert heldout["albedo_psnr"] is heldout["roughness_psnr"] is None

@@ -169,6 +169,8 @@ def evaluate(run: Positional[Run], /, *, evaluate: OmitArgPrefixes[EvaluationFla
     metrics = go(run, settings, tell=_say)
     for split in ("heldout", "train"):
         values = {k: v for k, v in metrics[split].items() if k != "views"}
+        if not metrics["quantities"]:  # of known materials there are no scores
+            values = {k: v for k, v in values.items() if v is not None}
         shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in values.items())
         _say(f"{split} ({metrics[split]['views']} views): {shown}")
     _say(f"wrote {RunFolder(run).evaluation}; next: unbake report {run} --out report.html")

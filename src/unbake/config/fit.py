@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from ..errors import UserError, require
 from ..fields.registry import representation, representations
-from ..fields.settings import FieldSettings
+from ..fields.settings import FieldSettings, require_rate
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
 from ..transport.methods import METHODS, Method
 from .flag import Flag
@@ -71,7 +71,7 @@ class LightingConfig:
         require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
         anchored = math.isfinite(self.anchor) and self.anchor >= 0
         require(anchored, "anchor", "0 or more", self.anchor)
-        require(self.learning_rate > 0, "learning_rate", "positive", self.learning_rate)
+        require_rate(self.learning_rate)
 
 
 @dataclass(frozen=True)
@@ -246,6 +246,8 @@ class FitConfig:
 
     def _complete_fields(self) -> None:
         """Check quantities and representations, and fill in the field settings not given."""
+        if isinstance(self.quantities, str):
+            raise TypeError(f"quantities are a tuple of names, not the text {self.quantities!r}")
         try:
             chosen = in_order(self.quantities)
         except UserError as error:

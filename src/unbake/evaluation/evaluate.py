@@ -74,7 +74,8 @@ def evaluate(
         row, seen, truth = _evaluate_view(recovered, view, folder, settings)
         rows.append(row)
         materials.append((seen, truth))
-        values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in row if k.endswith("_psnr"))
+        told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
+        values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told)
         tell(f"{view.name}: {', '.join(values)}")
     recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     both = recovered.config.unknown == "materials+lighting"

@@ -97,6 +97,7 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     folder.write_settings(config)
     folder.forget_after(progress.step)
 
+    unknown = next(iter(state.phi)).partition(".")[0]  # the first one, whose rate is logged
     total = config.seconds or config.steps
     saved_at = shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
@@ -126,7 +127,7 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
             if not (full or last or due):
                 continue
 
-            entry = _log_entry(recent, progress, rates[config.quantities[0]])
+            entry = _log_entry(recent, progress, rates[unknown])
             skipped = skipped + entry["skipped"] if entry["skipped"] == len(recent) else 0
             recent.clear()
             # Scores, checkpoints and previews are not training: the clock stands still.
