@@ -2,7 +2,7 @@
 
 For experiments with what PyTorch has and Dr.Jit has not. PyTorch evaluates and differentiates the
 module, with kernels of its own, and nothing of it can be recorded: steps are traced anew each time,
-and take several times as long (`benchmarks/torch_field.py` measures it).
+which takes longer; `benchmarks/torch_field.py` measures how much.
 """
 
 from __future__ import annotations
