@@ -151,6 +151,18 @@ def test_the_page_shows_every_view_run_and_number(made, tmp_path: Path):
     assert "10 log10(1/MSE)" in text
 
 
+def test_logged_terms_without_a_title_have_charts_too(made, tmp_path: Path):
+    """Regularizers, and terms of methods that are not registered here."""
+    log = made[1][0] / "log.jsonl"
+    line = {"step": 1, "seconds": 0.1, "samples_per_second": 9, "learning_rate": 1, "skipped": 0}
+    terms = {"roughness_smoothness": 0.5, f"term{EVIL}": 0.25}
+    log.write_text(json.dumps(line | terms) + "\n" + json.dumps(line | terms | {"step": 2}) + "\n")
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert "<title>Roughness smoothness over step</title>" in text
+    assert "<title>Term" in text and EVIL.lower() not in text.lower()
+    assert "Learning rate over" not in text and "Skipped over" not in text
+
+
 def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
     text = write_report(made[1], tmp_path / "report.html").read_text()
     differing, shared = text.split("What differs between the runs.")[1].split("<details>")

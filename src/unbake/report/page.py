@@ -21,6 +21,7 @@ from unbake.quantities import QUANTITIES
 from unbake.report import charts, display
 from unbake.report.lighting import lighting_section
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
+from unbake.training.monitor import loss_terms
 from unbake.transport.terms import TERMS
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
@@ -369,10 +370,18 @@ def _setting(value: object) -> str:
 
 
 def _loss_charts(runs: list[Run]) -> list[dict[str, Any]]:
-    titles = {name: term.title or name for name, term in TERMS.items()}
+    logged = dict.fromkeys(name for run in runs for line in run.log for name in loss_terms(line))
+    names = [*(name for name in TERMS if name in logged), *(n for n in logged if n not in TERMS)]
+    titles = {name: _term_title(name) for name in names}
     return _charts(
         runs, [run.log for run in runs], titles, "relative L2, no unit", logarithmic=True
     )
+
+
+def _term_title(name: str) -> str:
+    """The title of a term, also of a regularizer and of a term that is not registered here."""
+    title = TERMS[name].title if name in TERMS else name.replace("_", " ").capitalize()
+    return title or name
 
 
 def _score_charts(runs: list[Run]) -> list[dict[str, Any]]:

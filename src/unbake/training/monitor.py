@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
-from ..transport.terms import TERMS
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
+#: Numbers in a line of the log that are no loss terms.
+_PROGRESS = frozenset(
+    ["step", "seconds", "samples", "samples_per_second", "memory_mb", "learning_rate", "skipped"]
+)
+
+
+def loss_terms(entry: Mapping[str, Any]) -> list[str]:
+    """Names of the loss terms in a line of the log: the method's, then the regularizers."""
+    return [k for k, v in entry.items() if isinstance(v, int | float) and k not in _PROGRESS]
 
 
 class Monitor:
@@ -59,7 +68,7 @@ class Monitor:
             entry: the line of the log; its loss terms are shown.
         """
         self._write(entry)
-        losses = "  ".join(f"{t} {entry[t]:.4f}" for t in TERMS if t in entry)
+        losses = "  ".join(f"{t} {entry[t]:.4f}" for t in loss_terms(entry))
         speed = f"{entry['samples_per_second'] / 1e3:.0f} k samples/s"
         line = f"step {entry['step']}  {losses}  {speed}  {entry['memory_mb']:.0f} MB"
         self._bar.update(self._task, completed=done, description=line)
