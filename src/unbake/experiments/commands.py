@@ -59,11 +59,15 @@ def command(
     except OSError as error:
         raise UserError(f"the program cannot be started ({error.strerror})", words[0]) from error
     copy = threading.Thread(target=_copy, args=(process, log))
-    copy.start()
     try:
+        copy.start()
         status = _wait(process, until)
+    except KeyboardInterrupt:
+        _stop(process)
+        raise
     finally:
-        copy.join()
+        if copy.ident is not None:
+            copy.join()
     if status in _STOPPED:
         raise Unfinished
     if status:
@@ -79,9 +83,6 @@ def _wait(process: subprocess.Popen, until: float | None) -> int:
         _stop(process)
         # It may have come to its end just then.
         return process.returncode and -signal.SIGTERM
-    except KeyboardInterrupt:
-        _stop(process)
-        raise
 
 
 def _stop(process: subprocess.Popen) -> None:
