@@ -133,7 +133,7 @@ def _evaluate_view(
         hide_emitters=problem.hide_emitters,
     ).reshape(camera.height, camera.width, 3)
     photograph = read_view(view.image, view, settings.clip_negative or recovered.clip_negative)
-    truth, seen = GroundTruth.of(view), None
+    truth, seen = GroundTruth.of(view, recovered.config.quantities), None
     alpha, mask = photograph[..., 3], photograph[..., 3] >= 1
     if recovered.config.learns_materials:
         (seen,) = MaterialBuffers.of(problem, [view], settings.material_spp, seed=1)

@@ -28,7 +28,8 @@ class Preview:
         self._problem = problem
         self._run = run
         self._view: View = (dataset.heldout or dataset.train)[0]
-        self._truth = None if problem.materials is None else GroundTruth.of(self._view)
+        materials = problem.materials
+        self._truth = None if materials is None else GroundTruth.of(self._view, materials)
         known = None if problem.environment is None else true_environment(dataset.folder)
         self._environment = [] if known is None else [[tonemap(known)]]
 

@@ -28,13 +28,18 @@ class GroundTruth:
     known: np.ndarray  # (H, W) bool: the whole pixel sees a material that is optimized
 
     @staticmethod
-    def of(view: View) -> GroundTruth | None:
+    def of(view: View, names: Iterable[str] | None = None) -> GroundTruth | None:
         """The truth images of a view; None where it has none.
+
+        Args:
+            names: quantities to read, as far as there are images of them; None: all.
 
         Raises:
             UserError: an image cannot be read.
         """
-        images = {name: read_view(file, view) for name, file in view.truth.items()}
+        chosen = set(view.truth if names is None else names)
+        files = {name: file for name, file in view.truth.items() if name in chosen}
+        images = {name: read_view(file, view) for name, file in files.items()}
         if not images:
             return None
         values = {name: x[..., : QUANTITIES[name].channels] for name, x in images.items()}
@@ -102,7 +107,7 @@ class Score:
 
     def __init__(self, problem: Problem, views: Sequence[View]) -> None:
         self._problem = problem
-        pairs = [(view, GroundTruth.of(view)) for view in views]
+        pairs = [(view, GroundTruth.of(view, problem.materials)) for view in views]
         self._views = [view for view, truth in pairs if truth is not None]
         self._truths = [truth for _, truth in pairs if truth is not None]
 
