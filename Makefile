@@ -1,10 +1,11 @@
 # One command a job; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup lint test test-fast test-slow docs demo bench clean distclean
+.PHONY: help setup setup-dev lint test test-fast test-slow docs demo bench clean distclean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-complete
+DEV_STAMP := .venv/.setup-dev-complete
 PYTEST := $(BIN)/python -m pytest
 FORMATTED := src tests benchmarks scripts examples
 # Dr.Jit compiles on one thread: two processes of tests take little more than half the time of one.
@@ -25,8 +26,14 @@ $(STAMP): pyproject.toml scripts/setup.sh
 	@bash scripts/setup.sh
 	@touch $(STAMP)
 
+setup-dev: $(DEV_STAMP) ## setup, and what linters, tests and documentation need
+
+$(DEV_STAMP): $(STAMP)
+	@bash scripts/setup.sh dev
+	@touch $(DEV_STAMP)
+
 # All checks run even where one fails.
-lint: setup ## format, lint, layers and types, without running anything
+lint: setup-dev ## format, lint, layers and types, without running anything
 	@status=0; \
 	$(BIN)/ruff format --check --quiet $(FORMATTED) || status=1; \
 	$(BIN)/ruff check . || status=1; \
@@ -35,19 +42,19 @@ lint: setup ## format, lint, layers and types, without running anything
 	exit $$status
 
 # The tests run last, also where a linter fails.
-test: setup ## linters and the tests that take seconds
+test: setup-dev ## linters and the tests that take seconds
 	@status=0; \
 	$(MAKE) --no-print-directory lint || status=1; \
 	$(PYTEST) $(PARALLEL) -m "not slow and not gpu" $(ARGS) || status=1; \
 	exit $$status
 
-test-fast: setup ## tests of single functions, under a minute
+test-fast: setup-dev ## tests of single functions, under a minute
 	@$(PYTEST) $(PARALLEL) -q -m "not slow and not gpu" $(FAST) $(ARGS)
 
-test-slow: setup ## every test, minutes; those for a GPU run where there is one
+test-slow: setup-dev ## every test, minutes; those for a GPU run where there is one
 	@$(PYTEST) --timeout 1800 $(ARGS)
 
-docs: setup ## the documentation site, into site/
+docs: setup-dev ## the documentation site, into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 demo: setup ## capture, fit, evaluate and report a small room into demo/ (FRESH=1 starts over)

@@ -1,6 +1,8 @@
 #!/usr/bin/env bash
 # Creates .venv with unbake in it and makes sure that an LLVM is there for Dr.Jit. Safe to run again.
 #
+#   setup.sh [EXTRA]     EXTRA: an extra of pyproject.toml to install too, such as dev
+#
 #   PYTHON               the interpreter to build on (default: the first python3 >= 3.10 found)
 #   DRJIT_LIBLLVM_PATH   the LLVM shared library to use (default: the newest installed)
 set -euo pipefail
@@ -125,7 +127,10 @@ ensure_llvm() {
 if ! "$VENV_PYTHON" -m pip --version >/dev/null 2>&1; then
   make_venv
 fi
-say "installing unbake and what it needs into .venv (about 850 MB on disk)"
-"$VENV_PYTHON" -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+extra=${1:+[$1]}
+size='450 MB'
+[ -z "$extra" ] || size='850 MB'
+say "installing unbake$extra and what it needs into .venv (about $size on disk)"
+"$VENV_PYTHON" -m pip install --quiet --disable-pip-version-check -e ".$extra"
 ensure_llvm
 say "done: .venv/bin/unbake --help"
