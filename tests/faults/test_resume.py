@@ -1,5 +1,6 @@
 """Runs that end early: what was learned stays, and goes on where it ended."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -8,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from unbake import cli
 from unbake.config import read_toml
 from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.training import loop
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
 
@@ -265,6 +268,13 @@ def test_a_folder_that_may_not_be_written(fit, tmp_path):
     outcome = fit("--steps", 1, name="closed/run")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert "Permission denied" in outcome.err
+
+
+def test_a_fit_in_another_thread_runs_without_handling_signals(cornell, tiny, tmp_path):
+    config = dataclasses.replace(read_toml(tiny), steps=2)
+    with ThreadPoolExecutor(1) as threads:
+        progress = threads.submit(loop.fit, cornell, tmp_path / "run", config).result()
+    assert progress.step == 2
 
 
 def test_a_log_forgets_what_lies_after_a_step(tmp_path):

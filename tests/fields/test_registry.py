@@ -162,6 +162,11 @@ def test_what_cannot_be_a_representation_is_refused(strips, bad, error, message)
         register_representation(Representation(**row))
 
 
+def test_the_same_again_is_no_error(strips):
+    register_representation(registry.representation("strips"))
+    register_representation(replace(registry.representation("neural")))
+
+
 def test_settings_of_another_representation_are_refused():
     with pytest.raises(TypeError, match="settings of 'neural' are NetworkConfig, not DenseGrid"):
         FitConfig(materials={"albedo": {"neural": DenseGridConfig()}})

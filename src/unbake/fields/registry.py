@@ -68,11 +68,11 @@ def register_representation(representation: Representation) -> None:
     """Make a representation known by its name.
 
     Raises:
-        ValueError: the name is taken, or no bare key of TOML.
+        ValueError: another one has the name, or it is no bare key of TOML.
         TypeError: the settings are not a dataclass with a learning rate.
     """
     name = representation.name
-    if name in _REPRESENTATIONS:
+    if _REPRESENTATIONS.get(name, representation) != representation:
         raise ValueError(f"there is a representation named {name!r} already")
     if not name.replace("-", "").replace("_", "").isalnum() or not name.isascii():
         raise ValueError(f"{name!r} is not a name: letters, digits, - and _ only")

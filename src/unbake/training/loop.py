@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -201,8 +202,14 @@ def _require_same_photographs(run: RunFolder, data: Path, mean_radiance: float) 
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[list[bool]]:
-    """A list that fills on Ctrl-C or SIGTERM; a second Ctrl-C ends the program at once."""
+    """A list that fills on Ctrl-C or SIGTERM; a second Ctrl-C ends the program at once.
+
+    In another thread than the main one signals cannot be handled, and the list stays empty.
+    """
     stop: list[bool] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
 
     def handler(number: int, frame: object) -> None:
         if stop:
