@@ -117,7 +117,7 @@ def fit(
 ) -> int:
     """Recover materials or lighting from the photographs of a data set.
 
-    Ctrl-C stops after the present step and keeps what was learned; --resume goes on from there.
+    Ctrl-C stops after the present step and writes a checkpoint; --resume continues from it.
 
     Args:
         data: Folder of the data set, with its transforms.json.
@@ -154,7 +154,7 @@ def fit(
 
 
 def evaluate(run: Positional[Run], /, *, evaluate: OmitArgPrefixes[EvaluationFlags]) -> None:
-    """Render views with what was recovered and measure it against the truth.
+    """Render the recovered scene and measure it against photographs and truth.
 
     Writes pictures and metrics.json to RUN/evaluation.
 
@@ -204,7 +204,7 @@ def compare(
     *,
     compare: OmitArgPrefixes[CompareFlags],
 ) -> int:
-    """Fit several methods with the same settings, evaluate them, and tell which is good how soon.
+    """Fit several methods with the same settings, and compare their quality over time.
 
     Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. The same command
     again keeps finished runs and goes on with interrupted ones. A method that fails is recorded
@@ -295,8 +295,8 @@ def reproduce(
 ) -> None:
     """Make a table or a figure of the paper again: data, table and picture.
 
-    Writes OUT/WHAT/data.json, data.csv, table.md and pictures. What was stopped goes on with the
-    same command; data sets and fits are kept in OUT/work, and experiments share them.
+    Writes OUT/WHAT/data.json, data.csv, table.md and pictures. The same command continues what was
+    stopped; data sets and fits are kept in OUT/work, and experiments share them.
 
     table1: scenes, views, path lengths. table2: path lengths in a cube. fig3: time of a step, by
     scene. fig4: gradients of a roughness. fig5: time and memory against albedo. fig6: materials of
@@ -304,7 +304,7 @@ def reproduce(
 
     Args:
         what: Which one.
-        scale: smoke (takes seconds, and shows nothing but that it runs), cpu (sized for two cores)
+        scale: smoke (seconds, to see that it runs), cpu (sized for two cores),
             or paper (for a GPU).
         out: Folder to write to, shared by all experiments.
         scenes: Folder of the published scenes, each in a folder or as .tar.xz.
@@ -318,7 +318,7 @@ def reproduce(
 
 
 def doctor() -> int:
-    """Show what unbake runs on here, and what to install if it cannot."""
+    """Check that unbake runs on this machine, and say what to install if it does not."""
     from .. import doctor as module
 
     return module.main()
