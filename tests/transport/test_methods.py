@@ -164,6 +164,8 @@ def test_a_method_that_makes_no_sense_is_not_made(settings, message):
 def test_a_term_that_makes_no_sense_is_not_made():
     with pytest.raises(ValueError, match="no vertices of its own"):
         Term("mine", len, lhs=(1,), of_image=True)
+    with pytest.raises(ValueError, match="skipped is a number of the log"):
+        Term("skipped", len)
     with pytest.raises(ValueError, match="numbered from 1"):
         Term("mine", len, lhs=(0,))
 

@@ -11,18 +11,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
+from ..transport.terms import LOGGED
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
-#: Numbers in a line of the log that are no loss terms.
-_PROGRESS = frozenset(
-    ["step", "seconds", "samples", "samples_per_second", "memory_mb", "learning_rate", "skipped"]
-)
 
 
 def loss_terms(entry: Mapping[str, Any]) -> list[str]:
     """Names of the loss terms in a line of the log: the method's, then the regularizers."""
-    return [k for k, v in entry.items() if isinstance(v, int | float) and k not in _PROGRESS]
+    return [k for k, v in entry.items() if isinstance(v, int | float) and k not in LOGGED]
 
 
 class Monitor:

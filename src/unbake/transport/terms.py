@@ -18,6 +18,11 @@ from .methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, Attached
 from .path_sample import PathSample, lhs, rhs
 from .prior import residual, residual_norm
 
+#: Numbers that stand beside the terms in a line of the log: no term may have such a name.
+LOGGED = frozenset(
+    ["step", "seconds", "samples", "samples_per_second", "memory_mb", "learning_rate", "skipped"]
+)
+
 
 @dataclass(frozen=True)
 class TermInputs:
@@ -75,6 +80,8 @@ class Term:
     title: str = ""
 
     def __post_init__(self) -> None:
+        if self.name in LOGGED:
+            raise ValueError(f"{self.name} is a number of the log: a term cannot have its name")
         if self.of_image and (self.scene or self.lhs or self.rhs):
             raise ValueError(f"{self.name}: a term of the image has no vertices of its own")
         if min((*self.scene, *self.lhs, *self.rhs, 1)) < 1:
