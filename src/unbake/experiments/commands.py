@@ -20,6 +20,9 @@ from .jobs import Job, JobRunner, Outcome, Unfinished
 
 #: Seconds that a command has to write what it needs to continue, after SIGTERM.
 _GRACE = 120.0
+#: Seconds between looks for a signal: one that another thread of this process received does not end
+#: the wait by itself.
+_LOOK = 0.5
 #: Exit status of commands that were stopped; `unbake` exits with 130.
 _STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)
 
@@ -77,12 +80,15 @@ def command(
 
 def _wait(process: subprocess.Popen, until: float | None) -> int:
     """Wait for the end of a process and return its status; stop it when the time is up."""
-    try:
-        return process.wait(None if until is None else max(0.0, until - time.monotonic()))
-    except subprocess.TimeoutExpired:
-        _stop(process)
-        # It may have come to its end just then.
-        return process.returncode and -signal.SIGTERM
+    while until is None or time.monotonic() < until:
+        left = _LOOK if until is None else min(_LOOK, until - time.monotonic())
+        try:
+            return process.wait(max(0.0, left))
+        except subprocess.TimeoutExpired:
+            continue
+    _stop(process)
+    # It may have come to its end just then.
+    return process.returncode and -signal.SIGTERM
 
 
 def _stop(process: subprocess.Popen) -> None:
