@@ -157,23 +157,6 @@ def false_colour(values: np.ndarray, scale: float, mask: np.ndarray | None = Non
     return painted
 
 
-def error_picture(
-    image: np.ndarray, reference: np.ndarray, scale: float, mask: np.ndarray | None = None
-) -> np.ndarray:
-    """False-colour picture of `absolute_error`: (H, W, C) twice to (H, W, 3) uint8 sRGB.
-
-    Args:
-        image: linear.
-        reference: linear, same shape.
-        scale: the error painted in the brightest colour.
-        mask: (H, W) bool; mid grey where False.
-
-    Raises:
-        ValueError: the shapes differ or `scale` is not positive.
-    """
-    return false_colour(absolute_error(image, reference), scale, mask)
-
-
 def shrink(picture: np.ndarray, longest: int) -> np.ndarray:
     """Average (H, W) or (H, W, C) over square blocks until no side is longer than `longest`.
 
