@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 
 class UserError(Exception):
     """Bad input or an unusable machine, told in one line.
@@ -23,6 +25,19 @@ class UserError(Exception):
     def __str__(self) -> str:
         text = self.what if self.where is None else f"{self.where}: {self.what}"
         return text if self.remedy is None else f"{text}. {self.remedy}"
+
+
+def require_name(name: str, known: Collection[str], what: str, where: object | None = None) -> None:
+    """Raise a `UserError` unless a name is one of those that are known; it lists them.
+
+    Args:
+        name: what was given.
+        known: the names there are.
+        what: what is named, such as `method`.
+        where: as in `UserError`.
+    """
+    if name not in known:
+        raise UserError(f"no {what} named {name!r}", where, f"There are {', '.join(known)}")
 
 
 def require(good: bool, key: str, wanted: str, value: object) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from .errors import UserError
+from .errors import UserError, require_name
 
 
 @dataclass(frozen=True)
@@ -134,9 +134,7 @@ def quantity(name: str) -> Quantity:
     Raises:
         UserError: there is none.
     """
-    if name not in QUANTITIES:
-        known = ", ".join(QUANTITIES)
-        raise UserError(f"no quantity named {name!r}", remedy=f"There are {known}")
+    require_name(name, QUANTITIES, "quantity")
     return QUANTITIES[name]
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import final
 
 from ..config import Estimator, FitConfig
-from ..errors import UserError
+from ..errors import UserError, require_name
 from ..fields.registry import representations
-from ..transport.methods import METHODS
+from ..transport.methods import METHODS, method_named
 
 
 @final
@@ -44,9 +44,7 @@ class MethodVariant:
             raise UserError(f"{text!r} has too many parts", "--methods", "METHOD:REPRESENTATION")
         chosen: dict[str, typing.Any] = dict(zip(choices, words, strict=False))
         for what, word in chosen.items():
-            if word not in choices[what]:
-                remedy = f"There are {', '.join(choices[what])}"
-                raise UserError(f"no {what} named {word!r}", "--methods", remedy)
+            require_name(word, choices[what], what, "--methods")
         return MethodVariant(**chosen)
 
     @property
@@ -56,7 +54,7 @@ class MethodVariant:
 
     def settings(self, shared: FitConfig) -> FitConfig:
         """The shared settings with this method, without the options that it does not take."""
-        takes_options = METHODS[self.method].takes_options
+        takes_options = method_named(self.method).takes_options
         own = shared if takes_options else replace(shared, bounces=1, prior="extra-bounce")
         representation = self.representation or shared.representation
         estimator = self.estimator or shared.estimator

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ..errors import UserError
+from ..errors import require_name
 from .settings import (
     BitmapConfig,
     DenseGridConfig,
@@ -94,9 +94,7 @@ def representation(name: str) -> Representation:
     Raises:
         UserError: there is none.
     """
-    if name not in _REPRESENTATIONS:
-        known = ", ".join(representations())
-        raise UserError(f"no representation named {name!r}", remedy=f"There are {known}")
+    require_name(name, _REPRESENTATIONS, "representation")
     return _REPRESENTATIONS[name]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from ..errors import UserError
+from ..errors import require_name
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,7 @@ def method_named(name: str) -> Method:
     Raises:
         UserError: there is none.
     """
-    if name not in METHODS:
-        raise UserError(f"no method named {name!r}", remedy=f"There are {', '.join(METHODS)}")
+    require_name(name, METHODS, "method")
     return METHODS[name]
 
 

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import mitsuba as mi
 
-from ..errors import UserError
+from ..errors import UserError, require_name
 from ..fields.radiance import RadianceField
 from .loss import RelativeL2, squared_error
 from .methods import BOUNCES, PATH_REPLAY, PHOTOMETRIC, Method
@@ -217,6 +217,5 @@ def make_sampler(context: SamplerContext) -> PathSampler:
         UserError: there is no such sampler, or it cannot serve the method's terms.
     """
     name = context.method.sampler
-    if name not in SAMPLERS:
-        raise UserError(f"no sampler named {name!r}", remedy=f"There are {', '.join(SAMPLERS)}")
+    require_name(name, SAMPLERS, "sampler")
     return SAMPLERS[name](context)

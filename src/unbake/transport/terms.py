@@ -12,7 +12,7 @@ from types import MappingProxyType
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UserError
+from ..errors import UserError, require_name
 from .loss import RelativeL2, squared_error
 from .methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, Attached
 from .path_sample import PathSample, lhs, rhs
@@ -122,8 +122,7 @@ def term_named(name: str) -> Term:
     Raises:
         UserError: there is none.
     """
-    if name not in TERMS:
-        raise UserError(f"no term named {name!r}", remedy=f"There are {', '.join(TERMS)}")
+    require_name(name, TERMS, "term")
     return TERMS[name]
 
 
