@@ -5,7 +5,7 @@ Import it from test modules alone, which are read once the Mitsuba variant is se
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from statistics import NormalDist
 
 import drjit as dr
@@ -36,6 +36,32 @@ TINY_FIT = update(
         "radiance": {"neural": _SIZES},
     },
 )
+
+
+_TRIPLANE = {"levels": 2, "features": 2, "base_resolution": 3, "width": 8}
+
+
+def tiny_fields(representation="neural", radiance="neural") -> FitConfig:
+    """Settings of a tiny fit whose fields are small in every representation."""
+    small = update(
+        TINY_FIT,
+        {
+            "materials": {
+                "albedo": {
+                    "grid": {"cells": 5},
+                    "bitmap": {"resolution": 6},
+                    "triplane": _TRIPLANE,
+                },
+                "roughness": {
+                    "grid": {"cells": 3},
+                    "bitmap": {"resolution": 4},
+                    "triplane": _TRIPLANE,
+                },
+            },
+            "radiance": {"grid": {"cells": 4}, "triplane": _TRIPLANE},
+        },
+    )
+    return replace(small, representation=representation, radiance_representation=radiance)
 
 
 # ------------------------------------------------------------------------------------ rays

@@ -1,14 +1,12 @@
 """Materials as networks, dense grids and bitmaps: one interface, each with a meaning of its own."""
 
-import dataclasses
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, seeded
+from support import seeded, tiny_fields
 
-from unbake.config import BitmapConfig, DenseGridConfig, update
+from unbake.config import BitmapConfig, DenseGridConfig
 from unbake.errors import UserError
 from unbake.fields.bitmap import Bitmaps
 from unbake.fields.domain import Domain, SurfacePoint
@@ -22,27 +20,6 @@ from unbake.fields.triplane import TriPlane
 
 LANES = 300
 REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
-TRIPLANE = {"levels": 2, "features": 2, "base_resolution": 3, "width": 8}
-
-
-def settings(representation="neural", radiance="neural"):
-    small = update(
-        TINY_FIT,
-        {
-            "materials": {
-                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}, "triplane": TRIPLANE},
-                "roughness": {
-                    "grid": {"cells": 3},
-                    "bitmap": {"resolution": 4},
-                    "triplane": TRIPLANE,
-                },
-            },
-            "radiance": {"grid": {"cells": 4}, "triplane": TRIPLANE},
-        },
-    )
-    return dataclasses.replace(
-        small, representation=representation, radiance_representation=radiance
-    )
 
 
 def uniform(dimensions, lanes=LANES, seed=1):
@@ -76,7 +53,7 @@ def interactions(lanes=LANES):
 
 def made(representation):
     fields = make_materials(
-        representation, settings(representation).material_settings, ["one"], seed=3
+        representation, tiny_fields(representation).material_settings, ["one"], seed=3
     )
     fields.domain = Domain((0.0, 0.0, 0.0), 2.0)
     return fields
@@ -210,7 +187,7 @@ def test_near_points_show_a_slope(representation):
 
 
 def radiance_field(representation, domain, *, scale, seed):
-    config = settings(radiance=representation)
+    config = tiny_fields(radiance=representation)
     return make_radiance(representation, config.radiance_settings, domain, scale=scale, seed=seed)
 
 

@@ -1,6 +1,5 @@
 """Materials in scenes: each shape has its bitmap, stock integrators see them, steps train them."""
 
-import dataclasses
 import gc
 
 import drjit as dr
@@ -8,15 +7,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support import (
-    TINY_FIT,
     assert_only_replayed,
     built_in_cameras,
     grey_photographs,
     pixel_rays,
     seeded,
+    tiny_fields,
 )
 
-from unbake.config import BitmapConfig, update
+from unbake.config import BitmapConfig
 from unbake.errors import UserError
 from unbake.fields.materials import make_materials
 from unbake.fields.texture import material_numbers, material_textures
@@ -29,27 +28,6 @@ from unbake.transport.operator import attach_albedo, attach_material
 from unbake.transport.vertex import SceneView, find_vertex
 
 REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
-TRIPLANE = {"levels": 2, "features": 2, "base_resolution": 3, "width": 8}
-
-
-def settings(representation="neural", radiance="neural"):
-    small = update(
-        TINY_FIT,
-        {
-            "materials": {
-                "albedo": {"grid": {"cells": 5}, "bitmap": {"resolution": 6}, "triplane": TRIPLANE},
-                "roughness": {
-                    "grid": {"cells": 3},
-                    "bitmap": {"resolution": 4},
-                    "triplane": TRIPLANE,
-                },
-            },
-            "radiance": {"grid": {"cells": 4}, "triplane": TRIPLANE},
-        },
-    )
-    return dataclasses.replace(
-        small, representation=representation, radiance_representation=radiance
-    )
 
 
 def randomised(fields, seed=0, scale=0.7):
@@ -187,7 +165,7 @@ def test_missing_texture_coordinates_are_told(tmp_path):
         path.write_text(
             f'<scene version="3.0.0">{"".join(shapes)}<emitter type="constant"/></scene>'
         )
-        return make_problem(path, "visible", settings(representation), 0.2)
+        return make_problem(path, "visible", tiny_fields(representation), 0.2)
 
     with pytest.raises(UserError) as caught:
         problem('<bsdf type="diffuse"/>', "bitmap")
@@ -203,7 +181,7 @@ def test_missing_texture_coordinates_are_told(tmp_path):
 
 
 def cornell_problem(built_in, representation, radiance="neural"):
-    config = settings(representation, radiance)
+    config = tiny_fields(representation, radiance)
     return config, make_problem(built_in("cornell"), "visible", config, 0.2)
 
 

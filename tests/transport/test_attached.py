@@ -6,9 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, enable_gradients, pixel_rays, seeded
+from support import built_in_cameras, enable_gradients, pixel_rays, seeded
 
-from unbake.training.problem import make_problem
 from unbake.transport.loss import RelativeL2
 from unbake.transport.methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, Attached
 from unbake.transport.objective import objective, requirements
@@ -30,11 +29,6 @@ class LearnedConstant:
 
     def evaluate(self, p, w, n, albedo, valid, engine=None) -> mi.Color3f:
         return dr.select(valid, mi.Color3f(self.value), 0)
-
-
-@pytest.fixture(scope="module")
-def problem(built_in):
-    return make_problem(built_in("cornell"), "visible", TINY_FIT, 0.2)
 
 
 @pytest.fixture(scope="module")

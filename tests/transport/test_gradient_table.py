@@ -7,9 +7,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, enable_gradients, pieces, pixel_rays, seeded
+from support import built_in_cameras, enable_gradients, pieces, pixel_rays, seeded
 
-from unbake.training.problem import make_problem
 from unbake.transport.loss import RelativeL2
 from unbake.transport.methods import EXTRA, LHS, METHODS, PHOTOMETRIC, PRIOR, Attached
 from unbake.transport.objective import objective, requirements
@@ -33,11 +32,6 @@ SYNTHETIC = [
     for on in itertools.product([False, True], repeat=len(EDGES[term]))
 ]
 LOSSES = {"photograph": RelativeL2(0.01)}
-
-
-@pytest.fixture(scope="module")
-def problem(built_in):
-    return make_problem(built_in("cornell"), "visible", TINY_FIT, 0.2)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ from support import (
     seeded,
 )
 
-from unbake.training.problem import make_problem
 from unbake.transport.loss import RelativeL2
 from unbake.transport.methods import METHODS, PHOTOMETRIC
 from unbake.transport.objective import objective, requirements
@@ -23,11 +22,6 @@ from unbake.transport.path_sample import SampleSubset, lhs, rhs, trace
 from unbake.transport.prior import residual
 
 SPP, FEW = 8, 2
-
-
-@pytest.fixture(scope="module")
-def problem(built_in):
-    return make_problem(built_in("cornell"), "visible", TINY_FIT, 0.2)
 
 
 @pytest.fixture(scope="module")
