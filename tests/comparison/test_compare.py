@@ -216,3 +216,16 @@ def test_a_contender_is_a_method_and_maybe_a_representation():
     assert (chosen.method, chosen.representation) == ("prb", "bitmap")
     # Those are settings of ours alone, which the others refuse.
     assert (chosen.bounces, chosen.prior) == (1, "extra-bounce")
+
+
+def test_samples_of_both_passes_count(compare, tmp_path):
+    assert compare("direct", "prb:neural:two-pass", "prb:neural:split-halves").status == 0
+    rows = result(tmp_path)["methods"]
+    samples = {row["estimator"]: row["samples"] for name, row in rows.items() if "prb" in name}
+    assert samples == {"split-halves": 8 * 256, "two-pass": 2 * 8 * 256}
+    assert rows["direct"]["samples"] == 8 * 256
+    for name, row in rows.items():
+        log = (tmp_path / "out" / name / "log.jsonl").read_text().splitlines()
+        assert json.loads(log[-1])["samples"] == row["samples"]
+        rate = 1e3 * row["samples"] / row["steps"] / row["milliseconds_per_step"]
+        assert row["samples_per_second"] == pytest.approx(rate)

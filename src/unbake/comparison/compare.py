@@ -27,12 +27,13 @@ from .method_variant import MethodVariant
 from .tables import print_comparison
 
 DEFINITIONS = {
+    "samples": "camera samples traced in training; of an estimator with two passes, both count",
     "seconds": "training time: without scores, previews and checkpoints, with the compilation of "
     "the first steps",
     "milliseconds_per_step": "median after the first steps",
     "start_up_seconds": "training time beyond its steps at that median, most of it compilation "
     "(kernels of earlier runs are cached)",
-    "samples_per_second": "camera samples of a step over that median; of two passes, one counts",
+    "samples_per_second": "camera samples of a step over that median",
     "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
     "time_to_quality": "target: the last albedo PSNR of a run; seconds: training time after which "

@@ -335,9 +335,14 @@ class FitConfig:
         return min(self.radiance_spp or self.spp, self.spp)
 
     @property
-    def samples_per_step(self) -> int:
-        """Camera samples of a training step."""
+    def samples_per_pass(self) -> int:
+        """Camera samples that one pass of a training step traces at once."""
         return self.pixels * self.spp
+
+    @property
+    def samples_per_step(self) -> int:
+        """Camera samples that a training step traces, in all its passes."""
+        return self.samples_per_pass * (1 if self.halves else 2)
 
 
 def default_settings(name: str, form: str) -> FieldSettings:

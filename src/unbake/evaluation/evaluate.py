@@ -32,6 +32,7 @@ DEFINITIONS = {
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
+    "samples": "camera samples traced in training; of an estimator with two passes, both count",
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",
 }
@@ -84,7 +85,8 @@ def evaluate(
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
         "steps": recovered.progress.step,
-        "samples": recovered.progress.samples,
+        # Not what the checkpoint says: version 0.1 counts one of two passes.
+        "samples": recovered.progress.step * recovered.config.samples_per_step,
         "seconds": round(recovered.progress.seconds, 2),
         "heldout": _summary(rows, "heldout"),
         "train": _summary(rows, "train"),

@@ -61,7 +61,8 @@ def bench_step(
     """Measure the training step of a method on a data set, and its phases.
 
     Times are medians after warm-up. A camera sample is one path from the camera with its RHS and
-    all gradients. Samples that train L_θ also have an LHS and residuals.
+    all gradients; of an estimator with two passes, those of both count. Samples that train L_θ also
+    have an LHS and residuals.
 
     Args:
         data: folder of the data set.

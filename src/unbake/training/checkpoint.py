@@ -36,7 +36,7 @@ class Progress:
 
     step: int = 0
     seconds: float = 0.0  #: of training, without previews and checkpoints
-    samples: int = 0
+    samples: int = 0  #: from the camera, traced in all passes
 
 
 def save_checkpoint(run: RunFolder, state: State, progress: Progress) -> Path:

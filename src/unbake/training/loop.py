@@ -115,7 +115,7 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
             rates = learning_rates(config, progress.step, done)
             recent.append(step(state, progress.step, rates))
             progress.step += 1
-            progress.samples += config.samples_per_step
+            progress.samples = progress.step * config.samples_per_step
             last = _done(config, progress) >= total or bool(stop)
 
             full = len(recent) >= READ_EVERY

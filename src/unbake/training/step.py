@@ -85,7 +85,7 @@ class TrainingStep:
         except RuntimeError as error:
             if not lacks_memory(error):
                 raise
-            lanes = self._config.samples_per_step
+            lanes = self._config.samples_per_pass
             raise UserError(f"no memory for a step of {lanes} paths", None, SMALLER) from None
 
     def require_memory(self, state: State) -> None:
@@ -99,7 +99,7 @@ class TrainingStep:
         """
         if self._fits_memory:
             return
-        require_memory(self.bytes_needed(state), self._config.method, self._config.samples_per_step)
+        require_memory(self.bytes_needed(state), self._config.method, self._config.samples_per_pass)
         self._fits_memory = True
 
     def bytes_needed(self, state: State) -> float | None:
