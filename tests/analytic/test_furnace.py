@@ -27,7 +27,7 @@ from unbake.fields.radiance import RadianceField
 from unbake.fields.texture import material_textures
 from unbake.scene.parse import parse
 from unbake.transport.loss import RelativeL2
-from unbake.transport.methods import EXTRA, METHODS, PHOTOMETRIC, PRIOR, Attached
+from unbake.transport.methods import EXTRA, METHODS, PHOTOMETRIC, PRIOR, PRIOR_PAIR, Attached
 from unbake.transport.objective import objective, requirements
 from unbake.transport.path_sample import lhs, rhs, trace
 from unbake.transport.prior import residual
@@ -221,3 +221,42 @@ def test_more_live_bounces_come_nearer_to_the_true_gradient(learnable):
         found.append(float(dr.sum(dr.grad(materials.albedo))[0]))
     closed = [sum(i * 0.8 ** (i - 1) for i in range(1, k)) + 5 * k * 0.8 ** (k - 1) for k in (1, 4)]
     np.testing.assert_allclose(found[1] / found[0], closed[1] / closed[0], rtol=0.02)
+
+
+# ---------------------------------------------- the prior without its stop gradient, for exact L
+
+
+def prior_gradients(learnable, albedo, term, batches=16):
+    """Of the prior by the albedo of the walls, which it trains too: mean, its error, the value.
+
+    L_θ is the exact radiance, which has no residual: neither it nor the albedo need to change.
+    """
+    materials, cache = learnable.materials, ConstantRadiance(albedo / (1 - albedo))
+    row, cameras = {term: Attached(scene=True, lhs=True)}, built_in_cameras("furnace", 16, views=8)
+    gradients, values = [], []
+    for k in range(batches):
+        materials.albedo = mi.Color3f(albedo)
+        dr.enable_grad(materials.albedo)
+        ray = pixel_rays(cameras, 16, seed=100 + k)
+        sampler = seeded(200 + k, dr.width(ray))
+        sample = trace(learnable, cache, ray, sampler, requirements(row), hide_emitters=False)
+        value = objective(row, sample, mi.Color3f(0), RelativeL2(0.01))[term]
+        dr.backward(value)
+        gradients.append(float(dr.sum(dr.grad(materials.albedo))[0]))
+        values.append(float(value[0]))
+    return np.mean(gradients), np.std(gradients, ddof=1) / np.sqrt(batches), np.mean(values)
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.5, 0.8])
+def test_the_prior_of_the_exact_radiance_pulls_at_the_albedo_unless_it_is_a_pair(learnable, albedo):
+    """One squared sample has the variance of T in it: here that is ∝ ρ², its derivative 2 Var/ρ."""
+    biased, error, variance = prior_gradients(learnable, albedo, PRIOR)
+    print(f"{albedo}: one sample {biased:.5f} ± {error:.5f}, 2 Var/ρ = {2 * variance / albedo:.5f}")
+    assert biased > 20 * error
+    np.testing.assert_allclose(biased, 2 * variance / albedo, rtol=0.03)
+
+    unbiased, error, value = prior_gradients(learnable, albedo, PRIOR_PAIR)
+    print(f"{albedo}: a pair {unbiased:.5f} ± {error:.5f}, value {value:.5f}")
+    # The walls overlap by a millimetre, where shadow rays end too early: T is 0.04 % ρ too bright.
+    assert abs(unbiased) < 3 * error + 0.01 * biased
+    assert abs(value) < 0.02 * variance

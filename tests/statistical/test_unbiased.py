@@ -19,9 +19,10 @@ from unbake.training.problem import make_problem
 from unbake.training.state import State
 from unbake.training.step import TrainingStep
 from unbake.transport.loss import RelativeL2, pixel_means, squared_error
-from unbake.transport.methods import PHOTOMETRIC, Attached
-from unbake.transport.objective import objective
+from unbake.transport.methods import PHOTOMETRIC, PRIOR, PRIOR_PAIR, Attached
+from unbake.transport.objective import objective, requirements
 from unbake.transport.path_sample import rhs, trace
+from unbake.transport.prior import residual
 from unbake.transport.vertex import SceneView
 
 
@@ -169,6 +170,56 @@ def test_the_gradient_of_a_real_pixel_is_unbiased(room):
     z = z_of(gradients(False, naive), exact, error)
     print(f"naive: z {z}")
     assert z.max() > 5
+
+
+# ------------------------------------------------------- a prior that trains the materials too
+
+CACHE = 0.3
+ONE_PRIOR = RelativeL2(0.01)
+
+
+def one_point_a_pixel(room, repeats, albedo, seed, wanted):
+    """Path samples through the centres of 16 pixels, `repeats` lanes each."""
+    rays = CameraRays.of(built_in_cameras("cornell", 4))
+    pixel = dr.arange(mi.UInt32, 16 * repeats) // repeats
+    ray = rays.through(pixel, mi.Point2f(0.5) + dr.zeros(mi.Point2f, 16 * repeats))
+    room.materials.albedo = albedo
+    sampler = seeded(seed, 16 * repeats)
+    return trace(room, ConstantRadiance(CACHE), ray, sampler, wanted, hide_emitters=False)
+
+
+def squared_residual(room, albedo, seed, repeats=1 << 13):
+    """Of the mean of many samples of T at each point, by channel: mean over the points."""
+    row = {PRIOR: Attached(lhs=True)}
+    with dr.suspend_grad():
+        sample = one_point_a_pixel(room, repeats, mi.Color3f(albedo), seed, requirements(row))
+        r = residual(sample, 1, sample.radiance[0], sample.radiance[1])
+    mean = np.array(r, np.float64).reshape(3, 16, repeats).mean(2)
+    return (np.square(mean) / (CACHE**2 + ONE_PRIOR.epsilon)).mean(1)
+
+
+def test_the_product_of_two_residuals_has_an_unbiased_gradient_and_the_square_of_one_has_not(room):
+    """By the albedo, against central differences: the squared residual is quadratic in it."""
+    ends = [[squared_residual(room, 0.5 + h, 300 + k) for h in (0.1, -0.1)] for k in range(24)]
+    differences = np.array([(a - b) / 0.2 for a, b in ends])
+    exact, error = differences.mean(0), differences.std(0, ddof=1) / np.sqrt(len(ends))
+    print(f"exact {exact} ± {error}")
+
+    repeats = 1 << 13
+    found = {}
+    for term in (PRIOR_PAIR, PRIOR):
+        row = {term: Attached(scene=True)}
+        albedo = dr.full(mi.Color3f, 0.5, 16 * repeats)
+        dr.enable_grad(albedo)
+        sample = one_point_a_pixel(room, repeats, albedo, 900, requirements(row))
+        value = objective(row, sample, mi.Color3f(0), ONE_PRIOR)[term]
+        dr.backward(value)
+        lanes = np.array(dr.grad(albedo), np.float64).reshape(3, 16, repeats)
+        # The objective is a mean over lanes and channels, the reference one over points.
+        found[term] = z_of((3 * repeats * lanes.sum(1)).T, exact, error)
+        print(f"{term}: z {found[term]}")
+    assert np.abs(found[PRIOR_PAIR]).max() < 3
+    assert found[PRIOR].min() > 5
 
 
 # -------------------------------------------------------------------------- the training step

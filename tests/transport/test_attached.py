@@ -9,7 +9,7 @@ import pytest
 from support import built_in_cameras, enable_gradients, pixel_rays, seeded
 
 from unbake.transport.loss import RelativeL2
-from unbake.transport.methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, Attached
+from unbake.transport.methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, PRIOR_PAIR, Attached
 from unbake.transport.objective import objective, requirements
 from unbake.transport.path_sample import SampleSubset, trace
 
@@ -72,7 +72,9 @@ def rows_of(term_names, attached):
 
 
 RESIDUALS = pytest.mark.parametrize(
-    "terms", [(PRIOR,), (EXTRA,), (PRIOR, EXTRA)], ids=["one", "second", "both"]
+    "terms",
+    [(PRIOR,), (EXTRA,), (PRIOR, EXTRA), (PRIOR_PAIR,)],
+    ids=["one", "second", "both", "pair"],
 )
 
 
@@ -100,6 +102,8 @@ def test_the_gradient_of_a_residual_is_that_of_both_its_sides(
         ({EXTRA: BOTH}, 1),
         ({PRIOR: BOTH, EXTRA: BOTH}, 1),
         ({PRIOR: BOTH, EXTRA: BOTH}, 3),
+        ({PRIOR_PAIR: BOTH}, 1),
+        ({PRIOR_PAIR: BOTH, EXTRA: BOTH}, 2),
         ({PRIOR: Attached(rhs=True), LHS: Attached(lhs=True)}, 2),
         ({PHOTOMETRIC: Attached(rhs=True)}, 1),
         ({PHOTOMETRIC: Attached(rhs=True)}, 2),
@@ -152,8 +156,8 @@ def _mixed(terms, samples, target, bounces):
     total = 0.0
     for term in terms:
         left, right = samples["lhs"], samples["rhs"]
-        if term in (PRIOR, EXTRA):
-            number = 1 if term == PRIOR else 2
+        if term in (PRIOR, PRIOR_PAIR, EXTRA):
+            number = 2 if term == EXTRA else 1
             left, right = left.learned or left, right.learned or right
             radiance = list(right.radiance)
             radiance[number - 1] = left.radiance[number - 1]

@@ -10,7 +10,15 @@ import pytest
 from support import built_in_cameras, enable_gradients, pieces, pixel_rays, seeded
 
 from unbake.transport.loss import RelativeL2
-from unbake.transport.methods import EXTRA, LHS, METHODS, PHOTOMETRIC, PRIOR, Attached
+from unbake.transport.methods import (
+    EXTRA,
+    LHS,
+    METHODS,
+    PHOTOMETRIC,
+    PRIOR,
+    PRIOR_PAIR,
+    Attached,
+)
 from unbake.transport.objective import objective, requirements
 from unbake.transport.path_sample import trace
 
@@ -19,6 +27,7 @@ SPP = 4
 EDGES = {
     PHOTOMETRIC: {"scene": "bounce1", "rhs": "L2"},
     PRIOR: {"scene": "bounce1", "lhs": "L1", "rhs": "L2"},
+    PRIOR_PAIR: {"scene": "bounce1", "lhs": "L1", "rhs": "L2"},
     EXTRA: {"lhs": "L2"},
     LHS: {"lhs": "L1"},
 }
@@ -63,15 +72,29 @@ def non_zero(arrays):
 
 
 def with_live_pieces(sample):
-    """A path sample whose pieces up to L(x₂) take gradients, and the arrays of each piece."""
+    """A path sample whose pieces up to L(x₂) take gradients, and the arrays of each piece.
+
+    Those of a second bounce from x₁ are arrays of the same pieces.
+    """
     sample = dr.detach(sample)
-    step = replace(sample.bounces[0])
-    step.direct, step.weight = mi.Color3f(step.direct), mi.Color3f(step.weight)
+    step = live_bounce(sample)
     L1, L2, L3 = (mi.Color3f(L) for L in sample.radiance)
-    sample = replace(sample, bounces=[step, sample.bounces[1]], radiance=[L1, L2, L3])
     arrays = {"bounce1": [step.direct, step.weight], "L1": [L1], "L2": [L2]}
+    pair = sample.pair
+    if pair is not None:
+        again, L2_again = live_bounce(pair), mi.Color3f(pair.radiance[1])
+        pair = replace(pair, bounces=[again], radiance=[pair.radiance[0], L2_again])
+        arrays["bounce1"] += [again.direct, again.weight]
+        arrays["L2"].append(L2_again)
+    sample = replace(sample, bounces=[step, sample.bounces[1]], radiance=[L1, L2, L3], pair=pair)
     dr.enable_grad(arrays)
     return sample, arrays
+
+
+def live_bounce(sample):
+    """A copy of the first bounce, with arrays of its own."""
+    step = sample.bounces[0]
+    return replace(step, direct=mi.Color3f(step.direct), weight=mi.Color3f(step.weight))
 
 
 def test_nothing_beyond_the_second_vertex_passes_gradients(problem, rays):
@@ -82,12 +105,15 @@ def test_nothing_beyond_the_second_vertex_passes_gradients(problem, rays):
         assert dr.grad_enabled(attached)
     for fixed in (second.direct, second.weight, sample.radiance[2], sample.x1.albedo):
         assert not dr.grad_enabled(fixed)
+    assert sample.pair is None, "a second bounce that no term reads"
 
 
 @pytest.mark.parametrize("reference", LOSSES)
 @pytest.mark.parametrize(("term", "attached"), SYNTHETIC)
 def test_a_row_makes_those_pieces_live_that_it_says(problem, rays, term, attached, reference):
-    sample, arrays = with_live_pieces(traced(problem, rays))
+    wanted = replace(pieces(1, 2), pair=term == PRIOR_PAIR)
+    sample, arrays = with_live_pieces(traced(problem, rays, wanted))
+    assert len(arrays["bounce1"]) == (4 if term == PRIOR_PAIR else 2)
     values = objective({term: attached}, sample, photographs(rays), LOSSES[reference])
     assert list(values) == [term]
     if dr.grad_enabled(values[term]):
@@ -157,3 +183,26 @@ def test_the_paper_trains_materials_by_photographs_and_radiance_by_all_else(meth
 def test_a_row_of_a_single_residual_asks_for_the_radiance_field(row):
     assert requirements(row).radiance
     assert requirements(row).residuals == (2 if EXTRA in row else 1)
+
+
+@pytest.mark.parametrize("method", ROWS)
+def test_a_second_bounce_is_traced_for_the_product_of_residuals_alone(method):
+    wanted = requirements(ROWS[method])
+    assert wanted.pair == (PRIOR_PAIR in ROWS[method]) == (method == "with-prior")
+    assert not wanted.pair_attached
+    assert requirements({PRIOR_PAIR: Attached(rhs=True)}).pair_attached
+
+
+def test_the_product_of_residuals_leaves_the_other_samples_as_they_are(problem, rays):
+    """The second bounce is drawn last: all that other terms read is the same number for number."""
+    row = METHODS["ours"].terms
+    alone = traced(problem, rays, requirements(row))
+    beside = traced(problem, rays, requirements({**row, PRIOR_PAIR: Attached(scene=True)}))
+    target = photographs(rays)
+    values = [objective(row, sample, target, LOSSES["photograph"]) for sample in (alone, beside)]
+    for term in row:
+        assert float(values[0][term][0]) == float(values[1][term][0]), term
+    first, second = beside.bounces[0].next.si.p, beside.pair.bounces[0].next.si.p
+    hit = np.array(beside.bounces[0].next.valid & beside.pair.bounces[0].next.valid)
+    assert hit.mean() > 0.5
+    assert (np.array(dr.norm(first - second))[hit] > 1e-4).all(), "the same bounce twice"

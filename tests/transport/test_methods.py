@@ -23,6 +23,7 @@ from unbake.transport.methods import (
     METHODS,
     PHOTOMETRIC,
     PRIOR,
+    PRIOR_PAIR,
     Attached,
     Method,
     method_named,
@@ -199,6 +200,7 @@ def test_a_method_that_attaches_every_edge_is_recorded_and_replayed(built_in, ra
     row = {
         PHOTOMETRIC: Attached(scene=True, rhs=True),
         PRIOR: Attached(scene=True, lhs=True, rhs=True),
+        PRIOR_PAIR: Attached(scene=True, lhs=True, rhs=True),
         EXTRA: Attached(scene=True, lhs=True, rhs=True),
         LHS: LIGHT,
     }

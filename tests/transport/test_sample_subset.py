@@ -57,7 +57,7 @@ def traced(problem, rays, wanted, *, subset, seed=2):
     )
 
 
-@pytest.mark.parametrize("method", ["ours", "one-bounce", "no-prior", "with-prior"])
+@pytest.mark.parametrize("method", ["ours", "one-bounce", "no-prior", "with-biased-prior"])
 @pytest.mark.parametrize("bounces", [1, 2, 3])
 def test_what_is_learned_of_is_what_all_samples_have_there(problem, rays, method, bounces):
     wanted = requirements(row_of(method), bounces)
@@ -107,7 +107,7 @@ def as_samples(batches):
     return mi.Color3f(*[mi.Float(row) for row in flat])
 
 
-@pytest.mark.parametrize("method", ["ours", "no-prior", "with-prior"])
+@pytest.mark.parametrize("method", ["ours", "no-prior", "with-prior", "with-biased-prior"])
 def test_terms_train_the_same_parameters(problem, rays, method):
     row = METHODS[method].terms
     target = mi.Color3f(0.1 + 0.3 * dr.arange(mi.Float, dr.width(rays) // SPP) / 36)

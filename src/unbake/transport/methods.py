@@ -25,6 +25,7 @@ class Attached:
 
 #: Names of the terms that `terms.py` defines.
 PHOTOMETRIC, PRIOR, EXTRA, LHS = "photometric", "prior", "prior_extra", "lhs"
+PRIOR_PAIR = "prior_pair"
 #: Names of the samplers that `samplers.py` defines.
 BOUNCES, PATH_REPLAY = "bounces", "path-replay"
 
@@ -102,7 +103,7 @@ def method_named(name: str) -> Method:
 
 _SCENE, _LHS = Attached(scene=True), Attached(lhs=True)
 
-# Photometric: Eq. 5 with Eq. 12. Prior: Eq. 10. Extra: the same at x₂. LHS: Eq. 14.
+# Photometric: Eq. 5 with Eq. 12. Prior, pair: Eq. 10. Extra: the same at x₂. LHS: Eq. 14.
 for _method in (
     Method(
         "ours",
@@ -129,15 +130,23 @@ for _method in (
         sampler=PATH_REPLAY,
         follows_paths=True,
     ),
-    # The ablation of Fig. 7 and 8, from `direct` to `ours`, each with one thing more.
+    # The ablation of Fig. 7 and 8, from `direct` to `ours`, each with one thing more. The authors'
+    # row "+ prior" is `with-biased-prior`: their residuals are squared sample by sample, with one
+    # sample of T(L_θ) each. `with-prior` is the same idea without that bias. The rows after these
+    # take the square: with the scene detached its gradient has no bias.
     Method(
         "with-prior",
-        "direct, and a prior that trains the materials too",
+        "direct, and a prior that trains the materials too, free of bias",
+        {PHOTOMETRIC: _SCENE, PRIOR_PAIR: Attached(scene=True, lhs=True)},
+    ),
+    Method(
+        "with-biased-prior",
+        "with-prior as the authors have it, biased by the noise of its samples",
         {PHOTOMETRIC: _SCENE, PRIOR: Attached(scene=True, lhs=True)},
     ),
     Method(
         "with-stop-gradient",
-        "with-prior, whose prior trains the radiance field alone",
+        "direct, and a prior that trains the radiance field alone",
         {PHOTOMETRIC: _SCENE, PRIOR: _LHS},
     ),
     Method(

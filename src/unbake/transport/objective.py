@@ -21,7 +21,7 @@ def requirements(terms: Mapping[str, Attached], bounces: int = 1) -> Requirement
     """
     residuals, attached, constant = 0, set(), set()
     differentiable: set[int] = set()
-    image_attached = False
+    image_attached = pair = pair_attached = False
     for name, edges in terms.items():
         term = term_named(name)
         term.check(edges)
@@ -32,6 +32,8 @@ def requirements(terms: Mapping[str, Attached], bounces: int = 1) -> Requirement
             (attached if live else constant).update(numbers)
         if edges.scene:
             differentiable |= set(term.scene)
+        pair |= term.pair
+        pair_attached |= term.pair and edges.rhs
         residuals = max((residuals, *term.scene, *(n - 1 for n in (*term.lhs, *term.rhs))))
     return Requirements(
         bounces,
@@ -40,6 +42,8 @@ def requirements(terms: Mapping[str, Attached], bounces: int = 1) -> Requirement
         frozenset(constant - attached),
         image_attached,
         frozenset(differentiable),
+        pair,
+        pair_attached,
     )
 
 
@@ -68,6 +72,7 @@ def objective(
     for name, attached in terms.items():
         term = term_named(name)
         paths = sample if term.of_image else (sample.learned or sample)
+        pair = paths.pair.radiance if paths.pair is not None else []
         values[name] = term.value(
             TermInputs(
                 paths if attached.scene else dr.detach(paths),
@@ -77,6 +82,7 @@ def objective(
                 loss,
                 primal if term.of_image else None,
                 bounces,
+                [L if attached.rhs else dr.detach(L) for L in pair],
             )
         )
     return values

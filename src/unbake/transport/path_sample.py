@@ -3,7 +3,8 @@
     L(x, ω) = E(x, ω) + T(L)(x, ω)
      LHS         RHS
 
-`trace` samples the vertices, bounces and look-ups of L_θ that the loss terms read, each once.
+`trace` samples the vertices, bounces and look-ups of L_θ that the loss terms read, each once. A
+term may ask for a second, independent bounce from x₁ (`PathSample.pair`).
 `Requirements` lists them, and says which pass gradients.
 """
 
@@ -35,6 +36,8 @@ class PathSample:
     bounces: list[Bounce]  # from x₁, x₂, …; each starts at the next vertex of the one before
     radiance: list[mi.Color3f]  # L_θ at x₁, x₂, …; zero where no term reads it
     learned: PathSample | None = None  # the samples that L_θ learns of; None: all of these
+    #: One more bounce from the same x₁, independent of the first; None where no term reads it.
+    pair: PathSample | None = None
 
     def vertex(self, number: int) -> Vertex:
         """Vertex x₁, x₂, … of the path."""
@@ -62,6 +65,8 @@ class Requirements:
     constant: frozenset[int] = frozenset()  #: vertices of these where L_θ is a constant
     image_attached: bool = False  #: whether L_θ at the end of the image's paths passes gradients
     differentiable: frozenset[int] = frozenset()  #: further vertices with gradients to φ
+    pair: bool = False  #: a second, independent bounce from x₁, with gradients to φ
+    pair_attached: bool = False  #: whether L_θ at its end passes gradients to θ
 
     @property
     def radiance(self) -> bool:
@@ -123,7 +128,11 @@ def trace(
         learned is sample or requirements.residuals > requirements.bounces
     ):
         _end(scene_view, learned)
-    for paths in (sample, learned):
+    if requirements.pair:
+        # The material at x₁ is attached already, by the first bounce.
+        learned.pair = PathSample(learned.x1, [bounce(scene_view, learned.x1, sampler)], [])
+        _end(scene_view, learned.pair)
+    for paths in filter(None, (sample, learned, learned.pair)):
         paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
     if requirements.radiance:
         if radiance is None:
@@ -137,6 +146,9 @@ def trace(
         if learned is not sample:
             with dr.suspend_grad(when=not requirements.image_attached):
                 _look_up(radiance, sample, last)
+        if learned.pair is not None:
+            with dr.suspend_grad(when=not requirements.pair_attached):
+                _look_up(radiance, learned.pair, {2})
         with dr.suspend_grad():
             _look_up(radiance, learned, constant)
     return sample

@@ -25,15 +25,23 @@ def residual(sample, number: int, L: mi.Color3f, L_next: mi.Color3f) -> mi.Color
     return dr.select(valid, L - transported(sample.bounces[number - 1], L_next), 0)
 
 
-def residual_norm(residual: mi.Color3f, reference: mi.Color3f, epsilon: float) -> mi.Float:
+def residual_norm(
+    residual: mi.Color3f,
+    reference: mi.Color3f,
+    epsilon: float,
+    independent: mi.Color3f | None = None,
+) -> mi.Float:
     """Relative squared norm of residuals, mean over samples and channels.
 
     Args:
         residual: of each sample, linear RGB.
         reference: the radiance that it is relative to; taken as a constant.
         epsilon: added to the squared reference.
+        independent: the same residuals from other samples of T. The product of both is free of the
+            variance that is part of the expected square of one; None: the square.
 
-    Paper: Eq. 4, Eq. 10, Sec. 5.4.
+    Paper: Eq. 4, Eq. 10, Sec. 5.2, 5.4.
     """
     weight = dr.rcp(dr.square(dr.detach(reference)) + epsilon)
-    return dr.mean(dr.mean(dr.square(residual) * weight))
+    squared = dr.square(residual) if independent is None else residual * independent
+    return dr.mean(dr.mean(squared * weight))

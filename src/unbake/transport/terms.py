@@ -6,7 +6,7 @@ A term of your own is a `Term` given to `register_term`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import drjit as dr
@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..errors import UserError, require_name
 from .loss import RelativeL2, squared_error
-from .methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, Attached
+from .methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, PRIOR_PAIR, Attached
 from .path_sample import PathSample, lhs, rhs
 from .prior import residual, residual_norm
 
@@ -37,6 +37,7 @@ class TermInputs:
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
             None: the split-halves estimator. For terms of the image alone.
         bounces: k, after which the image takes L_θ.
+        pair_rhs: as `rhs`, on `sample.pair`; empty where the method has no term that reads it.
     """
 
     sample: PathSample
@@ -46,6 +47,7 @@ class TermInputs:
     loss: RelativeL2
     primal: mi.Color3f | None
     bounces: int
+    pair_rhs: list[mi.Color3f] = field(default_factory=list)
 
     @property
     def spp(self) -> int:
@@ -69,6 +71,7 @@ class Term:
         of_image: whether it reads the image: all camera samples, of k bounces and L_θ at the vertex
             after those. All other terms read the samples that L_θ learns from.
         title: of its curve in reports; empty: its name.
+        pair: whether it reads a second, independent bounce from x₁ (`TermInputs.sample.pair`).
     """
 
     name: str
@@ -78,11 +81,12 @@ class Term:
     rhs: tuple[int, ...] = ()
     of_image: bool = False
     title: str = ""
+    pair: bool = False
 
     def __post_init__(self) -> None:
         if self.name in LOGGED:
             raise ValueError(f"{self.name} is a number of the log: a term cannot have its name")
-        if self.of_image and (self.scene or self.lhs or self.rhs):
+        if self.of_image and (self.scene or self.lhs or self.rhs or self.pair):
             raise ValueError(f"{self.name}: a term of the image has no vertices of its own")
         if min((*self.scene, *self.lhs, *self.rhs, 1)) < 1:
             raise ValueError(f"{self.name}: vertices are numbered from 1")
@@ -136,11 +140,31 @@ def photometric(x: TermInputs) -> mi.Float:
 
 
 def prior(x: TermInputs) -> mi.Float:
-    """The residual at x₁.
+    """The squared residual at x₁, of one sample of T(L_θ).
 
-    Paper: Eq. 10.
+    Its expectation is the squared residual plus the variance of the sample of T(L_θ). With the
+    scene and the right-hand side detached, as in `ours`, the variance is a constant and the
+    gradient is unbiased. With the scene attached the gradient has that of the variance in it,
+    which pulls materials and lights to where paths are less noisy; see `prior_pair`.
+
+    Paper: Eq. 10, Sec. 5.2.
     """
     return residual_norm(residual(x.sample, 1, x.lhs[0], x.rhs[1]), x.lhs[0], x.loss.epsilon)
+
+
+def prior_pair(x: TermInputs) -> mi.Float:
+    """The squared residual at x₁, as the product of two residuals.
+
+    Each has a sample of T(L_θ) of its own. These are independent, so that the expectation is the
+    square of the expected residual, and its gradients are unbiased whichever edges are attached.
+    The value of few samples can be negative.
+
+    Paper: Eq. 10, Sec. 5.2.
+    """
+    assert x.sample.pair is not None
+    first = residual(x.sample, 1, x.lhs[0], x.rhs[1])
+    second = residual(x.sample.pair, 1, x.lhs[0], x.pair_rhs[1])
+    return residual_norm(first, x.lhs[0], x.loss.epsilon, second)
 
 
 def prior_extra(x: TermInputs) -> mi.Float:
@@ -163,6 +187,15 @@ def lhs_loss(x: TermInputs) -> mi.Float:
 for _term in (
     Term(PHOTOMETRIC, photometric, of_image=True, title="Photometric loss"),
     Term(PRIOR, prior, scene=(1,), lhs=(1,), rhs=(2,), title="Prior loss"),
+    Term(
+        PRIOR_PAIR,
+        prior_pair,
+        scene=(1,),
+        lhs=(1,),
+        rhs=(2,),
+        title="Prior loss, of two samples",
+        pair=True,
+    ),
     Term(EXTRA, prior_extra, scene=(2,), lhs=(2,), rhs=(3,), title="Prior loss, extra bounce"),
     Term(LHS, lhs_loss, lhs=(1,), title="LHS loss"),
 ):
