@@ -1,16 +1,23 @@
 """Comparisons: complete, taken up again, honest about what failed."""
 
+import dataclasses
+import io
 import json
 import os
 import shutil
 import signal
 
 import pytest
+from rich.console import Console
 
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.comparison import compare as module
 from unbake.comparison.method_variant import MethodVariant
 from unbake.config import FitConfig, read_toml
 from unbake.errors import UserError
+from unbake.evaluation.evaluate import evaluate
+from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training import loop
 
@@ -39,7 +46,8 @@ def test_two_methods_side_by_side(compare, tmp_path):
     outcome = compare("ours", "direct")
     assert outcome.status == 0 and outcome.err == ""
     out = tmp_path / "out"
-    assert {p.name for p in out.iterdir()} == {"ours", "direct", "compare.json", "report.html"}
+    made = {"untrained", "ours", "direct", "compare.json", "report.html"}
+    assert {p.name for p in out.iterdir()} == made
     found = result(tmp_path)
     assert list(found["methods"]) == ["ours", "direct"]
     for name, row in found["methods"].items():
@@ -78,6 +86,41 @@ def test_only_the_method_differs(compare, tmp_path):
     assert {key for key in ours if ours[key] != direct[key]} == {"method"}
 
 
+def test_the_untrained_fields_stand_beside_the_methods(compare, tmp_path):
+    outcome = compare("ours", "direct", steps=3)
+    found, out = result(tmp_path), tmp_path / "out"
+    start, metrics = (
+        found["untrained"],
+        json.loads((out / "untrained/evaluation/metrics.json").read_text()),
+    )
+    assert metrics["steps"] == metrics["samples"] == metrics["seconds"] == 0
+    assert start["heldout"] == metrics["heldout"] and start["train"] == metrics["train"]
+    assert start["representation"] == "neural" and start["quantities"] == ["albedo", "roughness"]
+    # These are the fields that the methods start from; and no method or time belongs to them.
+    first = found["methods"]["ours"]["score"][0]
+    assert first["step"] == 0
+    assert start["heldout"]["albedo_psnr"] == pytest.approx(first["albedo_psnr"], abs=0.2)
+    assert not start.keys() & {"method", "seconds", "milliseconds_per_step", "score", "memory_mb"}
+    assert "untrained" not in found["methods"]
+    for target in found["time_to_quality"]:
+        assert target["run"] != "untrained" and "untrained" not in target["seconds"]
+    table = outcome.out[outcome.out.index("Held-out views, PSNR in dB") :]
+    assert table.index("untrained") < table.index("ours") < table.index("direct")
+    page = (out / "report.html").read_text()
+    assert '<td class="method">untrained' in page
+    race = page.split('<table class="race">')[1].split("</table>")[0]
+    assert "untrained" not in race and "direct" in race
+
+    before = contents(out / "untrained")
+    assert compare("ours", "direct", steps=3).status == 0
+    kept = contents(out / "untrained")
+    rewritten = {"config.toml", "origin.json", "log.jsonl"}  # as of any run that is kept
+    assert before.keys() == kept.keys()
+    for file, content in before.items():
+        same = content[0] == kept[file][0] if file.name in rewritten else content == kept[file]
+        assert same, file
+
+
 def test_finished_runs_are_kept(compare, tmp_path):
     assert compare("direct", steps=3).status == 0
     run = tmp_path / "out" / "direct"
@@ -95,6 +138,41 @@ def test_another_quality_of_evaluation_is_evaluated_anew(compare, tmp_path):
     assert compare("direct", steps=2, extra=("--evaluate-spp", 3)).status == 0
     metrics = json.loads((tmp_path / "out/direct/evaluation/metrics.json").read_text())
     assert metrics["render"]["spp"] == result(tmp_path)["evaluation"]["spp"] == 3
+
+
+@pytest.mark.parametrize(
+    "changes", [{"train_views": 1}, {"clip_negative": True}, {"material_spp": 3}, {"rr_depth": 2}]
+)
+def test_an_evaluation_with_other_settings_is_repeated(changes, cornell, tiny, tmp_path):
+    config = dataclasses.replace(read_toml(tiny), steps=1)
+    console = Console(file=io.StringIO())
+
+    def go(**settings):
+        evaluation = EvaluationSettings(spp=2, **settings)
+        variants = [MethodVariant("direct")]
+        module.compare(cornell, variants, tmp_path, config, evaluation=evaluation, console=console)
+        file = tmp_path / "direct" / "evaluation" / "metrics.json"
+        return file.stat().st_mtime_ns, json.loads(file.read_text())["evaluation"]
+
+    first, again, (time, other) = go(), go(), go(**changes)
+    assert first == again and time != first[0]
+    assert other == first[1] | changes
+
+
+def test_paths_may_be_texts(cornell, tiny, tmp_path):
+    config = dataclasses.replace(read_toml(tiny), steps=1)
+    small = CaptureSettings(views=1, held_out=0, resolution=8, spp=4, max_depth=3)
+    data = str(tmp_path / "data")
+    capture("cornell", data, small, tell=lambda line: None)
+    run = str(tmp_path / "run")
+    assert module.fit(data, run, config, console=Console(file=io.StringIO())).step == 1
+    metrics = evaluate(run, EvaluationSettings(spp=1), tell=lambda line: None)
+    assert metrics["steps"] == 1
+    out, variants = str(tmp_path / "out"), [MethodVariant("direct")]
+    evaluation = EvaluationSettings(spp=1)
+    console = Console(file=io.StringIO())
+    found = module.compare(data, variants, out, config, evaluation=evaluation, console=console)
+    assert found["methods"]["direct"]["steps"] == 1
 
 
 def test_an_interrupted_comparison_goes_on(compare, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from rich.console import Console
 from unbake.comparison import tables
 from unbake.comparison.tables import print_comparison, print_step_times
 
+START = {"heldout": {"render_psnr": 11.0, "albedo_psnr": 12.25}}
 LENGTH = {"steps": 5, "seconds": 2.0, "milliseconds_per_step": None, "samples_per_second": 1e3}
 
 
@@ -16,15 +17,27 @@ def printed(show, content, width=200):
     return console.file.getvalue()
 
 
+def compared(methods):
+    return {"untrained": START, "methods": methods, "time_to_quality": []}
+
+
+def test_untrained_fields_are_the_first_row():
+    text = printed(print_comparison, compared({"ours": LENGTH | {"heldout": {"albedo_psnr": 9.5}}}))
+    rows = [line.split("│")[1:] for line in text.splitlines() if line.startswith("│")]
+    cells = [[cell.strip() for cell in row] for row in rows]
+    assert cells[0][:4] == ["untrained", "11.00", "12.25", "0"] and not any(cells[0][4:])
+    assert cells[1][:4] == ["ours", "—", "9.50", "5"]
+
+
 def test_a_comparison_has_a_column_for_each_quantity(monkeypatch):
     monkeypatch.setattr(tables, "QUANTITIES", (*tables.QUANTITIES, "gloss"))
     means = {"render_psnr": 20.0, "albedo_psnr": 30.125, "roughness_psnr": None}
     methods = {"ours": LENGTH | {"heldout": means}, "prb": {"error": "no memory"}}
-    text = printed(print_comparison, {"methods": methods, "time_to_quality": []})
+    text = printed(print_comparison, compared(methods))
     assert "albedo" in text and "roughness" in text and "gloss" not in text
     assert "30.12" in text and "—" in text and "failed" in text
     methods["ours"]["heldout"] = means | {"gloss_psnr": 17.0}
-    text = printed(print_comparison, {"methods": methods, "time_to_quality": []})
+    text = printed(print_comparison, compared(methods))
     assert "gloss" in text and "17.00" in text
 
 
@@ -33,7 +46,7 @@ def test_what_is_known_of_lighting_is_printed():
     light |= {"relight_psnr": 31.0, "relight_psnr_aligned": 32.0}
     emission = [{"name": "lamp", "emission_error": 0.25}, {"name": "dark", "emission_error": None}]
     row = LENGTH | {"heldout": {}, "environment": light, "emission": emission}
-    text = printed(print_comparison, {"methods": {"ours": row}, "time_to_quality": []})
+    text = printed(print_comparison, compared({"ours": row}))
     assert "12.5 %" in text and "32.0 dB" in text
     assert "ours: lamp 25.00 % off" in text and "dark" not in text
 

@@ -31,11 +31,11 @@ TRUTH_SAMPLES = 16
 
 
 def capture(
-    scene: str,
-    out: Path,
+    scene: str | Path,
+    out: Path | str,
     settings: CaptureSettings,
     *,
-    cameras: Path | None = None,
+    cameras: Path | str | None = None,
     tell: Callable[[str], None] = print,
 ) -> Dataset:
     """Render a scene from many cameras, with its true materials and lighting.
@@ -51,13 +51,14 @@ def capture(
 
     Paper: Sec. 6.
     """
+    out, cameras = Path(out), None if cameras is None else Path(cameras)
     if out.exists():
         raise UserError("exists already", where=out, remedy="Give another --out, or remove it")
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        dataset = _capture(scene, DataFolder(partial), settings, cameras, tell)
+        dataset = _capture(str(scene), DataFolder(partial), settings, cameras, tell)
         dataset.save(partial)
         partial.rename(out)
     except OSError as error:

@@ -146,6 +146,9 @@ def fit(
     progress = run(data, out, chosen, resume=resume, clip_negative=clip_negative, console=console)
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
         return 130
+    if not progress.step:
+        _say(f"nothing was learned: the fields are untrained; next: unbake evaluate {out}")
+        return 0
     _say(
         f"{progress.step} steps, {progress.samples / 1e6:.1f} M samples in "
         f"{progress.seconds:.0f} s; next: unbake evaluate {out}"
@@ -167,6 +170,8 @@ def evaluate(run: Positional[Run], /, *, evaluate: OmitArgPrefixes[EvaluationFla
     from ..evaluation.evaluate import evaluate as go
 
     metrics = go(run, settings, tell=_say)
+    if not metrics["steps"]:
+        _say("untrained: after 0 steps the fields have their initial values")
     for split in ("heldout", "train"):
         values = {k: v for k, v in metrics[split].items() if k != "views"}
         if not metrics["quantities"]:  # of known materials there are no scores
@@ -206,7 +211,8 @@ def compare(
 ) -> int:
     """Fit several methods with the same settings, and compare their quality over time.
 
-    Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. The same command
+    Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. OUT/untrained has
+    the fields before the first step: a method is worth what it adds to these. The same command
     again keeps finished runs and goes on with interrupted ones. A method that fails is recorded
     with its error; the exit status is then 1.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +35,28 @@ DEFINITIONS = {
     "(kernels of earlier runs are cached)",
     "samples_per_second": "camera samples of a step over that median",
     "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
+    "untrained": "the fields that all methods start from, with the shared representation and seed",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
     "time_to_quality": "target: the last albedo PSNR of a run; seconds: training time after which "
     "a run stays above it, interpolated linearly between scores; null: never",
 }
 
+#: Name of the run whose fields are those that all methods start from.
+UNTRAINED = "untrained"
+#: The method of that run, which learns nothing: any has the same fields before its first step.
+_CHEAPEST = MethodVariant("direct")
 #: Metrics of an evaluation that describe recovered lighting.
 LIGHTING = ("environment", "emission", "albedo_scale")
 #: Keys of an evaluation that the comparison needs.
 NUMBERS = {"steps", "samples", "seconds", "heldout", "train"}
+#: Keys of the row of untrained fields: no method and no time belong to them.
+OF_UNTRAINED = ("unknown", "quantities", "representation", "error", "heldout", "train", *LIGHTING)
 
 
 def compare(
-    data: Path,
+    data: Path | str,
     variants: Sequence[MethodVariant],
-    out: Path,
+    out: Path | str,
     config: FitConfig,
     *,
     evaluation: EvaluationSettings,
@@ -59,7 +66,8 @@ def compare(
     """Fit, evaluate and report several methods, one after the other.
 
     The runs are in `out`/NAME. Finished runs are kept, interrupted ones continue. A method that
-    fails is recorded with its error.
+    fails is recorded with its error. One more run, `out`/untrained, has the fields that all methods
+    start from: where the truth is grey, a method that learns nothing would seem to win.
 
     Args:
         data: folder of the data set.
@@ -71,7 +79,8 @@ def compare(
         console: shows progress and tables.
 
     Returns:
-        The content of `compare.json`.
+        The content of `compare.json`: the methods' rows by name in `methods`, and that of the
+        untrained fields in `untrained`.
 
     Raises:
         UserError: the data set cannot be used, a run in `out` has other settings or data, or every
@@ -81,17 +90,22 @@ def compare(
     Paper: Sec. 6.1, Fig. 3.
     """
     console = console or Console(highlight=False)
+    data, out = Path(data), Path(out)
     chosen = {variant.name: variant.settings(config) for variant in variants}
     if len(chosen) < len(variants) or not chosen:
         what = "a method is given twice" if chosen else "no method given"
         raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
+    if UNTRAINED in chosen:
+        raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
+    untrained = replace(_CHEAPEST.settings(config), steps=0, seconds=0.0, score_seconds=0.0)
+    fits = {UNTRAINED: untrained, **chosen}
     Dataset.load(data)
-    for name, settings in chosen.items():
+    for name, settings in {**chosen, **fits}.items():
         _check_kept(RunFolder(out / name), settings, data)
 
     rows: dict[str, dict[str, Any]] = {}
-    errors: list[UserError] = []
-    for name, settings in chosen.items():
+    errors: dict[str, UserError] = {}
+    for name, settings in fits.items():
         console.rule(name, align="left")
         try:
             run = RunFolder(out / name)
@@ -99,28 +113,30 @@ def compare(
             metrics = _evaluated(run, progress, evaluation, console)
             rows[name] = description(settings) | _numbers(run, metrics)
         except UserError as error:
-            errors.append(error)
+            errors[name] = error
             rows[name] = description(settings) | {"error": str(error)}
             console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
         # Free the memory of this method for the next one.
         gc.collect()
         dr.flush_malloc_cache()
-    if len(errors) == len(rows):
-        raise errors[0]
+    if errors.keys() >= chosen.keys():
+        raise next(iter(errors.values()))
 
+    start = {key: value for key, value in rows.pop(UNTRAINED).items() if key in OF_UNTRAINED}
     targets = time_to_quality({name: row.get("score", []) for name, row in rows.items()})
     result = {
         "data": str(data.resolve()),
         "machine": machine(),
         "settings": asdict(config),
         "evaluation": asdict(evaluation),
+        "untrained": start,
         "methods": rows,
         "time_to_quality": [asdict(target) for target in targets],
         "definitions": DEFINITIONS,
     }
     write_json(out / "compare.json", result, allow_nan=False)
-    good = [out / name for name, row in rows.items() if "error" not in row]
-    failed = {name: row["error"] for name, row in rows.items() if "error" in row}
+    good = [out / name for name in fits if name not in errors]
+    failed = {name: str(error) for name, error in errors.items()}
     write_report(good, out / "report.html", failed)
     print_comparison(result, console)
     return result
@@ -162,8 +178,8 @@ def _evaluated(
     """Metrics of the run. Evaluates it unless they are of this state and these settings."""
     if run.metrics_file.is_file():
         metrics = run.metrics()
-        render = {"spp": settings.spp, "max_depth": settings.max_depth}
-        same = metrics.get("steps") == progress.step and metrics.get("render") == render
+        same = metrics.get("steps") == progress.step
+        same = same and metrics.get("evaluation") == asdict(settings)
         if same and NUMBERS <= metrics.keys():
             return metrics
     return evaluate(run.path, settings, tell=lambda line: console.print(line, soft_wrap=True))

@@ -14,7 +14,7 @@ Row = dict[str, Any]
 
 def print_comparison(result: Row, console: Console) -> None:
     """Print the content of `compare.json`: quality, speed, lighting and time to quality."""
-    rows = result["methods"]
+    rows = {"untrained": result["untrained"]} | result["methods"]
     _print_quality(rows, console)
     _print_lighting(rows, console)
     _print_time_to_quality(result["time_to_quality"], console)
@@ -48,12 +48,17 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
         table.add_row(
             name,
             *(_number(row["heldout"].get(f"{quantity}_psnr"), 2) for quantity in quantities),
-            str(row["steps"]),
-            f"{row['seconds']:.0f} s",
-            _number(row["milliseconds_per_step"], 1),
-            _number(row["samples_per_second"], 0),
+            *_effort(row),
         )
     console.print(table)
+
+
+def _effort(row: Row) -> list[str]:
+    """Steps and times of a run; nothing for untrained fields."""
+    if "steps" not in row:
+        return ["0"]
+    time, rate = row["milliseconds_per_step"], row["samples_per_second"]
+    return [str(row["steps"]), f"{row['seconds']:.0f} s", _number(time, 1), _number(rate, 0)]
 
 
 def _print_lighting(rows: dict[str, Row], console: Console) -> None:

@@ -176,7 +176,9 @@ class FitConfig:
     seed: Annotated[int, Flag("Seed of weights and samples")] = 0
 
     #: Table 1.
-    steps: Annotated[int, Flag("Length of the fit in training steps")] = 2400
+    steps: Annotated[
+        int, Flag("Length of the fit in training steps; with 0 the fields stay untrained")
+    ] = 2400
     #: Stop after this much training time instead (0: count steps).
     seconds: Annotated[
         float,
@@ -219,8 +221,7 @@ class FitConfig:
         require(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
         few = self.radiance_spp
         require(few >= 0 and few % 2 == 0, "radiance_spp", "an even number, 0 or more", few)
-        for name in ("steps", "pixels"):
-            require(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+        require(self.pixels >= 1, "pixels", "1 or more", self.pixels)
         require(
             self.final_learning_rate > 0,
             "final_learning_rate",
@@ -228,7 +229,7 @@ class FitConfig:
             self.final_learning_rate,
         )
         times = ("seconds", "checkpoint_seconds", "preview_seconds", "score_seconds")
-        for name in (*times, "warm_up", "seed"):
+        for name in (*times, "steps", "warm_up", "seed"):
             require(getattr(self, name) >= 0, name, "0 or more", getattr(self, name))
         require(self.loss_epsilon > 0, "loss_epsilon", "positive", self.loss_epsilon)
         require(

@@ -43,7 +43,7 @@ METRICS = ("render_psnr", "render_psnr_unclamped")
 
 
 def evaluate(
-    run: Path,
+    run: Path | str,
     settings: EvaluationSettings | None = None,
     *,
     tell: Callable[[str], None] = print,
@@ -66,6 +66,7 @@ def evaluate(
     Paper: Sec. 6, Fig. 6.
     """
     settings = settings or EvaluationSettings()
+    run = Path(run)
     recovered, folder = load_run(run), RunFolder(run)
     dataset = recovered.dataset
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
@@ -95,6 +96,7 @@ def evaluate(
         "definitions": DEFINITIONS | (lighting.DEFINITIONS if recovered_lighting else {}),
         "data": str(dataset.folder),
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
+        "evaluation": asdict(settings),
     }
     folder.write_metrics(metrics)
     return metrics

@@ -136,6 +136,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             losses=_loss_charts(loaded),
             scores=_score_charts(loaded),
             race=_race(loaded),
+            trained=[i for i, run in enumerate(loaded) if not run.untrained],
             validation=_validation_charts(loaded),
             validated=sorted(
                 {r["split"] for log in _validations(loaded) for r in log if "split" in r}
@@ -234,7 +235,8 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
     return [
         {
             "run": run,
-            "details": _details(run.metrics),
+            "method": "untrained" if run.untrained else run.metrics["method"],
+            "details": _details(run),
             "steps": _count(run.metrics.get("steps")),
             "samples": _count(run.metrics.get("samples")),
             "seconds": _seconds(run.metrics.get("seconds")),
@@ -244,12 +246,15 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
     ]
 
 
-def _details(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+def _details(run: Run) -> list[tuple[str, str, str]]:
     """Representations, unknown and estimator of a run as text, symbol and subscript."""
+    metrics = run.metrics
     if "estimator" not in metrics:
         return []
     estimator = str(metrics["estimator"])
     details = [(form, "φ", "")] if (form := _form(metrics.get("representation"))) else []
+    if run.untrained:
+        return [*details, ("initial values, the same for all methods", "", "")]
     details.append((_form(metrics.get("radiance")) or "no", "L", "θ"))
     if _unknown(metrics) != "materials":
         details.append(
@@ -412,7 +417,8 @@ def _charts(
 
 def _race(runs: list[Run]) -> list[dict[str, Any]]:
     """Times to the last score of each run; empty if fewer than two runs have scores."""
-    targets = time_to_quality({run.label: score_curve(run.log) for run in runs})
+    raced = [run for run in runs if not run.untrained]
+    targets = time_to_quality({run.label: score_curve(run.log) for run in raced})
     if len(targets) < 2:
         return []
     index = {run.label: i for i, run in enumerate(runs)}

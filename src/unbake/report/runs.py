@@ -21,13 +21,21 @@ TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
 @final
 @dataclass(frozen=True)
 class Run:
-    """The contents of an evaluated run folder; `label` is its name on the page."""
+    """The contents of an evaluated run folder; `label` is its name on the page.
+
+    A run of no steps has untrained fields, and an empty log.
+    """
 
     folder: RunFolder
     label: str
     metrics: dict[str, Any]
     config: dict[str, Any]
     log: list[dict[str, Any]]
+
+    @property
+    def untrained(self) -> bool:
+        """Whether nothing was learned."""
+        return self.metrics.get("steps") == 0
 
     def optimizes(self, quantity: str) -> bool:
         """Whether a quantity was unknown to the run, so that it has images or numbers of it."""
@@ -94,7 +102,8 @@ def read_run(path: Path, label: str) -> Run:
     if metrics.get("unknown") == "emission" and not emitters:
         raise UserError("`emission` has no light", metrics_file, evaluate)
     settings = dict(_flatten(folder.settings_table()))
-    return Run(folder, label, metrics, settings, folder.log())
+    log = [] if metrics.get("steps") == 0 else folder.log()
+    return Run(folder, label, metrics, settings, log)
 
 
 def data_folder(runs: list[Run]) -> Path:

@@ -39,8 +39,8 @@ GIVE_UP_AFTER = 100
 
 
 def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
-    data: Path,
-    run: Path,
+    data: Path | str,
+    run: Path | str,
     config: FitConfig,
     *,
     resume: bool = False,
@@ -52,7 +52,8 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     Args:
         data: a data set's folder, with `transforms.json`.
         run: the folder to write: settings, log, checkpoints and previews.
-        config: what to do; ignored, but for `steps` and `seconds`, when resuming.
+        config: what to do; ignored, but for `steps` and `seconds`, when resuming. With no steps
+            and no seconds the run has untrained fields.
         resume: go on with the run's newest checkpoint.
         clip_negative: take negative pixels as zero.
 
@@ -66,6 +67,7 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     Paper: Sec. 4, 5.4.
     """
     console = console or Console()
+    data, run = Path(data), Path(run)
     folder = RunFolder(run)
     if resume:
         config = _resumed_config(folder, config)
@@ -84,9 +86,9 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
     state = initial_state(problem)
-    progress = Progress()
+    restored = load_checkpoint(folder, state) if resume else None
+    progress = restored or Progress()
     if resume:
-        progress = load_checkpoint(folder, state) or progress
         console.print(f"going on after step {progress.step}", highlight=False)
     step = TrainingStep(problem, pixels, config)
     preview = Preview(problem, dataset, folder)
@@ -109,6 +111,11 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
         clock = time.perf_counter() - progress.seconds
         # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
         last = _done(config, progress) >= total
+        if last and restored is None:  # nothing to learn: the untrained fields are the result
+            save_checkpoint(folder, state, progress)
+            state.publish(problem)
+            for line in preview.show(progress):
+                monitor.validation(line)
         while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
             done = _done(config, progress) / total

@@ -72,7 +72,8 @@ class Monitor:
         if not self._console.is_terminal and entry["seconds"] - self._last_line >= QUIET_SECONDS:
             self._last_line = entry["seconds"]
             left = "" if not done else f"  {entry['seconds'] * (self._total / done - 1):.0f} s left"
-            self.say(f"{100 * done / self._total:3.0f} %  {line}{left}")
+            share = done / self._total if self._total else 1.0
+            self.say(f"{100 * share:3.0f} %  {line}{left}")
 
     def validation(self, entry: dict) -> None:
         """Log and print how good the materials are by now, or how strong the lights."""
