@@ -91,7 +91,15 @@ def phases(result: dict) -> str:
     rows.append(
         ["roofline", *("" if r is None else f"{r['milliseconds']['all']:.1f}" for r in least)]
     )
-    return markdown(["", *(f"`{s['method']}`, {s['data']}" for s in result["steps"])], rows)
+    return markdown(["", *map(_step_title, result["steps"])], rows)
+
+
+def _step_title(step: dict) -> str:
+    """Method, materials unless they are networks, and scene; version 0.1.0 knows no materials."""
+    materials = step["settings"].get("representation", "neural")
+    method = step["method"] if materials == "neural" else f"{step['method']}:{materials}"
+    scene = "demo" if step["data"] == "demo" else "STAIRCASE"
+    return f"`{method}`, {scene}"
 
 
 def spreads(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
@@ -103,6 +111,25 @@ def spreads(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
             for name, row in result["methods"].items()
         ]
         return markdown(["run", *(title for title, *_ in columns)], rows)
+
+    return table
+
+
+def variants(names: list[str], *columns: tuple[str, str, float, int]) -> Callable[..., str]:
+    """One method with several settings, a file of results each."""
+
+    def table(*results: dict) -> str:
+        rows = [
+            [
+                name,
+                *(
+                    spread(result["methods"]["ours"], key, by, digits)
+                    for _, key, by, digits in columns
+                ),
+            ]
+            for name, result in zip(names, results, strict=True)
+        ]
+        return markdown(["", *(title for title, *_ in columns)], rows)
 
     return table
 
@@ -144,14 +171,19 @@ TABLES = (
     ("Time to quality, STAIRCASE", ("long-staircase", "rivals-staircase"), time_to_quality),
     ("Ablation, materials", ("ablation-materials",), spreads(*PSNR)),
     ("Ablation, lighting", ("ablation-lighting",), spreads(*LIGHT)),
-    *(
-        (f"still, {unknown}", (f"still-{unknown}",), spreads(*BOTH))
-        for unknown in ("materials", "lighting", "materials+lighting")
+    (
+        "Materials and lighting",
+        ("still-materials", "still-lighting", "still-materials+lighting"),
+        variants(["materials alone", "lighting alone", "both"], *BOTH),
     ),
     ("Emission", ("emission",), spreads(("error, %", "emission_error", 100, 2))),
-    *(
-        (f"Six views, {name}", (f"sparse-{name}",), spreads(*PSNR))
-        for name in ("none", "smooth", "tied", "both")
+    (
+        "Few views",
+        ("sparse-none", "sparse-smooth", "sparse-tied", "sparse-both"),
+        variants(
+            ["none", "`roughness_smoothness = 0.02`", "`albedo_ties_roughness = 0.1`", "both"],
+            *PSNR,
+        ),
     ),
 )
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -96,8 +95,3 @@ def test_a_call_that_makes_no_sense_is_told_in_one_line(
 def test_without_a_folder_the_script_tells_how_to_use_it(repository):
     done = cuda(repository, "")
     assert done.returncode == 2 and "OUT [JOB ...]" in done.stdout + done.stderr
-
-
-def test_the_page_of_the_papers_figures_is_the_one_that_their_results_make(repository):
-    page = runpy.run_path(str(repository / "scripts" / "write_reproduction.py"))["page"]
-    assert page() == (repository / "docs" / "reproduction.md").read_text(encoding="utf-8")

@@ -162,6 +162,7 @@ def _settings(config: FitConfig) -> dict:
         "spp": config.spp,
         "radiance_spp": config.radiance_samples,
         "radiance": asdict(config.radiance_settings),
+        "representation": config.representation,
         "materials": {name: asdict(field) for name, field in config.material_settings.items()},
     }
 

@@ -1,0 +1,301 @@
+"""Measured numbers for the templates of pages: committed results, and how they are printed.
+
+Results are `benchmarks/results/NAME.json`, and `docs/reproduction/NAME/` for the paper's tables and
+figures. A number that is not there ends the writing of pages with the command that makes it.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import tables as benchmark_tables  # noqa: E402
+from summary import phases_of, read, roofline_of  # noqa: E402
+
+Row = dict[str, Any]
+
+TAKE_OVER = "python scripts/write_docs.py --results reproduction --scenes scenes"
+#: What a template may call a number, where it has another key in a file of results.
+KEYS = {"albedo": "albedo_psnr", "roughness": "roughness_psnr", "rendering": "render_psnr"}
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
+
+
+class Unfounded(Exception):
+    """A page asks for a number that no committed result has."""
+
+
+class Facts:
+    """Committed results, as templates ask for them.
+
+    Args:
+        results: folder of the benchmarks' results.
+        kept: folder of the paper's tables and figures.
+    """
+
+    def __init__(self, results: Path, kept: Path) -> None:
+        self.results, self.kept = results, kept
+        self.result: Callable[[str], Row] = cache(self._result)
+        self.rows: Callable[[str], list[Row]] = cache(self._rows)
+
+    # ------------------------------------------------------------------------------- Benchmarks
+
+    def _result(self, name: str) -> Row:
+        file = self.results / f"{name}.json"
+        if not file.is_file():
+            raise Unfounded(f"{file} is missing. `{made_by(name)}` makes it")
+        return read(file)
+
+    def has(self, *names: str) -> bool:
+        """Whether all of these results are committed."""
+        return all((self.results / f"{name}.json").is_file() for name in names)
+
+    def table(self, title: str) -> str:
+        """A table of `benchmarks/tables.py`, by its title there."""
+        known = {known: (names, make) for known, names, make in benchmark_tables.TABLES}
+        if title not in known:
+            raise Unfounded(f"no table is called {title!r}. There are: {'; '.join(known)}")
+        names, make = known[title]
+        return make(*map(self.result, names))
+
+    def method(self, name: str, method: str) -> Row:
+        """The numbers of a method in a comparison."""
+        methods = self.result(name)["methods"]
+        row = part(methods, method, f"{name}.json")
+        if "error" in row:
+            raise Unfounded(f"{name}.json: {method} failed: {row['error']}")
+        return row
+
+    def of(self, name: str, method: str, key: str) -> float:
+        """A number of a method in a comparison: `of("rivals-demo", "ours", "albedo")`."""
+        row = self.method(name, method)
+        return part(row, KEYS.get(key, key), f"{name}.json, {method}")
+
+    def db(self, name: str, method: str, key: str, digits: int = 1) -> str:
+        """A PSNR in dB; with its standard deviation if there are several seeds."""
+        row = self.method(name, method)
+        value = self.of(name, method, key)
+        spread = row.get(f"{KEYS.get(key, key)}_sd")
+        more = "" if spread is None else f" ± {spread:.{digits}f}"
+        return f"{value:.{digits}f}{more} dB"
+
+    def gap(self, name: str, a: str, b: str, key: str, other: str | None = None) -> str:
+        """How far a is above b, in words: `2.4 dB above`, `0.3 dB below`, `level with`.
+
+        They are level where the printed difference is zero, or where it is within the standard
+        deviation of the difference of two fits over seeds.
+
+        Args:
+            name: the comparison that holds a.
+            a: a method.
+            b: a method.
+            key: what is compared.
+            other: the comparison that holds b, if it is another one.
+        """
+        key = KEYS.get(key, key)
+        first, second = self.method(name, a), self.method(other or name, b)
+        difference = self.of(name, a, key) - self.of(other or name, b, key)
+        spread = math.hypot(*(row.get(f"{key}_sd") or 0.0 for row in (first, second)))
+        return above(difference, spread)
+
+    def seeds(self, *names: str) -> str:
+        """How many seeds there are of each fit, in words."""
+        count = min(len(self.result(name)["seeds"]) for name in names)
+        return "one seed each" if count == 1 else f"{count} seeds each"
+
+    def ratio(self, name: str, a: str, b: str, key: str = "milliseconds_per_step") -> float:
+        """A number of a over that of b."""
+        return self.of(name, a, key) / self.of(name, b, key)
+
+    def step(self, name: str, method: str, materials: str = "neural", spp: str = "") -> Row:
+        """A row of `unbake bench methods`, the first that fits."""
+        for row in self.result(name)["rows"]:
+            asked = {"method": method, "representation": materials, "estimator": spp}
+            if all(value in ("", row[key]) for key, value in asked.items()):
+                return row
+        raise Unfounded(f"{name}.json has no {method} with {materials} materials {spp}")
+
+    def step_ratio(self, name: str, method: str, materials: str = "neural", spp: str = "") -> float:
+        """Time of a step as a multiple of that of ours with the same materials."""
+        return benchmark_tables.ratio(self.step(name, method, materials, spp), self.result(name))
+
+    def phases(self, name: str) -> str:
+        """Where the time of the steps of a machine goes, as a table."""
+        return benchmark_tables.phases(self.result(name))
+
+    def machine_file(self) -> str:
+        """The name of the file of `unbake bench step` on the machine of the comparisons."""
+        machine = self.result("rivals-demo")["machine"]
+        for file in sorted(self.results.glob("*.json")):
+            result = self.result(file.stem)
+            if isinstance(result.get("steps"), list) and result["machine"] == machine:
+                return file.stem
+        raise Unfounded(f"{self.results}: no steps of {machine}. `{made_by('machine')}` makes them")
+
+    def machine_step(self, name: str, method: str, demo: bool = True) -> Row:
+        """A step of a machine's file on the demo or on STAIRCASE, whatever the file's version."""
+        for step in self.result(name)["steps"]:
+            if step["method"] == method and (step["data"] == "demo") == demo:
+                return step | {"phases": phases_of(step), "roofline": roofline_of(step)}
+        scene = "the demo" if demo else "STAIRCASE"
+        raise Unfounded(f"{name}.json has no step of {method} on {scene}. `{made_by('machine')}`")
+
+    def machine(self, *names: str) -> str:
+        """The one machine that all of these results are of, in words."""
+        found = {name: self.result(name)["machine"] for name in names}
+        return machine_words(found)
+
+    # ------------------------------------------------------------ The paper's tables and figures
+
+    def about(self, experiment: str) -> Row:
+        """What is known of a run of `unbake reproduce`."""
+        return read(self._kept(experiment, "about.json"))
+
+    def _kept(self, experiment: str, name: str) -> Path:
+        file = self.kept / experiment / name
+        if not file.is_file():
+            make = f"unbake reproduce {experiment} --out reproduction"
+            raise Unfounded(f"{file} is missing. `{make}`, then `{TAKE_OVER}` make it")
+        return file
+
+    def _rows(self, experiment: str) -> list[Row]:
+        with open(self._kept(experiment, "data.csv"), encoding="utf-8", newline="") as file:
+            return [{k: number_or_text(v) for k, v in row.items()} for row in csv.DictReader(file)]
+
+    def where(self, experiment: str, **values: object) -> Row:
+        """The first record of an experiment's data with these values."""
+        for row in self.rows(experiment):
+            if all(row.get(key) == value for key, value in values.items()):
+                return row
+        raise Unfounded(f"{self.kept / experiment / 'data.csv'}: no row with {values}")
+
+    def experiment_table(self, experiment: str) -> str:
+        """The table that an experiment wrote."""
+        return self._kept(experiment, "table.md").read_text(encoding="utf-8").strip()
+
+    def cost(self, experiment: str) -> str:
+        """The time that an experiment took, in words."""
+        seconds = self.about(experiment)["seconds"]
+        return f"{seconds / 60:.0f} minutes" if seconds >= 90 else f"{seconds:.0f} seconds"
+
+    def picture(self, experiment: str, file: str, words: str) -> str:
+        """A picture of an experiment, as Markdown on a page of docs/."""
+        self._kept(experiment, f"{file}.jpg")
+        return f"![{words}]({self.kept.name}/{experiment}/{file}.jpg)"
+
+    def state(self, experiment: str) -> str:
+        """A warning where an experiment was run with an older state of the code."""
+        older = self.about(experiment).get("made_with")
+        return "" if older is None else f"> **Older results.** {older}\n"
+
+    def by_scene(self, experiment: str) -> list[str]:
+        """The scenes of an experiment, in its order."""
+        return list(dict.fromkeys(row["scene"] for row in self.rows(experiment)))
+
+    def wins(self, experiment: str, key: str, a: str, b: str) -> int:
+        """The number of scenes where a is above b, as printed with one digit."""
+
+        def of(scene: str, method: str) -> float:
+            return round(self.where(experiment, scene=scene, method=method)[key], 1)
+
+        return sum(of(scene, a) > of(scene, b) for scene in self.by_scene(experiment))
+
+    def experiments_machine(self) -> str:
+        """The one machine of all experiments, in words."""
+        found = {
+            f"{file.parent.name}-{i}": machine
+            for file in sorted(self.kept.glob("*/about.json"))
+            for i, machine in enumerate(self.about(file.parent.name)["machines"])
+        }
+        return machine_words(found)
+
+
+# ---------------------------------------------------------------------------- How they are printed
+
+
+def part(row: Mapping[str, Any], key: str, where: str) -> Any:
+    """A key of a result, or an error that says which there are."""
+    if row.get(key) is None:
+        raise Unfounded(f"{where} has no {key!r}. It has: {', '.join(map(str, row))}")
+    return row[key]
+
+
+def made_by(name: str) -> str:
+    """The command that makes a file of results."""
+    import run
+
+    benchmark = run.BENCHMARKS.get(name)
+    if benchmark is not None:
+        return f"python benchmarks/run.py {benchmark.job}"
+    return f"grep -rl {name} benchmarks CONTRIBUTING.md"
+
+
+def machine_words(found: Mapping[str, Row]) -> str:
+    """A machine in words, the same for all results."""
+    first_name, first = next(iter(found.items()))
+    keys = ("processor", "cores", "variant", "mitsuba")
+    for name, machine in found.items():
+        if any(machine[key] != first[key] for key in keys):
+            raise Unfounded(f"a page mixes machines: {first_name}: {first}; {name}: {machine}")
+    cores = {1: "one core", 2: "two cores"}.get(first["cores"], f"{first['cores']} cores")
+    return f"{cores} of an {first['processor']}, `{first['variant']}`, Mitsuba {first['mitsuba']}"
+
+
+def number_or_text(text: str) -> float | str | None:
+    """A cell of a table: a number where it is one, None where it is empty."""
+    if not text:
+        return None
+    return float(text) if _NUMBER.fullmatch(text) else text
+
+
+def above(difference: float, spread: float = 0.0, digits: int = 1) -> str:
+    """A difference of PSNRs in words."""
+    shown = f"{abs(difference):.{digits}f}"
+    if float(shown) == 0 or abs(difference) < spread:
+        return "level with"
+    return f"{shown} dB {'above' if difference > 0 else 'below'}"
+
+
+def span(values: list[float], digits: int = 0) -> str:
+    """The smallest and the largest of some numbers: `3.2 to 6.5`."""
+    low, high = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def unit(form: str, factor: float = 1.0) -> Callable[[float, int], str]:
+    """A filter that prints a number with a unit."""
+
+    def shown(value: float, digits: int = 0) -> str:
+        if value is None:
+            raise Unfounded("the number to print is null in the results")
+        return form.format(f"{factor * value:,.{digits}f}")
+
+    return shown
+
+
+FILTERS: dict[str, Callable[..., str]] = {
+    "number": unit("{}"),
+    "dB": unit("{} dB"),
+    "s": unit("{} s"),
+    "minutes": unit("{} minutes", 1 / 60),
+    "ms": unit("{} ms"),
+    "percent": unit("{} %", 100),
+    "times": unit("{} times"),
+    "millions": unit("{} M", 1e-6),
+    "thousands": unit("{} k", 1e-3),
+    "megabytes": unit("{} MB"),
+}
+
+
+def context(facts: Facts) -> dict[str, Any]:
+    """What templates call."""
+    public = (name for name in dir(facts) if not name.startswith("_"))
+    return {name: getattr(facts, name) for name in public} | {"above": above, "span": span}

@@ -1,0 +1,170 @@
+"""Write every page that has measured numbers, from its template and committed results.
+
+    python scripts/write_docs.py                      all pages again
+    python scripts/write_docs.py --check              tell which are not what their results make
+    python scripts/write_docs.py --results reproduction --scenes scenes
+
+The last one first takes over what `unbake reproduce` wrote: tables, data, pictures and the scenes'
+licences go to docs/reproduction. The template of a page lies beside it, as `PAGE.jinja`;
+`scripts/facts.py` has what templates call.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import sys
+import textwrap
+from pathlib import Path
+
+import jinja2
+
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT / "src"), str(ROOT / "scripts")]
+
+from facts import FILTERS, Facts, Unfounded, context  # noqa: E402
+
+from unbake import activate  # noqa: E402
+
+RESULTS, KEPT = ROOT / "benchmarks" / "results", ROOT / "docs" / "reproduction"
+WIDTH = 120
+#: A comment of Markdown.
+NOTE = "[//]: # (Made by scripts/write_docs.py from {}: edit that.)\n\n"
+
+
+def templates() -> list[Path]:
+    """The template of every page."""
+    return [*sorted(ROOT.glob("*.md.jinja")), *sorted((ROOT / "docs").rglob("*.md.jinja"))]
+
+
+def render(template: Path, facts: Facts) -> str:
+    """The text of a page.
+
+    Raises:
+        Unfounded: a number of the page is in no committed result.
+    """
+    from unbake.experiments.scenes import SCENES
+
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
+    )
+    environment.filters |= FILTERS
+    scenes = {scene.folder: scene.label for scene in SCENES}
+    try:
+        page = environment.from_string(template.read_text(encoding="utf-8"))
+        text = page.render(**context(facts), scenes=scenes)
+    except (Unfounded, jinja2.TemplateError) as error:
+        line = _line(error)
+        raise Unfounded(f"{template.relative_to(ROOT)}{line}: {error}") from None
+    return NOTE.format(template.name) + filled(text)
+
+
+def filled(text: str) -> str:
+    """Refill the paragraphs and list items of a page, whose lines numbers have made uneven."""
+    lines: list[str] = []
+    for i, block in enumerate(text.split("```")):
+        # Blocks of code, every second one, stay as they are.
+        lines.append(block if i % 2 else "\n\n".join(map(_filled, re.split(r"\n{2,}", block))))
+    return "```".join(lines)
+
+
+def _filled(paragraph: str) -> str:
+    if (
+        re.search(r"^(\||#|!\[|<!--|\[//\]|\s{4,})", paragraph, re.MULTILINE)
+        or not paragraph.strip()
+    ):
+        return paragraph
+    head, tail = re.match(r"\n*", paragraph)[0], re.search(r"\n*$", paragraph)[0]
+    items = re.split(r"\n(?=[-*>] |\d+\. )", paragraph.strip("\n"))
+    return head + "\n".join(map(_filled_item, items)) + tail
+
+
+def _filled_item(item: str) -> str:
+    mark = re.match(r"(?:[-*>] |\d+\. )?", item)[0]
+    inner = "> " if mark == "> " else " " * len(mark)
+    words = " ".join(line.removeprefix(">").strip() for line in item.removeprefix(mark).split("\n"))
+    return textwrap.fill(
+        words, WIDTH, initial_indent=mark, subsequent_indent=inner,
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
+
+
+def _line(error: BaseException) -> str:
+    """The line of the template that an error is from."""
+    if isinstance(error, jinja2.TemplateSyntaxError):
+        return f", line {error.lineno}"
+    trace, line = error.__traceback__, ""
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == "<template>":
+            line = f", line {trace.tb_lineno}"
+        trace = trace.tb_next
+    return line
+
+
+def pages(results: Path = RESULTS, kept: Path = KEPT) -> dict[Path, str]:
+    """The text of every page with measured numbers, by its file."""
+    activate()
+    facts = Facts(results, kept)
+    return {template.with_suffix(""): render(template, facts) for template in templates()}
+
+
+def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
+    """Copy tables and data, pictures as JPEG, and licences, a folder an experiment."""
+    import mitsuba as mi
+
+    from unbake.experiments.scenes import SCENES
+
+    for data in sorted(results.glob("*/data.json")):
+        about = json.loads(data.read_text(encoding="utf-8"))
+        if about["scale"] != "cpu":
+            raise SystemExit(f"{data}: the page is of cpu scale, this is {about['scale']} scale")
+        del about["rows"]
+        folder = kept / data.parent.name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        (folder / "about.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        for name in ("data.csv", "table.md"):
+            shutil.copy(data.with_name(name), folder / name)
+        for picture in data.parent.glob("*.png"):
+            bitmap = mi.Bitmap(str(picture))
+            rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True)
+            rgb.write(str(folder / f"{picture.stem}.jpg"), quality=88)
+    for scene in SCENES:
+        licences = kept / "licences"
+        licences.mkdir(parents=True, exist_ok=True)
+        shutil.copy(scenes / scene.folder / "LICENSE.txt", licences / f"{scene.folder}.txt")
+
+
+def main() -> None:
+    """Write the pages."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--results", type=Path, help="folder that `unbake reproduce` wrote")
+    parser.add_argument("--scenes", type=Path, default=Path("scenes"), help="unpacked scenes")
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    args = parser.parse_args()
+    activate()
+    if args.results is not None:
+        take_over(args.results, args.scenes)
+    try:
+        found = pages()
+    except Unfounded as error:
+        raise SystemExit(f"error: {error}") from None
+    stale = [page for page, text in found.items() if _text(page) != text]
+    for page in stale:
+        if not args.check:
+            page.write_text(found[page], encoding="utf-8")
+        print(f"{'stale' if args.check else 'wrote'}: {page.relative_to(ROOT)}")
+    if args.check and stale:
+        raise SystemExit(1)
+
+
+def _text(page: Path) -> str | None:
+    return page.read_text(encoding="utf-8") if page.is_file() else None
+
+
+if __name__ == "__main__":
+    main()

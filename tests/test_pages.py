@@ -1,0 +1,222 @@
+"""Pages with measured numbers are made from committed results, and hold no other number."""
+
+import json
+import re
+import runpy
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+import pytest
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[1]
+SETTINGS = Path(__file__).with_name("allowed_numbers.toml")
+REMEDY = (
+    "A measured number comes from a committed result: {{ db('rivals-demo', 'ours', 'albedo') }}, "
+    "see scripts/facts.py. A setting, a published or a defined value goes to "
+    "tests/allowed_numbers.toml, with the reason."
+)
+
+
+@pytest.fixture(scope="module")
+def writer():
+    """The script that writes pages."""
+    return runpy.run_path(str(ROOT / "scripts" / "write_docs.py"))
+
+
+@pytest.fixture(scope="module")
+def written(writer):
+    return writer["pages"]()
+
+
+# ------------------------------------------------------------------------- Pages are what is made
+
+
+def test_every_page_is_the_one_that_its_results_make(written):
+    stale = [
+        str(page.relative_to(ROOT))
+        for page, text in written.items()
+        if not page.is_file() or page.read_text(encoding="utf-8") != text
+    ]
+    assert not stale, f"{', '.join(stale)}: edit the template, then run scripts/write_docs.py"
+    assert len(written) >= 5
+
+
+def test_another_result_makes_another_page(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    file = results / "rivals-demo.json"
+    content = json.loads(file.read_text())
+    content["methods"]["ours"]["albedo_psnr"] = 77.7
+    file.write_text(json.dumps(content))
+    text = writer["pages"](results=results)[ROOT / "docs" / "comparison.md"]
+    assert "77.7" in text
+
+
+def test_a_result_that_is_missing_is_named_with_the_command_that_makes_it(writer, tmp_path):
+    results = tmp_path / "results"
+    ignored = shutil.ignore_patterns("rivals-demo.json")
+    shutil.copytree(ROOT / "benchmarks" / "results", results, ignore=ignored)
+    message = r"md\.jinja, line \d+: .*rivals-demo\.json is missing.*benchmarks/run\.py rivals"
+    with pytest.raises(Exception, match=message):
+        writer["pages"](results=results)
+    kept = tmp_path / "reproduction"
+    shutil.copytree(ROOT / "docs" / "reproduction", kept, ignore=shutil.ignore_patterns("fig5"))
+    with pytest.raises(Exception, match=r"fig5.*is missing.*unbake reproduce fig5"):
+        writer["pages"](kept=kept)
+
+
+def test_a_page_does_not_mix_machines(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    file = results / "rivals-demo.json"
+    content = json.loads(file.read_text())
+    content["machine"]["cores"] = 64
+    file.write_text(json.dumps(content))
+    with pytest.raises(Exception, match="mixes machines"):
+        writer["pages"](results=results)
+
+
+# -------------------------------------------------------------------- No number without a source
+
+NUMBER = r"(?<![\w.,/^-])[+−-]?\d[\d,]*(?:\.\d+)?(?:\s?(?:to|and|or|–|±|/)\s?\d[\d,]*(?:\.\d+)?)*"
+WORDS = (
+    r"(?:one|two|three|four|five|six|seven|eight|nine|ten|eleven|twelve|fifteen|twenty|thirty|"
+    r"forty|fifty|sixty|ninety|hundred)"
+)
+UNITS = (
+    r"\s?(?:dB|µs|ms|s|min|minutes?|seconds?|hours?|%|per ?cent|[kMG]B|[KMG]iB|times|fold|×|"
+    r"x(?!\s?[\d⟦])|(?:k|M|G)?\s?(?:samples/s|samples|steps|launches|levels|triangles|seeds)|[kM])"
+    r"(?!\w)"
+)
+FRACTIONS = (
+    r"\b(?:twice|thrice|half|(?:an?|one|two|three) (?:thirds?|quarters?|fifths?|sixths?|eighths?|"
+    r"tenths?))(?= (?:as|the|more|less|longer|shorter|faster|slower|sooner|of the time))"
+)
+#: What counts as a measured number, unless it is in the list of settings.
+SUSPECTS = re.compile(
+    "|".join(
+        [
+            NUMBER + UNITS,
+            rf"\b{WORDS} (?:dB|minutes?|seconds?|hours?|times|per ?cent)\b",
+            r"(?<![\w.,/^-])[+−-]?\d[\d,]*\.\d+(?:e-?\d+)?(?![\w.])",
+            r"(?<=\| )[+−-]?[\d,.]+(?: ± [\d.]+)?(?: \([^|)]*\))?(?= \|)",
+            FRACTIONS,
+            r"\b(?:more|less|better|worse|nearer|fewer) (?:than|by) \d[\d,.]*",
+        ]
+    )
+)
+#: Parts of a page that are no claims: code, comments, targets of links, front matter of references.
+EXEMPT = re.compile(
+    r"```.*?```|`[^`\n]*`|<!--.*?-->|\]\([^)]*\)|<https?:[^>]*>|"
+    r"\b(?:Eqs?|Secs?|Figs?|Figures?|Tables?)\.? \d[\d.]*(?:(?:, | and | to |–)\d[\d.]*)*",
+    re.DOTALL,
+)
+JINJA = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Allowed:
+    pages: list[str]
+    pattern: str
+    reason: str
+
+
+def allowed() -> list[Allowed]:
+    entries = tomllib.loads(SETTINGS.read_text(encoding="utf-8"))["allow"]
+    return [Allowed(**entry) for entry in entries]
+
+
+def sources() -> list[Path]:
+    """Where the text of pages is written: a template if there is one, else the page."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    own = [page for page in pages if page.name != "table.md"]
+    beside = [(page, page.with_name(f"{page.name}.jinja")) for page in own]
+    return [template if template.is_file() else page for page, template in beside]
+
+
+def blank(match: re.Match) -> str:
+    """Something that is no number and has as many lines."""
+    return "⟦⟧" + "\n" * match[0].count("\n")
+
+
+def literals(source: str, page: str, entries: list[Allowed]) -> tuple[list[str], set[Allowed]]:
+    """Numbers of a page's source that have no source of their own, and the entries in use."""
+    text = EXEMPT.sub(blank, JINJA.sub(blank, source))
+    used = set()
+    for entry in entries:
+        if any(Path(page).match(name) for name in entry.pages):
+            text, count = re.subn(entry.pattern, blank, text)
+            used |= {entry.pattern} if count else set()
+    found = [
+        f"{page}:{number}: {match[0].strip()!r} in: {line.strip()[:100]}"
+        for number, line in enumerate(text.splitlines(), 1)
+        for match in SUSPECTS.finditer(line)
+    ]
+    return found, used
+
+
+def test_no_page_holds_a_measured_number_that_it_does_not_read_from_a_result():
+    found, used, entries = [], set(), allowed()
+    for source in sources():
+        page = str(source.relative_to(ROOT)).removesuffix(".jinja")
+        here, there = literals(source.read_text(encoding="utf-8"), page, entries)
+        found, used = found + here, used | there
+    assert not found, "\n".join([f"{len(found)} numbers without a source. {REMEDY}", *found])
+    stale = [entry.pattern for entry in entries if entry.pattern not in used]
+    assert not stale, f"{SETTINGS.name}: these entries are not needed any more: {stale}"
+    assert all(len(entry.reason) > 10 for entry in entries)
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "It reaches 29.3 dB.", "A step takes 12 ms.", "It is 21 times sooner.", "Python takes 1 %.",
+        "It needs one minute for it.", "A step takes twice as long.", "774 k samples/s",
+        "in a third more samples", "| ours | 29.3 | 4 |", "| ours | 29.3 ± 0.1 |", "within 0.5",
+        "below 20 launches", "1.4 GB", "a step of {{ ms(x) }} and 12 ms", "22 or 23 times",
+        "3.6x faster", "A launch costs 20 µs.", "more than 40 of them",
+    ],
+)  # fmt: skip
+def test_a_measured_number_is_found(sentence):
+    found, _ = literals(sentence, "page.md", [])
+    assert found, sentence
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "{{ db('a', 'ours', 'albedo') }} and {{ 100 * x | number(1) }} dB", "Figures 1 and 6",
+        "`--seconds 120`", "```sh\nfit --seconds 120\n```", "<!-- 12 dB -->", "Sec. 5.2, Eq. 12",
+        "[the paper](https://a.b/3.14)", "x₁ and L_θ lie in [0,1]", "a map of 64 x 64 texels",
+        "{% if 2.5 > x %}nearer{% endif %}",
+    ],
+)  # fmt: skip
+def test_what_is_no_measurement_is_not(sentence):
+    found, _ = literals(sentence, "page.md", [])
+    assert not found
+
+
+def test_templates_compute_what_they_print():
+    """A number that is written into an expression is as bare as one beside it."""
+    environment = jinja2.Environment()
+    for template in sources():
+        if template.suffix != ".jinja":
+            continue
+        tree = environment.parse(template.read_text(encoding="utf-8"))
+        for output in tree.find_all(jinja2.nodes.Output):
+            for node in output.nodes:
+                if isinstance(node, jinja2.nodes.TemplateData):
+                    continue
+                known = isinstance(node, jinja2.nodes.Name) or any(
+                    node.find_all((jinja2.nodes.Call, jinja2.nodes.Name))
+                )
+                text = [c.value for c in node.find_all(jinja2.nodes.Const)]
+                bare = [t for t in text if isinstance(t, str) and re.search(r"\d\.\d|\d dB", t)]
+                assert known and not bare, f"{template.name}:{node.lineno}: a bare number {bare}"
