@@ -2,17 +2,19 @@
 
     python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
 
-Jobs: machine steps rivals long ablation lighting emission sparse (default: all; hours). STAIRCASE
-takes part where --staircase, or STAIRCASE of the environment, names its data set
+Jobs: machine steps rivals equal long ablation lighting emission sparse (default: all; hours).
+STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
 (docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
 that the same command continues what was stopped. Results go to --results; `python
-benchmarks/tables.py` prints them as tables.
+benchmarks/tables.py` prints them as tables. Methods are compared over three seeds: results have the
+mean of a number, and its sample standard deviation as NUMBER_sd.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,8 +29,9 @@ sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
 from rich.console import Console  # noqa: E402
-from summary import machine_results, read, summary  # noqa: E402
+from summary import machine_results, read, summarized, summary  # noqa: E402
 
+from unbake.config import FitConfig  # noqa: E402
 from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 from unbake.experiments.commands import (  # noqa: E402
@@ -38,7 +41,7 @@ from unbake.experiments.commands import (  # noqa: E402
     run_jobs,
     unbake,
 )
-from unbake.experiments.jobs import Findings, Job, JobRunner, digest  # noqa: E402
+from unbake.experiments.jobs import Findings, Job, JobRunner, Unfinished, digest  # noqa: E402
 from unbake.experiments.scales import SMOKE  # noqa: E402
 from unbake.io import write_atomically, write_json  # noqa: E402
 
@@ -46,6 +49,9 @@ RESULTS = ROOT / "benchmarks" / "results"
 STAIRCASE = "staircase"
 
 # ---------------------------------------------------------------------------------------- The jobs
+
+#: Of every comparison of methods.
+SEEDS = (0, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -91,9 +97,29 @@ class Compare:
     methods: Sequence[str]
     steps: int = 0
     seconds: int = 0
-    seeds: Sequence[int] = (0,)
+    seeds: Sequence[int] = SEEDS
     options: Sequence[object] = ()
     settings: str | None = None
+
+
+@dataclass(frozen=True)
+class EqualSamples:
+    """Methods with as many camera samples as a slower one traced in its time, seed by seed.
+
+    Their schedules have this length: rates decay until the last sample. The slow method's row is
+    that of its own fit.
+
+    Args:
+        job: the job that it belongs to.
+        methods: as `unbake compare` reads them; all trace the same number of samples in a step.
+        like: name of the comparison at equal time that has the slow method, and its settings.
+        slow: name of the slow method's run.
+    """
+
+    job: str
+    methods: Sequence[str]
+    like: str
+    slow: str
 
 
 @dataclass(frozen=True)
@@ -121,22 +147,22 @@ class Machine:
 NO_SCORES = ("--score-seconds", 0)
 COARSE_RENDERING = ("--evaluate-spp", 16)
 ABLATION = (
-    "direct", "with-prior", "with-stop-gradient", "with-second-bounce", "ours", "no-prior",
+    "direct", "with-biased-prior", "with-prior", "with-stop-gradient", "with-second-bounce", "ours",
+    "no-prior",
 )  # fmt: skip
 STEP_METHODS = (
     "ours", "direct", "no-prior", "ad-pt", "ad-pt:neural:split-halves", "prb",
     "prb:neural:split-halves", "ours:bitmap", "prb:bitmap", "prb:bitmap:split-halves", "ours:grid",
     "prb:grid", "prb:grid:split-halves",
 )  # fmt: skip
-RIVALS = (
-    "ours", "prb", "prb:neural:split-halves", "prb:bitmap", "ad-pt:neural:split-halves", "direct",
-    "no-prior",
-)  # fmt: skip
-ROOM_RIVALS = ("ours", "prb", "ad-pt:neural:split-halves", "direct", "no-prior")
+#: The estimator of PRB that is not its default.
+OTHER_ESTIMATOR = "two-pass" if FitConfig(method="prb").halves else "split-halves"
+ROOM_RIVALS = ("ours", "prb", f"prb:neural:{OTHER_ESTIMATOR}", "ad-pt", "direct", "no-prior")
+RIVALS = (*ROOM_RIVALS, "prb:bitmap")
 ROOM = "staircase.toml"
 
 #: By the name of the file of results; that of `machine` is named after the machine.
-BENCHMARKS: dict[str, Compare | Steps | Machine] = {
+BENCHMARKS: dict[str, Compare | EqualSamples | Steps | Machine] = {
     "machine": Machine(
         "machine",
         (
@@ -151,21 +177,20 @@ BENCHMARKS: dict[str, Compare | Steps | Machine] = {
     "methods-demo": Steps("steps", "demo", STEP_METHODS),
     "methods-staircase": Steps("steps", STAIRCASE, STEP_METHODS, ROOM),
     # Equal time, and equal samples.
-    "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=90),
-    "equal-demo": Compare("rivals", "demo", ("ours", "prb"), steps=2400),
+    "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=60),
     "rivals-staircase": Compare(
-        "rivals", STAIRCASE, ROOM_RIVALS, seconds=180, options=COARSE_RENDERING, settings=ROOM
+        "rivals", STAIRCASE, ROOM_RIVALS, seconds=120, options=COARSE_RENDERING, settings=ROOM
     ),
+    "equal-demo": EqualSamples("equal", ("ours", "no-prior", "direct"), "rivals-demo", "prb"),
     # What PRB has after 20 minutes; `rivals` shows when ours has it.
-    "long-demo": Compare("long", "demo", ("prb",), seconds=1200),
+    "long-demo": Compare("long", "demo", ("prb",), seconds=1200, seeds=(0,)),
     "long-staircase": Compare(
-        "long", STAIRCASE, ("prb",), seconds=1200, options=COARSE_RENDERING, settings=ROOM
+        "long", STAIRCASE, ("prb",), seconds=1200, seeds=(0,), options=COARSE_RENDERING,
+        settings=ROOM,
     ),
-    "ablation-materials": Compare(
-        "ablation", "demo", ABLATION, steps=2400, seeds=(0, 1, 2), options=NO_SCORES
-    ),
+    "ablation-materials": Compare("ablation", "demo", ABLATION, steps=2400, options=NO_SCORES),
     "ablation-lighting": Compare(
-        "ablation", "still", ABLATION, steps=1200, seeds=(0, 1, 2),
+        "ablation", "still", ABLATION, steps=1200,
         options=(*NO_SCORES, "--unknown", "lighting"),
     ),
     # Materials and lighting, alone and together.
@@ -177,7 +202,8 @@ BENCHMARKS: dict[str, Compare | Steps | Machine] = {
         for unknown in ("materials", "lighting", "materials+lighting")
     },
     "emission": Compare(
-        "emission", "demo", ("ours",), steps=2400, options=(*NO_SCORES, "--unknown", "emission")
+        "emission", "demo", ("ours",), steps=2400, seeds=(0,),
+        options=(*NO_SCORES, "--unknown", "emission"),
     ),
     # Six views, with and without regularization.
     **{
@@ -191,9 +217,13 @@ BENCHMARKS: dict[str, Compare | Steps | Machine] = {
 JOBS = tuple(dict.fromkeys(benchmark.job for benchmark in BENCHMARKS.values()))
 
 
-def at_smoke_scale(benchmark: Compare | Steps | Machine) -> Compare | Steps | Machine:
+def at_smoke_scale(
+    benchmark: Compare | EqualSamples | Steps | Machine,
+) -> Compare | EqualSamples | Steps | Machine:
     """The same in seconds: two methods, few steps."""
     match benchmark:
+        case EqualSamples():
+            return replace(benchmark, methods=benchmark.methods[:1])
         case Machine():
             return replace(benchmark, cases=[(*case[:3], 10) for case in benchmark.cases[::5]])
         case Steps():
@@ -232,6 +262,10 @@ class Bench:
     def work(self) -> Path:
         """The folder of a scale."""
         return self.out / self.scale
+
+    def run(self, name: str, seed: int) -> Path:
+        """The folder of a comparison's runs with a seed."""
+        return self.work / "runs" / f"{name}-{seed}"
 
     def has(self, data: str) -> bool:
         """Whether a data set can be used."""
@@ -345,9 +379,11 @@ def steps_of(bench: Bench) -> int:
 
 def plan_compare(bench: Bench, name: str, benchmark: Compare) -> Planned:
     """Fits of methods, a job for each seed."""
-    folders = [bench.work / "runs" / f"{name}-{seed}" for seed in benchmark.seeds]
+    folders = [bench.run(name, seed) for seed in benchmark.seeds]
     length = ["--seconds", benchmark.seconds] if benchmark.seconds else ["--steps", benchmark.steps]
     jobs = bench.capture(benchmark.data)
+    if benchmark.seconds:
+        jobs.append(compiled(bench, name, benchmark))
     for seed, folder in zip(benchmark.seeds, folders, strict=True):
         words = ["compare", bench.data(benchmark.data), "--methods", *benchmark.methods]
         words += [*length, *benchmark.options, "--seed", seed, "--out", folder]
@@ -370,18 +406,97 @@ def plan_compare(bench: Bench, name: str, benchmark: Compare) -> Planned:
     return Planned(jobs, write)
 
 
+def compiled(bench: Bench, name: str, benchmark: Compare) -> Job:
+    """A job that takes a few steps of every method, which leaves their kernels in Dr.Jit's cache.
+
+    The time of a fit has the compilation of kernels in it that are not there. It is longest for
+    methods that follow whole paths, and the first seed would pay for all.
+    """
+    file = bench.work / "steps" / f"compiled-{name}.json"
+    words = ["bench", "methods", "--data", bench.data(benchmark.data)]
+    words += ["--methods", *benchmark.methods, "--steps", 10, "--out", file]
+    seconds = 12.0 * len(benchmark.methods)
+    return bench.command(file.stem, words, file, benchmark.data, benchmark.settings, seconds)
+
+
+def plan_equal(bench: Bench, name: str, benchmark: EqualSamples) -> Planned:
+    """Fits with the samples of a slower method, after those at equal time that it needs."""
+    at_time = BENCHMARKS[benchmark.like]
+    if bench.scale == "smoke":
+        at_time = at_smoke_scale(at_time)
+    assert isinstance(at_time, Compare)
+    timed = plan_compare(bench, benchmark.like, at_time)
+    pairs = [(bench.run(benchmark.like, seed), bench.run(name, seed)) for seed in at_time.seeds]
+    jobs = list(timed.jobs)
+    for seed, (slow, folder) in zip(at_time.seeds, pairs, strict=True):
+        options, text = bench.settings(at_time.settings)
+        words = ["compare", bench.data(at_time.data), "--methods", *benchmark.methods, *options]
+        words += [*NO_SCORES, *at_time.options, "--seed", seed, "--out", folder]
+
+        def work(slow: Path = slow, words: Sequence[object] = words) -> Findings:
+            if not (slow / "compare.json").is_file():
+                raise Unfinished
+            steps = steps_of_equal_samples(read(slow / "compare.json"), benchmark)
+            unbake(*words, "--steps", steps, until=bench.until)
+            return {"steps": steps}
+
+        settings = {"words": [str(word) for word in words], "settings": text}
+        settings |= {"like": benchmark.like, "slow": benchmark.slow}
+        # They are quicker than the slow method, by a factor that depends on the machine.
+        seconds = (OVERHEAD + at_time.seconds / 3) * len(benchmark.methods)
+        jobs.append(Job(folder.name, settings, work, seconds, files=[folder / "compare.json"]))
+
+    def write() -> Path:
+        both = [[read(folder / "compare.json") for folder in pair] for pair in pairs]
+        merged = [with_slow(slow, equal, benchmark.slow) for slow, equal in both]
+        write_json(bench.results / f"{name}.json", summarized(merged))
+        return bench.results / f"{name}.json"
+
+    return Planned(jobs, write)
+
+
+def steps_of_equal_samples(at_time: dict[str, Any], benchmark: EqualSamples) -> int:
+    """Steps of the quick methods with the camera samples of the slow one, to the nearest step.
+
+    Args:
+        at_time: content of `compare.json`, which has them all.
+
+    Raises:
+        UserError: the slow method failed.
+        ValueError: the quick methods trace different numbers of samples in a step.
+    """
+    rows = at_time["methods"]
+    slow = rows[benchmark.slow]
+    if "error" in slow:
+        raise UserError(f"{benchmark.slow} failed: {slow['error']}", benchmark.like)
+    each = {rows[method]["samples"] // rows[method]["steps"] for method in benchmark.methods}
+    if len(each) > 1:
+        raise ValueError(f"steps of {each} samples cannot have the same length")
+    return round(slow["samples"] / each.pop())
+
+
+def with_slow(at_time: dict[str, Any], equal: dict[str, Any], slow: str) -> dict[str, Any]:
+    """The comparison at equal samples, with the fit of the slow method at equal time."""
+    return equal | {"methods": equal["methods"] | {slow: at_time["methods"][slow]}}
+
+
+#: Computing time beside the fit: compiling, scores and the final renderings.
+OVERHEAD = 25.0
+
+
 def fit_seconds(bench: Bench, name: str, benchmark: Compare) -> float | None:
     """Computing time of a comparison, from the committed results of the reference machine."""
     if bench.scale == "smoke":
         return 5.0 * len(benchmark.methods)
-    other = 30.0 * len(benchmark.methods)  # compiling, and the final renderings
+    other = OVERHEAD * len(benchmark.methods)
     if benchmark.seconds:
         return other
     file = RESULTS / f"{name}.json"
     if not file.is_file():
         return None
     rows: dict[str, Any] = read(file)["methods"]
-    return other + sum(row.get("seconds", 0.0) for row in rows.values())
+    known = [row["seconds"] for row in rows.values() if "seconds" in row]
+    return other + statistics.fmean(known) * len(benchmark.methods)
 
 
 def planned(bench: Bench, names: Sequence[str]) -> list[Planned]:
@@ -396,6 +511,8 @@ def planned(bench: Bench, names: Sequence[str]) -> list[Planned]:
             match benchmark:
                 case Machine():
                     plans.append(plan_machine(bench, benchmark))
+                case EqualSamples():
+                    plans.append(plan_equal(bench, name, benchmark))
                 case _ if not bench.has(benchmark.data):
                     print(f"STAIRCASE is not set: {name} is left out", flush=True)
                 case Steps():

@@ -5,13 +5,20 @@ from __future__ import annotations
 import json
 import re
 import statistics
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
+
+from unbake.experiments.seeds import across_seeds
+
 Row = dict[str, Any]
 
-KEPT = ("steps", "samples", "seconds", "milliseconds_per_step", "representation", "radiance")
+#: What tells runs apart, and what is measured of each.
+KEPT = ("representation", "radiance", "estimator")
+LENGTH = ("steps", "samples", "seconds", "milliseconds_per_step", "start_up_seconds")
 QUALITY = ("albedo_psnr", "albedo_psnr_aligned", "roughness_psnr", "render_psnr")
 ENVIRONMENT = ("sh_error", "sh_error_aligned", "relight_psnr", "relight_psnr_aligned")
 
@@ -22,16 +29,28 @@ def read(file: Path) -> Row:
 
 
 def summary(folders: Sequence[Path]) -> Row:
-    """Held-out quality of each method from comparisons that differ in the seed: mean and spread."""
-    comparisons = [read(folder / "compare.json") for folder in folders]
+    """Length and held-out quality of each method from comparisons that differ in the seed.
+
+    Returns:
+        By method in `methods`, and of the fields before their first step in `untrained`: each
+        number as its mean over seeds, with its sample standard deviation as KEY_sd if there are
+        several; and `per_seed`, the numbers of each seed with its scores during the fit.
+    """
+    return summarized([read(folder / "compare.json") for folder in folders])
+
+
+def summarized(comparisons: Sequence[Row]) -> Row:
+    """The same of the contents of files."""
     first = comparisons[0]
+    seeds = [comparison["settings"]["seed"] for comparison in comparisons]
     return {
         "machine": first["machine"],
         "unknown": first["settings"]["unknown"],
-        "seeds": [comparison["settings"]["seed"] for comparison in comparisons],
+        "seeds": seeds,
         "views": next(_heldout(first))["views"],
+        "untrained": _method(seeds, [comparison["untrained"] for comparison in comparisons]),
         "methods": {
-            name: _method([comparison["methods"][name] for comparison in comparisons])
+            name: _method(seeds, [comparison["methods"][name] for comparison in comparisons])
             for name in first["methods"]
         },
         "time_to_quality": [comparison["time_to_quality"] for comparison in comparisons],
@@ -58,31 +77,40 @@ def roofline_of(step: Row) -> Row | None:
     return step["roofline"] if "roofline" in step else step["floor"]
 
 
+def mean_of_known(values: Sequence[float | None]) -> float | None:
+    """The mean of the values that are not None; None if there are none."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
+
+
 def _heldout(comparison: Row) -> Iterator[Row]:
     return (row["heldout"] for row in comparison["methods"].values() if "heldout" in row)
 
 
-def _method(rows: list[Row]) -> Row:
-    """The numbers of a method, a row for each seed."""
+def _method(seeds: Sequence[int], rows: Sequence[Row]) -> Row:
+    """The numbers of a method, from a row for each seed."""
     failed = [row["error"] for row in rows if "error" in row]
     if failed:
         return {"error": failed[0]}
-    numbers = {key: rows[0][key] for key in KEPT}
-    for key in QUALITY:
-        numbers |= _spread(key, [row["heldout"].get(key) for row in rows])
-    for key in ENVIRONMENT:
-        numbers |= _spread(key, [(row.get("environment") or {}).get(key) for row in rows])
-    errors = [light["emission_error"] for row in rows for light in row.get("emission", ())]
-    numbers |= _spread("emission_error", errors)
-    if len(rows) == 1 and rows[0]["score"]:
-        numbers["score"] = rows[0]["score"]
-    return numbers
+    per_seed = [{"seed": seed} | _numbers(row) for seed, row in zip(seeds, rows, strict=True)]
+    keys = (*LENGTH, *QUALITY, *ENVIRONMENT, "emission_error")
+    kept = {key: rows[0][key] for key in KEPT if key in rows[0]}
+    return kept | across_seeds(per_seed, keys) | {"per_seed": per_seed}
 
 
-def _spread(key: str, values: list[float | None]) -> Row:
-    """Mean and standard deviation of the known values."""
-    known = [value for value in values if value is not None]
-    if not known:
-        return {}
-    spread = statistics.stdev(known) if len(known) > 1 else None
-    return {key: statistics.mean(known)} | ({f"{key}_sd": spread} if spread is not None else {})
+def _numbers(row: Row) -> Row:
+    """What is measured of a run; what is not known is left out."""
+    numbers = {key: row.get(key) for key in LENGTH}
+    numbers |= {key: row["heldout"].get(key) for key in QUALITY}
+    numbers |= {key: (row.get("environment") or {}).get(key) for key in ENVIRONMENT}
+    errors = [light["emission_error"] for light in row.get("emission", ())]
+    numbers["emission_error"] = mean_of_known(errors)
+    numbers["score"] = row.get("score") or None
+    return {key: value for key, value in numbers.items() if value is not None}
+
+
+def scores(row: Row) -> list[list[Row]]:
+    """The scores during the fits of a method, a curve for each seed that has one."""
+    if "per_seed" not in row:  # written by version 0.1.0, which keeps those of single seeds
+        return [row["score"]] if row.get("score") else []
+    return [fit["score"] for fit in row["per_seed"] if "score" in fit]

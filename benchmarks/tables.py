@@ -8,9 +8,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
-from summary import phases_of, read, roofline_of
+from summary import phases_of, read, roofline_of, scores
 
 from unbake.evaluation.convergence import seconds_to
+from unbake.experiments.seeds import across_seeds, plus_minus, seeds_in_words
 from unbake.experiments.tables import markdown
 
 RESULTS = Path(__file__).parent / "results"
@@ -51,28 +52,44 @@ def ratio(row: dict, table: dict) -> float:
 
 
 def quality(result: dict) -> str:
-    """What every method reaches on held-out views, and when."""
+    """What every method reaches on held-out views, and with how many samples."""
     rows = []
-    for name, row in result["methods"].items():
+    for name, row in methods_of(result):
         if "error" in row:
-            rows.append([f"`{name}`", "", "", row["error"], "", ""])
+            rows.append([f"`{name}`", "", "", "", row["error"], "", ""])
             continue
-        psnr = [f"{row[f'{k}_psnr']:.1f}" for k in ("albedo", "roughness", "render")]
-        cells = f"`{name}`", str(row["steps"]), f"{row['milliseconds_per_step']:.0f}"
-        rows.append([*cells, *psnr])
-    return markdown(["run", "steps", "ms a step", "albedo", "roughness", "rendering"], rows)
+        # Version 0.1.0, whose rows have no `per_seed`, counts one of two passes.
+        millions = f"{row.get('samples', 0) / 1e6:.1f}" if "per_seed" in row else ""
+        length = f"{row.get('steps', 0):.0f}", millions, spread(row, "milliseconds_per_step", 1, 0)
+        psnr = (spread(row, key, by, digits) for _, key, by, digits in PSNR)
+        rows.append([f"`{name}`", *length, *psnr])
+    titles = ["run", "steps", "M samples", "ms a step", "albedo", "roughness", "rendering"]
+    return markdown(titles, rows) + over_seeds(result)
+
+
+def over_seeds(result: dict) -> str:
+    """The line below a table that says what its spread is of."""
+    return f"\n\n{seeds_in_words(len(result['seeds'])).capitalize()}."
+
+
+def methods_of(result: dict) -> list[tuple[str, dict]]:
+    """Rows of a comparison by name, after that of the fields before their first step."""
+    untrained = {"untrained": result["untrained"]} if "untrained" in result else {}
+    return list((untrained | result["methods"]).items())
 
 
 def time_to_quality(end: dict, runs: dict) -> str:
     """When ours has the albedo that another method ends with, and keeps it."""
-    (name, row), ours = next(iter(end["methods"].items())), runs["methods"]["ours"]["score"]
-    last = row["score"][-1]
-    seconds = seconds_to(ours, last["albedo_psnr"])
+    name, last = next((n, c[-1]) for n, r in methods_of(end) for c in scores(r) if len(c) > 1)
+    curves = scores(runs["methods"]["ours"])
+    times = [seconds_to(curve, last["albedo_psnr"]) for curve in curves]
     cells = [f"`{name}`", f"{last['seconds']:.0f} s", f"{last['albedo_psnr']:.2f} dB"]
-    if seconds is None:
-        cells += ["not in this run", ""]
+    if None in times:
+        cells += [f"not in {times.count(None)} of {len(times)} runs", ""]
     else:
-        cells += [f"{seconds:.0f} s", f"{last['seconds'] / seconds:.0f}"]
+        ratios = [{"s": t, "times": last["seconds"] / t} for t in times if t is not None]
+        found = across_seeds(ratios, ("s", "times"))
+        cells += [f"{plus_minus(found, 's', 0)} s", plus_minus(found, "times", 0)]
     titles = ["method", "ends after", "with albedo", "`ours` has it after", "times"]
     return markdown(titles, [cells])
 
@@ -108,9 +125,9 @@ def spreads(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
     def table(result: dict) -> str:
         rows = [
             [f"`{name}`", *(spread(row, key, by, digits) for _, key, by, digits in columns)]
-            for name, row in result["methods"].items()
+            for name, row in methods_of(result)
         ]
-        return markdown(["run", *(title for title, *_ in columns)], rows)
+        return markdown(["run", *(title for title, *_ in columns)], rows) + over_seeds(result)
 
     return table
 
@@ -136,11 +153,7 @@ def variants(names: list[str], *columns: tuple[str, str, float, int]) -> Callabl
 
 def spread(row: dict, key: str, factor: float, digits: int) -> str:
     """A mean, and the standard deviation over seeds if there are several."""
-    if key not in row:
-        return ""
-    text = f"{factor * row[key]:.{digits}f}"
-    deviation = row.get(f"{key}_sd")
-    return text if deviation is None else f"{text} ± {factor * deviation:.{digits}f}"
+    return plus_minus(row, key, digits, factor) or ""
 
 
 PSNR = (
@@ -150,7 +163,9 @@ PSNR = (
 )
 LIGHT = (
     ("SH error, %", "sh_error", 100, 1),
+    ("SH error, aligned", "sh_error_aligned", 100, 1),
     ("relighting, dB", "relight_psnr", 1, 1),
+    ("relighting, aligned", "relight_psnr_aligned", 1, 1),
     ("rendering, dB", "render_psnr", 1, 1),
 )
 BOTH = (

@@ -57,11 +57,30 @@ def test_jobs_of_every_kind_run_to_their_end_and_once(repository, cornell, tmp_p
     assert before == {file: file.stat().st_mtime_ns for file in before}
 
 
+@pytest.mark.slow
+def test_quick_methods_get_the_samples_of_the_slow_one(repository, tmp_path):
+    done = call(repository, "run.py", "equal", "--scale", "smoke", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    result = read(tmp_path / "smoke" / "results" / "equal-demo.json")
+    rows = result["methods"]
+    assert result["seeds"] == [0, 1] and rows.keys() == {"ours", "prb"}
+    assert result["untrained"]["albedo_psnr"] > 0
+    assert rows["prb"]["steps"] == 4 and "albedo_psnr_sd" in rows["ours"]
+    passes = {"split-halves": 1, "two-pass": 2}[rows["prb"]["estimator"]]
+    assert rows["ours"]["steps"] == 4 * passes
+    assert rows["ours"]["samples"] == rows["prb"]["samples"] == 4 * passes * 256
+    config = (tmp_path / "smoke" / "runs" / "equal-demo-1" / "ours" / "config.toml").read_text()
+    assert f"steps = {4 * passes}\n" in config and "seed = 1\n" in config
+    again = call(repository, "run.py", "equal", "--scale", "smoke", "--out", tmp_path)
+    assert again.returncode == 0 and "all 5 jobs are done" in again.stdout, again.stdout
+
+
 def test_a_plan_tells_what_is_left_and_what_is_left_out(repository, tmp_path):
     done = call(repository, "run.py", "long", "--plan", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "0 of 2 jobs are done, the others take about" in done.stdout
-    assert "data-demo" in done.stdout and "long-demo-0" in done.stdout
+    assert "0 of 3 jobs are done, the others take about" in done.stdout
+    for job in ("data-demo", "compiled-long-demo", "long-demo-0"):
+        assert f"\n  {job}\n" in done.stdout
     assert "STAIRCASE is not set: long-staircase is left out" in done.stdout
     assert not list(tmp_path.iterdir())
 
@@ -81,7 +100,12 @@ def benchmarks(repository, monkeypatch):
 
 def comparison(folder, seed, psnr, error=None):
     """What `unbake compare` writes, reduced to what is read of it."""
-    length = {"steps": 5, "samples": 10, "seconds": 1.0, "milliseconds_per_step": 2.0}
+    length = {
+        "steps": 5 + seed,
+        "samples": 10 * (5 + seed),
+        "seconds": 1.0,
+        "milliseconds_per_step": 2.0,
+    }
     fields = {"representation": "neural", "radiance": "neural"}
     heldout = {"views": 4, "albedo_psnr": psnr, "roughness_psnr": None}
     row = length | fields | {"heldout": heldout, "score": [{"step": 0}]}
@@ -89,6 +113,7 @@ def comparison(folder, seed, psnr, error=None):
     methods = {"ours": row, "prb": row if error is None else {"error": error}}
     settings = {"unknown": "materials", "seed": seed}
     content = {"machine": {}, "settings": settings, "methods": methods, "time_to_quality": []}
+    content["untrained"] = {"heldout": heldout | {"albedo_psnr": 8.0}}
     folder.mkdir()
     (folder / "compare.json").write_text(json.dumps(content))
     return folder
@@ -100,13 +125,67 @@ def test_seeds_become_mean_and_spread(benchmarks, tmp_path):
     both = summary(folders)
     assert both["seeds"] == [0, 2] and both["views"] == 4
     ours = both["methods"]["ours"]
+    assert ours["steps"] == 6 and ours["steps_sd"] == pytest.approx(2**0.5)
     assert ours["albedo_psnr"] == 21.0 and ours["albedo_psnr_sd"] == pytest.approx(2**0.5)
     assert ours["sh_error"] == 0.5 and ours["emission_error"] == pytest.approx(2.1)
-    assert "roughness_psnr" not in ours and "score" not in ours
+    assert "roughness_psnr" not in ours
+    assert [fit["seed"] for fit in ours["per_seed"]] == [0, 2]
+    assert [fit["albedo_psnr"] for fit in ours["per_seed"]] == [20.0, 22.0]
     one = summary(folders[:1])["methods"]["ours"]
-    assert "albedo_psnr_sd" not in one and one["score"] == [{"step": 0}]
+    assert one["albedo_psnr"] == 20.0 and "albedo_psnr_sd" not in one
+    scores = benchmarks("summary")["scores"]
+    assert scores(ours) == 2 * [[{"step": 0}]] and scores(one) == [[{"step": 0}]]
+    assert scores({"steps": 5}) == []
+    assert both["untrained"]["albedo_psnr"] == 8.0 and both["untrained"]["albedo_psnr_sd"] == 0.0
     failed = summary([*folders, comparison(tmp_path / "3", 3, 1.0, error="no memory")])
     assert failed["methods"]["prb"] == {"error": "no memory"}
+
+
+def test_both_passes_of_the_slow_method_set_the_length_at_equal_samples(benchmarks):
+    run = benchmarks("run")
+    equal = run["BENCHMARKS"]["equal-demo"]
+    two_passes = {"steps": 7, "samples": 7 * 2 * 512}
+    one_pass = {"steps": 100, "samples": 100 * 512}
+    rows = dict.fromkeys(("ours", "no-prior", "direct"), one_pass) | {"prb": two_passes}
+    assert run["steps_of_equal_samples"]({"methods": rows}, equal) == 14
+    rows["direct"] = {"steps": 100, "samples": 100 * 256}
+    with pytest.raises(ValueError, match="cannot have the same length"):
+        run["steps_of_equal_samples"]({"methods": rows}, equal)
+    rows["prb"] = {"error": "no memory"}
+    with pytest.raises(Exception, match="rivals-demo: prb failed: no memory"):
+        run["steps_of_equal_samples"]({"methods": rows}, equal)
+
+
+def test_tables_have_the_untrained_fields_first_and_tell_of_how_many_seeds(benchmarks, tmp_path):
+    folders = [comparison(tmp_path / f"{seed}", seed, 20.0 + seed) for seed in (0, 2)]
+    result = benchmarks("summary")["summary"](folders)
+    tables = benchmarks("tables")
+    quality = tables["quality"](result).splitlines()
+    assert quality[2] == "| `untrained` | 0 | 0.0 |  | 8.0 ± 0.0 |  |  |"
+    assert quality[3] == "| `ours` | 6 | 0.0 | 2 ± 0 | 21.0 ± 1.4 |  |  |"
+    assert quality[-1] == "Mean ± standard deviation over 2 seeds."
+    for _, names, table in tables["TABLES"]:
+        if table.__name__ == "table" and len(names) == 1:  # made by `spreads`
+            lines = table(result).splitlines()
+            assert lines[2].startswith("| `untrained` |") and lines[-1] == quality[-1]
+    columns = tables["spreads"](*tables["LIGHT"])(result).splitlines()[0]
+    assert "SH error, aligned" in columns and "relighting, aligned" in columns
+
+
+def test_the_time_to_a_quality_is_told_of_all_seeds(benchmarks):
+    def fits(*ends):
+        curves = [
+            [{"seconds": 0.0, "albedo_psnr": 0.0}, {"seconds": 60.0, "albedo_psnr": end}]
+            for end in ends
+        ]
+        return {"per_seed": [{"seed": i, "score": curve} for i, curve in enumerate(curves)]}
+
+    time_to_quality = benchmarks("tables")["time_to_quality"]
+    slow = {"untrained": {"per_seed": [{"seed": 0}]}, "methods": {"prb": fits(10.0)}}
+    last = time_to_quality(slow, {"methods": {"ours": fits(20.0, 30.0)}}).splitlines()[-1]
+    assert last == "| `prb` | 60 s | 10.00 dB | 25 ± 7 s | 2 ± 1 |"
+    last = time_to_quality(slow, {"methods": {"ours": fits(20.0, 9.0)}}).splitlines()[-1]
+    assert "not in 1 of 2 runs" in last
 
 
 def test_files_of_steps_become_one_of_the_machine(benchmarks, tmp_path):
