@@ -10,8 +10,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
 from summary import phases_of, read, roofline_of, scores
 
-from unbake.evaluation.convergence import seconds_to
-from unbake.experiments.seeds import across_seeds, plus_minus, seeds_in_words
+from unbake.evaluation import convergence
+from unbake.experiments.seeds import plus_minus, seeds_in_words
+from unbake.experiments.seeds import spread as spread_of
 from unbake.experiments.tables import markdown
 
 RESULTS = Path(__file__).parent / "results"
@@ -79,19 +80,25 @@ def methods_of(result: dict) -> list[tuple[str, dict]]:
 
 
 def time_to_quality(end: dict, runs: dict) -> str:
-    """When ours has the albedo that another method ends with, and keeps it."""
-    name, last = next((n, c[-1]) for n, r in methods_of(end) for c in scores(r) if len(c) > 1)
-    curves = scores(runs["methods"]["ours"])
-    times = [seconds_to(curve, last["albedo_psnr"]) for curve in curves]
-    cells = [f"`{name}`", f"{last['seconds']:.0f} s", f"{last['albedo_psnr']:.2f} dB"]
-    if None in times:
-        cells += [f"not in {times.count(None)} of {len(times)} runs", ""]
-    else:
-        ratios = [{"s": t, "times": last["seconds"] / t} for t in times if t is not None]
-        found = across_seeds(ratios, ("s", "times"))
-        cells += [f"{plus_minus(found, 's', 0)} s", plus_minus(found, "times", 0)]
-    titles = ["method", "ends after", "with albedo", "`ours` has it after", "times"]
-    return markdown(titles, [cells])
+    """When ours has what another method ends with, or a little less, and keeps it."""
+    name, curve = next((n, c) for n, r in methods_of(end) for c in scores(r) if len(c) > 1)
+    ours = {f"ours {i}": curve for i, curve in enumerate(scores(runs["methods"]["ours"]))}
+    rows = []
+    for target in convergence.time_to_quality({name: curve, **ours}):
+        if target.run != name:
+            continue
+        own = target.seconds[name]
+        below = f"{target.below:g} dB below" if target.below else "at its end"
+        cells = [target.quantity, below, f"{target.psnr:.1f} dB", f"{own:.0f} s"]
+        times = [target.seconds[run] for run in ours]
+        if None in times:
+            cells += [f"not in {times.count(None)} of {len(times)} runs", ""]
+        else:
+            found = spread_of("s", times) | spread_of("times", [own / t for t in times if t])
+            cells += [f"{plus_minus(found, 's', 0)} s", plus_minus(found, "times", 1) or ""]
+        rows.append(cells)
+    titles = ["", "quality", "PSNR", f"`{name}` keeps it after", "`ours` after", "times sooner"]
+    return markdown(titles, rows)
 
 
 def phases(result: dict) -> str:
@@ -146,7 +153,7 @@ def variants(names: list[str], *columns: tuple[str, str, float, int]) -> Callabl
             ]
             for name, result in zip(names, results, strict=True)
         ]
-        return markdown(["", *(title for title, *_ in columns)], rows)
+        return markdown(["", *(title for title, *_ in columns)], rows) + over_seeds(results[0])
 
     return table
 

@@ -21,6 +21,8 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import tables as benchmark_tables  # noqa: E402
 from summary import phases_of, read, roofline_of  # noqa: E402
 
+from unbake.experiments.seeds import plus_minus  # noqa: E402
+
 Row = dict[str, Any]
 
 TAKE_OVER = "python scripts/write_docs.py --results reproduction --scenes scenes"
@@ -81,11 +83,8 @@ class Facts:
 
     def db(self, name: str, method: str, key: str, digits: int = 1) -> str:
         """A PSNR in dB; with its standard deviation if there are several seeds."""
-        row = self.method(name, method)
-        value = self.of(name, method, key)
-        spread = row.get(f"{KEYS.get(key, key)}_sd")
-        more = "" if spread is None else f" ± {spread:.{digits}f}"
-        return f"{value:.{digits}f}{more} dB"
+        self.of(name, method, key)
+        return f"{plus_minus(self.method(name, method), KEYS.get(key, key), digits)} dB"
 
     def gap(self, name: str, a: str, b: str, key: str, other: str | None = None) -> str:
         """How far a is above b, in words: `2.4 dB above`, `0.3 dB below`, `level with`.
@@ -105,11 +104,6 @@ class Facts:
         difference = self.of(name, a, key) - self.of(other or name, b, key)
         spread = math.hypot(*(row.get(f"{key}_sd") or 0.0 for row in (first, second)))
         return above(difference, spread)
-
-    def seeds(self, *names: str) -> str:
-        """How many seeds there are of each fit, in words."""
-        count = min(len(self.result(name)["seeds"]) for name in names)
-        return "one seed each" if count == 1 else f"{count} seeds each"
 
     def ratio(self, name: str, a: str, b: str, key: str = "milliseconds_per_step") -> float:
         """A number of a over that of b."""

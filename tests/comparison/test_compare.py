@@ -68,11 +68,15 @@ def test_two_methods_side_by_side(compare, tmp_path):
     assert found["machine"]["cores"] >= 1 and found["evaluation"]["spp"] == 2
     assert found["settings"]["pixels"] == 64
     for target in found["time_to_quality"]:
-        assert target["albedo_psnr"] == found["methods"][target["run"]]["score"][-1]["albedo_psnr"]
+        last = found["methods"][target["run"]]["score"][-1][f"{target['quantity']}_psnr"]
+        assert target["psnr"] == pytest.approx(last - target["below"])
         assert target["seconds"].keys() == {"ours", "direct"}
         own = target["seconds"][target["run"]]
         assert 0 <= own <= found["methods"][target["run"]]["score"][-1]["seconds"]
-    assert "ms/step" in outcome.out and "Seconds to that quality" in outcome.out
+    raced = {(t["run"], t["quantity"]) for t in found["time_to_quality"] if t["below"] == 0}
+    assert raced == {(run, name) for run in ("ours", "direct") for name in ("albedo", "roughness")}
+    assert found["format"] == 2 and "1 and 2 dB" in found["definitions"]["time_to_quality"]
+    assert "ms/step" in outcome.out and "Seconds to roughness PSNR" in outcome.out
     page = (out / "report.html").read_text()
     assert "Time to quality" in page and "Held-out albedo PSNR" in page
     assert "split halves" in page and "Validation during training" not in page
@@ -212,7 +216,7 @@ def test_a_method_that_fails_is_recorded_and_the_others_go_on(compare, tmp_path,
     assert found["methods"]["ours"]["error"] == said
     assert found["methods"]["ours"]["method"] == "ours"
     assert found["methods"]["direct"]["steps"] == 3
-    assert [t["run"] for t in found["time_to_quality"]] == ["direct"]
+    assert {t["run"] for t in found["time_to_quality"]} == {"direct"}
     assert found["time_to_quality"][0]["seconds"]["ours"] is None
     page = (tmp_path / "out" / "report.html").read_text()
     assert "a &lt;step&gt; needs 9 GB" in page

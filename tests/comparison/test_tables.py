@@ -51,6 +51,25 @@ def test_what_is_known_of_lighting_is_printed():
     assert "ours: lamp 25.00 % off" in text and "dark" not in text
 
 
+def test_the_time_to_quality_of_many_runs_fits_into_80_columns():
+    runs = ["ours", "prb", "prb-neural-split-halves", "prb-bitmap", "ad-pt-neural-split-halves"]
+    runs += ["direct", "no-prior"]
+    targets = [
+        {"run": run, "quantity": quantity, "below": below, "psnr": 20.0 - below,
+         "seconds": {name: None if name == "direct" else 1234.5 - i for name in runs}}
+        for quantity in ("albedo", "roughness") for i, run in enumerate(runs) for below in (0.0, 1)
+    ]  # fmt: skip
+    told = compared({}) | {"time_to_quality": targets}
+    text = printed(print_comparison, told, width=80)
+    race = text[text.index("Seconds to") :]
+    assert "Seconds to albedo PSNR" in race and "Seconds to roughness PSNR" in race
+    assert max(map(len, text.splitlines())) <= 80
+    rows = [[c.strip() for c in line.split("│")[1:-1]] for line in race.splitlines() if "│" in line]
+    assert rows[0] == ["1 ours", "20.0", *["1234"] * 5, "—", "1234"]
+    assert rows[1][:3] == ["1 dB below", "19.0", "1234"]
+    assert "".join(row[0] for row in rows).count("5ad-pt-neural-split-halves") == 2
+
+
 def test_a_method_that_failed_has_no_step_time():
     names = {"method": "ours", "representation": None, "radiance": None, "estimator": "auto"}
     times = {"milliseconds_per_step": 12.5, "samples_per_second": 2e3, "times_the_first": None}

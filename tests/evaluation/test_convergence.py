@@ -64,9 +64,41 @@ def test_a_curve_that_ends_below_never_reached_it(points, seconds):
 def test_every_run_sets_a_target_for_all():
     fast, slow = curve((0, 10), (4, 20), (8, 20)), curve((0, 10), (10, 15))
     targets = time_to_quality({"fast": fast, "slow": slow, "none": []})
-    assert [(t.run, t.albedo_psnr) for t in targets] == [("fast", 20), ("slow", 15)]
+    told = [(t.run, t.below, t.psnr) for t in targets]
+    assert told == [("fast", b, 20 - b) for b in (0, 1, 2)] + [
+        ("slow", b, 15 - b) for b in (0, 1, 2)
+    ]
     assert targets[0].seconds == {"fast": 4, "slow": None, "none": None}
-    assert targets[1].seconds == {"fast": 2, "slow": 10, "none": None}
+    assert targets[3].seconds == {"fast": 2, "slow": 10, "none": None}
+    assert targets[5].seconds == {"fast": pytest.approx(1.2), "slow": 6, "none": None}
+
+
+def test_every_scored_quantity_has_targets_of_its_own():
+    points = [(0, 10.0, 8.0), (5, 20.0, None), (10, 21.0, 18.0)]
+    scored = [{"seconds": t, "albedo_psnr": a, "gloss_psnr": g} for t, a, g in points]
+    targets = time_to_quality({"one": scored, "other": curve((0, 10), (10, 30))})
+    ends = {(t.run, t.quantity): t for t in targets if t.below == 0}
+    assert ends.keys() == {("one", "albedo"), ("other", "albedo"), ("one", "gloss")}
+    assert ends["one", "gloss"].seconds == {"one": 10, "other": None}
+    assert seconds_to(scored, 13.0, "gloss") == pytest.approx(5)
+
+
+def test_what_a_run_has_before_its_first_step_is_no_target():
+    targets = time_to_quality(
+        {"lazy": curve((0, 15.2), (10, 16.5)), "worse": curve((0, 9), (9, 8))}
+    )
+    assert [(t.run, t.below) for t in targets] == [("lazy", 0), ("lazy", 1), ("worse", 0)]
+
+
+def test_a_score_that_is_noisy_at_the_end_changes_the_first_target_alone():
+    """Which is why there are several: the last score is one sample of a noisy curve."""
+    steady = [(t, 10 + 10 * (1 - 2 ** (-t / 10))) for t in range(0, 100, 5)]
+    ours = curve(*((t / 10, v) for t, v in steady))
+    for noise in (-0.3, 0.3):
+        rival = curve(*steady[:-1], (95, 20 + noise))
+        times = {t.below: t.seconds for t in time_to_quality({"rival": rival, "ours": ours})[:3]}
+        assert times[2]["rival"] / times[2]["ours"] == pytest.approx(10, rel=0.15)
+    assert times[0]["ours"] is None
 
 
 def test_the_table_of_benchmarks_and_the_comparison_agree_on_the_time_to_quality(
@@ -78,6 +110,7 @@ def test_the_table_of_benchmarks_and_the_comparison_agree_on_the_time_to_quality
     runs = {"methods": {"ours": {"score": noisy}}}
     end = {"methods": {"prb": {"score": curve((0, 10), (90, 20))}}}
     assert time_to_quality({"prb": curve((90, 20)), "ours": noisy})[0].seconds["ours"] == 22.5
-    assert "| `prb` | 90 s | 20.00 dB | 22 s | 4 |" in table(end, runs)
-    end["methods"]["prb"]["score"] = curve((90, 22.5))
-    assert "not in this run" in table(end, runs)
+    assert "| albedo | at its end | 20.0 dB | 90 s | 22 s | 4.0 |" in table(end, runs)
+    assert "| albedo | 1 dB below | 19.0 dB | 81 s | 8 s | 9.9 |" in table(end, runs)
+    end["methods"]["prb"]["score"] = curve((0, 10), (90, 22.5))
+    assert "| albedo | at its end | 22.5 dB | 90 s | not in 1 of 1 runs |  |" in table(end, runs)

@@ -250,8 +250,13 @@ def test_scores_become_curves_and_a_race(made, tmp_path: Path):
     rows = re.findall(r"<tr>.*?</tr>", text.split('class="race"')[1].split("</table>")[0], re.S)
     assert [re.findall(r'<td class="(.*?)">(.*?)</td>', row) for row in rows[1:]] == [
         [("n", "31.00"), ("n best", "20.0"), ("n", "—")],
+        [("n", "30.00"), ("n best", "10.0"), ("n", "—")],
+        [("n", "29.00"), ("n best", "9.5"), ("n", "—")],
         [("n", "20.00"), ("n best", "5.0"), ("n", "10.0")],
+        [("n", "19.00"), ("n best", "4.5"), ("n", "9.0")],
+        [("n", "18.00"), ("n best", "4.0"), ("n", "8.0")],
     ]
+    assert text.count('class="race"') == 2 and "Roughness PSNR of" in text
 
 
 def test_one_run_is_no_race(made, tmp_path: Path):

@@ -37,9 +37,13 @@ DEFINITIONS = {
     "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
     "untrained": "the fields that all methods start from, with the shared representation and seed",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
-    "time_to_quality": "target: the last albedo PSNR of a run; seconds: training time after which "
-    "a run stays above it, interpolated linearly between scores; null: never",
+    "time_to_quality": "psnr: the last score of a run, and 1 and 2 dB below it, for each unknown "
+    "of the materials; seconds: training time after which a run stays at or above it for good, "
+    "interpolated linearly between scores; null: never. Targets that a run has before its first "
+    "step are left out",
 }
+#: Of compare.json; 1 had the last albedo alone in `time_to_quality`, and no key `format`.
+COMPARISON_FORMAT = 2
 
 #: Name of the run whose fields are those that all methods start from.
 UNTRAINED = "untrained"
@@ -125,6 +129,7 @@ def compare(
     start = {key: value for key, value in rows.pop(UNTRAINED).items() if key in OF_UNTRAINED}
     targets = time_to_quality({name: row.get("score", []) for name, row in rows.items()})
     result = {
+        "format": COMPARISON_FORMAT,
         "data": str(data.resolve()),
         "machine": machine(),
         "settings": asdict(config),

@@ -79,14 +79,27 @@ def _print_lighting(rows: dict[str, Row], console: Console) -> None:
 
 
 def _print_time_to_quality(targets: list[Row], console: Console) -> None:
-    if len(targets) < 2:
+    """A table for each quantity. Runs are numbered, so that many fit beside each other."""
+    numbers = {run: str(i) for i, run in enumerate(_runs(targets), 1)}
+    if len(numbers) < 2:
         return
-    table = _table("albedo PSNR of", title="Seconds to that quality")
-    _add_numbers(table, "dB", *targets[0]["seconds"])
-    for target in targets:
-        times = [_number(seconds, 1) for seconds in target["seconds"].values()]
-        table.add_row(target["run"], _number(target["albedo_psnr"], 2), *times)
-    console.print(table)
+    for quantity in dict.fromkeys(target["quantity"] for target in targets):
+        table = _table("end of", title=f"Seconds to {quantity} PSNR")
+        _add_numbers(table, "dB", *numbers.values())
+        for target in targets:
+            if target["quantity"] != quantity:
+                continue
+            run, below = target["run"], target["below"]
+            label = f"  {below:g} dB below" if below else f"{numbers[run]} {run}"
+            times = [_number(target["seconds"][name], 0) for name in numbers]
+            table.add_row(label, _number(target["psnr"], 1), *times)
+        console.print(table)
+
+
+def _runs(targets: list[Row]) -> list[str]:
+    """The runs that set targets, in the order of the comparison."""
+    setting = {target["run"] for target in targets}
+    return [run for run in targets[0]["seconds"] if run in setting] if targets else []
 
 
 def _table(*names: str, title: str | None = None) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, final
@@ -12,6 +12,8 @@ import numpy as np
 
 from ..quantities import DEFAULT_QUANTITIES
 
+#: How far below the last score of a run further targets are, in dB: one score alone is noisy.
+BELOW = (0.0, 1.0, 2.0)
 #: The first steps trace and compile; intervals of the log that begin before are left out.
 WARM_UP = 4
 
@@ -23,8 +25,10 @@ Log = Sequence[Mapping[str, Any]]
 class Target:
     """A score, and the time from which each run stays at or above it."""
 
-    run: str  #: the run whose last score this is
-    albedo_psnr: float  #: dB, over all held-out views
+    run: str  #: the run whose last score sets it
+    quantity: str  #: what is scored: `albedo`
+    below: float  #: dB below that last score
+    psnr: float  #: dB, over all held-out views
     seconds: dict[str, float | None]  #: of training by run; None: never
 
 
@@ -52,19 +56,22 @@ def score_curve(log: Log) -> list[dict[str, float | None]]:
     ]
 
 
-def seconds_to(curve: Sequence[Mapping[str, Any]], target: float) -> float | None:
+def seconds_to(
+    curve: Sequence[Mapping[str, Any]], target: float, quantity: str = "albedo"
+) -> float | None:
     """The time from which a score curve stays at or above a target: its last upward crossing.
 
     Scores are interpolated linearly.
 
     Args:
         curve: as `score_curve` gives it.
-        target: albedo PSNR in dB.
+        target: PSNR in dB.
+        quantity: what is scored.
 
     Returns:
         Seconds of training, None if the curve ends below the target.
     """
-    points = _points(curve)
+    points = _points(curve, quantity)
     below = [i for i, (_, value) in enumerate(points) if value < target]
     if not points or below[-1:] == [len(points) - 1]:
         return None
@@ -75,20 +82,39 @@ def seconds_to(curve: Sequence[Mapping[str, Any]], target: float) -> float | Non
 
 
 def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Target]:
-    """A target for the last score of each run.
+    """Targets for every scored quantity: the last score of each run, and scores below it.
+
+    A run sets no target that it has before its first step.
 
     Args:
         curves: score curve of each run by name; a run without scores sets no target.
+
+    Returns:
+        By quantity, then by run, then from the highest to the lowest.
     """
-    ends = {name: points[-1][1] for name, c in curves.items() if (points := _points(c))}
-    return [
-        Target(run, end, {name: seconds_to(curve, end) for name, curve in curves.items()})
-        for run, end in ends.items()
-    ]
+    targets = []
+    for quantity in _scored(curves.values()):
+        for run, curve in curves.items():
+            if not (points := _points(curve, quantity)):
+                continue
+            (_, first), (_, last) = points[0], points[-1]
+            for below in BELOW:
+                if below and last - below <= first:
+                    break
+                psnr = last - below
+                times = {name: seconds_to(c, psnr, quantity) for name, c in curves.items()}
+                targets.append(Target(run, quantity, below, psnr, times))
+    return targets
 
 
-def _points(curve: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    scored = [(point["seconds"], point.get("albedo_psnr")) for point in curve]
+def _scored(curves: Iterable[Sequence[Mapping[str, Any]]]) -> list[str]:
+    """The quantities that score curves have, in the order of their appearance."""
+    keys = dict.fromkeys(key for curve in curves for point in curve for key in point)
+    return [key.removesuffix("_psnr") for key in keys if key.endswith("_psnr")]
+
+
+def _points(curve: Sequence[Mapping[str, Any]], quantity: str) -> list[tuple[float, float]]:
+    scored = [(point["seconds"], point.get(f"{quantity}_psnr")) for point in curve]
     return [(t, v) for t, v in scored if isinstance(v, int | float) and math.isfinite(v)]
 
 

@@ -416,23 +416,28 @@ def _charts(
 
 
 def _race(runs: list[Run]) -> list[dict[str, Any]]:
-    """Times to the last score of each run; empty if fewer than two runs have scores."""
+    """For each quantity, times to the scores that runs end with, and below.
+
+    Empty if fewer than two runs have scores.
+    """
     raced = [run for run in runs if not run.untrained]
     targets = time_to_quality({run.label: score_curve(run.log) for run in raced})
-    if len(targets) < 2:
+    if len({target.run for target in targets}) < 2:
         return []
     index = {run.label: i for i, run in enumerate(runs)}
-    return [
-        {
+    tables: dict[str, list[dict[str, Any]]] = {}
+    for target in targets:
+        row = {
             "run": index[target.run],
-            "target": display.decibels(target.albedo_psnr),
+            "below": f"{target.below:g} dB below" if target.below else None,
+            "target": display.decibels(target.psnr),
             "times": [
                 {"text": _seconds(t), "best": t is not None and t == _first(target.seconds)}
                 for t in target.seconds.values()
             ],
         }
-        for target in targets
-    ]
+        tables.setdefault(target.quantity, []).append(row)
+    return [{"title": NAMES.get(name, name), "rows": rows} for name, rows in tables.items()]
 
 
 def _first(times: Mapping[str, float | None]) -> float | None:
