@@ -31,6 +31,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PY
 from rich.console import Console  # noqa: E402
 from summary import machine_results, read, summarized, summary  # noqa: E402
 
+from unbake.acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES  # noqa: E402
 from unbake.config import FitConfig  # noqa: E402
 from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
@@ -276,7 +277,9 @@ class Bench:
         if name == STAIRCASE:
             assert self.staircase is not None
             return self.staircase
-        return self.work / "data" / digest(vars(self._capture(name))) / name
+        # Data sets of before do not tell the light of their paths.
+        captured = vars(self._capture(name)) | {"light_by_depth": [LIGHT_PIXELS, LIGHT_SAMPLES]}
+        return self.work / "data" / digest(captured) / name
 
     def settings(self, name: str | None) -> tuple[list[object], str]:
         """Options that choose settings, and the text of their file."""

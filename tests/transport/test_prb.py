@@ -185,6 +185,6 @@ def test_split_halves_and_two_passes_have_one_expectation(built_in):
 
 def test_settings_reach_the_integrator():
     config = dataclasses.replace(TINY_FIT, method="prb")
-    integrator = path_replay(config.path.max_depth, config.path.rr_depth, True)
+    integrator = path_replay(config.path.chosen_depth, config.path.rr_depth, True)
     assert (integrator.max_depth, integrator.rr_depth) == (15, 5)
     assert integrator.hide_emitters

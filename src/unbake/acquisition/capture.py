@@ -16,15 +16,17 @@ from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
+from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import parse, write
+from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
 from .placement import coverage, is_room, place
-from .settings import CaptureSettings
+from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
 #: Samples a pixel of the truth images, which are noisy at edges only.
 TRUTH_SAMPLES = 16
@@ -91,6 +93,7 @@ def _capture(
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
+    light = _light_by_depth(scene, [c for split, c in posed if split == "train"], settings, room)
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
         shape = (camera.height, camera.width)
@@ -124,6 +127,7 @@ def _capture(
             "mitsuba": mi.__version__,
         },
         coverage=round(float(seen), 4),
+        light_by_depth=light,
     )
 
 
@@ -213,6 +217,29 @@ def _photographs(
         count = int((~np.isfinite(rgb).all(1)).sum())
         raise UserError(f"{count} rendered pixels are not finite", None, "Check the scene's values")
     return rgb, np.minimum(alpha, 1)
+
+
+def _light_by_depth(
+    scene: mi.Scene, cameras: list[Camera], settings: CaptureSettings, room: bool
+) -> tuple[float, ...]:
+    """Shares of the photographs' light by depth, up to the depth that carries all (to 0.01 %)."""
+    rays = CameraRays.of(cameras)
+    count = min(rays.pixels, LIGHT_PIXELS)
+    chosen = np.random.default_rng(settings.seed).integers(rays.pixels, size=count)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(settings.seed, count * LIGHT_SAMPLES)
+    pixel = from_numpy(mi.UInt32, np.repeat(chosen, LIGHT_SAMPLES))
+    ray = rays.through(pixel, sampler.next_2d())
+    shares = light_by_depth(
+        scene,
+        ray,
+        settings.seed + 1,
+        max_depth=settings.max_depth,
+        rr_depth=settings.rr_depth,
+        hide_emitters=not room,
+        groups=LIGHT_SAMPLES,
+    ).round(4)
+    return tuple(shares[: np.searchsorted(shares, 1.0) + 1].tolist()) if shares[-1] > 0 else ()
 
 
 def _truth(

@@ -8,6 +8,10 @@ from typing import Annotated
 from ..config.flag import Flag
 from ..errors import require
 
+#: Pixels of the training views, chosen at random, and samples of each, that measure how much light
+#: paths carry by their depth.
+LIGHT_PIXELS, LIGHT_SAMPLES = 16384, 16
+
 
 @dataclass(frozen=True)
 class CaptureSettings:

@@ -22,6 +22,7 @@ from ..machine import machine
 from ..report.page import write_report
 from ..training.checkpoint import Progress
 from ..training.loop import fit
+from ..training.path_depth import with_path_depth
 from ..training.run_folder import RunFolder
 from .method_variant import MethodVariant
 from .tables import print_comparison
@@ -95,6 +96,7 @@ def compare(
     """
     console = console or Console(highlight=False)
     data, out = Path(data), Path(out)
+    config = with_path_depth(config, Dataset.load(data))
     chosen = {variant.name: variant.settings(config) for variant in variants}
     if len(chosen) < len(variants) or not chosen:
         what = "a method is given twice" if chosen else "no method given"
@@ -103,7 +105,6 @@ def compare(
         raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
     untrained = replace(_CHEAPEST.settings(config), steps=0, seconds=0.0, score_seconds=0.0)
     fits = {UNTRAINED: untrained, **chosen}
-    Dataset.load(data)
     for name, settings in {**chosen, **fits}.items():
         _check_kept(RunFolder(out / name), settings, data)
 

@@ -11,6 +11,7 @@ from ..fields.settings import (
 )
 from .fit import (
     MOST_BOUNCES,
+    PAPER_DEPTH,
     Estimator,
     FitConfig,
     LightingConfig,
@@ -30,6 +31,7 @@ from .toml import from_toml, read_toml, to_toml
 
 __all__ = [
     "MOST_BOUNCES",
+    "PAPER_DEPTH",
     "BitmapConfig",
     "DenseGridConfig",
     "Estimator",

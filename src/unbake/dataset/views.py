@@ -61,6 +61,9 @@ class Dataset:
         views: all views, in the order of the file.
         render: how the images were rendered; empty where they were not.
         coverage: fraction of surface area that training views see, in [0, 1]; None if unknown.
+        light_by_depth: shares of the light that surfaces reflect to the training views on paths of
+            depth 1, 2, … at most (Mitsuba's meaning: 2 is direct illumination), not decreasing;
+            deeper paths add nothing. Empty if unknown.
     """
 
     folder: Path
@@ -69,6 +72,16 @@ class Dataset:
     views: tuple[View, ...]
     render: dict[str, Any]
     coverage: float | None
+    light_by_depth: tuple[float, ...] = ()
+
+    def depth_of_light(self, share: float) -> int | None:
+        """The smallest depth of paths that carry this share of the light; None if unknown."""
+        return next((d for d, x in enumerate(self.light_by_depth, 1) if x >= share), None)
+
+    def light_of_depth(self, depth: int) -> float | None:
+        """The share of the light that paths of at most this depth carry; None if unknown."""
+        shares = self.light_by_depth
+        return shares[min(depth, len(shares)) - 1] if shares else None
 
     @property
     def train(self) -> tuple[View, ...]:
@@ -101,7 +114,9 @@ class Dataset:
         for view in views:
             for image in (view.image, *view.truth.values()):
                 _check_header(image, view.camera.width, view.camera.height)
-        return cls(data.path, scene, _background(top, file), views, *_provenance(top, file))
+        render, seen = _provenance(top, file)
+        light = _light_by_depth(top, file)
+        return cls(data.path, scene, _background(top, file), views, render, seen, light)
 
     def save(self, folder: Path) -> None:
         """Write `transforms.json` into a folder, atomically; images are not touched.
@@ -118,6 +133,7 @@ class Dataset:
             "background": self.background,
             "render": self.render,
             "coverage": self.coverage,
+            "light_by_depth": list(self.light_by_depth),
             "frames": [_frame(data, view) for view in self.views],
         }
         data.write_transforms(content)
@@ -298,3 +314,18 @@ def _provenance(top: dict[str, Any], file: Path) -> tuple[dict[str, Any], float 
     if not number or not math.isfinite(coverage) or not 0 <= coverage <= 1:
         raise UserError("'coverage' is not a number from 0 to 1", file, "Set it to null")
     return render, float(coverage)
+
+
+def _light_by_depth(top: dict[str, Any], file: Path) -> tuple[float, ...]:
+    """The shares in the file; none where it has none, as those of unbake 0.1.0 and older."""
+    shares = top.get("light_by_depth") or []
+    what = "'light_by_depth' is not a list of shares from 0 to 1 that ends at 1"
+    error = UserError(what, file, "Remove it if it is unknown")
+    if not isinstance(shares, list):
+        raise error
+    if not all(isinstance(x, int | float) and not isinstance(x, bool) for x in shares):
+        raise error
+    rises = all(a <= b for a, b in zip([0, *shares], [*shares, 1], strict=True))
+    if shares and (not rises or shares[-1] != 1):
+        raise error
+    return tuple(map(float, shares))

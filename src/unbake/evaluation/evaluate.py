@@ -106,7 +106,7 @@ def description(config: FitConfig) -> dict:
     """The settings that tell runs apart: unknown, quantities, method, fields and estimator.
 
     `representation` is that of the materials, None if they are known; `radiance` is that of L_θ,
-    None if the method has no radiance field.
+    None if the method has no radiance field; `path_depth` is that of methods that follow paths.
     """
     cached = requirements(config.chosen_method.terms).radiance
     return {
@@ -118,6 +118,7 @@ def description(config: FitConfig) -> dict:
         "representation": config.representation if config.learns_materials else None,
         "radiance": config.radiance_representation if cached else None,
         "estimator": "split-halves" if config.halves else "two-pass",
+        "path_depth": config.path.chosen_depth if config.follows_paths else None,
     }
 
 

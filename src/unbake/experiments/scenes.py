@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..acquisition.capture import capture
-from ..acquisition.settings import CaptureSettings
+from ..acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 from ..config import FitConfig, from_toml
 from ..dataset.data_folder import DataFolder
 from ..dataset.views import Dataset
@@ -162,6 +162,8 @@ class PaperScene:
             "photographs": asdict(shots or self.capture_settings(context)),
             "albedo_power": self.albedo_power,
             "lit_by": self.lit_by,
+            # Data sets of before do not tell the light of their paths.
+            "light_by_depth": [LIGHT_PIXELS, LIGHT_SAMPLES],
             "cameras": hashlib.sha256(self.cameras.read_bytes()).hexdigest(),
         }
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from ..config import FitConfig
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
+from .path_depth import with_path_depth
 from .problem import Problem, make_problem, training_pixels
 from .state import State, initial_state
 from .step import TrainingStep
@@ -24,6 +25,7 @@ class FreshFit:
 
 def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     """A fit of a data set that writes nothing."""
+    config = with_path_depth(config, dataset)
     smoothed = config.loss_reference == "smoothed"
     pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed)
     mean = pixels.photographs.mean

@@ -21,6 +21,7 @@ from ..errors import UserError
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .memory import memory_mb
 from .monitor import Monitor
+from .path_depth import told_depth, with_path_depth
 from .preview import Preview
 from .problem import camera_warnings, make_problem, training_pixels
 from .run_folder import Origin, RunFolder
@@ -74,6 +75,7 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     else:
         folder.require_new()
     dataset = Dataset.load(data)
+    config = with_path_depth(config, dataset)
     clip_negative = clip_negative or (resume and folder.origin().clip_negative)
     pixels = training_pixels(
         dataset, clip_negative=clip_negative, smoothed=config.loss_reference == "smoothed"
@@ -85,6 +87,8 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     for warning in camera_warnings(dataset, problem.scene_view.scene):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
+    if config.follows_paths:
+        console.print(told_depth(config, dataset), highlight=False, soft_wrap=True)
     state = initial_state(problem)
     restored = load_checkpoint(folder, state) if resume else None
     progress = restored or Progress()

@@ -187,7 +187,7 @@ def _context(problem: Problem, config: FitConfig) -> SamplerContext:
         hide_emitters=problem.hide_emitters,
         spp=config.spp,
         bounces=config.bounces,
-        max_depth=config.path.max_depth,
+        max_depth=config.path.chosen_depth,
         rr_depth=config.path.rr_depth,
         read_by_scene=problem.read_by_scene,
     )

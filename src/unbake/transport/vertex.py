@@ -124,7 +124,7 @@ def find_vertex(
         ray, active = mi.Ray3f(ray), mi.Bool(active)
         pi = scene.ray_intersect_preliminary(ray, origin is None, active)
         if scene_view.has_area_emitters and hide_emitters:
-            pi, ray = _behind_area_emitters(scene, pi, ray, active)
+            pi, ray = behind_area_emitters(scene, pi, ray, active)
         first = si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         seen = active & (si.is_valid() | (not hide_emitters))
         weight = _emission_weight(scene_view, si, origin, active)
@@ -148,7 +148,7 @@ def find_vertex(
     return vertex
 
 
-def _behind_area_emitters(
+def behind_area_emitters(
     scene: mi.Scene, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
     """The first hits behind area emitters, and the rays that start there."""
