@@ -242,11 +242,21 @@ class PathTracedRadiance:
 
 
 def stock_path(
-    scene: mi.Scene, ray: mi.Ray3f, seed: int, *, max_depth: int, hide_emitters: bool = False
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    seed: int,
+    *,
+    max_depth: int,
+    hide_emitters: bool = False,
+    integrator: str = "path",
 ) -> mi.Color3f:
-    """Radiance along rays by Mitsuba's own `path`, one sample a lane."""
+    """Radiance along rays by Mitsuba's own path tracer, one sample a lane.
+
+    Args:
+        integrator: `volpath` where opacities are fractions: see `path_integrator`.
+    """
     integrator = mi.load_dict(
-        {"type": "path", "max_depth": max_depth, "rr_depth": 5, "hide_emitters": hide_emitters}
+        {"type": integrator, "max_depth": max_depth, "rr_depth": 5, "hide_emitters": hide_emitters}
     )
     with dr.suspend_grad():
         ray = mi.RayDifferential3f(ray)

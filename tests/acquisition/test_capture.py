@@ -142,3 +142,31 @@ def test_a_capture_that_fails_leaves_nothing(failure, tmp_path, monkeypatch):
     with pytest.raises((UserError, KeyboardInterrupt)):
         capture("cube", tmp_path / "data", settings, tell=lambda line: None)
     assert not list(tmp_path.iterdir())
+
+
+HALF_OPAQUE = """<scene version="3.0.0">
+  <emitter type="point"><point name="position" x="0" y="0" z="2"/>
+    <float name="intensity" value="4"/></emitter>
+  <shape type="shapegroup" id="leaf"><shape type="rectangle">
+    <bsdf type="mask"><float name="opacity" value="{}"/><bsdf type="principled"/></bsdf>
+  </shape></shape>
+  <shape type="instance"><ref id="leaf"/></shape>
+</scene>
+"""
+
+
+def test_a_half_opaque_leaf_is_half_as_bright_as_an_opaque_one(tmp_path):
+    """It was a quarter: `path` of Mitsuba 3.9.1 counts opacities twice."""
+    settings = CaptureSettings(views=1, held_out=0, resolution=8, spp=1024, max_depth=3)
+    images = []
+    for opacity in (1.0, 0.5):
+        (tmp_path / "scene.xml").write_text(HALF_OPAQUE.format(opacity))
+        out, cameras = tmp_path / f"{opacity}", front(tmp_path)
+        found = capture(
+            str(tmp_path / "scene.xml"), out, settings, cameras=cameras, tell=lambda line: None
+        )
+        assert found.render["integrator"] == "volpath"
+        images.append(read_exr(found.views[0].image))
+    opaque, half = images
+    assert opaque[..., :3].min() > 0.05
+    np.testing.assert_allclose(half.mean((0, 1)), opaque.mean((0, 1)) / 2, rtol=0.02)

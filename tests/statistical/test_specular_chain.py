@@ -15,6 +15,7 @@ from support import (
 from unbake.dataset.camera import Camera
 from unbake.transport.path_sample import lhs, rhs, trace
 from unbake.transport.path_tracer import path_traced
+from unbake.transport.prb import path_radiance, path_replay
 from unbake.transport.vertex import SceneView, find_vertex
 
 SPP = 1024
@@ -30,7 +31,7 @@ def pane(bsdf: dict, origin, target, up=(0, 0, 1), size=1.0, **more) -> dict:
     return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf, **more}
 
 
-def box(thing: dict) -> mi.Scene:
+def box(thing: dict, **others) -> mi.Scene:
     """A thing in an open box with a lamp; dark walls, so that paths are short."""
     return mi.load_dict(
         {
@@ -51,8 +52,23 @@ def box(thing: dict) -> mi.Scene:
                 emitter={"type": "area", "radiance": {"type": "rgb", "value": [6, 5, 4]}},
             ),
             "thing": thing,
+            **others,
         }
     )
+
+
+def box_of_instances(thing: dict) -> mi.Scene:
+    """The same box, whose thing stands there as two instances of a group."""
+    group = {"type": "shapegroup", "shape": thing}
+    here, there = (
+        {
+            "type": "instance",
+            "group": {"type": "ref", "id": "group"},
+            "to_world": mi.ScalarTransform4f().translate([x, 0.2, 0]).scale(0.6),
+        }
+        for x in (-0.4, 0.5)
+    )
+    return box(here, group=group, there=there)
 
 
 def ball(bsdf: dict) -> dict:
@@ -90,6 +106,18 @@ THINGS = {
 }
 
 
+def image_of_mitsuba(name: str, scene: mi.Scene, ray: mi.Ray3f) -> mi.Color3f:
+    """Radiance by a path tracer of Mitsuba: `path`, or the one inside of `prb`.
+
+    `path` of Mitsuba 3.9.1 is wrong where opacities are fractions: see `path_integrator`.
+    `test_prb.py` compares `prb` with `volpath` there.
+    """
+    if not name.startswith("half opaque"):
+        return stock_path(scene, ray, 2, max_depth=64)
+    replay = path_replay(64, 5, False)
+    return path_radiance(replay, scene, seeded(2, dr.width(ray)), ray, {})
+
+
 @pytest.mark.parametrize("name", THINGS)
 def test_series_is_the_image_of_path(name):
     scene = box(THINGS[name])
@@ -98,9 +126,20 @@ def test_series_is_the_image_of_path(name):
     # Caustics have heavy tails: with few samples a pixel's own variance is no measure of them.
     spp = 4 * SPP if name == "glass ball" else SPP
     ray = pixel_rays([CAMERA], spp, seed=1)
-    truth = stock_path(scene, ray, 2, max_depth=64)
+    truth = image_of_mitsuba(name, scene, ray)
     series = path_traced(scene_view, ray, 3, max_depth=16, rr_depth=5, hide_emitters=False)
     assert_same_expectation(series, truth, spp)
+
+
+@pytest.mark.parametrize("name", ["mirror", "cut-out", "half opaque", "half opaque gloss"])
+def test_series_is_the_image_of_path_inside_instances(name):
+    scene = box_of_instances(THINGS[name])
+    scene_view = SceneView.of(scene, None, 40)
+    assert scene_view.has_chains
+    ray = pixel_rays([CAMERA], SPP, seed=1)
+    truth = image_of_mitsuba(name, scene, ray)
+    series = path_traced(scene_view, ray, 3, max_depth=16, rr_depth=5, hide_emitters=False)
+    assert_same_expectation(series, truth, SPP)
 
 
 @pytest.mark.parametrize("name", ["coloured mirror", "glass ball", "glass pane"])

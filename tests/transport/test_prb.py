@@ -18,6 +18,7 @@ from support import (
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
+from unbake.dataset.camera import Camera
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
@@ -140,12 +141,69 @@ def test_hidden_lights_are_those_of_the_photographs(tmp_path):
     np.testing.assert_allclose(image, photographs, atol=0.1)
 
 
-# ----------------------------------------------------------------- split halves and two passes
-
-
 class Everywhere(ConstantMaterials):
     def stand_alone(self):
         self.carried = False
+
+
+# ------------------------------------------------------------------------------------ cut-outs
+
+
+def leaves(tmp_path, *, instanced):
+    """A half opaque leaf over a floor, under a lamp and a sky; and a camera that sees both."""
+    leaf = """<shape type="rectangle"><bsdf type="mask"><float name="opacity" value="0.5"/>
+      <bsdf type="twosided"><bsdf type="principled"/></bsdf></bsdf>{}</shape>"""
+    place = """<transform name="to_world"><rotate x="1" angle="25"/><scale value="0.7"/>
+      <translate z="0.6"/></transform>"""
+    group = f'<shape type="shapegroup" id="leaf">{leaf.format("")}</shape>'
+    group += f'<shape type="instance"><ref id="leaf"/>{place}</shape>'
+    floor = '<shape type="rectangle"><bsdf type="principled"/></shape>'
+    content = (group if instanced else leaf.format(place)) + floor
+    scene = LIT_OBJECT.replace('<shape type="sphere"><ref id="grey"/></shape>', content)
+    path = tmp_path / "leaves.xml"
+    path.write_text(scene)
+    return path, Camera.look_at((1.5, -2, 2), (0, 0, 0.2), (0, 0, 1), 40.0, 12, 12)
+
+
+@pytest.mark.parametrize("instanced", [False, True], ids=["shape", "instance"])
+def test_cut_outs_are_those_of_mitsubas_volumetric_path_tracer(tmp_path, instanced):
+    path, camera = leaves(tmp_path, instanced=instanced)
+    scene = mi.load_file(str(path))
+    ray = pixel_rays([camera], 1024, seed=1)
+    ours = path_radiance(path_replay(24, 5, False), scene, seeded(2, dr.width(ray)), ray, {})
+    # `volpath` does not count the surfaces that a path passes.
+    theirs = stock_path(scene, ray, 3, max_depth=12, integrator="volpath")
+    assert_same_expectation(ours, theirs, 1024)
+
+
+@pytest.mark.parametrize("instanced", [False, True], ids=["shape", "instance"])
+def test_gradients_through_cut_outs_are_finite_differences(tmp_path, instanced):
+    """Neither the material nor the cut-out samples by albedo: the same paths show its effect."""
+    path, camera = leaves(tmp_path, instanced=instanced)
+    materials = Everywhere(0.5, 0.6)
+    parsed = parse(path)
+    edit.set_textures(parsed, material_textures(materials))
+    scene = parsed.instantiate()
+    ray, integrator = pixel_rays([camera], 64, seed=1), path_replay(5, 99, False)
+
+    def mean(albedo):
+        materials.albedo = mi.Color3f(albedo)
+        dr.enable_grad(materials.albedo)
+        with materials_along_paths(materials):
+            sampler, phi = seeded(2, dr.width(ray)), {"albedo": materials.albedo}
+            loss = dr.mean(path_radiance(integrator, scene, sampler, ray, phi).y)
+            dr.backward(loss)
+        return float(loss[0]), float(dr.grad(materials.albedo).y[0])
+
+    _, gradient = mean(0.5)
+    above, below = (mean(0.5 + h)[0] for h in (0.02, -0.02))
+    difference = (above - below) / 0.04
+    print(f"{gradient:.5f}, {difference:.5f}")
+    assert difference > 0.1
+    assert gradient == pytest.approx(difference, rel=2e-3)
+
+
+# ----------------------------------------------------------------- split halves and two passes
 
 
 def test_split_halves_and_two_passes_have_one_expectation(built_in):

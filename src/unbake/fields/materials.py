@@ -13,6 +13,7 @@ from . import registry
 from .domain import Domain, SurfacePoint
 from .field import Engine, Field, FieldSpec
 from .settings import FieldSettings
+from .shapes import registry_number
 
 #: Values by the name of their quantity: linear RGB, or one number, within the quantity's bounds.
 #: Roughness is perceptual (α_GGX = roughness²).
@@ -155,11 +156,6 @@ class _Together(dr.CustomOp):
 
     def name(self):
         return "together"
-
-
-def registry_number(shape: mi.Shape) -> int:
-    """The number by which arrays of shapes refer to this one."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def make_materials(

@@ -7,7 +7,8 @@ import re
 import mitsuba as mi
 
 from ..quantities import QUANTITIES
-from .materials import Materials, read_carried, registry_number
+from .materials import Materials, read_carried
+from .shapes import met_shapes, registry_number
 
 #: By which the BSDF's parameters tell the number of its material.
 _NUMBER = "material_number"
@@ -81,24 +82,19 @@ def material_numbers(scene: mi.Scene) -> dict[int, int]:
     Returns:
         Numbers of materials by the shapes' numbers in Dr.Jit's registry.
     """
-    numbers = {registry_number(shape): _number_of(shape) for shape in _shapes(scene)}
+    numbers = {registry_number(shape): _number_of(shape) for shape in met_shapes(scene)}
     return {shape: number for shape, number in numbers.items() if number is not None}
 
 
 def painted_meshes_without_uv(scene: mi.Scene) -> list[str]:
     """The names of meshes that have textures of fields, but no texture coordinates."""
     meshes = [
-        shape for shape in _shapes(scene) if shape.is_mesh() and _number_of(shape) is not None
+        shape for shape in met_shapes(scene) if shape.is_mesh() and _number_of(shape) is not None
     ]
     bare = [mesh for mesh in meshes if not mesh.has_vertex_texcoords()]
     # Mitsuba tells the names of meshes in their printed form alone.
     names = [re.search(r'^  name = "(.*)"', str(mesh), re.MULTILINE) for mesh in bare]
     return [name[1] if name else "a mesh" for name in names]
-
-
-def _shapes(scene: mi.Scene) -> list[mi.Shape]:
-    """All shapes of a scene, those that are only seen through instances too."""
-    return [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
 
 
 def _number_of(shape: mi.Shape) -> int | None:

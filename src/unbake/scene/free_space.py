@@ -6,13 +6,14 @@ Positions, normals and directions are (n, 3) float64 arrays in world space.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..fields.shapes import placed_shapes, registry_number
 from ..transport.optimized import has_optimized_material
 
 # Fractions of the scene's diagonal.
@@ -136,20 +137,28 @@ def sample_surface(scene: mi.Scene, count: int, seed: int, power: float = 1.0) -
 
     All other surfaces are left out: see `transport/optimized.py`. The probability of a shape is
     proportional to its area to the given power: 1 samples uniformly by area, less favours small
-    shapes.
+    shapes. Each instance of a shape is one more shape; where it is stretched along one axis, points
+    inside of it are as dense as on the shape before that.
     """
     rng = np.random.default_rng(seed)
-    # Mitsuba 3.9 loads in parallel: the order of the shapes changes from run to run.
-    order = sorted(range(len(scene.shapes())), key=lambda i: _sort_key(scene.shapes()[i]))
-    shapes = [scene.shapes()[i] for i in order]
-    share = np.array([_area(shape) for shape in shapes]) ** power
+    surfaces = _surfaces(scene)
+    share = np.array([surface.area for surface in surfaces]) ** power
     if share.sum() == 0:
         return SurfacePoints(np.empty((0, 3)), np.empty((0, 3)))
-    chosen = np.sort(rng.choice(len(shapes), size=count, p=share / share.sum()))
+    chosen = np.sort(rng.choice(len(surfaces), size=count, p=share / share.sum()))
     uv = mi.Point2f(rng.random((2, count)).astype(np.float32))
-    index = mi.UInt32(np.array(order, dtype=np.uint32)[chosen])
-    sampled = dr.gather(mi.ShapePtr, scene.shapes_dr(), index).sample_position(0.0, uv)
-    return SurfacePoints(_as_rows(sampled.p), _as_rows(sampled.n))
+    numbers = np.array([surface.number for surface in surfaces], np.uint32)[chosen]
+    shapes = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(numbers))
+    # A symbolic call asks all shapes there are, and those called `Instance` cannot be sampled.
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, False):
+        sampled = shapes.sample_position(0.0, uv)
+        position, normal = _as_rows(sampled.p), _as_rows(sampled.n)
+    for i in (i for i in np.unique(chosen) if surfaces[i].instanced):
+        here = chosen == i
+        position[here] = surfaces[i].moved(position[here])
+        turned = surfaces[i].turned(normal[here])
+        normal[here] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    return SurfacePoints(position, normal)
 
 
 def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
@@ -301,15 +310,59 @@ def _matrix(sensor: mi.Sensor) -> np.ndarray:
     return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
 
 
-def _sort_key(shape: mi.Shape) -> tuple[float, ...]:
-    """Bounding box and area: a key that does not depend on the order of a scene's shapes."""
-    box = shape.bbox()
-    corners = np.concatenate([np.array(box.min).ravel(), np.array(box.max).ravel()])
-    return (*corners.tolist(), float(np.asarray(shape.surface_area()).ravel()[0]))
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A shape as it is placed in a scene."""
+
+    number: int  # in Dr.Jit's registry
+    matrix: np.ndarray  # (4, 4), local to world space: of the instance
+    corners: np.ndarray  # (2, 3), of the bounding box
+    area: float  # zero if its material is not optimized
+    instanced: bool
+
+    def sort_key(self) -> tuple[float, ...]:
+        """Bounding box and area: a key that does not depend on the order of a scene's shapes."""
+        return (*self.corners.ravel().tolist(), self.area)
+
+    def moved(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) in world space."""
+        return points @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+
+    def turned(self, normals: np.ndarray) -> np.ndarray:
+        """Normals (n, 3) in world space; their lengths tell how much areas grow."""
+        linear = self.matrix[:3, :3]
+        return abs(np.linalg.det(linear)) * normals @ np.linalg.inv(linear)
+
+
+def _surfaces(scene: mi.Scene) -> list[_Surface]:
+    """All shapes as often as they are placed, in an order that is the same in every run.
+
+    Mitsuba 3.9 loads in parallel: the order of a scene's shapes changes from run to run.
+    """
+    surfaces, normals = [], {}
+    for placed in placed_shapes(scene):
+        shape, box, area = placed.shape, placed.shape.bbox(), _area(placed.shape)
+        corners = np.array([np.array(box.min).ravel(), np.array(box.max).ravel()])
+        number = registry_number(shape)
+        if placed.to_world is None:
+            surfaces.append(_Surface(number, np.eye(4), corners, area, instanced=False))
+            continue
+        surface = _Surface(number, placed.to_world, corners, area, instanced=True)
+        if area and number not in normals:
+            uv = mi.Point2f(np.random.default_rng(0).random((2, 256)).astype(np.float32))
+            normals[number] = _as_rows(shape.sample_position(0.0, uv).n)
+        if area:
+            area *= float(np.linalg.norm(surface.turned(normals[number]), axis=1).mean())
+        ends = surface.moved(
+            np.array([corners[(i, j, k), range(3)] for i, j, k in np.ndindex(2, 2, 2)])
+        )
+        around = np.array([ends.min(0), ends.max(0)])
+        surfaces.append(replace(surface, corners=around, area=area))
+    return sorted(surfaces, key=_Surface.sort_key)
 
 
 def _area(shape: mi.Shape) -> float:
-    """The shape's area; zero if its material is not optimized."""
+    """The shape's own area; zero if its material is not optimized."""
     if not has_optimized_material(shape):
         return 0.0
     return float(np.asarray(shape.surface_area()).ravel()[0])

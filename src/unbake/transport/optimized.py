@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..fields.materials import registry_number
+from ..fields.shapes import met_shapes, registry_number
 
 
 def has_optimized_material(shape: mi.Shape) -> bool:
@@ -24,5 +24,5 @@ def optimized_shapes(scene: mi.Scene) -> frozenset[int]:
 
     Shapes of groups, which rays meet through instances, are among them.
     """
-    shapes = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape))
-    return frozenset(registry_number(shape) for shape in shapes if has_optimized_material(shape))
+    shapes = filter(has_optimized_material, met_shapes(scene))
+    return frozenset(registry_number(shape) for shape in shapes)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, fields, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..fields.materials import Materials, registry_number
+from ..fields.materials import Materials
+from ..fields.shapes import met_shapes, registry_number
 from .optimized import optimized_shapes
 
 
@@ -37,10 +38,11 @@ class SceneView:
 
     @staticmethod
     def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> SceneView:
-        """The view of a scene; looks at every BSDF once."""
-        flags = [int(shape.bsdf().flags()) for shape in scene.shapes() if shape.bsdf() is not None]
+        """The view of a scene; looks at every BSDF once, also at those inside of instances."""
+        shapes = met_shapes(scene)
+        flags = [int(shape.bsdf().flags()) for shape in shapes if shape.bsdf() is not None]
         chains = any(not f & int(mi.BSDFFlags.Smooth) or f & int(mi.BSDFFlags.Null) for f in flags)
-        area_emitters = any(shape.emitter() is not None for shape in scene.shapes())
+        area_emitters = any(shape.emitter() is not None for shape in shapes)
         optimized = optimized_shapes(scene)
         return SceneView(scene, materials, max_specular, chains, area_emitters, optimized)
 
