@@ -17,13 +17,12 @@ from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..fields.shapes import met_shapes
 from ..imaging.pictures import write_exr
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import parse, write
 from ..transport.light_by_depth import light_by_depth
-from ..transport.render import parts_of, render_materials
+from ..transport.render import parts_of, path_integrator, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
 from .placement import coverage, is_room, place
@@ -180,17 +179,6 @@ def _cameras(
     if not any(split == "train" for split, _ in posed):
         raise UserError("no training view", where=file, remedy="Ask for at least one with --views")
     return posed
-
-
-def path_integrator(scene: mi.Scene) -> str:
-    """The name of Mitsuba's path tracer for a scene: `path`, or `volpath` if it has cut-outs.
-
-    Where a cut-out's opacity is a fraction, `path` of Mitsuba 3.9.1 multiplies the light of emitter
-    sampling by it twice: a leaf of opacity 0.5 is half as bright as it should be.
-    """
-    found = [int(shape.bsdf().flags()) for shape in met_shapes(scene) if shape.bsdf() is not None]
-    cut_out = int(mi.BSDFFlags.Null)
-    return "volpath" if any(f & cut_out and f & int(mi.BSDFFlags.Smooth) for f in found) else "path"
 
 
 def _photographs(

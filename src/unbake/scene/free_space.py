@@ -15,6 +15,7 @@ import numpy as np
 
 from ..fields.shapes import placed_shapes, registry_number
 from ..transport.optimized import has_optimized_material
+from ..transport.render import path_integrator
 
 # Fractions of the scene's diagonal.
 CLEARANCE = 0.03
@@ -126,7 +127,7 @@ def outgoing_radiance(
     length = np.maximum(np.linalg.norm(segment, axis=1, keepdims=True), 1e-12)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, len(eyes))
-    integrator = mi.load_dict({"type": "path", "max_depth": depth})
+    integrator = mi.load_dict({"type": path_integrator(scene), "max_depth": depth})
     ray = mi.RayDifferential3f(_ray(eyes, segment / length))
     colour, _, _ = integrator.sample(scene, sampler, ray)
     return np.array(colour, dtype=np.float64).mean(axis=0)
