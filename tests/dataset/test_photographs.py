@@ -1,5 +1,6 @@
 """Photographs: the same in memory and in a mapped file, which is made once and never stale."""
 
+import json
 import os
 
 import mitsuba as mi
@@ -8,10 +9,11 @@ import pytest
 
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
-from unbake.dataset.photographs import Photographs
+from unbake.dataset.photographs import DARKEST_BLUR, Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
+from unbake.transport.loss import RelativeL2
 
 WIDTH, HEIGHT = 7, 5
 
@@ -63,7 +65,8 @@ def test_pixels_are_those_of_the_images(dataset, background, where, monkeypatch)
     assert found.mean == pytest.approx(truth[counted, :3].mean(), rel=1e-5)
     # The blurred photographs, far from their edges
     first = truth[: WIDTH * HEIGHT, :3].reshape(HEIGHT, WIDTH, 3)
-    expected = first[0:5, 1:6].mean((0, 1))
+    mask = counted[: WIDTH * HEIGHT].reshape(HEIGHT, WIDTH)[0:5, 1:6]
+    expected = np.maximum(first[0:5, 1:6][mask].mean(0), first[2, 3] / 4)
     np.testing.assert_allclose(found.table[2 * WIDTH + 3, 3:], expected, rtol=1e-5)
 
 
@@ -109,6 +112,54 @@ def test_a_blurred_copy_is_made_only_where_it_is_asked_for(dataset, where, monke
         np.testing.assert_array_equal(a, b)
 
 
+def one_view(rgb, alpha, *, foreground_only):
+    height, width = alpha.shape
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, width, height)
+    rgb = np.repeat(np.asarray(rgb, np.float32).reshape(-1, 1), 3, 1)
+    return Photographs.of([camera], rgb, alpha.ravel(), foreground_only=foreground_only)
+
+
+def weights(found, epsilon=0.001):
+    """What pixels weigh in the relative loss, and what they do relative to themselves."""
+    own, smoothed = (mi.Color3f(np.ascontiguousarray(x.T)) for x in np.split(found.table, 2, 1))
+    pair = RelativeL2(epsilon, smoothed).weight(own), RelativeL2(epsilon).weight(own)
+    return [np.array(w)[0] for w in pair]
+
+
+def test_the_blur_stays_within_the_foreground():
+    """Across the edge of a disc, and of a single pixel, it would mix in the black background."""
+    y, x = np.mgrid[:16, :16]
+    disc = (x - 8) ** 2 + (y - 8) ** 2 < 25
+    disc[1, 1] = True
+    found = one_view(np.where(disc, 3.0, 0.0), disc.astype(np.float32), foreground_only=True)
+    np.testing.assert_allclose(found.table[disc.ravel(), 3:], 3, rtol=1e-6)
+    smoothed, itself = weights(found)
+    np.testing.assert_allclose(smoothed[disc.ravel()], itself[disc.ravel()], rtol=1e-5)
+    # Where black pixels are trained on, too, they count.
+    visible = one_view(np.where(disc, 3.0, 0.0), disc.astype(np.float32), foreground_only=False)
+    assert visible.table[17, 3] == pytest.approx(3 / 4, rel=1e-5)
+
+
+@pytest.mark.parametrize("foreground_only", [False, True])
+def test_a_firefly_weighs_little_more_than_relative_to_itself(foreground_only):
+    image, alpha = np.full((16, 16), 0.02), np.ones((16, 16), np.float32)
+    image[5, 6] = 20.0
+    smoothed, itself = weights(one_view(image, alpha, foreground_only=foreground_only))
+    assert (smoothed / itself).max() == pytest.approx(DARKEST_BLUR**-2, rel=1e-3)
+    far = np.ones((16, 16), bool)
+    far[3:8, 4:9] = False
+    np.testing.assert_allclose(smoothed[far.ravel()], itself[far.ravel()], rtol=1e-5)
+
+
+def test_without_background_and_outliers_the_blur_is_the_plain_mean():
+    image = np.random.default_rng(2).uniform(0.5, 1.5, (12, 10)).astype(np.float32)
+    found = one_view(image, np.ones((12, 10)), foreground_only=True)
+    padded = np.pad(np.stack([image] * 3, -1), ((2, 2), (2, 2), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), (0, 1))
+    plain = windows.mean((-2, -1), dtype=np.float32).reshape(-1, 3)
+    np.testing.assert_array_equal(found.table[:, 3:], plain)
+
+
 def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_both(
     dataset, on_disk, monkeypatch
 ):
@@ -140,7 +191,7 @@ def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
 
 @pytest.mark.parametrize(
     "change",
-    ["another image", "clipped", "interrupted", "damaged key", "odd key", "cut table"],
+    ["another image", "clipped", "interrupted", "damaged key", "odd key", "cut table", "old blur"],
 )
 def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch, change):
     made = dataset()
@@ -156,6 +207,10 @@ def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch,
         (made.folder / ".cache" / "key.json").write_text("{")
     elif change == "odd key":
         (made.folder / ".cache" / "key.json").write_text("[]")
+    elif change == "old blur":
+        key = json.loads((made.folder / ".cache" / "key.json").read_text())
+        del key["key"]["blur"]
+        (made.folder / ".cache" / "key.json").write_text(json.dumps(key))
     elif change == "cut table":
         os.truncate(made.folder / ".cache" / "photographs.npy", 40)
     read = []

@@ -21,6 +21,13 @@ from .views import Dataset, View, read_image
 IN_MEMORY = 512 << 20
 #: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
 _COLUMNS, _WITH_BLURRED = 3, 6
+#: Half the edge of the blur, in pixels.
+_RADIUS = 2
+#: Blurred photographs are no darker than this share of the photograph, so that no pixel weighs
+#: more than 1 / share² = 16 times as much in the relative loss as it does relative to itself. The
+#: blur is there against noise, and noise does not make a pixel four times as bright as the mean
+#: around it. A brighter one is a firefly, which weighed up to 25² = 625 times as much.
+DARKEST_BLUR = 0.25
 
 
 @final
@@ -30,7 +37,7 @@ class Photographs:
 
     Args:
         table: float32, shape (pixels, 3): radiance; or (pixels, 6): radiance, and radiance blurred
-            over 5 x 5 pixels.
+            over those of 5 x 5 pixels that can be trained on, no darker than `DARKEST_BLUR` of it.
         chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
             background pixels say nothing about the scene and only those with alpha > 0 are taken
             (the paper: at least half of them).
@@ -123,7 +130,8 @@ def _fill(
         rgb, foreground = pixels[:, :3], pixels[:, 3] > 0
         table[start:stop, :3] = rgb
         if table.shape[1] == _WITH_BLURRED:
-            table[start:stop, 3:] = _blurred(rgb.reshape(camera.height, camera.width, 3))
+            counts = foreground if foreground_only else np.ones_like(foreground)
+            table[start:stop, 3:] = _blurred(rgb, counts, camera)
         counted = rgb[foreground] if foreground_only else rgb
         total += float(counted.sum(dtype=np.float64))
         if foreground_only:
@@ -134,11 +142,26 @@ def _fill(
     return Photographs(table, chosen, total / max(3 * count, 1))
 
 
-def _blurred(image: np.ndarray, radius: int = 2) -> np.ndarray:
-    """Every pixel the mean of the (2 radius + 1)² pixels around it; shape (pixels, 3)."""
-    padded = np.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * radius + 1,) * 2, (0, 1))
-    return windows.mean((-2, -1), dtype=np.float32).reshape(-1, 3)
+def _blurred(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarray:
+    """The mean of those of the 5 x 5 pixels around each one that count; itself where none does.
+
+    Args:
+        rgb: of one view, shape (pixels, 3).
+        counts: whether a pixel counts, shape (pixels,). Background that is hidden is black, and
+            says nothing about the noise of the foreground.
+    """
+    weight = counts.astype(np.float32)[:, None]
+    share = _window_means(weight, camera)
+    blurred = _window_means(rgb * weight, camera) / np.where(share > 0, share, 1)
+    return np.maximum(np.where(share > 0, blurred, rgb), DARKEST_BLUR * rgb)
+
+
+def _window_means(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """The mean of 5 x 5 pixels around each one, edges repeated; shape (pixels, channels)."""
+    image = pixels.reshape(camera.height, camera.width, -1)
+    padded = np.pad(image, ((_RADIUS, _RADIUS), (_RADIUS, _RADIUS), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * _RADIUS + 1,) * 2, (0, 1))
+    return windows.mean((-2, -1), dtype=np.float32).reshape(len(pixels), -1)
 
 
 # ------------------------------------------------------------------------------- The mapped file
@@ -160,6 +183,8 @@ def _cached(
         "columns": columns,
         "clip_negative": clip_negative,
         "foreground_only": hidden,
+        # What the blurred copy is; files that do not say it blurred across the foreground's edge.
+        "blur": {"radius": _RADIUS, "darkest": DARKEST_BLUR, "within": "pixels to train on"},
     }
     found = _open_cache(data, key)
     if found is None and columns < _WITH_BLURRED:
