@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from .training.checkpoint import Progress as Progress
     from .training.checkpoint import load_checkpoint as load_checkpoint
     from .training.checkpoint import save_checkpoint as save_checkpoint
+    from .training.defaults import with_defaults as with_defaults
     from .training.loop import fit as fit
     from .training.path_depth import with_path_depth as with_path_depth
     from .training.problem import Problem as Problem
@@ -156,6 +157,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "transport.vertex": ("SceneView", "Vertex"),
     # The parts of a training loop.
     "training.checkpoint": ("Progress", "load_checkpoint", "save_checkpoint"),
+    "training.defaults": ("with_defaults",),
     "training.path_depth": ("with_path_depth",),
     "training.problem": ("Problem", "make_problem", "training_pixels"),
     "training.run_folder": ("Origin", "RunFolder"),

@@ -64,6 +64,15 @@ def test_rates_of_the_unknowns_rise_while_that_of_the_radiance_does_not():
             assert rate == pytest.approx(share * full[name]), (step, name)
 
 
+def test_rates_of_the_unknowns_are_multiples_of_the_fields_own():
+    factors = {"albedo": 2.5, "roughness": 0.4, "environment": 6.25}
+    plain, scaled = (
+        learning_rates(config, 9, 0.5) for config in (STEADY, changed(rate_factors=factors))
+    )
+    for name, rate in plain.items():
+        assert scaled[name] == pytest.approx(factors.get(name, 1.0) * rate), name
+
+
 @pytest.mark.parametrize(
     ("settings", "albedo", "roughness", "radiance"),
     [

@@ -25,7 +25,7 @@ from .options import (
     Experiment,
     File,
     Flag,
-    Folder,
+    Folders,
     Methods,
     Preset,
     Run,
@@ -246,35 +246,52 @@ def compare(
 
 
 def bench(
-    what: Positional[Literal["step", "methods"]] = "step",
+    what: Positional[Literal["step", "methods", "rates"]] = "step",
     /,
-    data: Folder = None,
+    data: Folders = (),
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None,
     methods: Annotated[tuple[str, ...], arg(metavar="METHODS")] = ("ours",),
-    steps: int = 100,
+    steps: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
+    seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
     preset: Preset = None,
     settings: File = None,
     out: File = None,
 ) -> None:
-    """Measure the training step: samples a second, and where the time goes.
+    """Measure the training step: samples a second, and where the time goes. Or search for rates.
 
     step takes one method apart; methods measures several side by side, their steps in turn.
 
+    rates searches the learning rates of each method on each data set, and the estimator of those
+    that follow paths, by fits that are scored on held-out views. The same command goes on after the
+    fits that --out has.
+
     Args:
         what: What to measure.
-        data: Folder of a data set.
+        data: Folder of a data set; rates takes several.
         scene: Without --data: a scene to render a small data set of (default: demo).
         methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
             prb:bitmap prb:bitmap:split-halves.
-        steps: Steps to take the median of, after warm-up.
+        steps: Steps to take the median of, after warm-up (default: 100). For rates, the length of a
+            fit (default: as in the settings).
+        seconds: For rates, the length of a fit in seconds of training, instead of steps.
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code).
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
-    require("steps", steps, 10)
-    if data is not None:
+    if data:
         exclude("data", {"scene": scene})
     chosen = chosen_settings(preset, settings)
+    if what == "rates":
+        length = {"steps": steps, "seconds": seconds}
+        chosen = with_length(chosen, {k: v for k, v in length.items() if v is not None})
+        _bench_rates(data, methods, chosen, out)
+        return
+    if seconds is not None:
+        raise UserError("is an option of rates", "--seconds")
+    if len(data) > 1:
+        raise UserError(f"{what} takes one data set", "--data", "Or: unbake bench rates")
+    steps = 100 if steps is None else steps
+    require("steps", steps, 10)
     backend.activate()
     from ..comparison.bench_methods import bench_methods
     from ..comparison.method_variant import MethodVariant
@@ -284,11 +301,29 @@ def bench(
     if what == "step" and len(variants) != 1:
         raise UserError("step takes one method", "--methods", "Or: unbake bench methods")
     console = Console(highlight=False)
-    with small_data(data, scene or "demo") as folder:
+    with small_data(next(iter(data), None), scene or "demo") as folder:
         if what == "step":
             bench_step(folder, variants[0].settings(chosen), steps, out, console)
         else:
             bench_methods(folder, variants, chosen, steps, out, console)
+
+
+def _bench_rates(
+    data: tuple[Path, ...], methods: tuple[str, ...], chosen: FitConfig, out: Path | None
+) -> None:
+    for option, value in {"data": data, "out": out}.items():
+        if not value:
+            raise UserError("is needed for rates", f"--{option}")
+    if not chosen.steps and not chosen.seconds:
+        raise UserError("must be 1 or more, not 0", "--steps")
+    backend.activate()
+    from ..comparison.bench_rates import bench_rates
+    from ..comparison.method_variant import MethodVariant
+
+    assert out is not None
+    variants = [MethodVariant.of(method) for method in methods]
+    bench_rates(data, variants, chosen, out, Console(highlight=False))
+    _say(f"wrote {out}")
 
 
 def reproduce(

@@ -21,7 +21,7 @@ Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 #: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
-Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
+Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
 Preset = Annotated[
     config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
 ]

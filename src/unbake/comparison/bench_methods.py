@@ -16,8 +16,8 @@ from ..errors import UserError
 from ..evaluation.evaluate import description
 from ..io import write_json
 from ..machine import machine
+from ..training.defaults import with_defaults
 from ..training.fresh_fit import begin_fit
-from ..training.path_depth import with_path_depth
 from ..training.schedule import learning_rates
 from .method_variant import MethodVariant
 from .tables import print_step_times
@@ -55,8 +55,7 @@ def bench_methods(
     Paper: Sec. 6.2, Fig. 3.
     """
     dataset = Dataset.load(data)
-    shared = with_path_depth(shared, dataset)
-    configs = [variant.settings(shared) for variant in variants]
+    configs = [with_defaults(variant.settings(shared), dataset) for variant in variants]
     seconds: list[list[float]] = [[] for _ in configs]
     errors: dict[int, UserError] = {}
     for turn in range(TURNS):

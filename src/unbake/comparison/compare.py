@@ -21,6 +21,7 @@ from ..io import write_json
 from ..machine import machine
 from ..report.page import write_report
 from ..training.checkpoint import Progress
+from ..training.defaults import with_defaults
 from ..training.loop import fit
 from ..training.path_depth import with_path_depth
 from ..training.run_folder import RunFolder
@@ -96,14 +97,17 @@ def compare(
     """
     console = console or Console(highlight=False)
     data, out = Path(data), Path(out)
-    config = with_path_depth(config, Dataset.load(data))
-    chosen = {variant.name: variant.settings(config) for variant in variants}
-    if len(chosen) < len(variants) or not chosen:
-        what = "a method is given twice" if chosen else "no method given"
+    names = [variant.name for variant in variants]
+    if len(set(names)) < len(names) or not names:
+        what = "a method is given twice" if names else "no method given"
         raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
-    if UNTRAINED in chosen:
+    if UNTRAINED in names:
         raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
-    untrained = replace(_CHEAPEST.settings(config), steps=0, seconds=0.0, score_seconds=0.0)
+    dataset = Dataset.load(data)
+    config = with_path_depth(config, dataset)
+    chosen = {v.name: with_defaults(v.settings(config), dataset) for v in variants}
+    untrained = with_defaults(_CHEAPEST.settings(config), dataset)
+    untrained = replace(untrained, steps=0, seconds=0.0, score_seconds=0.0)
     fits = {UNTRAINED: untrained, **chosen}
     for name, settings in {**chosen, **fits}.items():
         _check_kept(RunFolder(out / name), settings, data)

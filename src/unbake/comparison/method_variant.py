@@ -53,9 +53,15 @@ class MethodVariant:
         return "-".join(filter(None, (self.method, self.representation, self.estimator)))
 
     def settings(self, shared: FitConfig) -> FitConfig:
-        """The shared settings with this method, without the options that it does not take."""
+        """The shared settings with this method, without the options that it does not take.
+
+        Factors of learning rates are of one method: another one has its own, which a fit chooses
+        when it starts.
+        """
         takes_options = method_named(self.method).takes_options
         own = shared if takes_options else replace(shared, bounces=1, prior="extra-bounce")
         representation = self.representation or shared.representation
         estimator = self.estimator or shared.estimator
+        if self.method != shared.method:
+            own = replace(own, rate_factors={})
         return replace(own, method=self.method, representation=representation, estimator=estimator)

@@ -35,6 +35,20 @@ def print_step_times(rows: list[Row], console: Console) -> None:
     console.print(table)
 
 
+def print_rates(searches: list[Row], console: Console) -> None:
+    """Print the best trials of `unbake bench rates`, beside the fields' own rates."""
+    table = _table("data", "method", "best", title="Mean PSNR in dB, and multiples of the rates")
+    _add_numbers(table, "trials", "untrained", "own rates", "best")
+    for search in searches:
+        best, trials = search["best"], search["trials"]
+        rates = [f"{name} {by:g}" for name, by in best["factors"].items()]
+        chosen = "\n".join([*rates, best["estimator"]])
+        scores = search["untrained"]["score"], trials[0]["score"], best["score"]
+        numbers = (_number(score, 2) for score in scores)
+        table.add_row(search["data"], search["method"], chosen, str(len(trials)), *numbers)
+    console.print(table)
+
+
 def _print_quality(rows: dict[str, Row], console: Console) -> None:
     evaluated = [row["heldout"] for row in rows.values() if "heldout" in row]
     materials = [q for q in QUANTITIES if any(f"{q}_psnr" in means for means in evaluated)]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from ..errors import UserError, require
+from ..errors import UserError, require, require_name
 from ..fields.registry import representation, representations
 from ..fields.settings import FieldSettings, require_rate
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
@@ -109,6 +109,9 @@ class RegularizationConfig:
             value = getattr(self, name)
             require(math.isfinite(value) and value > 0, name, "positive", value)
 
+
+#: What a fit can recover, each with a learning rate of its own.
+UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
 #: Bounces that can be differentiated before the radiance field takes over.
 MOST_BOUNCES = 16
@@ -213,8 +216,13 @@ class FitConfig:
     radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
 
     final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)
-    warm_up: int = 100  #: steps over which the materials' rate rises, so that L_θ stays ahead
-    estimator: Estimator = "auto"  #: unbiased squared error (Sec. 5.2); see `halves`
+    #: Multiples of the fields' learning rates, by unknown. None: what was found best for the method
+    #: and the kind of scene (`method_defaults.py`; ours); a run that was started has numbers.
+    rate_factors: Mapping[str, float | None] = field(default_factory=dict)
+    #: Steps over which the unknowns' rates rise, so that L_θ stays ahead; none without L_θ (ours).
+    warm_up: int = 100
+    #: Unbiased squared error (Sec. 5.2). auto: what was found best for the method; see `halves`.
+    estimator: Estimator = "auto"
     loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)
     loss_epsilon: float = 0.001  #: added to the denominator of the relative L2 loss (release: 0.01)
 
@@ -291,11 +299,18 @@ class FitConfig:
             for name in [*QUANTITIES, *self.materials]
             if quantity(name)
         }
+        factors = dict(self.rate_factors)
+        for name, factor in factors.items():
+            require_name(name, UNKNOWNS, "unknown", "rate_factors")
+            good = factor is None or (math.isfinite(factor) and factor > 0)
+            require(good, f"rate_factors.{name}", "a positive number", factor)
+        factors = {name: factors.get(name) for name in UNKNOWNS}
         of_radiance = {form: representation(form).radiance for form in representations()}
         radiance = _completed(self.radiance, {f: s for f, s in of_radiance.items() if s})
         # Frozen: the completed settings take the place of what was given.
         for key, value in (
             ("quantities", chosen),
+            ("rate_factors", factors),
             ("materials", materials),
             ("radiance", radiance),
         ):
@@ -305,8 +320,8 @@ class FitConfig:
     def halves(self) -> bool:
         """Whether squared errors come from split halves of a pixel's samples.
 
-        With `estimator = "auto"` every method has its usual one: split halves in one pass for ours
-        and its ablations, two decorrelated passes for `ad-pt` and `prb`, as in Mitsuba.
+        With `estimator = "auto"`, as runs of earlier versions may have it, they do but for methods
+        that follow paths. A fit that starts chooses the one that was found best.
         """
         if self.estimator == "auto":
             return not self.follows_paths

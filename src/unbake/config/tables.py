@@ -16,20 +16,23 @@ from ..errors import UserError
 Settings = TypeVar("Settings")
 
 
-def update(settings: Settings, table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Settings:
+def update(
+    settings: Settings, table: Mapping[str, Any], path: tuple[str, ...] = (), values: Any = None
+) -> Settings:
     """Settings with the values of a table.
 
     Args:
-        settings: a dataclass, or dataclasses by name.
+        settings: a dataclass, or dataclasses or values by name.
         table: nested as the settings are; what is absent stays.
         path: keys that lead to the table, for errors.
+        values: type of the values by name.
 
     Raises:
         UserError: a key is unknown, or a value has the wrong type or range.
     """
     if isinstance(settings, Mapping):
         current = dict(settings)
-        hints = dict.fromkeys(current)
+        hints = dict.fromkeys(current, values)
     else:
         hints = typing.get_type_hints(type(settings))
         current = {key: getattr(settings, key) for key in hints}
@@ -43,7 +46,8 @@ def update(settings: Settings, table: Mapping[str, Any], path: tuple[str, ...] =
         if dataclasses.is_dataclass(current[key]) or isinstance(current[key], Mapping):
             if not isinstance(value, Mapping):
                 raise UserError("must be a table", where=dotted)
-            changes[key] = update(current[key], value, here)
+            _, inner = typing.get_args(hints[key]) or (None, None)
+            changes[key] = update(current[key], value, here, inner)
         else:
             changes[key] = typed(value, hints[key], dotted)
     if isinstance(settings, Mapping):

@@ -14,6 +14,7 @@ import numpy as np
 
 from unbake.dataset.camera import Camera, camera_from_frame, read_split
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
+from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError
 from unbake.io import text
 from unbake.quantities import QUANTITIES
@@ -82,6 +83,11 @@ class Dataset:
         """The share of the light that paths of at most this depth carry; None if unknown."""
         shares = self.light_by_depth
         return shares[min(depth, len(shares)) - 1] if shares else None
+
+    @property
+    def kind(self) -> SceneKind:
+        """The kind of scene."""
+        return scene_kind(self.background)
 
     @property
     def train(self) -> tuple[View, ...]:

@@ -19,7 +19,7 @@ from ..quantities import QUANTITIES
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
-from ..transport.objective import requirements
+from ..transport.objective import has_radiance
 from ..transport.render import render_radiance
 from . import lighting
 from .settings import EvaluationSettings
@@ -108,7 +108,7 @@ def description(config: FitConfig) -> dict:
     `representation` is that of the materials, None if they are known; `radiance` is that of L_θ,
     None if the method has no radiance field; `path_depth` is that of methods that follow paths.
     """
-    cached = requirements(config.chosen_method.terms).radiance
+    cached = has_radiance(config.chosen_method)
     return {
         "unknown": config.unknown,
         "quantities": list(config.quantities) if config.learns_materials else [],

@@ -25,7 +25,6 @@ from ..io import write_json
 from ..machine import machine
 from ..training.fresh_fit import begin_fit
 from ..training.memory import memory_mb
-from ..training.path_depth import with_path_depth
 from ..training.schedule import learning_rates
 from ..training.state import State
 from ..training.step import TrainingStep
@@ -76,8 +75,8 @@ def bench_step(
         The content of the file.
     """
     dataset = Dataset.load(data)
-    config = with_path_depth(config, dataset)
     fit = begin_fit(dataset, config)
+    config = fit.config
     result = {"machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(fit.step, fit.state, config, steps)

@@ -19,6 +19,7 @@ from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
+from .defaults import with_defaults
 from .memory import memory_mb
 from .monitor import Monitor
 from .path_depth import told_depth, with_path_depth
@@ -75,7 +76,7 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     else:
         folder.require_new()
     dataset = Dataset.load(data)
-    config = with_path_depth(config, dataset)
+    config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = clip_negative or (resume and folder.origin().clip_negative)
     pixels = training_pixels(
         dataset, clip_negative=clip_negative, smoothed=config.loss_reference == "smoothed"

@@ -26,7 +26,7 @@ from ..fields.registry import representation
 from ..fields.texture import material_numbers, material_textures
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
-from ..transport.objective import requirements
+from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 
 Parameters = Mapping[str, mi.Float | mi.TensorXf]
@@ -120,7 +120,7 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
             materials.numbers = material_numbers(loaded)
 
     radiance = None
-    if requirements(config.chosen_method.terms).radiance:
+    if has_radiance(config.chosen_method):
         radiance = make_radiance(
             config.radiance_representation,
             config.radiance_settings,

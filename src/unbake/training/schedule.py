@@ -8,10 +8,13 @@ from ..config import FitConfig
 def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float]:
     """Adam's rates, by the first word of a parameter's name; `radiance` is that of L_θ.
 
-    All decay exponentially to a fraction of where they start. Those of the unknowns first rise, so
-    that L_θ is never far behind: while it is wrong, albedo would run into its bounds.
+    All decay exponentially to a fraction of where they start. Those of the unknowns are multiples
+    of the fields' own rates, and first rise, so that L_θ is never far behind: while it is wrong,
+    albedo would run into its bounds.
 
     Args:
+        config: settings of a fit. Those that a fit was not started with have no factors and the
+            warm-up that they name; see `with_defaults`.
         step: steps taken so far.
         done: fraction of the fit that is done, [0,1].
     """
@@ -19,6 +22,8 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     rise = min(1.0, (step + 1) / (config.warm_up + 1))
     unknowns = {name: field.learning_rate for name, field in config.material_settings.items()}
     unknowns |= dict.fromkeys(("environment", "emission"), config.lighting.learning_rate)
-    return {name: rate * decay * rise for name, rate in unknowns.items()} | {
-        "radiance": config.radiance_settings.learning_rate * decay
+    rates = {
+        name: rate * (config.rate_factors[name] or 1.0) * decay * rise
+        for name, rate in unknowns.items()
     }
+    return rates | {"radiance": config.radiance_settings.learning_rate * decay}

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .loss import RelativeL2
-from .methods import Attached
+from .methods import Attached, Method
 from .path_sample import PathSample, Requirements
 from .terms import TermInputs, term_named
 
@@ -45,6 +45,15 @@ def requirements(terms: Mapping[str, Attached], bounces: int = 1) -> Requirement
         pair,
         pair_attached,
     )
+
+
+def has_radiance(method: Method) -> bool:
+    """Whether a method has an L_θ: whether one of its terms reads or trains it.
+
+    Raises:
+        UserError: a term does not exist, or lacks an edge that is attached.
+    """
+    return requirements(method.terms).radiance
 
 
 def objective(

@@ -1,0 +1,299 @@
+"""Learning rates and estimators of methods, found by fits with several of each.
+
+The file of results is the record: it is written after each trial, and the trials that it holds are
+not repeated.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, final
+
+import drjit as dr
+import numpy as np
+from rich.console import Console
+
+from ..config import FitConfig, to_toml
+from ..config.method_defaults import MethodDefaults
+from ..dataset.lighting import ROWS, true_environment
+from ..dataset.scene_kind import SceneKind
+from ..dataset.views import Dataset
+from ..errors import UserError
+from ..evaluation.lighting import recovered_emitters, relight_psnr
+from ..formats import check_format
+from ..io import read_object, write_json
+from ..machine import machine
+from ..training.defaults import with_defaults
+from ..training.fresh_fit import FreshFit, begin_fit
+from ..training.schedule import learning_rates
+from ..training.validation import Score
+from .method_variant import MethodVariant
+from .rate_search import LEAST, MARGIN, STEP, Estimator, Trial, best_trial
+from .tables import print_rates
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+#: The newest format of the file that can be read, and the one that is written.
+FORMAT = 1
+#: Camera samples a pixel of a score.
+SPP = 16
+#: Steps between looks at the clock, which wait for the machine.
+TIME_EVERY = 4
+
+DEFINITIONS = {
+    "factors": "multiples of the learning rates of the fields, by unknown",
+    "score": "mean of the numbers in dB of a trial: PSNRs of materials over all held-out views, "
+    f"PSNR of balls that are relit by the environment, -20 log10 of the relative error of lights; "
+    f"{SPP} samples a pixel",
+    "best": f"from the fields' own rates, one unknown after the other is moved by factors of "
+    f"{STEP} for as long as the score grows by {MARGIN} dB or more; then the other estimator "
+    "needs as much; and once again if anything moved",
+    "seconds": "of the steps, with the compilation of the first ones",
+}
+
+Row = dict[str, Any]
+
+
+def bench_rates(
+    data: Sequence[Path | str],
+    variants: Sequence[MethodVariant],
+    shared: FitConfig,
+    out: Path | str,
+    console: Console,
+) -> Row:
+    """Search the learning rates of methods, and the estimator of those that follow paths.
+
+    A search begins with the fields' own rates; see `best_trial`. Its trials are fits of the length
+    that the settings say, scored at their end. The same call goes on after the trials that `out`
+    has.
+
+    Args:
+        data: folders of data sets, each with true materials or light.
+        variants: the methods.
+        shared: settings of all fits. Factors of rates are not taken from there; an estimator other
+            than `auto` is not searched.
+        out: JSON file to write; searches of other methods and data sets that it has are kept.
+        console: shows progress and a table.
+
+    Returns:
+        The content of the file.
+
+    Raises:
+        UserError: a data set cannot be used or has no truth to judge by, or the file has the same
+            search with other settings.
+    """
+    out = Path(out)
+    result = _read(out)
+    datasets = [Dataset.load(Path(folder)) for folder in data]
+    if not datasets:
+        raise UserError("no data set given", "--data")
+    planned = [(d, variant) for d in datasets for variant in variants]
+    searches = [_search(result, dataset, variant, shared, out) for dataset, variant in planned]
+    for (dataset, variant), search in zip(planned, searches, strict=True):
+        _Search(dataset, variant, shared, search, result, out, console).run()
+    print_rates(searches, console)
+    return result
+
+
+def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
+    """The best rates and estimators of a file, by method and kind of scene.
+
+    Searches of other unknowns of the same method and kind belong together.
+    """
+    found: dict[str, dict[SceneKind, MethodDefaults]] = {}
+    for search in result["searches"]:
+        best, kinds = search["best"], found.setdefault(search["method"], {})
+        if best is None:
+            continue
+        before = kinds.get(search["kind"], MethodDefaults())
+        estimator = before.estimator or (best["estimator"] if search["follows_paths"] else None)
+        kinds[search["kind"]] = MethodDefaults({**before.factors, **best["factors"]}, estimator)
+    return {method: kinds for method, kinds in found.items() if kinds}
+
+
+@final
+class _Search:
+    """One method on one data set."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        variant: MethodVariant,
+        shared: FitConfig,
+        record: Row,
+        result: Row,
+        out: Path,
+        console: Console,
+    ) -> None:
+        self._dataset = dataset
+        self._config = variant.settings(shared)
+        self._record = record
+        self._result = result
+        self._out = out
+        self._console = console
+        self._name = f"{dataset.folder.name}, {variant.name}"
+
+    def run(self) -> None:
+        """Make the trials that are missing, and note the best one."""
+        config, record = self._config, self._record
+        if record["untrained"] is None:
+            record["untrained"] = _scores(begin_fit(self._dataset, config), self._dataset)
+            self._say("untrained", record["untrained"])
+        best = best_trial(_unknowns(config), _estimators(config), self._score)
+        found = self._known(best) or {}
+        if "error" in found:
+            raise UserError(found["error"], self._name)
+        record["best"] = {key: found[key] for key in ("factors", "estimator", "score")}
+        write_json(self._out, self._result, allow_nan=False)
+
+    def _score(self, trial: Trial) -> float:
+        found = self._known(trial)
+        if found is None:
+            found = self._fitted(trial)
+            self._record["trials"].append(found)
+            write_json(self._out, self._result, allow_nan=False)
+            factors = ", ".join(f"{name} x {by:g}" for name, by in trial.factors.items())
+            self._say(f"{factors}, {trial.estimator}", found)
+        return LEAST if found["score"] is None else found["score"]
+
+    def _known(self, trial: Trial) -> Row | None:
+        """The trial's line of the record."""
+        same = {"factors": trial.factors, "estimator": trial.estimator}
+        return next((row for row in self._record["trials"] if same.items() <= row.items()), None)
+
+    def _fitted(self, trial: Trial) -> Row:
+        """Fit with the settings of a trial, and score the result."""
+        described: Row = {"factors": trial.factors, "estimator": trial.estimator}
+        config = replace(self._config, rate_factors=trial.factors, estimator=trial.estimator)
+        try:
+            fit = begin_fit(self._dataset, config)
+            steps, seconds = _learn(fit)
+            scores = _scores(fit, self._dataset)
+        except UserError as error:
+            return described | {"score": None, "error": str(error)}
+        finally:
+            gc.collect()
+            dr.flush_malloc_cache()
+        return described | scores | {"steps": steps, "seconds": seconds, "machine": machine()}
+
+    def _say(self, what: str, row: Row) -> None:
+        values = [f"{k} {'—' if v is None else f'{v:.2f}'}" for k, v in row.items() if _is_score(k)]
+        text = row.get("error") or ", ".join(values)
+        line = f"{self._name}: {what}: {text}"
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _is_score(key: str) -> bool:
+    return key == "score" or key.endswith(("_psnr", "_db"))
+
+
+def _read(out: Path) -> Row:
+    """The record so far."""
+    if not out.exists():
+        return {"format": FORMAT, "definitions": DEFINITIONS, "searches": []}
+    result = read_object(out)
+    check_format(result, FORMAT, out)
+    if not isinstance(result.get("searches"), list):
+        raise UserError("no record of searches", out, "Give another --out")
+    return result
+
+
+def _search(
+    result: Row, dataset: Dataset, variant: MethodVariant, shared: FitConfig, out: Path
+) -> Row:
+    """The search of a method on a data set in the record; a new one if there is none."""
+    config = with_defaults(variant.settings(shared), dataset)
+    if not _unknowns(config):
+        raise UserError("nothing is unknown", "unknown")
+    settings = tomllib.loads(to_toml(config))
+    del settings["rate_factors"], settings["estimator"]
+    camera = dataset.train[0].camera
+    described: Row = {
+        "method": variant.name,
+        "data": dataset.folder.name,
+        "kind": dataset.kind,
+        "unknown": config.unknown,
+        "views": len(dataset.train),
+        "heldout": len(dataset.heldout),
+        "resolution": [camera.width, camera.height],
+        "follows_paths": config.follows_paths,
+        "seed": config.seed,
+        "settings": settings,
+    }
+    same = ("method", "data", "unknown")
+    for search in result["searches"]:
+        if all(search[key] == described[key] for key in same):
+            other = [key for key, value in described.items() if search[key] != value]
+            if "settings" in other:
+                other += [k for k, v in settings.items() if search["settings"].get(k) != v]
+            if other:
+                what = f"the search of {variant.name} in this file differs in {', '.join(other)}"
+                raise UserError(what, out, "Give another --out")
+            return search
+    search = described | {"untrained": None, "trials": [], "best": None}
+    result["searches"].append(search)
+    return search
+
+
+def _unknowns(config: FitConfig) -> list[str]:
+    """The unknowns whose rates are searched, in order: what photographs tell least of first."""
+    found = list(reversed(config.quantities)) if config.learns_materials else []
+    lights = {"environment": config.learns_environment, "emission": config.unknown == "emission"}
+    return [*found, *(name for name, learned in lights.items() if learned)]
+
+
+def _estimators(config: FitConfig) -> list[Estimator]:
+    """The estimators to choose from, the cheapest first."""
+    if config.estimator != "auto":
+        return ["split-halves" if config.halves else "two-pass"]
+    return ["split-halves", "two-pass"] if config.follows_paths else ["split-halves"]
+
+
+def _learn(fit: FreshFit) -> tuple[int, float]:
+    """Take the steps of a fit; their number, and seconds."""
+    config, step, spent = fit.config, 0, 0.0
+    start = time.perf_counter()
+    while (spent < config.seconds) if config.seconds else (step < config.steps):
+        done = spent / config.seconds if config.seconds else step / config.steps
+        fit.step(fit.state, step, learning_rates(config, step, done))
+        step += 1
+        if step % TIME_EVERY == 0 or step == config.steps:
+            dr.sync_thread()
+            spent = time.perf_counter() - start
+    return step, round(spent, 2)
+
+
+def _scores(fit: FreshFit, dataset: Dataset) -> Row:
+    """How near the unknowns are to the truth, in dB, and `score`, the mean of that.
+
+    Raises:
+        UserError: there is no truth to compare with.
+    """
+    problem, values = fit.problem, {}
+    fit.state.publish(problem)
+    if problem.materials is not None:
+        score = Score(problem, dataset.heldout).measure(SPP)
+        values |= {key: value for key, value in score.items() if key != "views"}
+    if problem.environment is not None:
+        truth = true_environment(dataset.folder)
+        found = problem.environment.to_latlong(ROWS)
+        values["relight_psnr"] = None if truth is None else relight_psnr(found, truth)
+    if problem.emission is not None:
+        rows = recovered_emitters(problem, dataset.folder)
+        errors = [row.emission_error for row in rows if row.emission_error is not None]
+        error = max(float(np.mean(errors)), 1e-6) if errors else None
+        values["emission_db"] = None if error is None else -20 * math.log10(error)
+    known = [value for value in values.values() if value is not None]
+    if not known:
+        what = "has no held-out view with true materials, and no true light, to judge by"
+        raise UserError(what, dataset.folder, "Capture it with `unbake capture`")
+    return values | {"score": sum(known) / len(known)}

@@ -1,0 +1,35 @@
+"""Learning rates and estimators of methods: what `unbake bench rates` found best.
+
+The table repeats `benchmarks/results/rates.json`, where the scores of all trials are; a test
+compares the two. It holds for the preset `cpu`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..dataset.scene_kind import SceneKind
+
+
+@dataclass(frozen=True)
+class MethodDefaults:
+    """What a method uses where the settings do not say.
+
+    Args:
+        factors: by unknown, multiples of the learning rate of its field; 1 where absent.
+        estimator: of gradients; None: split halves, or two passes for methods that follow paths.
+    """
+
+    factors: Mapping[str, float] = field(default_factory=dict)
+    estimator: Literal["split-halves", "two-pass"] | None = None
+
+
+#: By method and kind of scene. Methods that are not listed have the fields' own rates.
+METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {}
+
+
+def method_defaults(method: str, kind: SceneKind) -> MethodDefaults:
+    """What a method uses in a kind of scene where the settings do not say."""
+    return METHOD_DEFAULTS.get(method, {}).get(kind, MethodDefaults())

@@ -1,0 +1,52 @@
+"""The settings of a new fit: what they leave to the method is filled in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ..config import FitConfig
+from ..config.method_defaults import MethodDefaults, method_defaults
+from ..dataset.scene_kind import SceneKind
+from ..dataset.views import Dataset
+from ..transport.objective import has_radiance
+from .path_depth import with_path_depth
+
+
+def with_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
+    """The settings of a new fit, with what they leave to the method and to the data set.
+
+    Raises:
+        UserError: the method has a term that does not exist.
+    """
+    return with_method_defaults(with_path_depth(config, dataset), dataset.kind)
+
+
+def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
+    """The settings with the method's own learning rates, estimator and warm-up.
+
+    Factors of learning rates and an estimator that are given stay. A method without L_θ has no
+    warm-up. A run is started with these settings and its `config.toml` has them, so that it goes on
+    with the same ones, whatever a later version finds better.
+
+    Args:
+        config: settings as a user gives them; those that are complete already are returned as is.
+        kind: of the scene.
+
+    Raises:
+        UserError: the method has a term that does not exist.
+    """
+    # The factors were found with the fields and batches of this preset.
+    found = method_defaults(config.method, kind) if config.preset == "cpu" else MethodDefaults()
+    factors = {
+        name: found.factors.get(name, 1.0) if given is None else given
+        for name, given in config.rate_factors.items()
+    }
+    estimator = config.estimator
+    if estimator == "auto":
+        estimator = found.estimator or ("split-halves" if config.halves else "two-pass")
+    return replace(
+        config,
+        rate_factors=factors,
+        estimator=estimator,
+        warm_up=config.warm_up if has_radiance(config.chosen_method) else 0,
+    )

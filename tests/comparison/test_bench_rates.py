@@ -1,0 +1,168 @@
+"""`unbake bench rates`: it keeps each trial, goes on where it was stopped, and gives defaults."""
+
+import json
+import shutil
+
+import pytest
+
+from unbake.comparison import bench_rates as module
+from unbake.comparison.bench_rates import found_defaults
+from unbake.config.method_defaults import MethodDefaults
+
+
+@pytest.fixture
+def rates(unbake, cornell, tiny, tmp_path):
+    """`rates("direct")` into the file `rates.json`."""
+
+    def run(*methods, data=cornell, steps=2, extra=()):
+        return unbake("bench", "rates", "--data", data, "--methods", *methods, "--steps", steps,
+                      "--settings", tiny, "--out", tmp_path / "rates.json", *extra)  # fmt: skip
+
+    return run
+
+
+def searches(tmp_path):
+    return json.loads((tmp_path / "rates.json").read_text())["searches"]
+
+
+def test_each_rate_is_tried_and_the_best_is_noted(rates, tmp_path):
+    outcome = rates("direct")
+    assert outcome.status == 0 and outcome.err == ""
+    assert max(map(len, outcome.out.split("Mean PSNR in dB")[1].splitlines())) <= 80
+    (search,) = searches(tmp_path)
+    assert (search["method"], search["kind"], search["data"]) == ("direct", "room", "cornell")
+    assert search["settings"]["steps"] == 2 and search["settings"]["pixels"] == 64
+    trials = search["trials"]
+    assert trials[0]["factors"] == {"roughness": 1.0, "albedo": 1.0}
+    for name in ("roughness", "albedo"):
+        assert {0.4, 1.0, 2.5} <= {trial["factors"][name] for trial in trials}
+    for trial in (search["untrained"], *trials):
+        mean = (trial["albedo_psnr"] + trial["roughness_psnr"]) / 2
+        assert trial["score"] == pytest.approx(mean)
+    # Fits with other rates come to other values, all from the same start.
+    assert len({trial["score"] for trial in trials}) == len(trials)
+    assert all(t["steps"] == 2 and t["seconds"] > 0 and t["machine"]["cores"] for t in trials)
+    assert {t["estimator"] for t in trials} == {"split-halves"}
+    kept = {key: search["best"][key] for key in ("factors", "estimator", "score")}
+    assert any(kept.items() <= trial.items() for trial in trials)
+    found = found_defaults({"searches": [search]})
+    assert found == {"direct": {"room": MethodDefaults(search["best"]["factors"])}}
+
+
+def test_a_search_goes_on_with_the_trials_that_it_has(rates, tmp_path, monkeypatch):
+    plain, fitted = module._learn, []
+
+    def learn(fit):
+        if len(fitted) == 3:
+            raise KeyboardInterrupt
+        fitted.append({k: v for k, v in fit.config.rate_factors.items() if k == "albedo"})
+        return plain(fit)
+
+    monkeypatch.setattr(module, "_learn", learn)
+    assert rates("direct").status == 130
+    (stopped,) = searches(tmp_path)
+    assert len(stopped["trials"]) == 3 and stopped["best"] is None
+    assert found_defaults({"searches": [stopped]}) == {}
+    monkeypatch.setattr(module, "_learn", plain)
+    assert rates("direct").status == 0
+    (ended,) = searches(tmp_path)
+    assert ended["trials"][:3] == stopped["trials"] and ended["best"] is not None
+    # Another method is added to the file; what is complete is not repeated.
+    monkeypatch.setattr(module, "begin_fit", None)
+    assert rates("direct").status == 0
+    assert searches(tmp_path) == [ended]
+
+
+def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, monkeypatch):
+    """The cheaper one is the first, and an estimator that is asked for is the only one."""
+    made = []
+
+    def scores(fit, dataset):
+        made.append((fit.config.estimator, fit.config.rate_factors["albedo"]))
+        return {"score": 20.0 + (fit.config.estimator == "two-pass")}
+
+    monkeypatch.setattr(module, "_scores", scores)
+    monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
+    assert rates("prb").status == 0
+    (search,) = searches(tmp_path)
+    assert search["trials"][0]["estimator"] == "split-halves"
+    assert search["best"]["estimator"] == "two-pass"
+    found = found_defaults({"searches": [search]})["prb"]["room"]
+    assert found == MethodDefaults({"roughness": 1.0, "albedo": 1.0}, "two-pass")
+    made.clear()
+    assert rates("prb:neural:split-halves").status == 0
+    assert {estimator for estimator, _ in made} == {"split-halves"}
+
+
+@pytest.mark.parametrize(
+    ("unknown", "key", "name"),
+    [("lighting", "relight_psnr", "environment"), ("emission", "emission_db", "emission")],
+)
+def test_light_is_judged_too(unknown, key, name, unbake, tiny, tmp_path):
+    scene = {"lighting": "still", "emission": "cornell"}[unknown]
+    data = tmp_path / "data"
+    small = ("--views", 2, "--held-out", 1, "--resolution", 12, "--spp", 4, "--max-depth", 4)
+    assert unbake("capture", scene, "--out", data, *small).status == 0
+    settings = tmp_path / "light.toml"
+    settings.write_text(f'unknown = "{unknown}"\n[lighting]\nresolution = 8\n')
+    out = tmp_path / "rates.json"
+    words = ("--data", data, "--methods", "direct", "--settings", settings, "--out", out)
+    assert unbake("bench", "rates", *words, "--steps", 2).status == 0
+    (search,) = searches(tmp_path)
+    assert search["unknown"] == unknown and set(search["best"]["factors"]) == {name}
+    assert all(trial["score"] == trial[key] for trial in search["trials"])
+    assert {0.4, 1.0, 2.5} <= {trial["factors"][name] for trial in search["trials"]}
+
+
+def test_a_method_that_fails_is_recorded(rates, tmp_path, monkeypatch):
+    from unbake.errors import UserError
+
+    def learn(fit):
+        raise UserError("no memory for a step of 256 paths")
+
+    monkeypatch.setattr(module, "_learn", learn)
+    outcome = rates("direct")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "no memory for a step" in outcome.err
+    (search,) = searches(tmp_path)
+    assert search["best"] is None and "no memory" in search["trials"][0]["error"]
+
+
+def test_other_settings_are_not_mixed_in(rates, cornell, tmp_path):
+    assert rates("direct").status == 0
+    before = (tmp_path / "rates.json").read_bytes()
+    outcome = rates("direct", steps=3)
+    assert outcome.status == 2 and "differs in settings, steps. Give another --out" in outcome.err
+    data = shutil.copytree(cornell, tmp_path / "other" / "cornell")
+    content = json.loads((data / "transforms.json").read_text())
+    content["frames"] = [f for f in content["frames"] if f["file_path"] != "images/train_001.exr"]
+    (data / "transforms.json").write_text(json.dumps(content))
+    outcome = rates("direct", data=data)
+    assert outcome.status == 2 and "differs in views" in outcome.err
+    assert (tmp_path / "rates.json").read_bytes() == before
+
+
+def test_without_truth_there_is_nothing_to_judge_by(rates, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    shutil.rmtree(data / "truth")
+    outcome = rates("direct", data=data)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "no held-out view with true materials" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("rates", "--out", "o.json"), "--data: is needed for rates"),
+        (("rates", "--data", "x"), "--out: is needed for rates"),
+        (("rates", "--data", "x", "--out", "o", "--steps", 0), "--steps: must be 1 or more"),
+        (("rates", "--data", "x", "--out", "o", "--steps", 1, "--seconds", 1), "--steps: cannot"),
+        (("methods", "--seconds", 3), "--seconds: is an option of rates"),
+        (("step", "--data", "x", "y"), "--data: step takes one data set"),
+        (("rates", "--data", "x", "--out", "o.json"), "x: the data folder does not exist"),
+    ],
+)
+def test_a_wrong_word_is_named(words, message, unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = unbake("bench", *words)
+    assert outcome.status == 2 and outcome.err.startswith(f"error: {message}"), outcome.err

@@ -1,0 +1,150 @@
+"""What a new fit takes from its method, and what a run that was started keeps."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from support import TINY_FIT
+
+from unbake.comparison.method_variant import MethodVariant
+from unbake.config import FitConfig, from_toml, preset, read_toml, to_toml
+from unbake.config import method_defaults as module
+from unbake.config.fit import UNKNOWNS
+from unbake.config.method_defaults import MethodDefaults
+from unbake.dataset.scene_kind import scene_kind
+from unbake.dataset.views import Dataset
+from unbake.training.defaults import with_method_defaults
+from unbake.training.fresh_fit import begin_fit
+from unbake.training.run_folder import RunFolder
+from unbake.training.schedule import learning_rates
+from unbake.transport.methods import METHODS
+from unbake.transport.objective import has_radiance
+
+TABLE = {
+    "prb": {
+        "room": MethodDefaults({"roughness": 4.0, "albedo": 2.0}, "split-halves"),
+        "object": MethodDefaults({"roughness": 3.0}, "two-pass"),
+    },
+    "direct": {"room": MethodDefaults({"albedo": 0.5})},
+}
+
+
+@pytest.fixture
+def table(monkeypatch):
+    monkeypatch.setattr(module, "METHOD_DEFAULTS", TABLE)
+
+
+def defaults(method, kind="room", **settings):
+    return with_method_defaults(FitConfig(method=method, **settings), kind)
+
+
+def test_the_kind_of_scene_is_told_by_the_background(cornell):
+    assert scene_kind("visible") == "room" and scene_kind("hidden") == "object"
+    assert Dataset.load(cornell).kind == "room"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_only_methods_with_a_radiance_field_warm_up(method, cornell):
+    """Without L_θ there is nothing to wait for: the first step has the whole rate."""
+    config = replace(TINY_FIT, method=method, warm_up=100)
+    fit = begin_fit(Dataset.load(cornell), config)
+    assert (fit.problem.radiance is not None) == has_radiance(config.chosen_method)
+    first, later = (learning_rates(fit.config, step, 0.0) for step in (0, 500))
+    share = 1 / 101 if fit.problem.radiance is not None else 1.0
+    for name in ("albedo", "roughness"):
+        assert first[name] == pytest.approx(share * later[name])
+
+
+def test_a_fit_without_a_radiance_field_logs_its_whole_rate(unbake, cornell, tiny, tmp_path):
+    settings = tmp_path / "warm.toml"
+    settings.write_text(tiny.read_text().replace("warm_up = 0", "warm_up = 10"))
+    rates = {}
+    for method in ("direct", "no-prior"):
+        run = tmp_path / method
+        words = ("--out", run, "--settings", settings, "--method", method, "--steps", 1)
+        assert unbake("fit", cornell, *words).status == 0
+        rates[method] = json.loads((run / "log.jsonl").read_text().splitlines()[0])["learning_rate"]
+        assert read_toml(run / "config.toml").warm_up == (10 if method == "no-prior" else 0)
+    assert rates["direct"] == pytest.approx(11 * rates["no-prior"], rel=1e-4)
+
+
+def test_a_method_has_the_rates_that_were_found_for_it(table):
+    found = defaults("prb")
+    assert {name: found.rate_factors[name] for name in ("albedo", "roughness")} == {
+        "albedo": 2.0,
+        "roughness": 4.0,
+    }
+    # All are numbers from now on, and a second time nothing changes.
+    assert set(found.rate_factors) == set(UNKNOWNS)
+    assert found.rate_factors["environment"] == 1.0
+    assert with_method_defaults(found, "object") == found
+    assert found.estimator == "split-halves"
+    assert defaults("prb", "object").estimator == "two-pass"
+    assert defaults("prb", "object").rate_factors["albedo"] == 1.0
+    assert defaults("direct").estimator == defaults("ours").estimator == "split-halves"
+    assert defaults("ad-pt").estimator == "two-pass"
+    assert set(defaults("ours").rate_factors.values()) == {1.0}
+
+
+def test_what_a_user_says_stays(table):
+    found = defaults("prb", rate_factors={"roughness": 1.5}, estimator="two-pass")
+    assert found.rate_factors["roughness"] == 1.5 and found.rate_factors["albedo"] == 2.0
+    assert found.estimator == "two-pass"
+    # The table is of the preset cpu; the others are as they were published.
+    for name in ("paper", "release"):
+        published = with_method_defaults(replace(preset(name), method="prb"), "room")
+        assert set(published.rate_factors.values()) == {1.0}
+        assert published.estimator == "two-pass"
+
+
+def test_each_method_of_a_comparison_has_its_own_rates(table):
+    shared = defaults("prb")
+    own = with_method_defaults(MethodVariant("direct").settings(shared), "room")
+    assert own.rate_factors["albedo"] == 0.5 and own.rate_factors["roughness"] == 1.0
+    assert MethodVariant("prb").settings(shared) == shared
+
+
+def test_settings_files_have_factors_of_rates():
+    config = from_toml("[rate_factors]\nroughness = 4\n")
+    assert config.rate_factors["roughness"] == 4.0 and config.rate_factors["albedo"] is None
+    assert from_toml(to_toml(config)) == config
+    found = defaults("prb")
+    assert from_toml(to_toml(found)) == found
+
+
+def test_a_run_goes_on_with_the_rates_that_it_was_started_with(
+    table, unbake, cornell, tiny, tmp_path, monkeypatch
+):
+    folder = RunFolder(tmp_path / "run")
+    words = ("fit", cornell, "--out", folder.path)
+    start = ("--settings", tiny, "--method", "direct", "--steps", 2)
+    assert unbake(*words, *start).status == 0
+    assert folder.settings().rate_factors["albedo"] == 0.5
+    monkeypatch.setattr(module, "METHOD_DEFAULTS", {})
+    assert unbake(*words, "--resume", "--steps", 4).status == 0
+    assert folder.settings().rate_factors["albedo"] == 0.5
+    # Albedo is the unknown whose rate is logged.
+    rate = folder.settings().material_settings["albedo"].learning_rate
+    logged = [line["learning_rate"] for line in folder.log() if "validation" not in line]
+    assert logged == pytest.approx([0.5 * rate * 0.05**0.5, 0.5 * rate * 0.05**0.75], rel=1e-4)
+
+
+def test_a_run_of_an_earlier_version_goes_on_as_it_was(table, unbake, cornell, tiny, tmp_path):
+    """Its settings have no factors, and a warm-up whatever the method."""
+    folder = RunFolder(tmp_path / "run")
+    words = ("fit", cornell, "--out", folder.path)
+    start = ("--settings", tiny, "--method", "direct", "--steps", 1)
+    assert unbake(*words, *start).status == 0
+    text = folder.config_file.read_text()
+    before, _, after = text.partition("[rate_factors]\n")
+    after = after[after.index("[") :]
+    old = (before + after).replace("warm_up = 0", "warm_up = 9")
+    old = old.replace('estimator = "split-halves"', 'estimator = "auto"')
+    folder.config_file.write_text(old)
+    assert unbake(*words, "--resume", "--steps", 2).status == 0
+    config = folder.settings()
+    assert config.warm_up == 9 and config.estimator == "auto" and config.halves
+    assert set(config.rate_factors.values()) == {None}
+    rate = config.material_settings["albedo"].learning_rate
+    last = [line["learning_rate"] for line in folder.log() if "validation" not in line][-1]
+    assert last == pytest.approx(0.2 * rate * 0.05**0.5, rel=1e-4)
