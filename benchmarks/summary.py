@@ -19,7 +19,13 @@ Row = dict[str, Any]
 #: What tells runs apart, and what is measured of each.
 KEPT = ("representation", "radiance", "estimator")
 LENGTH = ("steps", "samples", "seconds", "milliseconds_per_step", "start_up_seconds")
-QUALITY = ("albedo_psnr", "albedo_psnr_aligned", "roughness_psnr", "render_psnr")
+QUALITY = (
+    "albedo_psnr",
+    "albedo_psnr_aligned",
+    "roughness_psnr",
+    "render_psnr",
+    "true_render_psnr",
+)
 ENVIRONMENT = ("sh_error", "sh_error_aligned", "relight_psnr", "relight_psnr_aligned")
 
 

@@ -68,6 +68,18 @@ def quality(result: dict) -> str:
     return markdown(titles, rows) + over_seeds(result)
 
 
+def demo(result: dict) -> str:
+    """What `make demo` recovers, and what its noise would leave of a perfect result."""
+    names = {"ours": "unbake", "direct": "direct illumination"}
+    rows = [
+        [names[name], f"{row['seconds']:.0f} s", *(spread(row, *column) for _, *column in PSNR)]
+        for name, row in result["methods"].items()
+    ]
+    limit = spread(result["methods"]["ours"], "true_render_psnr", 1, 1)
+    rows.append(["the true materials, rendered alike", "", "", "", limit])
+    return markdown(["", "training", *(title for title, *_ in PSNR)], rows)
+
+
 def over_seeds(result: dict) -> str:
     """The line below a table that says what its spread is of."""
     return f"\n\n{seeds_in_words(len(result['seeds'])).capitalize()}."
@@ -186,6 +198,7 @@ BOTH = (
 )
 TABLES = (
     ("Time of a step", ("methods-demo", "methods-staircase"), steps),
+    ("Demo", ("demo",), demo),
     ("Equal time, demo", ("rivals-demo",), quality),
     ("Equal time, STAIRCASE", ("rivals-staircase",), quality),
     ("Equal samples, demo", ("equal-demo",), quality),

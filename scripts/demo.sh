@@ -52,7 +52,7 @@ steps=$(last_logged "$OUT/ours" step)
 discard_unless_done fit-direct direct
 stage fit-direct "$OUT/direct/log.jsonl" \
   "$UNBAKE" fit "$OUT/data" --out "$OUT/direct" --method direct --steps "$steps"
-stage evaluate-ours "$OUT/ours/evaluation/metrics.json" "$UNBAKE" evaluate "$OUT/ours"
+stage evaluate-ours "$OUT/ours/evaluation/metrics.json" "$UNBAKE" evaluate "$OUT/ours" --truth
 stage evaluate-direct "$OUT/direct/evaluation/metrics.json" "$UNBAKE" evaluate "$OUT/direct"
 # The report takes seconds and shows the newest of everything: always made again.
 rm -f "$OUT/.done/report"

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from unbake.config import read_toml
+from unbake.dataset.views import Dataset
 from unbake.errors import UserError
-from unbake.evaluation.evaluate import evaluate
+from unbake.evaluation.evaluate import _true_scene, evaluate
 from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training.loop import TIME_EVERY, fit
@@ -170,3 +171,32 @@ def test_known_materials_are_not_evaluated(scored, tmp_path, monkeypatch):
     assert np.isfinite(heldout["render_psnr"])
     written = {p.name for p in (run / "evaluation" / "heldout").iterdir()}
     assert written == {"heldout_000_render.exr", "heldout_000_render.png"}
+
+
+def test_the_true_materials_are_rendered_alike(scored, cornell, tmp_path):
+    run = shutil.copytree(scored, tmp_path / "run", ignore=shutil.ignore_patterns("evaluation"))
+    few, many = (
+        evaluate(
+            run, dataclasses.replace(FEW, spp=spp, max_depth=32, truth=True), tell=lambda line: None
+        )
+        for spp in (2, 32)
+    )
+    for metrics in (few, many):
+        (view,) = (row for row in metrics["per_view"] if row["split"] == "heldout")
+        heldout = metrics["heldout"]
+        assert heldout["true_render_psnr"] == view["true_render_psnr"]
+        # What hardly any training recovered is no match for the truth.
+        assert heldout["true_render_psnr"] > heldout["render_psnr"] + 1
+    # Noise is all that is between the photograph and the true materials.
+    gained = many["heldout"]["true_render_psnr"] - few["heldout"]["true_render_psnr"]
+    assert gained > 3
+    assert "true_render_psnr" not in evaluate(run, FEW, tell=lambda line: None)["heldout"]
+
+    data = shutil.copytree(cornell, tmp_path / "data")
+    described = json.loads((data / "transforms.json").read_text())
+    del described["render"]
+    (data / "transforms.json").write_text(json.dumps(described))
+    recovered = load_run(run)
+    recovered.dataset = Dataset.load(data)
+    with pytest.raises(UserError, match="does not hold its true materials"):
+        _true_scene(recovered)

@@ -205,6 +205,7 @@ def compare(
     settings: File = None,
     score_seconds: Annotated[float, arg(metavar="SECONDS")] = 5.0,
     evaluate_spp: int = 32,
+    evaluate_truth: Flag = False,
     clip_negative: Flag = False,
     *,
     compare: OmitArgPrefixes[CompareFlags],
@@ -225,6 +226,7 @@ def compare(
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         score_seconds: Training time between scores on all held-out views (0: no scores).
         evaluate_spp: Samples per pixel of the final renderings.
+        evaluate_truth: Render captured scenes with their true materials too.
         clip_negative: Take negative pixels as zero instead of refusing them.
         compare: Settings of all methods that differ from those of the preset or the file.
     """
@@ -239,7 +241,9 @@ def compare(
     from ..comparison.method_variant import MethodVariant
 
     variants = [MethodVariant.of(method) for method in methods]
-    evaluation = EvaluationSettings(spp=evaluate_spp, clip_negative=clip_negative)
+    evaluation = EvaluationSettings(
+        spp=evaluate_spp, clip_negative=clip_negative, truth=evaluate_truth
+    )
     result = run(data, variants, out, chosen, evaluation=evaluation, clip_negative=clip_negative)
     _say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
     return 1 if any("error" in row for row in result["methods"].values()) else 0

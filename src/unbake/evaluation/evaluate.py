@@ -13,14 +13,18 @@ from ..config import FitConfig
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.pixels import CameraRays
 from ..dataset.views import View
+from ..errors import UserError
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
 from ..quantities import QUANTITIES
+from ..scene import edit
+from ..scene.parse import parse
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
 from ..transport.objective import has_radiance
 from ..transport.render import render_radiance
+from ..transport.vertex import SceneView
 from . import lighting
 from .settings import EvaluationSettings
 
@@ -29,6 +33,8 @@ DEFINITIONS = {
     "value of a split is the mean over its views. Renderings: both pictures clipped to [0,1], "
     "because one caustic pixel of a photograph would decide all; render_psnr_unclamped does not. "
     "Quantities of materials are not clipped",
+    "true_render_psnr": "render_psnr of the scene with its true materials and lights, with as many "
+    "samples: the limit that the noise of renderings and photographs sets",
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
@@ -61,7 +67,8 @@ def evaluate(
         The contents of the run's metrics file. Images are written beside it.
 
     Raises:
-        UserError: the run or its data set cannot be read.
+        UserError: the run or its data set cannot be read, or the true materials are
+            asked for and the data set was not captured by unbake.
 
     Paper: Sec. 6, Fig. 6.
     """
@@ -69,11 +76,12 @@ def evaluate(
     run = Path(run)
     recovered, folder = load_run(run), RunFolder(run)
     dataset = recovered.dataset
+    true_scene = _true_scene(recovered) if settings.truth else None
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
     views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
     rows, materials = [], []
     for view in views:
-        row, seen, truth = _evaluate_view(recovered, view, folder, settings)
+        row, seen, truth = _evaluate_view(recovered, view, folder, settings, true_scene)
         rows.append(row)
         materials.append((seen, truth))
         told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
@@ -122,21 +130,44 @@ def description(config: FitConfig) -> dict:
     }
 
 
-def _evaluate_view(
-    recovered: Recovered, view: View, folder: RunFolder, settings: EvaluationSettings
-) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
-    problem, camera = recovered.problem, view.camera
+def _true_scene(recovered: Recovered) -> SceneView:
+    """The scene that the photographs were rendered from, as the data set holds it."""
+    dataset = recovered.dataset
+    if not dataset.render:
+        known = "unbake capture SCENE --out DATA makes one that does"
+        raise UserError("the data set does not hold its true materials", dataset.folder, known)
+    parsed = parse(dataset.scene)
+    edit.to_principled(parsed)
+    specular = recovered.config.transport.max_specular
+    return SceneView.of(parsed.instantiate(), None, specular)
+
+
+def _render(
+    scene_view: SceneView, view: View, settings: EvaluationSettings, hide_emitters: bool
+) -> np.ndarray:
+    camera = view.camera
     rays = CameraRays.of([camera])
-    radiance = render_radiance(
-        problem.scene_view,
+    return render_radiance(
+        scene_view,
         rays.through,
         rays.pixels,
         settings.spp,
         seed=1,
         max_depth=settings.max_depth,
         rr_depth=settings.rr_depth,
-        hide_emitters=problem.hide_emitters,
+        hide_emitters=hide_emitters,
     ).reshape(camera.height, camera.width, 3)
+
+
+def _evaluate_view(
+    recovered: Recovered,
+    view: View,
+    folder: RunFolder,
+    settings: EvaluationSettings,
+    true_scene: SceneView | None,
+) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
+    problem = recovered.problem
+    radiance = _render(problem.scene_view, view, settings, problem.hide_emitters)
     photograph = read_view(view.image, view, settings.clip_negative or recovered.clip_negative)
     truth, seen = GroundTruth.of(view, recovered.config.quantities), None
     alpha, mask = photograph[..., 3], photograph[..., 3] >= 1
@@ -156,9 +187,13 @@ def _evaluate_view(
         write_png(folder.picture(view.split, view.name, name, ".png"), picture)
 
     keys = (*METRICS, *psnr_keys(recovered.config.quantities))
-    row = {"name": view.name, "split": view.split} | dict.fromkeys(keys)
+    limits = () if true_scene is None else ("true_render_psnr",)
+    row = {"name": view.name, "split": view.split} | dict.fromkeys((*keys, *limits))
     if mask.any():
         row |= _render_psnr(radiance, photograph[..., :3], mask)
+        if true_scene is not None:
+            limit = _render(true_scene, view, settings, problem.hide_emitters)
+            row["true_render_psnr"] = _render_psnr(limit, photograph[..., :3], mask)["render_psnr"]
     if seen is not None and truth is not None:
         row |= seen.psnr(truth)
     return row, seen, truth

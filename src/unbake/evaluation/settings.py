@@ -32,6 +32,10 @@ class EvaluationSettings:
         bool,
         Flag("Take negative pixels of photographs as zero, as in a fit with this option"),
     ] = False
+    truth: Annotated[
+        bool,
+        Flag("Render captured scenes with their true materials too: what noise alone leaves"),
+    ] = False
 
     def __post_init__(self) -> None:
         for name in ("spp", "max_depth", "rr_depth", "train_views", "material_spp"):
