@@ -95,7 +95,21 @@ def test_fig4_longer_paths_miss_less(rows, out, scenes_dir):
     missed = [told[f"PRB {n}"]["relative_rmse"] for n in (4, 10, 15, 30)]
     assert missed == sorted(missed, reverse=True) and missed[-1] < 0.05 < missed[0]
     assert told["direct"]["relative_rmse"] > missed[2]
-    assert told["reference"]["sign_agreement"] == 1
+    gradients = {name: {} for name in told}
+    for row in found:
+        if "gradient" in row:
+            gradients[row["method"]][row["current"], row["target"]] = row["gradient"]
+    reference = gradients["reference"]
+    size = np.mean(np.square(list(reference.values())))
+    off = [place for place in reference if place[0] != place[1]]
+    for name, row in told.items():
+        assert gradients[name].keys() == reference.keys() and len(off) == 6
+        same = [np.sign(gradients[name][place]) == np.sign(reference[place]) for place in off]
+        assert row["sign_agreement"] == pytest.approx(np.mean(same))
+        squares = np.mean([(gradients[name][place] - reference[place]) ** 2 for place in reference])
+        assert row["relative_rmse"] == pytest.approx((squares / size) ** 0.5)
+        # No method is the reference by another name.
+        assert (row["relative_rmse"] > 1e-6) == (name != "reference")
     assert len(found) == 10 + 10 * 3 * 3
     assert picture(out / "fig4" / "pictures.png").std() > 0
 

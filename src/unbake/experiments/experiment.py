@@ -107,6 +107,8 @@ def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool 
         UserError: a scene is missing, a job failed, or a file cannot be written.
         OSError: the folder cannot be made.
         KeyboardInterrupt: SIGINT or SIGTERM arrived. The same call continues.
+
+    Paper: Table 1, 2, Fig. 3–8.
     """
     jobs = experiment.jobs(context)
     runner = JobRunner(

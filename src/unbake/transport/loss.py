@@ -73,6 +73,6 @@ def squared_error(
 
 
 def pixel_means(samples: mi.Color3f, spp: int) -> mi.Color3f:
-    """Mean of each run of `spp` lanes: pixels from their camera samples."""
+    """Mean of each run of `spp` lanes: pixels from their camera samples. Paper: Eq. 2."""
     dr.eval(samples)
     return mi.Color3f([dr.block_sum(c, spp) / spp for c in samples])
