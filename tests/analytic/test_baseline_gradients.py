@@ -13,9 +13,9 @@ from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
-from unbake.transport.path_sample import Requirements, rhs, trace
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
 from unbake.transport.vertex import SceneView
+from unbake.transport.wavefront import PathLimits, path_light, plan_widths
 
 ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
 SPP, DEPTH = 16, 4
@@ -76,15 +76,16 @@ def with_bsdf(path, plugin, **properties):
     return parsed.instantiate()
 
 
-def path_traced(method, scene, materials, sampler, ray, rr_depth=DEPTH, depth=DEPTH):
+def path_traced(method, scene, materials, sampler, ray, rr_depth=DEPTH, depth=DEPTH, spp=SPP):
     """Radiance by a method, differentiable in the materials (None: the scene's own)."""
     if method == "ad-pt":
-        scene_view, requirements = (
-            SceneView.of(scene, materials, 8),
-            Requirements(depth - 1),
-        )
-        sample = trace(scene_view, None, ray, sampler, requirements, hide_emitters=False)
-        return rhs(sample, mi.Color3f(0), depth - 1)
+        scene_view, limits = SceneView.of(scene, materials, 8), PathLimits(depth, rr_depth, False)
+        # Without roulette what survives does not depend on φ, so that any widths will do.
+        plan = tuple(range(depth - 1))
+        if rr_depth < depth:
+            plan = plan_widths(scene_view, ray, sampler.clone(), spp, limits)
+            assert plan[0] < plan[-1], "the wavefront becomes narrower"
+        return path_light(scene_view, ray, sampler, spp, limits, plan)
     integrator = path_replay(depth, rr_depth, False)
     arrays = {}
     if materials is not None:
@@ -155,13 +156,13 @@ def test_the_whole_gradient_of_the_furnace(built_in, method, albedo):
     ray = pixel_rays(built_in_cameras("furnace", 12, views=4), 64, seed=5)
     dr.enable_grad(materials.albedo)
     with materials_along_paths(materials):
-        # With Russian roulette, where there is any.
-        image = path_traced(method, scene, materials, seeded(6, dr.width(ray)), ray, 3, depth=6)
+        # With Russian roulette
+        image = path_traced(method, scene, materials, seeded(6, dr.width(ray)), ray, 3, 12, 64)
         dr.backward(dr.sum(dr.mean(image, axis=1)))
     value = np.array(dr.mean(dr.detach(image), axis=1)).ravel()
     gradient = np.array(dr.grad(materials.albedo)).ravel()
 
-    powers = np.arange(6)
+    powers = np.arange(12)
     print(f"{method}, {albedo}: image {value}, gradient {gradient}")
     np.testing.assert_allclose(value, (albedo**powers).sum(), rtol=1e-2)
     np.testing.assert_allclose(gradient, (powers[1:] * albedo ** powers[:-1]).sum(), rtol=2e-2)

@@ -140,10 +140,11 @@ def test_a_killed_fit_goes_on(started, fit, tmp_path):
     ("method", "words"),
     [
         ("direct", ()),
+        ("ad-pt", ("--max-depth", "5")),
         ("ours", ()),
         ("ours", ("--representation", "triplane", "--radiance", "triplane")),
     ],
-    ids=["direct", "ours", "triplane"],
+    ids=["direct", "ad-pt", "ours", "triplane"],
 )
 def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(
     method, words, fit, tmp_path, monkeypatch

@@ -27,10 +27,8 @@ from unbake.training.regularizers import is_anchored
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
-from unbake.transport.methods import METHODS
-from unbake.transport.objective import requirements
-from unbake.transport.path_sample import rhs, trace
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
+from unbake.transport.wavefront import PathLimits, path_light, plan_widths
 
 FAST = LightingConfig(resolution=16, learning_rate=0.1)
 
@@ -127,9 +125,9 @@ def radiance(problem, method, ray, seed):
         replay = path_replay(DEPTH, DEPTH, hide_emitters=problem.hide_emitters)
         with materials_along_paths(scene_view.materials):
             return path_radiance(replay, scene_view.scene, sampler, ray, problem.read_by_scene())
-    wanted = requirements(METHODS["ad-pt"].terms, DEPTH - 1)
-    sample = trace(scene_view, None, ray, sampler, wanted, hide_emitters=problem.hide_emitters)
-    return rhs(sample, sample.radiance[DEPTH - 1], DEPTH - 1)
+    limits = PathLimits(DEPTH, DEPTH, hide_emitters=problem.hide_emitters)
+    plan = plan_widths(scene_view, ray, sampler.clone(), 2, limits)
+    return path_light(scene_view, ray, sampler, 2, limits, plan)
 
 
 def weighted(radiance, spp):

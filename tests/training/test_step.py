@@ -24,12 +24,12 @@ from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
 
 
-def start(built_in, config=TINY_FIT, pixels=None):
-    """A fresh fit of the Cornell box: its step, and the state it changes."""
+def start(built_in, config=TINY_FIT, pixels=None, scene="cornell"):
+    """A fresh fit of a built-in scene: its step, and the state it changes."""
     # What earlier tests left would be freed in between, and counted.
     gc.collect()
-    problem = make_problem(built_in("cornell"), "visible", config, 0.2)
-    pixels = pixels or grey_photographs(built_in_cameras("cornell", 8, views=2))
+    problem = make_problem(built_in(scene), "visible", config, 0.2)
+    pixels = pixels or grey_photographs(built_in_cameras(scene, 8, views=2))
     return TrainingStep(problem, pixels, config), initial_state(problem)
 
 
@@ -77,7 +77,7 @@ def one_thread():
         {"method": "ours", "prior": "one-bounce"},
         {"method": "ours", "bounces": 2},
         {"method": "direct"},
-        {"method": "ad-pt", "path": PathConfig(max_depth=4)},
+        {"method": "ad-pt", "path": PathConfig(max_depth=8, rr_depth=2)},
         {"method": "prb"},
         {"method": "prb", "representation": "grid"},
         {"method": "prb", "representation": "bitmap"},
@@ -117,9 +117,10 @@ def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, settings, 
         {"method": "ours"},
         {"method": "prb"},
         {"method": "prb", "representation": "grid"},
+        {"method": "ad-pt", "path": PathConfig(max_depth=8, rr_depth=2)},
         {"representation": "triplane", "radiance_representation": "triplane"},
     ],
-    ids=lambda settings: ", ".join(settings.values()),
+    ids=lambda settings: ", ".join(map(str, settings.values())),
 )
 def test_nothing_is_compiled_or_traced_after_the_third_step(built_in, settings):
     step, state = start(built_in, dataclasses.replace(TINY_FIT, **settings))
@@ -186,6 +187,22 @@ def test_the_estimate_of_memory_is_what_a_step_then_takes(built_in):
     taken = peak_bytes(lambda: step.unfrozen(state, 1))
     print(f"estimated {estimate / 1e6:.1f} MB, taken {taken / 1e6:.1f} MB")
     assert 0.5 * taken < estimate < 2 * taken
+
+
+def test_russian_roulette_saves_memory(built_in):
+    """In a closed room, where all other paths go on to the longest."""
+    needed = {}
+    for rr_depth in (1, 24):
+        path = PathConfig(max_depth=24, rr_depth=rr_depth)
+        config = dataclasses.replace(
+            TINY_FIT, method="ad-pt", pixels=8192, representation="grid", path=path
+        )
+        step, state = start(built_in, config, scene="furnace")
+        needed[rr_depth] = step.bytes_needed(state)
+        if needed[rr_depth] is None:
+            pytest.skip("the memory of a step cannot be measured here")
+    print({depth: f"{need / 1e6:.1f} MB" for depth, need in needed.items()})
+    assert 0 < needed[1] < 0.7 * needed[24]
 
 
 def test_dr_jit_running_out_of_memory_is_told_in_one_line(built_in, monkeypatch):

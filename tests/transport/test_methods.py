@@ -139,7 +139,7 @@ def test_a_method_is_refused_whose_terms_cannot_be_had(built_in, row, message):
 
 def test_a_sampler_must_exist_and_serve_the_terms(built_in):
     register_method(Method("lost", "a mistake", {PHOTOMETRIC: SCENE}, sampler="magic"))
-    with pytest.raises(UserError, match=r"no sampler named 'magic'. There are bounces, path-r"):
+    with pytest.raises(UserError, match=r"no sampler named 'magic'. There are bounces, kept-p"):
         start(built_in, replace(TINY_FIT, method="lost"))
     row = {PHOTOMETRIC: SCENE, PRIOR: SCENE}
     register_method(Method("both", "a mistake", row, sampler="path-replay"))

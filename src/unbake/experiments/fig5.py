@@ -40,7 +40,7 @@ class _Curve:
     variant: str
     prior: PriorName = "extra-bounce"
     #: Whether the loop over bounces is one kernel (a megakernel) or one kernel for each bounce.
-    #: Ours and AD-PT have no loop.
+    #: Ours and AD-PT have no such loop.
     symbolic: bool = True
     #: Milliseconds per step in the paper's figure: RTX 3090, 256² pixels x 16 samples, grids of
     #: 256³.

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..dataset.pixels import PixelBatch
-from ..transport import operator, path_sample, samplers
+from ..transport import operator, path_sample, samplers, wavefront
 
 #: Kernels outside of the calls below belong to this phase.
 OPTIMISER = "optimiser"
@@ -22,7 +22,11 @@ _CALLS = (
     (path_sample, "attach_material", "material nets"),
     (path_sample, "attach_albedo", "material nets"),
     (path_sample, "bounce", "BSDFs and lights"),
+    (wavefront, "find_vertex", "ray tracing"),
+    (wavefront, "attach_material", "material nets"),
+    (wavefront, "bounce", "BSDFs and lights"),
     (path_sample, "reflected_radiance", "radiance net"),
+    (samplers, "path_light", "paths"),
     (samplers, "path_radiance", "paths"),
     (samplers, "objective", "losses"),
     (dr, "backward", "gradients"),

@@ -91,11 +91,13 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     if config.follows_paths:
         console.print(told_depth(config, dataset), highlight=False, soft_wrap=True)
     state = initial_state(problem)
+    # A resumed fit plans with the first state, too, and so goes on as if it had not stopped.
+    step = TrainingStep(problem, pixels, config)
+    step.plan(state)
     restored = load_checkpoint(folder, state) if resume else None
     progress = restored or Progress()
     if resume:
         console.print(f"going on after step {progress.step}", highlight=False)
-    step = TrainingStep(problem, pixels, config)
     preview = Preview(problem, dataset, folder)
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None

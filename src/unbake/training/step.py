@@ -28,6 +28,9 @@ from .problem import Problem
 from .regularizers import regularization_terms
 from .state import State
 
+#: Camera samples, at most, of the batch that a path sampler plans with.
+_PLANNED_PATHS = 1 << 15
+
 
 @dataclass
 class Inputs:
@@ -64,6 +67,7 @@ class TrainingStep:
         )
         self._frozen = dr.freeze(self._step) if recordable else None
         self._fits_memory = not self._path_sampler.keeps_paths
+        self._planned = not self._path_sampler.keeps_paths
 
     def __call__(
         self, state: State, number: int, rates: Mapping[str, float]
@@ -77,6 +81,7 @@ class TrainingStep:
         Raises:
             UserError: `ad-pt` would need more memory than there is.
         """
+        self.plan(state)
         self.require_memory(state)
         step = self._step if self._frozen is None else self._frozen
         try:
@@ -87,6 +92,23 @@ class TrainingStep:
                 raise
             lanes = self._config.samples_per_pass
             raise UserError(f"no memory for a step of {lanes} paths", None, SMALLER) from None
+
+    def plan(self, state: State) -> None:
+        """Let the path sampler decide what it fixes for all steps, once.
+
+        The first step does this by itself. A fit that may be resumed does it with the first state,
+        so that it goes on as it would have without the interruption.
+        """
+        if self._planned:
+            return
+        config, path_sampler = self._config, self._path_sampler
+        with dr.suspend_grad(), path_sampler.prepared():
+            inputs = self._inputs(0, min(config.pixels, max(1, _PLANNED_PATHS // config.spp)))
+            state.publish(self._problem)
+            inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
+            batch = inputs.pixels.batch(inputs.rays, inputs.sampler, config.spp)
+            path_sampler.plan(inputs.scene, batch.ray, inputs.sampler)
+        self._planned = True
 
     def require_memory(self, state: State) -> None:
         """Raise an error if a step would need more memory than there is free.
@@ -104,6 +126,7 @@ class TrainingStep:
 
     def bytes_needed(self, state: State) -> float | None:
         """Memory that a step will take; None where it cannot be measured."""
+        self.plan(state)
 
         def probe(pixels: int) -> None:
             terms = self._gradients(self._inputs(0, pixels), state)
@@ -119,6 +142,7 @@ class TrainingStep:
 
     def unfrozen(self, state: State, number: int) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
+        self.plan(state)
         return self._step(self._inputs(number, self._config.pixels), state)
 
     def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:

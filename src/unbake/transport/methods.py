@@ -27,7 +27,7 @@ class Attached:
 PHOTOMETRIC, PRIOR, EXTRA, LHS = "photometric", "prior", "prior_extra", "lhs"
 PRIOR_PAIR = "prior_pair"
 #: Names of the samplers that `samplers.py` defines.
-BOUNCES, PATH_REPLAY = "bounces", "path-replay"
+BOUNCES, KEPT_PATHS, PATH_REPLAY = "bounces", "kept-paths", "path-replay"
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,7 @@ for _method in (
         "ad-pt",
         "path tracing, differentiated with all paths in memory",
         {PHOTOMETRIC: _SCENE},
+        sampler=KEPT_PATHS,
         follows_paths=True,
     ),
     Method(

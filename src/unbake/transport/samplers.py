@@ -5,6 +5,7 @@ A sampler of your own is a factory given to `register_sampler`, and named by a `
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -16,11 +17,12 @@ import mitsuba as mi
 from ..errors import UserError, require_name
 from ..fields.radiance import RadianceField
 from .loss import RelativeL2, squared_error
-from .methods import BOUNCES, PATH_REPLAY, PHOTOMETRIC, Method
+from .methods import BOUNCES, KEPT_PATHS, PATH_REPLAY, PHOTOMETRIC, Method
 from .objective import objective, requirements
 from .path_sample import PathSample, SampleSubset, rhs, trace
 from .prb import materials_along_paths, path_radiance, path_replay
 from .vertex import SceneView
+from .wavefront import PathLimits, Plan, path_light, plan_widths
 
 #: The arrays that the scene's textures and emitters read, by name.
 Arrays = dict[str, mi.Float | mi.TensorXf]
@@ -69,6 +71,13 @@ class PathSampler(Protocol):
         """A context around the other calls and backpropagation."""
         ...
 
+    def plan(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> None:
+        """Decide, from some camera samples, all that a recording fixes.
+
+        It is called once, before the first step, if `keeps_paths` is set.
+        """
+        ...
+
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Linear RGB radiance of camera samples."""
         ...
@@ -95,10 +104,8 @@ class PathSampler(Protocol):
 class BounceSampler:
     """A few bounces, then L_θ: the method of the paper and its ablations.
 
-    Also `ad-pt`: many bounces, all kept in memory, and nothing after them. (Mitsuba's `path` would
-    do, but asks textures, and so fields, inside virtual calls and several times a vertex: a step
-    took 8 to 60 times as long. Without a loop there is no Russian roulette either, which would save
-    nothing where all lanes wait for the longest path.)
+    For methods that follow paths to their end, as many bounces as the longest path has, in all
+    lanes and without Russian roulette; `KeptPathSampler` is faster.
     """
 
     can_be_recorded = True
@@ -112,6 +119,9 @@ class BounceSampler:
     def prepared(self) -> AbstractContextManager:
         """A context without effect."""
         return nullcontext()
+
+    def plan(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> None:
+        """Nothing is planned: all lanes are followed to the end."""
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Radiance of camera samples."""
@@ -147,14 +157,12 @@ class BounceSampler:
         )
 
 
-class PathReplaySampler:
-    """Paths to their end, by Mitsuba's `prb`.
+class _WholePathSampler(ABC):
+    """Paths to their end: their image is all that there is.
 
     Raises:
         UserError: the method has terms that are not of the image alone.
     """
-
-    keeps_paths = False
 
     def __init__(self, context: SamplerContext) -> None:
         self._context, method = context, context.method
@@ -162,19 +170,10 @@ class PathReplaySampler:
             what = f"the method {method.name} has other terms than {PHOTOMETRIC}"
             raise UserError(what, None, f"The sampler {method.sampler} gives the image alone")
         requirements(method.terms)
-        self._integrator = path_replay(context.max_depth, context.rr_depth, context.hide_emitters)
-        materials = context.scene_view.materials
-        # Inside Mitsuba's loop, fields are evaluated as they were prepared.
-        self.can_be_recorded = all(field.prepare_recordable for field in (materials or {}).values())
 
-    def prepared(self) -> AbstractContextManager:
-        """A context in which paths evaluate the material fields."""
-        return materials_along_paths(self._context.scene_view.materials)
-
+    @abstractmethod
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Radiance of camera samples."""
-        arrays = self._context.read_by_scene()
-        return path_radiance(self._integrator, scene, sampler, ray, arrays)
 
     def terms(
         self,
@@ -192,9 +191,81 @@ class PathReplaySampler:
         return {PHOTOMETRIC: squared_error(image, target, self._context.spp, weight, primal)}
 
 
+class KeptPathSampler(_WholePathSampler):
+    """Paths to their end, all kept in memory: `ad-pt`.
+
+    Mitsuba's `path` would do, but asks textures, and so fields, inside virtual calls and several
+    times a vertex. Here fields are asked once, and the wavefront becomes narrower as paths end.
+    """
+
+    keeps_paths = True
+    can_be_recorded = True
+
+    def __init__(self, context: SamplerContext) -> None:
+        super().__init__(context)
+        self._limits = PathLimits(context.max_depth, context.rr_depth, context.hide_emitters)
+        self._plan: Plan | None = None
+
+    def prepared(self) -> AbstractContextManager:
+        """A context without effect."""
+        return nullcontext()
+
+    def plan(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> None:
+        """Plan how wide the wavefront is at each bounce, once."""
+        if self._plan is None:
+            c = self._context
+            scene_view = c.scene_view.with_scene(scene)
+            self._plan = plan_widths(scene_view, ray, sampler, c.spp, self._limits)
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Radiance of camera samples.
+
+        Raises:
+            ValueError: nothing was planned.
+        """
+        if self._plan is None:
+            raise ValueError("the widths of the wavefront are to be planned first")
+        c = self._context
+        scene_view = c.scene_view.with_scene(scene)
+        return path_light(scene_view, ray, sampler, c.spp, self._limits, self._plan)
+
+
+class PathReplaySampler(_WholePathSampler):
+    """Paths to their end, by Mitsuba's `prb`.
+
+    Raises:
+        UserError: the method has terms that are not of the image alone.
+    """
+
+    keeps_paths = False
+
+    def __init__(self, context: SamplerContext) -> None:
+        super().__init__(context)
+        self._integrator = path_replay(context.max_depth, context.rr_depth, context.hide_emitters)
+        materials = context.scene_view.materials
+        # Inside Mitsuba's loop, fields are evaluated as they were prepared.
+        self.can_be_recorded = all(field.prepare_recordable for field in (materials or {}).values())
+
+    def prepared(self) -> AbstractContextManager:
+        """A context in which paths evaluate the material fields."""
+        return materials_along_paths(self._context.scene_view.materials)
+
+    def plan(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> None:
+        """Nothing is planned: Mitsuba's loop ends with the last path."""
+
+    def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
+        """Radiance of camera samples."""
+        arrays = self._context.read_by_scene()
+        return path_radiance(self._integrator, scene, sampler, ray, arrays)
+
+
 SamplerFactory = Callable[[SamplerContext], PathSampler]
 
-_SAMPLERS: dict[str, SamplerFactory] = {BOUNCES: BounceSampler, PATH_REPLAY: PathReplaySampler}
+_SAMPLERS: dict[str, SamplerFactory] = {
+    BOUNCES: BounceSampler,
+    KEPT_PATHS: KeptPathSampler,
+    PATH_REPLAY: PathReplaySampler,
+}
 #: All samplers by name.
 SAMPLERS: Mapping[str, SamplerFactory] = MappingProxyType(_SAMPLERS)
 
