@@ -21,11 +21,19 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import tables as benchmark_tables  # noqa: E402
 from summary import phases_of, read, roofline_of  # noqa: E402
 
+from unbake.comparison.rate_search import STEP  # noqa: E402
+from unbake.config import PAPER_DEPTH  # noqa: E402
 from unbake.experiments.seeds import plus_minus  # noqa: E402
+from unbake.experiments.tables import markdown  # noqa: E402
 
 Row = dict[str, Any]
 
 TAKE_OVER = "python scripts/write_docs.py --results reproduction --scenes scenes"
+VERSION_0_1 = """made with version 0.1, where PRB and AD-PT had the learning rates that were found
+for ours and their warm-up, paths of 15 interactions at most (no Russian roulette for AD-PT), and
+mostly one seed. They are being made anew."""
+NOT_SEARCHED = """The search has not been run yet (`unbake bench rates`): all methods have the rates
+of the fields, which were found for ours."""
 #: What a template may call a number, where it has another key in a file of results.
 KEYS = {"albedo": "albedo_psnr", "roughness": "roughness_psnr", "rendering": "render_psnr"}
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
@@ -120,6 +128,44 @@ class Facts:
     def step_ratio(self, name: str, method: str, materials: str = "neural", spp: str = "") -> float:
         """Time of a step as a multiple of that of ours with the same materials."""
         return benchmark_tables.ratio(self.step(name, method, materials, spp), self.result(name))
+
+    def older(self, *names: str) -> str:
+        """A warning where results were made before every method had settings of its own.
+
+        Files of version 0.1 hold no numbers of single seeds.
+        """
+        old = [
+            name
+            for name in names
+            if any("per_seed" not in row for row in self.result(name)["methods"].values())
+        ]
+        if not old:
+            return ""
+        files = ", ".join(f"`{name}.json`" for name in old)
+        return f"> **Older results.** {files}: {VERSION_0_1}\n"
+
+    def rates_table(self) -> str:
+        """What the search for learning rates found; that there was none, if there is no file."""
+        if not self.has("rates"):
+            return NOT_SEARCHED
+        rows = []
+        for search in self.result("rates")["searches"]:
+            best = part(search, "best", f"rates.json, {search['method']}")
+            factors = ", ".join(f"{name} x {by:g}" for name, by in best["factors"].items())
+            chosen = best["estimator"].replace("-", " ") if search["follows_paths"] else ""
+            scene = f"{search['kind']}s", search["unknown"], search["data"]
+            fits = len(search["trials"])
+            rows.append([f"`{search['method']}`", *scene, factors, chosen, fits])
+        titles = [
+            "method",
+            "for",
+            "unknown",
+            "found on",
+            "factors of the rates",
+            "estimator",
+            "fits",
+        ]
+        return markdown(titles, rows)
 
     def phases(self, name: str) -> str:
         """Where the time of the steps of a machine goes, as a table."""
@@ -292,4 +338,9 @@ FILTERS: dict[str, Callable[..., str]] = {
 def context(facts: Facts) -> dict[str, Any]:
     """What templates call."""
     public = (name for name in dir(facts) if not name.startswith("_"))
-    return {name: getattr(facts, name) for name in public} | {"above": above, "span": span}
+    # It needs Mitsuba, whose variant is chosen by now.
+    from unbake.training.path_depth import SHARE
+
+    settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
+    functions = {"above": above, "span": span}
+    return {name: getattr(facts, name) for name in public} | functions | settings
