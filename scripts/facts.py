@@ -217,6 +217,20 @@ class Facts:
                 return row
         raise Unfounded(f"{self.kept / experiment / 'data.csv'}: no row with {values}")
 
+    def fastest(self, experiment: str, *methods: str, **values: object) -> Row:
+        """Of the records of these methods with these values, the one of the shortest step."""
+        rows = [
+            row
+            for row in self.rows(experiment)
+            if row["method"] in methods
+            and isinstance(row["milliseconds"], int | float)
+            and all(row.get(key) == value for key, value in values.items())
+        ]
+        if not rows:
+            place = self.kept / experiment / "data.csv"
+            raise Unfounded(f"{place}: no time of {' or '.join(methods)} with {values}")
+        return min(rows, key=lambda row: row["milliseconds"])
+
     def experiment_table(self, experiment: str) -> str:
         """The table that an experiment wrote."""
         return self._kept(experiment, "table.md").read_text(encoding="utf-8").strip()

@@ -59,11 +59,20 @@ def test_table2_knows_how_long_paths_are(rows):
         assert row["mean_without_limit"] == pytest.approx(1 / (1 - row["albedo"]), rel=0.03)
 
 
-def test_fig5_ours_does_not_grow_and_differentiated_paths_do(rows):
+def test_fig5_ours_does_not_grow_and_differentiated_paths_do(rows, out):
     found = rows("fig5")
     kept = {(row["method"], row["albedo"]): row for row in found}
-    assert {albedo for _, albedo in kept} == {0.3, 0.7} and len(kept) == 10
+    assert {albedo for _, albedo in kept} == {0.3, 0.7} and len(kept) == 2 * 7
     assert not any(column(found, "error"))
+    for row in found:
+        assert 0 < row["milliseconds_in_kernels"] and 0 < row["times_ours_in_kernels"]
+    # Its step is traced in Python, which is not time of the method: the table has no ratio of it.
+    traced = kept["PRB, a kernel a bounce", 0.7]
+    assert traced["milliseconds_in_kernels"] < traced["milliseconds"]
+    table = (out / "fig5" / "table.md").read_text()
+    assert "traced anew each step, in Python" in table
+    assert f"{traced['times_ours']:.2f}" not in table
+    assert f"{traced['times_ours_in_kernels']:.2f}" in table
     ours, path = ([kept[m, a]["memory_mb"] for a in (0.3, 0.7)] for m in ("ours", "AD-PT"))
     if None in ours + path:
         pytest.skip("the memory that a step takes is not known here")
@@ -80,12 +89,19 @@ def test_table1_knows_the_scenes(rows, out, scenes_dir):
     (row,) = rows("table1", "--scenes", scenes_dir, figure=False)
     assert row["scene"] == "STAIRCASE" and (row["train"], row["heldout"]) == (26, 6)
     assert 1 < row["path_length"] < 15 and row["seen"] > 0.9
+    # With the raised albedo, light goes deeper than the paper's limit.
+    assert 15 < row["depth"] < 40 and 0.85 < row["light_at_15"] < 0.99
+    assert "depth of 99 %" in (out / "table1" / "table.md").read_text()
     assert picture(out / "table1" / "staircase.png").std() > 0
 
 
 def test_fig3_measures_every_method(rows, scenes_dir):
     found = rows("fig3", "--scenes", scenes_dir)
-    assert column(found, "method") == ["ours", "no prior", "direct", "PRB", "AD-PT"]
+    followed = ["PRB", "PRB, split halves", "AD-PT", "AD-PT, split halves"]
+    assert column(found, "method") == ["ours", "no prior", "direct", *followed]
+    assert column(found, "estimator") == ["split-halves"] * 3 + ["two-pass", "split-halves"] * 2
+    assert column(found, "path_depth") == [None] * 3 + [found[-1]["path_depth"]] * 4
+    assert found[-1]["path_depth"] >= 15
     assert min(column(found, "milliseconds")) > 0 and not any(column(found, "error"))
 
 

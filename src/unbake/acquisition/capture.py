@@ -93,7 +93,7 @@ def _capture(
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
-    light = _light_by_depth(scene, [c for split, c in posed if split == "train"], settings, room)
+    light = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
         shape = (camera.height, camera.width)
@@ -219,10 +219,20 @@ def _photographs(
     return rgb, np.minimum(alpha, 1)
 
 
-def _light_by_depth(
+def light_of_views(
     scene: mi.Scene, cameras: list[Camera], settings: CaptureSettings, room: bool
 ) -> tuple[float, ...]:
-    """Shares of the photographs' light by depth, up to the depth that carries all (to 0.01 %)."""
+    """The shares of the light that paths of depth 1, 2, … carry to views; see `light_by_depth`.
+
+    Args:
+        scene: with its true materials.
+        cameras: of the views.
+        settings: of the paths that carry all light.
+        room: whether emitters are seen.
+
+    Returns:
+        Shares to four digits, up to the depth that carries all; none where there is no light.
+    """
     rays = CameraRays.of(cameras)
     count = min(rays.pixels, LIGHT_PIXELS)
     chosen = np.random.default_rng(settings.seed).integers(rays.pixels, size=count)

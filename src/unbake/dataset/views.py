@@ -19,6 +19,7 @@ from unbake.errors import UserError
 from unbake.io import text
 from unbake.quantities import QUANTITIES
 from unbake.scene import free_space
+from unbake.transport.light_by_depth import depth_of_light, light_of_depth
 
 BACKGROUNDS = ("visible", "hidden")
 
@@ -77,12 +78,11 @@ class Dataset:
 
     def depth_of_light(self, share: float) -> int | None:
         """The smallest depth of paths that carry this share of the light; None if unknown."""
-        return next((d for d, x in enumerate(self.light_by_depth, 1) if x >= share), None)
+        return depth_of_light(self.light_by_depth, share)
 
     def light_of_depth(self, depth: int) -> float | None:
         """The share of the light that paths of at most this depth carry; None if unknown."""
-        shares = self.light_by_depth
-        return shares[min(depth, len(shares)) - 1] if shares else None
+        return light_of_depth(self.light_by_depth, depth)
 
     @property
     def kind(self) -> SceneKind:

@@ -20,6 +20,7 @@ from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig, PathConfig, PriorName, update
 from ..dataset.views import Dataset
 from ..errors import UserError
+from ..profiling.phases import kernel_history, milliseconds
 from ..scene.edit import to_principled
 from ..scene.parse import parse, write
 from ..training.fresh_fit import FreshFit, begin_fit
@@ -47,12 +48,16 @@ class _Curve:
     published: str = ""
 
 
+#: Dr.Jit cannot replay it: a step is traced anew each time, which takes longer than its kernels.
+TRACED = "PRB, a kernel a bounce"
 CURVES = (
     _Curve("ours", "ours:grid", published="110, mega kernels 98"),
     _Curve("one bounce", "ours:grid", "one-bounce", published="75, mega kernels 64"),
-    _Curve("PRB, one kernel", "prb:grid", published="up to 531"),
-    _Curve("PRB, a kernel a bounce", "prb:grid", symbolic=False, published="up to 4272"),
-    _Curve("AD-PT", "ad-pt:grid", published="1742 at 0.95, then out of memory"),
+    _Curve("PRB, one kernel", "prb:grid:two-pass", published="up to 531"),
+    _Curve("PRB, one kernel, split halves", "prb:grid:split-halves"),
+    _Curve(TRACED, "prb:grid:two-pass", symbolic=False, published="up to 4272"),
+    _Curve("AD-PT", "ad-pt:grid:two-pass", published="1742 at 0.95, then out of memory"),
+    _Curve("AD-PT, split halves", "ad-pt:grid:split-halves"),
 )
 #: How often each method is measured: a machine whose speed changes then affects all of them.
 TURNS = 2
@@ -60,7 +65,7 @@ TURNS = 2
 
 def _jobs(context: ExperimentContext) -> list[Job]:
     albedos = context.pick([0.3, 0.7], list(PATHS), list(PATHS))
-    cost = {0.3: 40, 0.5: 45, 0.7: 60, 0.9: 130, 0.95: 220, 0.97: 330}
+    cost = {0.3: 60, 0.5: 70, 0.7: 90, 0.9: 170, 0.95: 270, 0.97: 390}
     settings = {
         "grid": context.pick(8, 64, 256),
         "pixels": context.pick(64, 1024, 65536),
@@ -70,7 +75,9 @@ def _jobs(context: ExperimentContext) -> list[Job]:
     return [
         Job(
             f"albedo-{albedo}",
-            settings | {"albedo": albedo, "max_depth": PATHS[albedo][0]},
+            settings
+            | {"albedo": albedo, "max_depth": PATHS[albedo][0]}
+            | {"curves": [curve.name for curve in CURVES]},
             lambda albedo=albedo: _measure(context, albedo, **settings),
             context.pick(8.0, cost[albedo], None),
         )
@@ -103,16 +110,17 @@ def _measure(
                 config = replace(config, prior=curve.prior)
             try:
                 with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, curve.symbolic):
-                    times, memory = _steps(dataset, config, albedo, steps, frozen=curve.symbolic)
+                    measured = _steps(dataset, config, albedo, steps, frozen=curve.symbolic)
             except (UserError, RuntimeError) as error:
                 if isinstance(error, RuntimeError) and not lacks_memory(error):
                     raise
                 row["error"] = str(error)
                 context.tell(f"albedo {albedo}, {curve.name}: {error}")
                 continue
-            row["seconds"] += times
-            row["memory"] = memory
-            median = f"{1e3 * statistics.median(times):.0f} ms"
+            row["seconds"] += measured.seconds
+            row["kernel_seconds"] = row.get("kernel_seconds", []) + measured.kernel_seconds
+            row["memory"] = measured.memory
+            median = f"{1e3 * statistics.median(measured.seconds):.0f} ms"
             context.tell(f"turn {turn + 1}, albedo {albedo}, {curve.name}: {median}")
     return findings
 
@@ -140,10 +148,20 @@ def _cube(context: ExperimentContext, albedo: float) -> Dataset:
     return Dataset.load(folder)
 
 
+@final
+@dataclass(frozen=True)
+class _Steps:
+    """Steps after warm-up."""
+
+    seconds: list[float]
+    kernel_seconds: list[float]  #: sums over the kernels of further steps
+    memory: int | None  #: bytes that a step adds to those of the fit
+
+
 def _steps(
     dataset: Dataset, config: FitConfig, albedo: float, steps: int, *, frozen: bool
-) -> tuple[list[float], int | None]:
-    """Seconds of steps after warm-up, and the bytes of memory that a step adds to those of the fit.
+) -> _Steps:
+    """Measure steps, and further ones kernel by kernel.
 
     `dr.freeze` cannot record evaluated loops (Dr.Jit 1.5): such steps are traced anew each time.
     """
@@ -169,7 +187,12 @@ def _steps(
         start = time.perf_counter()
         step(number)
         times.append(time.perf_counter() - start)
-    return times, memory
+    in_kernels = []
+    for number in range(5 + steps, 5 + steps + min(steps, 3)):
+        with kernel_history() as kernels:
+            step(number)
+        in_kernels.append(milliseconds(kernels) / 1e3)
+    return _Steps(times, in_kernels, memory)
 
 
 def _paint(fit: FreshFit, albedo: float) -> None:
@@ -184,30 +207,52 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
     rows = []
     for job, methods in findings.items():
         good = {name: m for name, m in methods.items() if "error" not in m}
-        seconds = {name: statistics.median(m["seconds"]) for name, m in good.items()}
+        times, kernels = (
+            {name: statistics.median(m[key]) for name, m in good.items()}
+            for key in ("seconds", "kernel_seconds")
+        )
         for name, measured in methods.items():
             row = {"albedo": float(job.removeprefix("albedo-")), "method": name}
             if name in good:
                 memory = measured["memory"]
-                row["milliseconds"] = 1e3 * seconds[name]
-                row["times_ours"] = seconds[name] / seconds["ours"] if "ours" in good else None
+                row["milliseconds"] = 1e3 * times[name]
+                row["milliseconds_in_kernels"] = 1e3 * kernels[name]
+                row["times_ours"] = times[name] / times["ours"] if "ours" in good else None
+                row["times_ours_in_kernels"] = (
+                    kernels[name] / kernels["ours"] if "ours" in good else None
+                )
                 row["memory_mb"] = None if memory is None else memory / 1e6
             rows.append(row | {"error": measured.get("error")})
     albedos = sorted({row["albedo"] for row in rows})
-    tables = []
-    for title, key, digits in (
-        ("Milliseconds of a step", "milliseconds", 0),
-        ("As multiples of ours", "times_ours", 2),
-        ("Memory of a step, MB", "memory_mb", 0),
-    ):
-        lines = []
-        for curve in CURVES:
-            cells = {row["albedo"]: row for row in rows if row["method"] == curve.name}
-            line = [curve.name, *(_cell(cells[albedo], key, digits) for albedo in albedos)]
-            lines.append([*line, curve.published] if key == "milliseconds" else line)
-        titles = ["method", *(f"{albedo:g}" for albedo in albedos)]
-        titles += ["the paper"] if key == "milliseconds" else []
-        tables.append(f"{title}, at an albedo of:\n\n{markdown(titles, lines)}")
+
+    def line(title: str, name: str, key: str, digits: int) -> list[str | None]:
+        cells = {row["albedo"]: row for row in rows if row["method"] == name}
+        return [title, *(_cell(cells[albedo], key, digits) for albedo in albedos)]
+
+    titles = ["method", *(f"{albedo:g}" for albedo in albedos)]
+    milliseconds, multiples, memory = [], [], []
+    for curve in CURVES:
+        name = curve.name
+        if name == TRACED:
+            title = f"{name}, traced anew each step, in Python"
+            milliseconds += [
+                [*line(title, name, "milliseconds", 0), curve.published],
+                [*line(f"{name}, its kernels alone", name, "milliseconds_in_kernels", 0), ""],
+            ]
+            title = f"{name}, its kernels over those of ours"
+            multiples.append(line(title, name, "times_ours_in_kernels", 2))
+        else:
+            milliseconds.append([*line(name, name, "milliseconds", 0), curve.published])
+            multiples.append(line(name, name, "times_ours", 2))
+        memory.append(line(name, name, "memory_mb", 0))
+    tables = [
+        f"{title}, at an albedo of:\n\n{markdown(columns, lines)}"
+        for title, columns, lines in (
+            ("Milliseconds of a step", [*titles, "the paper"], milliseconds),
+            ("As multiples of ours", titles, multiples),
+            ("Memory of a step, MB", titles, memory),
+        )
+    ]
     return ExperimentResult(rows, "\n\n".join(tables), lambda path: _draw(path, rows))
 
 

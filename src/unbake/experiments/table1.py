@@ -8,12 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ..acquisition.capture import light_of_views
 from ..acquisition.placement import coverage
+from ..config import PAPER_DEPTH, PathConfig
 from ..dataset.camera import read_cameras
 from ..dataset.pixels import CameraRays
 from ..imaging.pictures import montage, tonemap, write_png
 from ..scene.edit import to_principled
 from ..scene.parse import parse
+from ..training.path_depth import SHARE
+from ..transport.light_by_depth import depth_of_light, light_of_depth
 from ..transport.path_tracer import path_lengths
 from ..transport.render import parts_of, render_radiance
 from ..transport.vertex import SceneView
@@ -33,8 +37,11 @@ PUBLISHED = {
     "FICUS": (1.43, 25, 64, 12),
     "DRAGON": (1.26, 25, 64, 12),
 }
-#: Limits of the paper: path length, and probability to survive Russian roulette.
-MAX_DEPTH, SURVIVAL = 15, 0.95
+#: Largest probability to survive Russian roulette, in the paper and in Mitsuba.
+SURVIVAL = 0.95
+#: The first interaction that roulette may take away. Mitsuba's `prb` (3.9.1) compares `rr_depth`
+#: with the interactions before the present one, and plays for the next one.
+FIRST_LOST = PathConfig().rr_depth + 2
 
 
 def _jobs(context: ExperimentContext) -> list[Job]:
@@ -46,7 +53,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
         jobs.append(
             Job(
                 scene.folder,
-                {"pixels": pixels, "spp": spp} | scene.described(context),
+                {"pixels": pixels, "spp": spp, "roulette": FIRST_LOST} | scene.described(context),
                 functools.partial(_measure, context, scene, pixels, spp),
                 context.pick(25.0, 30.0, None),
                 files=[_views(context, scene)],
@@ -70,7 +77,12 @@ def _measure(context: ExperimentContext, scene: PaperScene, pixels: int, spp: in
     lengths = [
         np.array(
             path_lengths(
-                scene_view, ray, seed, max_depth=MAX_DEPTH, rr_depth=2, most_likely=SURVIVAL
+                scene_view,
+                ray,
+                seed,
+                max_depth=PAPER_DEPTH,
+                rr_depth=FIRST_LOST,
+                most_likely=SURVIVAL,
             )
         )
         for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
@@ -91,7 +103,9 @@ def _measure(context: ExperimentContext, scene: PaperScene, pixels: int, spp: in
     write_png(_views(context, scene), montage(rows))
     lengths = np.concatenate(lengths)
     trained = [camera for split, camera in posed if split == "train"]
+    light = light_of_views(loaded, trained, scene.capture_settings(context), scene.room)
     return {
+        "light_by_depth": list(light),
         # Camera rays that hit nothing do not count.
         "path_length": float(lengths[lengths > 0].mean(dtype=np.float64)),
         "train": len(trained),
@@ -108,9 +122,13 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
         copy_file(_views(context, scene), context.out / "table1")
         config, shots = scene.settings(context), scene.capture_settings(context)
         length, views, spp, batch = PUBLISHED[scene.name]
+        found = dict(findings[scene.folder])
+        light = found.pop("light_by_depth")
+        found["depth"] = depth_of_light(light, SHARE)
+        found["light_at_15"] = light_of_depth(light, PAPER_DEPTH)
         rows.append(
             {"scene": scene.name, "label": scene.label}
-            | findings[scene.folder]
+            | found
             | {"pixels": shots.resolution, "photograph_spp": shots.spp}
             | {"spp": config.spp, "batch": config.pixels, "published_path_length": length}
             | {"published_views": views, "published_spp": spp, "published_batch": 2**batch}
@@ -121,6 +139,8 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
             "scene",
             "path length",
             "the paper",
+            "depth of 99 %",
+            "light at depth 15",
             "views",
             "the paper",
             "held out",
@@ -137,6 +157,8 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
                 r["label"],
                 f"{r['path_length']:.2f}",
                 f"{r['published_path_length']:.2f}",
+                r["depth"],
+                f"{100 * r['light_at_15']:.1f} %",
                 r["train"],
                 r["published_views"],
                 r["heldout"],

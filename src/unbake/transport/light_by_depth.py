@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -53,6 +55,24 @@ def light_by_depth(
     if not lit.size:
         return np.zeros(max_depth)
     return np.median(lit.cumsum(0) / lit.sum(0), axis=1)
+
+
+def depth_of_light(shares: Sequence[float], share: float) -> int | None:
+    """The smallest depth of paths that carry this share of the light; None if it is unknown.
+
+    Args:
+        shares: from `light_by_depth`; deeper paths add nothing to the last one.
+    """
+    return next((depth for depth, x in enumerate(shares, 1) if x >= share), None)
+
+
+def light_of_depth(shares: Sequence[float], depth: int) -> float | None:
+    """The share of the light that paths of at most this depth carry; None if it is unknown.
+
+    Args:
+        shares: as in `depth_of_light`.
+    """
+    return shares[min(depth, len(shares)) - 1] if shares else None
 
 
 @dr.syntax
