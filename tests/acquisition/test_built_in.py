@@ -11,6 +11,8 @@ if mi.variant() is None:
     mi.set_variant("llvm_ad_rgb")
 
 from unbake.acquisition import built_in  # noqa: E402
+from unbake.dataset.camera import Camera  # noqa: E402
+from unbake.dataset.pixels import CameraRays  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 
 RAYS = 2000
@@ -42,7 +44,7 @@ def test_cameras_stand_in_free_space(scenes, name):
         assert distance[hit].min() > 0.05, camera
 
 
-@pytest.mark.parametrize("name", ["demo", "cube", "furnace"])
+@pytest.mark.parametrize("name", ["demo", "annex", "cube", "furnace"])
 def test_closed_scenes_have_no_slit(scenes, name):
     for camera in built_in.default_cameras(name, 8, 4):
         assert all_round(scenes[name], camera)[0].all()
@@ -102,6 +104,37 @@ def test_demo_is_lit_indirectly(scenes):
     assert np.mean(dark) > 0.6
 
 
+def test_the_annex_is_lit_and_hardly_seen_through_its_door(scenes):
+    """Cameras to learn from stand in the first room, held-out ones in both by turns."""
+    scene, cameras = scenes["annex"], built_in.default_cameras("annex", 16, 6)
+    train, held_out = cameras[:16], cameras[16:]
+    assert all(c["origin"][0] < 3.2 for c in (*train, *held_out[::2]))
+    assert all(c["origin"][0] > 3.3 for c in held_out[1::2])
+    beyond = [seen_at(scene, c)[0] > 3.3 for c in train]
+    assert 0 < np.mean(beyond) < 0.05
+    assert np.mean([seen_at(scene, c)[0] > 3.3 for c in held_out[1::2]]) > 0.7
+    first, second = (
+        np.mean([radiance(scene, c, 32, 64) for c in group], (0, 1, 2))
+        for group in (held_out[::2], held_out[1::2])
+    )
+    assert (first > 0.03).all() and first.mean() < 0.2 * second.mean()
+    direct = [radiance(scene, c, 2, 16).mean(-1) > 0.02 for c in train]
+    assert np.mean(direct) < 0.2, "most of the first room sees no lamp"
+
+
+def seen_at(scene, camera):
+    """Points (3, n) that a camera sees, on a grid of pixels."""
+    look = Camera.look_at(camera["origin"], camera["target"], camera["up"], camera["fov"], 32, 32)
+    rays = CameraRays.of([look])
+    ray = rays.through(drjit.arange(mi.UInt32, rays.pixels), mi.Point2f(0.5))
+    return np.array(scene.ray_intersect(ray).p)
+
+
+def test_the_scenes_are_named_in_the_help(unbake):
+    for name in built_in.SCENES:
+        assert name in unbake("capture", "--help").out
+
+
 def test_scene_is_self_contained(tmp_path):
     text = built_in.write_scene("demo", tmp_path / "here").read_text(encoding="utf-8")
     assert str(tmp_path) not in text
@@ -122,8 +155,9 @@ def test_same_scene_twice(tmp_path):
             assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_textures_are_in_range(tmp_path):
-    built_in.write_scene("demo", tmp_path)
+@pytest.mark.parametrize("name", ["demo", "annex"])
+def test_textures_are_in_range(tmp_path, name):
+    built_in.write_scene(name, tmp_path)
     for path in (tmp_path / "textures").glob("*.exr"):
         values = np.array(mi.Bitmap(str(path))).astype(np.float32)
         low, high = (0.15, 0.95) if "roughness" in path.name else (0.02, 0.95)

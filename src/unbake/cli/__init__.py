@@ -90,7 +90,8 @@ def capture(
     """Render a data set from a Mitsuba scene: photographs, cameras, and the true materials.
 
     Args:
-        scene: A Mitsuba 3 XML file, or a built-in scene: demo, still, cornell, cube, furnace.
+        scene: A Mitsuba 3 XML file, or a built-in scene: demo, annex (two rooms, and training views
+            of one), still, cornell, cube, furnace.
         out: Folder to write; it must not exist.
         cameras: Camera file (or transforms.json) to use instead of --views and --held-out.
         capture: How the data set is rendered.

@@ -1,4 +1,4 @@
-"""The built-in scenes: a demo room, a still life, the Cornell box, the paper's cube, a furnace."""
+"""The built-in scenes: two rooms, a still life, the Cornell box, the paper's cube, a furnace."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import UserError
-from . import closed, cornell, demo, still
+from . import annex, closed, cornell, demo, still
 from .cameras import Camera
 
 __all__ = ["SCENES", "Camera", "default_cameras", "write_scene"]
@@ -28,6 +28,7 @@ class _BuiltIn:
 
 _SCENES = {
     "demo": _BuiltIn(lambda folder, albedo: demo.write(folder), demo.cameras),
+    "annex": _BuiltIn(lambda folder, albedo: annex.write(folder), annex.cameras),
     "still": _BuiltIn(lambda folder, albedo: still.write(folder), still.cameras),
     "cornell": _BuiltIn(lambda folder, albedo: cornell.write(folder), cornell.cameras),
     "cube": _BuiltIn(closed.write_cube, closed.cameras),
@@ -41,8 +42,9 @@ def write_scene(name: str, folder: Path, *, albedo: float = 0.5) -> Path:
     """Write a built-in scene as a self-contained Mitsuba 3 scene and return the path of its XML.
 
     `folder` gets `scene.xml`, `meshes/*.ply` and `textures/*.exr` (linear, raw); lengths are
-    metres in `demo`, half widths of the box or slab elsewhere; z is up. `albedo` in [0, 1) is that
-    of the walls of `cube` and `furnace`, the other scenes ignore it. Needs a Mitsuba variant.
+    metres in `demo` and `annex`, half widths of the box or slab elsewhere; z is up. `albedo` in
+    [0, 1) is that of the walls of `cube` and `furnace`, the other scenes ignore it. Needs a Mitsuba
+    variant.
 
     Raises:
         UserError: there is no such scene, or the albedo is out of range.
