@@ -2,7 +2,7 @@
 
     python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
 
-Jobs: machine steps rivals equal long ablation lighting emission sparse (default: all; hours).
+Jobs: machine steps rivals equal long ablation lighting emission sparse prior (default: all; hours).
 STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
 (docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
 that the same command continues what was stopped. Results go to --results; `python
@@ -64,6 +64,7 @@ class Capture:
     held_out: int = 4
     resolution: int = 128
     spp: int = 100
+    cameras: str | None = None  #: a camera file in `benchmarks`, instead of `views` and `held_out`
 
     @property
     def samples(self) -> int:
@@ -75,6 +76,10 @@ DATA = {
     "demo": Capture("demo"),
     "still": Capture("still", views=25, spp=400),
     "few": Capture("demo", views=6),
+    "three": Capture("demo", views=3),
+    # Cameras at x > 2 m that look towards +x; held-out ones look both ways by turns.
+    "half": Capture("demo", views=12, held_out=8, cameras="prior/half.json"),
+    "annex": Capture("annex", views=16, held_out=6, resolution=96, spp=625),
 }
 
 
@@ -91,6 +96,8 @@ class Compare:
         seeds: each is a comparison of its own.
         options: further options of `unbake compare`.
         settings: TOML file of settings, relative to `benchmarks`.
+        groups: names of groups of held-out views, which take turns: the first view belongs to the
+            first group. Each is also scored by itself.
     """
 
     job: str
@@ -101,6 +108,7 @@ class Compare:
     seeds: Sequence[int] = SEEDS
     options: Sequence[object] = ()
     settings: str | None = None
+    groups: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -214,6 +222,14 @@ BENCHMARKS: dict[str, Compare | EqualSamples | Steps | Machine] = {
         )
         for name in ("none", "smooth", "tied", "both")
     },
+    # What the prior gives where cameras see less: few views, half a room, a room behind a door.
+    **{
+        f"prior-{data}": Compare(
+            "prior", data, ("ours", "no-prior"), steps=1200, options=NO_SCORES,
+            groups=("seen", "unseen") if data in ("half", "annex") else (),
+        )
+        for data in ("demo", "few", "three", "half", "annex")
+    },
 }  # fmt: skip
 JOBS = tuple(dict.fromkeys(benchmark.job for benchmark in BENCHMARKS.values()))
 
@@ -300,6 +316,8 @@ class Bench:
             if not folder.exists():
                 sizes = ("--views", shots.views, "--held-out", shots.held_out)
                 sizes += ("--resolution", shots.resolution, "--spp", shots.spp)
+                if shots.cameras is not None:
+                    sizes += ("--cameras", ROOT / "benchmarks" / shots.cameras)
                 unbake("capture", shots.scene, "--out", folder, *sizes)
             return {}
 
@@ -403,7 +421,7 @@ def plan_compare(bench: Bench, name: str, benchmark: Compare) -> Planned:
         )
 
     def write() -> Path:
-        write_json(bench.results / f"{name}.json", summary(folders))
+        write_json(bench.results / f"{name}.json", summary(folders, benchmark.groups))
         return bench.results / f"{name}.json"
 
     return Planned(jobs, write)

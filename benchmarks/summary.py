@@ -13,6 +13,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
 from unbake.experiments.seeds import across_seeds
+from unbake.imaging.metrics import mean_psnr
+from unbake.training.run_folder import RunFolder
 
 Row = dict[str, Any]
 
@@ -34,15 +36,34 @@ def read(file: Path) -> Row:
     return json.loads(file.read_text(encoding="utf-8"))
 
 
-def summary(folders: Sequence[Path]) -> Row:
+def summary(folders: Sequence[Path], groups: Sequence[str] = ()) -> Row:
     """Length and held-out quality of each method from comparisons that differ in the seed.
+
+    Args:
+        folders: of the comparisons.
+        groups: names of groups of held-out views, which take turns; their quality is KEY_GROUP.
 
     Returns:
         By method in `methods`, and of the fields before their first step in `untrained`: each
         number as its mean over seeds, with its sample standard deviation as KEY_sd if there are
         several; and `per_seed`, the numbers of each seed with its scores during the fit.
     """
-    return summarized([read(folder / "compare.json") for folder in folders])
+    comparisons = [read(folder / "compare.json") for folder in folders]
+    for folder, comparison in zip(folders, comparisons, strict=True):
+        for name, row in comparison["methods"].items():
+            if groups and "error" not in row:
+                row["heldout"] |= _of_groups(RunFolder(folder / name).metrics(), groups)
+    return summarized(comparisons)
+
+
+def _of_groups(metrics: Row, groups: Sequence[str]) -> Row:
+    """Mean quality of every group of held-out views."""
+    views = [view for view in metrics["per_view"] if view["split"] == "heldout"]
+    return {
+        f"{key}_{group}": mean_psnr(view.get(key) for view in views[number :: len(groups)])
+        for key in QUALITY
+        for number, group in enumerate(groups)
+    }
 
 
 def summarized(comparisons: Sequence[Row]) -> Row:
@@ -99,7 +120,7 @@ def _method(seeds: Sequence[int], rows: Sequence[Row]) -> Row:
     if failed:
         return {"error": failed[0]}
     per_seed = [{"seed": seed} | _numbers(row) for seed, row in zip(seeds, rows, strict=True)]
-    keys = (*LENGTH, *QUALITY, *ENVIRONMENT, "emission_error")
+    keys = dict.fromkeys(key for row in per_seed for key in row if key not in ("seed", "score"))
     kept = {key: rows[0][key] for key in KEPT if key in rows[0]}
     return kept | across_seeds(per_seed, keys) | {"per_seed": per_seed}
 
@@ -107,7 +128,9 @@ def _method(seeds: Sequence[int], rows: Sequence[Row]) -> Row:
 def _numbers(row: Row) -> Row:
     """What is measured of a run; what is not known is left out."""
     numbers = {key: row.get(key) for key in LENGTH}
-    numbers |= {key: row["heldout"].get(key) for key in QUALITY}
+    # Also of groups of views, as KEY_GROUP.
+    quality = (key for key in row["heldout"] if key.startswith(QUALITY))
+    numbers |= {key: row["heldout"][key] for key in quality}
     numbers |= {key: (row.get("environment") or {}).get(key) for key in ENVIRONMENT}
     errors = [light["emission_error"] for light in row.get("emission", ())]
     numbers["emission_error"] = mean_of_known(errors)

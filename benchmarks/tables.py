@@ -170,6 +170,23 @@ def variants(names: list[str], *columns: tuple[str, str, float, int]) -> Callabl
     return table
 
 
+def prior(*results: dict) -> str:
+    """The same fits with and without the prior, by what the training cameras see."""
+    rows = []
+    for case, result in zip(PRIOR.values(), results, strict=True):
+        for name, row in result["methods"].items():
+            if "error" in row:
+                rows.append([case, f"`{name}`", row["error"], *[""] * 4])
+                continue
+            seen = "_seen" if "albedo_psnr_seen" in row else ""
+            keys = [f"{key}_psnr{seen}" for key in ("albedo", "roughness", "render")]
+            keys += ["albedo_psnr_unseen", "render_psnr_unseen"]
+            rows.append([case, f"`{name}`", *(spread(row, key, 1, 1) for key in keys)])
+    seen, unseen = ("albedo", "roughness", "rendering"), ("albedo, unseen", "rendering, unseen")
+    titles = ["training views", "run", *(f"{title}, dB" for title in (*seen, *unseen))]
+    return markdown(titles, rows) + over_seeds(results[0])
+
+
 def spread(row: dict, key: str, factor: float, digits: int) -> str:
     """A mean, and the standard deviation over seeds if there are several."""
     return plus_minus(row, key, digits, factor) or ""
@@ -196,6 +213,14 @@ BOTH = (
     ("relighting, dB", "relight_psnr", 1, 1),
     ("relighting, aligned", "relight_psnr_aligned", 1, 1),
 )
+#: Data sets of the job `prior`.
+PRIOR = {
+    "demo": "24 of the demo",
+    "few": "6 of the demo",
+    "three": "3 of the demo",
+    "half": "12 of one half of the demo",
+    "annex": "16 of the first room of the annex",
+}
 TABLES = (
     ("Time of a step", ("methods-demo", "methods-staircase"), steps),
     ("Demo", ("demo",), demo),
@@ -220,6 +245,7 @@ TABLES = (
             *PSNR,
         ),
     ),
+    ("With and without the prior", tuple(f"prior-{data}" for data in PRIOR), prior),
 )
 
 if __name__ == "__main__":
