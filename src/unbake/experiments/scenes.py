@@ -74,6 +74,8 @@ class PaperScene:
         albedo_power: exponent that is applied to every albedo. The authors raised the albedo of
             STAIRCASE; a value below 1 does so.
         environment: environment map of `envmaps_blender` that replaces the scene's own.
+        cut_outs: whether it has opacities that are fractions, which Mitsuba's `path` renders wrong
+            (see `path_integrator`).
     """
 
     name: str
@@ -86,6 +88,7 @@ class PaperScene:
     stands_in: str = ""
     albedo_power: float = 1.0
     environment: str | None = None
+    cut_outs: bool = False
 
     @property
     def label(self) -> str:
@@ -158,7 +161,8 @@ class PaperScene:
         self, context: ExperimentContext, shots: CaptureSettings | None = None
     ) -> dict[str, Any]:
         """Everything that the data set depends on."""
-        return {
+        integrator = {"integrator": "volpath"} if self.cut_outs else {}
+        return integrator | {
             "photographs": asdict(shots or self.capture_settings(context)),
             "albedo_power": self.albedo_power,
             "lit_by": self.lit_by,
@@ -221,7 +225,14 @@ STAIRCASE = PaperScene(
 SCENES = (
     STAIRCASE,
     PaperScene(
-        "KITCHEN", "kitchen", "scene_principled.xml", room=True, views=62, steps=32_000, spp=256
+        "KITCHEN",
+        "kitchen",
+        "scene_principled.xml",
+        room=True,
+        views=62,
+        steps=32_000,
+        spp=256,
+        cut_outs=True,
     ),
     PaperScene(
         "LIVING ROOM",
@@ -231,6 +242,7 @@ SCENES = (
         views=64,
         steps=32_000,
         spp=192,
+        cut_outs=True,
     ),
     PaperScene(
         "VEACH DOOR",
@@ -260,7 +272,14 @@ SCENES = (
         stands_in="vegboard",
     ),
     PaperScene(
-        "FICUS", "plant", "scene_mi3.xml", room=False, views=25, steps=10_000, stands_in="plant"
+        "FICUS",
+        "plant",
+        "scene_mi3.xml",
+        room=False,
+        views=25,
+        steps=10_000,
+        stands_in="plant",
+        cut_outs=True,
     ),
     PaperScene("DRAGON", "dragon", "scene_mi3.xml", room=False, views=25, steps=10_000),
 )
