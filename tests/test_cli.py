@@ -177,9 +177,14 @@ def test_every_option_is_explained(command, unbake):
 def test_the_help_of_fit_tells_what_the_presets_say(unbake):
     text = re.sub(r"[│\s]+", " ", unbake("fit", "--help").out)
     cpu, paper, release = preset("cpu"), preset("paper"), preset("release")
-    for key in ("steps", "pixels", "spp"):
+    lighting = preset("release-lighting")
+    for key in ("steps", "pixels"):
         assert getattr(paper, key) == getattr(release, key)
-        assert f"cpu: {getattr(cpu, key)}, paper and release: {getattr(paper, key)}" in text
+        told = f"cpu: {getattr(cpu, key)}, paper and release: {getattr(paper, key)}, "
+        assert f"{told}release-lighting: {getattr(lighting, key)}" in text
+    assert "cpu and release-lighting: 8, paper and release: 16" in text
+    crops = "paper and release and release-lighting: one-view-crop"
+    assert f"cpu: all-views, {crops}" in text
 
 
 @pytest.mark.parametrize(

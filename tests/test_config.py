@@ -23,6 +23,7 @@ from unbake.config import (
     to_toml,
 )
 from unbake.errors import UserError
+from unbake.training.schedule import learning_rates
 
 PRESETS = typing.get_args(PresetName)
 #: For another process to find the package of this checkout.
@@ -75,6 +76,34 @@ def test_absent_keys_come_from_the_named_preset():
     assert config == expected
 
 
+def test_presets_hold_the_published_values():
+    """Sec. 5.3, 5.4, Table 1 (STAIRCASE), and what the public release says beside that."""
+    paper, release = preset("paper"), preset("release")
+    for config in (paper, release):
+        assert (config.steps, config.pixels, config.spp) == (18_000, 2**14, 16)
+        assert (config.radiance_samples, config.pixel_sampling) == (16, "one-view-crop")
+        assert not config.halves and config.loss_reference == "photograph"
+        assert (config.loss_epsilon, config.final_learning_rate, config.warm_up) == (0.01, 1.0, 0)
+        fields = [*config.materials.values(), config.radiance]
+        networks = [settings["neural"] for settings in fields]
+        assert {n.learning_rate for n in networks} == {5e-4} and {n.width for n in networks} == {
+            256
+        }
+        assert [n.hidden for n in networks] == [1] * (len(fields) - 1) + [3]
+        # 128² texels over the sphere: as many around the horizon as an image of 256 x 128 has
+        light = config.lighting
+        assert (light.resolution, light.learning_rate, light.initial_radiance) == (128, 5e-4, 1.0)
+    grids = [config.radiance["neural"].grid for config in (paper, release)]
+    sizes = [(g.levels, g.features, g.table_log2, g.base_resolution, g.growth) for g in grids]
+    assert sizes == [(16, 2, 17, 2, 2.0), (17, 2, 18, 2, 1.5)]
+    assert grids[0].base_resolution * grids[0].growth ** (grids[0].levels - 1) == 2**16
+
+    light = preset("release-lighting")
+    assert (light.unknown, light.steps, light.pixels, light.spp) == ("lighting", 600, 256**2, 8)
+    rates = learning_rates(light, 0, 0.0), learning_rates(light, 599, 1.0)
+    assert rates[0]["environment"] == rates[1]["environment"] == 1e-3
+
+
 def test_settings_cannot_be_changed_in_place():
     with pytest.raises(dataclasses.FrozenInstanceError):
         FitConfig().steps = 3
@@ -110,10 +139,15 @@ def test_settings_cannot_be_changed_in_place():
         ("seed = -1", "seed: must be 0 or more"),
         ("warm_up = -1", "warm_up: must be 0 or more"),
         ("loss_epsilon = 0.0", "loss_epsilon: must be positive"),
-        ('preset = "fast"', "preset: must be one of cpu, paper, release, not 'fast'"),
-        ("preset = 1", "preset: must be one of cpu, paper, release, not 1"),
+        (
+            'preset = "fast"',
+            "preset: must be one of cpu, paper, release, release-lighting, not 'fast'",
+        ),
+        ("preset = 1", "preset: must be one of cpu, paper, release, release-lighting, not 1"),
         ("preset = [1]", "preset: must be one of"),
         ('method = "best"', "method: must be one of ours, no-prior, direct, ad-pt, .*not 'best'"),
+        ("[lighting]\ninitial_radiance = -1.0", "lighting.initial_radiance: must be 0 or more"),
+        ('pixel_sampling = "crop"', "pixel_sampling: must be one of all-views, one-view-crop"),
         ("[radiance.neural]\nwidth = 0", r"radiance.neural.width: must be 1 or more"),
         ("[radiance.neural]\nhidden = 0", r"radiance.neural.hidden: must be 1 or more"),
         ("[radiance.neural.grid]\nlevels = 0", r"radiance.neural.grid.levels: must be 1 or more"),

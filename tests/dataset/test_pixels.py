@@ -7,6 +7,7 @@ import pytest
 
 from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
+from unbake.errors import UserError
 
 SIZES = [(5, 3), (4, 4), (1, 7), (6, 2)]
 
@@ -170,3 +171,94 @@ def test_one_view_of_one_pixel():
     )
     batch = drawn(made, 0, 2, 4)
     assert (rows(batch.target) == 0.5).all() and (rows(batch.ray.d)[:, 2] < -0.9).all()
+
+
+# -------------------------------------------------------------------------------- one-view crops
+
+EDGE = 3
+CROP_SIZES = [(5, 4), (4, 6), (3, 3), (6, 5)]
+
+
+def crop_source(alpha=None):
+    """Views whose pixels have their number as colour; `alpha` is given by view, row and column."""
+    views = [
+        Camera.look_at((i, 0, 3), (0, 0, 0), (0, 1, 0), 50, w, h)
+        for i, (w, h) in enumerate(CROP_SIZES)
+    ]
+    count = sum(w * h for w, h in CROP_SIZES)
+    rgb = np.repeat(np.arange(count, dtype=np.float32)[:, None], 3, 1)
+    opaque = np.ones(count) if alpha is None else np.concatenate([a.ravel() for a in alpha])
+    return PixelSource.of(views, rgb, opaque, foreground_only=alpha is not None)
+
+
+def corner(made, seed):
+    """View, row and column of a crop's corner; checks that the rest is where it should be."""
+    batch = made.draw_crop(seed, EDGE * EDGE).batch(made.rays, sampler(EDGE * EDGE), 1)
+    numbers = rows(batch.target)[:, 0].astype(int)
+    first = np.cumsum([0, *(w * h for w, h in CROP_SIZES)])
+    view = int(np.searchsorted(first, numbers[0], "right")) - 1
+    width, height = CROP_SIZES[view]
+    row, column = divmod(numbers[0] - first[view], width)
+    assert row + EDGE <= height and column + EDGE <= width
+    y, x = np.mgrid[row : row + EDGE, column : column + EDGE]
+    assert np.array_equal(numbers, first[view] + (y * width + x).ravel())
+    return view, row, column
+
+
+def assert_uniform(drawn, places):
+    """χ² of what was drawn, over all views and, in each, over the places that it has."""
+    share = {(v, *place): 1 / len(places) / len(own) for v, own in places.items() for place in own}
+    assert set(drawn) <= set(share)
+    expected = np.array([len(drawn) * p for p in share.values()])
+    chi2 = ((np.array([drawn.count(place) for place in share]) - expected) ** 2 / expected).sum()
+    freedom = len(share) - 1
+    assert abs(chi2 - freedom) < 5 * np.sqrt(2 * freedom)
+
+
+def all_places(view):
+    width, height = CROP_SIZES[view]
+    return [(y, x) for y in range(height - EDGE + 1) for x in range(width - EDGE + 1)]
+
+
+def test_crops_lie_anywhere_in_any_view_equally_often():
+    made = crop_source()
+    assert_uniform(
+        [corner(made, seed) for seed in range(2000)], {v: all_places(v) for v in range(4)}
+    )
+
+
+def test_half_of_a_crop_is_foreground():
+    """In a view with too little of it, as much as there is; views without any are left out."""
+    rng = np.random.default_rng(5)
+    alpha = [(rng.random((h, w)) < 0.5).astype(float) for w, h in CROP_SIZES]
+    alpha[0][:, :2] = 0
+    alpha[1][:] = 0
+    alpha[3][:] = 0
+    alpha[3][2, 4:] = 1
+    made = crop_source(alpha)
+    inside = {
+        v: {(y, x): alpha[v][y : y + EDGE, x : x + EDGE].sum() for y, x in all_places(v)}
+        for v in (0, 2, 3)
+    }
+    places = {
+        v: [place for place, seen in counts.items() if seen >= min(4.5, max(counts.values()))]
+        for v, counts in inside.items()
+    }
+    assert 0 < len(places[0]) < len(inside[0]) and max(inside[3].values()) == 2
+    assert_uniform([corner(made, seed) for seed in range(2000)], places)
+
+
+def test_seeds_decide_the_crop():
+    made = crop_source()
+    crops = [corner(made, seed) for seed in (1, 1, *range(2, 9))]
+    assert crops[0] == crops[1] and len(set(crops)) > 3
+
+
+def test_a_crop_larger_than_a_view_is_told_in_one_line():
+    made = crop_source()
+    made.require_crops(9)
+    with pytest.raises(UserError, match="4 x 4 pixels is larger than the smallest photo") as caught:
+        made.require_crops(16)
+    assert "--batch 9 or less" in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(UserError, match=r"cannot have 8 pixels\. Use --batch 4, or"):
+        made.require_crops(8)

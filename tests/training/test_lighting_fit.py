@@ -151,6 +151,14 @@ def with_gradients(built_in, name, unknown, method):
     return problem, values
 
 
+@pytest.mark.parametrize(("initial", "start"), [(0.0, 0.3), (1.0, 1.0)])
+def test_an_environment_starts_as_the_settings_say(built_in, initial, start):
+    lighting = LightingConfig(resolution=8, initial_radiance=initial)
+    config = dataclasses.replace(TINY_FIT, unknown="lighting", lighting=lighting)
+    problem = make_problem(built_in("still"), "hidden", config, 0.3)
+    np.testing.assert_allclose(problem.environment.to_latlong(8), start, rtol=1e-5)
+
+
 @pytest.mark.parametrize("method", ["prb", "ad-pt"])
 def test_gradients_of_the_log_of_a_strength_are_its_light(built_in, method):
     """The picture is linear in the only light: so its own derivative by the log of that."""

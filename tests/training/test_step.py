@@ -119,6 +119,7 @@ def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, settings, 
         {"method": "prb", "representation": "grid"},
         {"method": "ad-pt", "path": PathConfig(max_depth=8, rr_depth=2)},
         {"representation": "triplane", "radiance_representation": "triplane"},
+        {"pixel_sampling": "one-view-crop", "pixels": 36},
     ],
     ids=lambda settings: ", ".join(map(str, settings.values())),
 )

@@ -123,7 +123,8 @@ def fit(
     Args:
         data: Folder of the data set, with its transforms.json.
         out: Folder to write the run to: settings, log, checkpoints, previews.
-        preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
+        preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code),
+            release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
         clip_negative: Take negative pixels as zero instead of refusing them.
@@ -223,7 +224,8 @@ def compare(
         methods: Methods of `unbake fit`, such as: ours prb direct. METHOD:REPRESENTATION, such as
             prb:bitmap, also says how materials are represented (neural, grid, ...).
         out: Folder to write to.
-        preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code).
+        preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code),
+            release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         score_seconds: Training time between scores on all held-out views (0: no scores).
         evaluate_spp: Samples per pixel of the final renderings.
@@ -279,7 +281,8 @@ def bench(
         steps: Steps to take the median of, after warm-up (default: 100). For rates, the length of a
             fit (default: as in the settings).
         seconds: For rates, the length of a fit in seconds of training, instead of steps.
-        preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code).
+        preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
+            release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """

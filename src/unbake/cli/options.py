@@ -23,7 +23,8 @@ Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
 Preset = Annotated[
-    config.PresetName | None, arg(metavar="{cpu,paper,release}", help_behavior_hint="")
+    config.PresetName | None,
+    arg(metavar="{cpu,paper,release,release-lighting}", help_behavior_hint=""),
 ]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
 

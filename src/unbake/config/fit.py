@@ -20,10 +20,11 @@ from .tables import update
 
 Estimator = Literal["auto", "split-halves", "two-pass"]
 Reference = Literal["smoothed", "photograph"]
+PixelSampling = Literal["all-views", "one-view-crop"]
 PriorName = Literal["one-bounce", "extra-bounce"]
 Unknown = Literal["materials", "lighting", "materials+lighting", "emission"]
 Precision = Literal["single", "half"]
-PresetName = Literal["cpu", "paper", "release"]
+PresetName = Literal["cpu", "paper", "release", "release-lighting"]
 
 
 @dataclass(frozen=True)
@@ -78,14 +79,21 @@ class LightingConfig:
     mean albedo of what the training views see is `mean_albedo`.
     """
 
-    resolution: int = 64  #: texels along an edge of the square that the sphere is mapped to
+    #: Texels along an edge of the square that the sphere is mapped to. An edge of n has 2n texels
+    #: around the horizon, as an image of 2n x n pixels has.
+    resolution: int = 64
     learning_rate: float = 0.02  #: Adam, log radiance
+    #: Radiance of the map at the start, W·sr⁻¹·m⁻²; 0: the mean of the photographs (ours).
+    initial_radiance: float = 0.0
     mean_albedo: float = 0.5  #: the convention, each channel (ours)
     anchor: float = 1.0  #: weight of the squared deviation from it
 
     def __post_init__(self) -> None:
         known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
         require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
+        start = self.initial_radiance
+        start_known = math.isfinite(start) and start >= 0
+        require(start_known, "initial_radiance", "0 or more", start)
         require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
         anchored = math.isfinite(self.anchor) and self.anchor >= 0
         require(anchored, "anchor", "0 or more", self.anchor)
@@ -211,6 +219,11 @@ class FitConfig:
     ] = 0.0
     #: Batch size in pixels (Table 1).
     pixels: Annotated[int, Flag("Pixels in a step", name="batch")] = 1024
+    #: Which pixels: random ones of all views (ours), or a random square crop of a random view, half
+    #: of it foreground at least (Sec. 5.4).
+    pixel_sampling: Annotated[
+        PixelSampling, Flag("Where the pixels of a step lie: anywhere, or in one crop of one view")
+    ] = "all-views"
     #: Camera samples a pixel a step (Table 1); even, for the split halves.
     spp: Annotated[int, Flag("Samples per pixel in a step, an even number")] = 8
     radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UserError
 from ..fields.arrays import from_numpy
 from .camera import Camera
 from .photographs import Photographs
@@ -117,9 +120,7 @@ class RayBatch:
 class PixelSource:
     """All training pixels, to draw batches from.
 
-    Random pixels over all views rather than one crop of one view a step (Sec. 5.4): neighbouring
-    pixels tell much the same, so that scattered ones learn faster at equal cost. They are drawn on
-    the host, where photographs that are larger than memory can stay on disk.
+    They are drawn on the host, where photographs that are larger than memory can stay on disk.
 
     Args:
         rays: through the pixels of all views.
@@ -145,11 +146,90 @@ class PixelSource:
         return PixelSource(CameraRays.of(cameras), found)
 
     def draw(self, seed: int, count: int) -> PixelBatch:
-        """Draw random pixels, each as likely as any other.
+        """Draw random pixels of all views, each as likely as any other (ours).
 
-        Paper: Sec. 5.4.
+        Neighbouring pixels tell much the same, so that scattered ones learn faster at equal cost
+        than those of `draw_crop`.
         """
         every = self.photographs
         slots = np.random.default_rng(seed).integers(0, every.count, count)
         numbers = slots if every.chosen is None else every.chosen[slots]
         return PixelBatch.of(numbers, every.table[numbers])
+
+    def draw_crop(self, seed: int, count: int) -> PixelBatch:
+        """Draw a square crop of one random view, with all its pixels.
+
+        Each view is as likely as any other, and so is each place in it. Where the background is
+        hidden, at least half of the crop are foreground pixels; in a view that has no such place,
+        it is one of those with the most of them, and a view without any is never drawn.
+
+        Args:
+            count: pixels of the crop; see `require_crops`.
+
+        Paper: Sec. 5.4.
+        """
+        edge = math.isqrt(count)
+        rng = np.random.default_rng(seed)
+        views = self._seen_views
+        view = int(views[rng.integers(len(views))])
+        first, width, height = self._layout[view]
+        across = width - edge + 1
+        places = self._places(view, edge)
+        if places is None:
+            place = int(rng.integers(across * (height - edge + 1)))
+        else:
+            place = int(places[rng.integers(len(places))])
+        row, column = np.divmod(np.arange(edge * edge), edge)
+        numbers = first + (place // across + row) * width + place % across + column
+        return PixelBatch.of(numbers, self.photographs.table[numbers])
+
+    def require_crops(self, count: int) -> None:
+        """Raise a `UserError` if there are no square crops of that many pixels in all views."""
+        edge = math.isqrt(count)
+        if edge * edge != count:
+            what = f"a square crop cannot have {count} pixels"
+            remedy = f"Use --batch {edge**2}, or --pixel-sampling all-views"
+            raise UserError(what, remedy=remedy)
+        short = min(min(width, height) for _, width, height in self._layout)
+        if short < edge:
+            what = f"a crop of {edge} x {edge} pixels is larger than the smallest photograph"
+            remedy = f"Use --batch {short**2} or less, or --pixel-sampling all-views"
+            raise UserError(f"{what}, whose shorter edge has {short}", remedy=remedy)
+
+    @cached_property
+    def _layout(self) -> list[tuple[int, int, int]]:
+        """The number of the first pixel, the width and the height of each view."""
+        first, width = np.array(self.rays._first, int), np.array(self.rays._width, int)
+        sizes = np.diff(first) // width
+        return list(zip(first[:-1].tolist(), width.tolist(), sizes.tolist(), strict=True))
+
+    @cached_property
+    def _seen_views(self) -> np.ndarray:
+        """The views with pixels to train on."""
+        if self.photographs.chosen is None:
+            return np.arange(self.rays.views)
+        first = [first for first, *_ in self._layout]
+        return np.unique(np.searchsorted(first, self.photographs.chosen, "right") - 1)
+
+    @cached_property
+    def _found(self) -> dict[tuple[int, int], np.ndarray]:
+        return {}
+
+    def _places(self, view: int, edge: int) -> np.ndarray | None:
+        """Where a crop of a view may lie, row by row; None: anywhere."""
+        chosen = self.photographs.chosen
+        if chosen is None:
+            return None
+        if (view, edge) not in self._found:
+            first, width, height = self._layout[view]
+            start, stop = np.searchsorted(chosen, [first, first + width * height])
+            mask = np.zeros((height + 1, width + 1), np.int64)
+            inner = np.zeros(height * width, np.int64)
+            inner[chosen[start:stop].astype(int) - first] = 1
+            mask[1:, 1:] = inner.reshape(height, width)
+            sums = mask.cumsum(0).cumsum(1)
+            count = sums[edge:, edge:] - sums[:-edge, edge:] - sums[edge:, :-edge]
+            count += sums[:-edge, :-edge]
+            least = min((edge * edge + 1) // 2, count.max())
+            self._found[view, edge] = np.flatnonzero(count >= least).astype(np.uint32)
+        return self._found[view, edge]

@@ -92,7 +92,8 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
     Args:
         scene: the Mitsuba scene; its own values of the unknowns are ignored.
         background: `visible` or `hidden`.
-        scale: radiance of the untrained radiance field, environment and emitters.
+        scale: radiance of the untrained radiance field and emitters, and of the environment unless
+            the settings say it.
 
     Raises:
         UserError: the scene cannot be loaded, has no emitter or nothing to fit, or has meshes
@@ -106,7 +107,8 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
     if config.learns_materials:
         materials = _unknown_materials(parsed, config, int(seeds[0]))
     if config.learns_environment:
-        environment = EnvironmentMap(config.lighting.resolution, scale=scale)
+        start = config.lighting.initial_radiance or scale
+        environment = EnvironmentMap(config.lighting.resolution, scale=start)
         edit.set_environment(parsed, environment_emitter(environment))
     if config.unknown == "emission":
         emission, emitter_names = _unknown_emission(parsed, scale)

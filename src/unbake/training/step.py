@@ -54,6 +54,8 @@ class TrainingStep:
         smoothed = config.loss_reference == "smoothed"
         if smoothed and not pixels.photographs.smoothed:
             raise ValueError("the loss is relative to smoothed photographs, which were not made")
+        if config.pixel_sampling == "one-view-crop":
+            pixels.require_crops(config.pixels)
         # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
         self._problem = problem
@@ -143,23 +145,29 @@ class TrainingStep:
     def unfrozen(self, state: State, number: int) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
         self.plan(state)
-        return self._step(self._inputs(number, self._config.pixels), state)
+        return self._step(self._inputs(number), state)
 
     def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:
         """The part of a replayed step that runs in Python."""
         state.set_learning_rates(rates)
-        return self._inputs(number, self._config.pixels)
+        return self._inputs(number)
 
-    def _inputs(self, number: int, pixels: int) -> Inputs:
+    def _inputs(self, number: int, probe: int | None = None) -> Inputs:
+        """The inputs of a step, or of so many pixels of all views, which stand for one."""
         seeds = np.random.SeedSequence([self._config.seed, number]).generate_state(2)
         return Inputs(
             scene=self._problem.scene_view.scene,
             rays=self._pixels.rays,
-            pixels=self._pixels.draw(int(seeds[0]), pixels),
+            pixels=self._drawn(int(seeds[0]), probe),
             sampler=self._sampler,
             second=self._second,
             seed=dr.opaque(mi.UInt32, int(seeds[1])),
         )
+
+    def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
+        if probe is None and self._config.pixel_sampling == "one-view-crop":
+            return self._pixels.draw_crop(seed, self._config.pixels)
+        return self._pixels.draw(seed, probe or self._config.pixels)
 
     def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         terms = self._gradients(inputs, state)
