@@ -32,7 +32,7 @@ from rich.console import Console  # noqa: E402
 from summary import machine_results, read, summarized, summary  # noqa: E402
 
 from unbake.acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES  # noqa: E402
-from unbake.config import FitConfig  # noqa: E402
+from unbake.config import FitConfig, method_defaults  # noqa: E402
 from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 from unbake.experiments.commands import (  # noqa: E402
@@ -344,7 +344,7 @@ class Bench:
         options, text = self.settings(settings)
         command = partial(unbake, *words, *options, until=self.until)
         described = {"words": [str(word) for word in words], "settings": text}
-        described["data"] = str(self.data(data))
+        described |= {"data": str(self.data(data)), "defaults": method_defaults.as_json()}
         return Job(name, described, lambda: command() or {}, seconds, waits, [file])
 
 

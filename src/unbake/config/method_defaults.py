@@ -7,8 +7,8 @@ compares the two. It holds for the preset `cpu`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 from ..dataset.scene_kind import SceneKind
 
@@ -30,6 +30,19 @@ class MethodDefaults:
 METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {}
 
 
+#: Methods without a search of their own: the method whose defaults they have, which estimates the
+#: same gradient from the same paths.
+SAME_AS: Mapping[str, str] = {"ad-pt": "prb"}
+
+
 def method_defaults(method: str, kind: SceneKind) -> MethodDefaults:
     """What a method uses in a kind of scene where the settings do not say."""
-    return METHOD_DEFAULTS.get(method, {}).get(kind, MethodDefaults())
+    return METHOD_DEFAULTS.get(SAME_AS.get(method, method), {}).get(kind, MethodDefaults())
+
+
+def as_json() -> dict[str, Any]:
+    """The table, for records of results that depend on it."""
+    return {
+        method: {str(kind): asdict(found) for kind, found in kinds.items()}
+        for method, kinds in METHOD_DEFAULTS.items()
+    }

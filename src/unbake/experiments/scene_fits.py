@@ -13,7 +13,7 @@ import numpy as np
 
 from ..comparison.compare import compare
 from ..comparison.method_variant import MethodVariant
-from ..config import FitConfig
+from ..config import FitConfig, method_defaults
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..evaluation.settings import EvaluationSettings
@@ -72,13 +72,15 @@ class SceneFits:
 
     def settings(self, context: ExperimentContext) -> dict[str, Any]:
         """Everything that the findings depend on."""
-        fits = {"methods": list(self.methods), "fit": asdict(self.config), "spp": self.spp}
-        return fits | self.scene.described(context)
+        return self._described(context) | {"methods": list(self.methods)}
 
     def runs(self, context: ExperimentContext) -> Path:
         """The folder of the runs. Experiments with the same settings share it."""
-        described = self.scene.described(context) | {"fit": asdict(self.config), "spp": self.spp}
-        return context.work / "runs" / f"{self.scene.folder}-{digest(described)}"
+        return context.work / "runs" / f"{self.scene.folder}-{digest(self._described(context))}"
+
+    def _described(self, context: ExperimentContext) -> dict[str, Any]:
+        fits = {"fit": asdict(self.config), "defaults": method_defaults.as_json(), "spp": self.spp}
+        return fits | self.scene.described(context)
 
     def jobs(self, context: ExperimentContext) -> list[Job]:
         """Jobs that render the data set, fit the methods and evaluate them."""
