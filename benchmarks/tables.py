@@ -91,25 +91,42 @@ def methods_of(result: dict) -> list[tuple[str, dict]]:
     return list((untrained | result["methods"]).items())
 
 
-def time_to_quality(end: dict, runs: dict) -> str:
-    """When ours has what another method ends with, or a little less, and keeps it."""
+def targets(end: dict, runs: dict) -> list[dict]:
+    """When another method has the quality that it ends with, or a little less, and when ours has.
+
+    Returns:
+        For each quantity and target: `psnr`; seconds after which the other method (`rival`) and
+        ours stay at or above it; `times`, their ratio. Numbers of ours are means over seeds, with
+        `KEY_sd`, and absent where a seed does not get there; `never` counts those.
+    """
     name, curve = next((n, c) for n, r in methods_of(end) for c in scores(r) if len(c) > 1)
     ours = {f"ours {i}": curve for i, curve in enumerate(scores(runs["methods"]["ours"]))}
     rows = []
     for target in convergence.time_to_quality({name: curve, **ours}):
         if target.run != name:
             continue
-        own = target.seconds[name]
-        below = f"{target.below:g} dB below" if target.below else "at its end"
-        cells = [target.quantity, below, f"{target.psnr:.1f} dB", f"{own:.0f} s"]
-        times = [target.seconds[run] for run in ours]
-        if None in times:
-            cells += [f"not in {times.count(None)} of {len(times)} runs", ""]
-        else:
-            found = spread_of("s", times) | spread_of("times", [own / t for t in times if t])
-            cells += [f"{plus_minus(found, 's', 0)} s", plus_minus(found, "times", 1) or ""]
-        rows.append(cells)
-    titles = ["", "quality", "PSNR", f"`{name}` keeps it after", "`ours` after", "times sooner"]
+        own, times = target.seconds[name], [target.seconds[run] for run in ours]
+        row = {"name": name, "quantity": target.quantity, "below": target.below}
+        row |= {"psnr": target.psnr, "rival": own, "seeds": len(times), "never": times.count(None)}
+        if None not in times:
+            row |= spread_of("ours", times) | spread_of("times", [own / t for t in times if t])
+        rows.append(row)
+    return rows
+
+
+def time_to_quality(end: dict, runs: dict) -> str:
+    """`targets` as a table."""
+    found, rows = targets(end, runs), []
+    for row in found:
+        below = f"{row['below']:g} dB below" if row["below"] else "at its end"
+        cells = [row["quantity"], below, f"{row['psnr']:.1f} dB", f"{row['rival']:.0f} s"]
+        never = f"not in {row['never']} of {row['seeds']} runs"
+        ours = plus_minus(row, "ours", 0)
+        rows.append(
+            [*cells, never if ours is None else f"{ours} s", plus_minus(row, "times", 1) or ""]
+        )
+    name = f"`{found[0]['name']}`" if found else "rival"
+    titles = ["", "quality", "PSNR", f"{name} keeps it after", "`ours` after", "times sooner"]
     return markdown(titles, rows)
 
 

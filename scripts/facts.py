@@ -95,7 +95,7 @@ class Facts:
         return f"{plus_minus(self.method(name, method), KEYS.get(key, key), digits)} dB"
 
     def gap(self, name: str, a: str, b: str, key: str, other: str | None = None) -> str:
-        """How far a is above b, in words: `2.4 dB above`, `0.3 dB below`, `level with`.
+        """How far a is above b: `+2.4 dB`, `−0.3 dB` or `level`.
 
         They are level where the printed difference is zero, or where it is within the standard
         deviation of the difference of two fits over seeds.
@@ -113,9 +113,31 @@ class Facts:
         spread = math.hypot(*(row.get(f"{key}_sd") or 0.0 for row in (first, second)))
         return above(difference, spread)
 
-    def ratio(self, name: str, a: str, b: str, key: str = "milliseconds_per_step") -> float:
-        """A number of a over that of b."""
-        return self.of(name, a, key) / self.of(name, b, key)
+    def versus(self, demo: str, room: str) -> str:
+        """What ours is ahead of each rival in two comparisons, the demo's first."""
+        rivals = [name for name in self.result(room)["methods"] if name != "ours"]
+        quantities = ("albedo", "roughness", "rendering")
+        rows = [
+            [
+                f"`{rival}`",
+                *(self.gap(n, "ours", rival, q) for q in quantities for n in (demo, room)),
+            ]
+            for rival in rivals
+        ]
+        titles = [f"{q}, {scene}" for q in quantities for scene in ("demo", "STAIRCASE")]
+        return markdown(["`ours` against", *titles], rows)
+
+    def time_to(self, end: str, runs: str, quantity: str, below: float) -> Row:
+        """When the method of a long run and ours keep a quality; a mean over seeds of ours.
+
+        Returns:
+            `psnr` in dB, `rival` and `ours` in seconds, `times`: the ratio. `ours` is None where
+            a seed does not get there.
+        """
+        for row in benchmark_tables.targets(self.result(end), self.result(runs)):
+            if (row["quantity"], row["below"]) == (quantity, below):
+                return row
+        raise Unfounded(f"{end}.json has no {quantity} {below:g} dB below its end")
 
     def step(self, name: str, method: str, materials: str = "neural", spp: str = "") -> Row:
         """A row of `unbake bench methods`, the first that fits."""
@@ -311,17 +333,18 @@ def number_or_text(text: str) -> float | str | None:
 
 
 def above(difference: float, spread: float = 0.0, digits: int = 1) -> str:
-    """A difference of PSNRs in words."""
+    """A difference of PSNRs: `+2.4 dB`, `−0.3 dB` or `level`."""
     shown = f"{abs(difference):.{digits}f}"
     if float(shown) == 0 or abs(difference) < spread:
-        return "level with"
-    return f"{shown} dB {'above' if difference > 0 else 'below'}"
+        return "level"
+    return f"{'+' if difference > 0 else '−'}{shown} dB"
 
 
-def span(values: list[float], digits: int = 0) -> str:
-    """The smallest and the largest of some numbers: `3.2 to 6.5`."""
-    low, high = (f"{value:.{digits}f}" for value in (min(values), max(values)))
-    return low if low == high else f"{low} to {high}"
+def reached(target: Row) -> str:
+    """When ours reached a target of the time to quality, in words."""
+    if "ours" in target:
+        return f"{plus_minus(target, 'ours', 0)} s ({target['times']:.0f} times sooner)"
+    return f"never in {target['never']} of {target['seeds']} runs"
 
 
 def unit(form: str, factor: float = 1.0) -> Callable[[float, int], str]:
@@ -356,5 +379,5 @@ def context(facts: Facts) -> dict[str, Any]:
     from unbake.training.path_depth import SHARE
 
     settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
-    functions = {"above": above, "span": span}
+    functions = {"above": above, "reached": reached}
     return {name: getattr(facts, name) for name in public} | functions | settings
