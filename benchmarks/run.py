@@ -32,7 +32,7 @@ from rich.console import Console  # noqa: E402
 from summary import machine_results, read, summarized, summary  # noqa: E402
 
 from unbake.acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES  # noqa: E402
-from unbake.config import FitConfig, method_defaults  # noqa: E402
+from unbake.config import method_defaults  # noqa: E402
 from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 from unbake.experiments.commands import (  # noqa: E402
@@ -160,12 +160,13 @@ ABLATION = (
     "no-prior",
 )  # fmt: skip
 STEP_METHODS = (
-    "ours", "direct", "no-prior", "ad-pt", "ad-pt:neural:split-halves", "prb",
-    "prb:neural:split-halves", "ours:bitmap", "prb:bitmap", "prb:bitmap:split-halves", "ours:grid",
-    "prb:grid", "prb:grid:split-halves",
+    "ours", "direct", "no-prior", "ad-pt:neural:two-pass", "ad-pt:neural:split-halves",
+    "prb:neural:two-pass", "prb:neural:split-halves", "ours:bitmap", "prb:bitmap:two-pass",
+    "prb:bitmap:split-halves", "ours:grid", "prb:grid:two-pass", "prb:grid:split-halves",
 )  # fmt: skip
-#: The estimator of PRB that is not its default.
-OTHER_ESTIMATOR = "two-pass" if FitConfig(method="prb").halves else "split-halves"
+#: The estimator of PRB that is not its default in rooms.
+_OF_PRB = method_defaults.method_defaults("prb", "room").estimator
+OTHER_ESTIMATOR = "two-pass" if _OF_PRB == "split-halves" else "split-halves"
 ROOM_RIVALS = ("ours", "prb", f"prb:neural:{OTHER_ESTIMATOR}", "ad-pt", "direct", "no-prior")
 RIVALS = (*ROOM_RIVALS, "prb:bitmap")
 ROOM = "staircase.toml"
