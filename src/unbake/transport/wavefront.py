@@ -103,16 +103,18 @@ def path_light(
 
     Paper: Eq. 1, Eq. 2, Sec. 6.
     """
-    narrows = any(plan)
-    if narrows:
-        order, back = _by_halves(dr.width(ray), spp)
-        ray = dr.gather(type(ray), ray, order)
     lanes = dr.width(ray)
-    x1, segments = _follow(
-        scene_view, ray, sampler, limits, lambda number, _: _width(plan[number - 1], lanes)
-    )
-    light = _gathered_light(x1, segments)
-    return dr.gather(mi.Color3f, light, back, mode=dr.ReduceMode.NoConflicts) if narrows else light
+
+    def light(ray: mi.Ray3f) -> mi.Color3f:
+        return _gathered_light(
+            *_follow(scene_view, ray, sampler, limits, lambda n, _: _width(plan[n - 1], lanes))
+        )
+
+    if not any(plan):
+        return light(ray)
+    order, back = _by_halves(lanes, spp)
+    found = light(dr.gather(type(ray), ray, order))
+    return dr.gather(mi.Color3f, found, back, mode=dr.ReduceMode.NoConflicts)
 
 
 def plan_widths(
