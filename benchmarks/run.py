@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
 
-Jobs: machine steps rivals equal long ablation lighting emission sparse prior (default: all; hours).
-STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
+Jobs: machine steps demo rivals equal long ablation lighting emission sparse prior (default: all;
+hours). STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
 (docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
 that the same command continues what was stopped. Results go to --results; `python
 benchmarks/tables.py` prints them as tables. Methods are compared over three seeds: results have the
@@ -186,6 +186,11 @@ BENCHMARKS: dict[str, Compare | EqualSamples | Steps | Machine] = {
     ),
     "methods-demo": Steps("steps", "demo", STEP_METHODS),
     "methods-staircase": Steps("steps", STAIRCASE, STEP_METHODS, ROOM),
+    # What `make demo` fits; and the true materials rendered alike, whose error is noise alone.
+    "demo": Compare(
+        "demo", "demo", ("ours", "direct"), steps=2400, seeds=(0,),
+        options=(*NO_SCORES, "--evaluate-spp", 64, "--evaluate-truth"),
+    ),
     # Equal time, and equal samples.
     "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=60),
     "rivals-staircase": Compare(

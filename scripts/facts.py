@@ -166,6 +166,11 @@ class Facts:
         files = ", ".join(f"`{name}.json`" for name in old)
         return f"> **Older results.** {files}: {VERSION_0_1}\n"
 
+    def searched(self, method: str) -> bool:
+        """Whether the learning rates of a method were searched."""
+        searches = self.result("rates")["searches"] if self.has("rates") else []
+        return any(search["method"] == method for search in searches)
+
     def rates_table(self) -> str:
         """What the search for learning rates found; that there was none, if there is no file."""
         if not self.has("rates"):

@@ -59,6 +59,41 @@ def test_another_result_makes_another_page(writer, tmp_path):
     assert "77.7" in text
 
 
+def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
+    """Of several seeds, with the true materials, and of views that see what training did not."""
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "rivals-demo.json").read_text())
+    content["seeds"] = [0, 1]
+    for name, row in content["methods"].items():
+        row |= {f"{k}_psnr_sd": 0.1 for k in ("albedo", "roughness", "render")}
+        row |= {"true_render_psnr": 24.75, "per_seed": [{"seed": 0}, {"seed": 1}]}
+        if name == "ours":
+            row["per_seed"] = [{"seed": i, "score": row["score"]} for i in (0, 1)]
+        unseen = {f"{k}_psnr_unseen": 33.25 for k in ("albedo", "render")}
+        seen = {f"{k}_psnr_seen": row[f"{k}_psnr"] for k in ("albedo", "roughness", "render")}
+        row |= unseen | seen
+    content["methods"]["no-prior"] |= {"render_psnr_unseen": 11.0}
+    few = {k: v for k, v in content["methods"].items() if k in ("ours", "no-prior")}
+    two = {k: v for k, v in content["methods"].items() if k in ("ours", "direct")}
+    made = {"rivals-demo": content, "demo": content | {"methods": two}}
+    for case in ("demo", "few", "three", "half", "annex"):
+        made[f"prior-{case}"] = content | {"methods": few}
+    best = {"factors": {"albedo": 2.5}, "estimator": "two-pass"}
+    search = {"method": "prb", "kind": "room", "data": "box", "unknown": "materials"}
+    search |= {"follows_paths": True, "trials": [{}, {}], "best": best}
+    made["rates"] = {"machine": content["machine"], "searches": [search]}
+    for name, result in made.items():
+        (results / f"{name}.json").write_text(json.dumps(result))
+    written = writer["pages"](results=results)
+    readme, page = written[ROOT / "README.md"], written[ROOT / "docs" / "comparison.md"]
+    assert "| the true materials, rendered alike |  |  |  | 24.8 |" in readme
+    assert "in a room behind a door +22.2 dB" in " ".join(readme.split())
+    assert "`prior-half`" in page and "+22.2 dB" in page
+    assert "| `prb` | rooms | materials | box | albedo x 2.5 | two pass | 2 |" in page
+    assert "`rivals-demo.json`" not in page and "`rivals-staircase.json`" in page
+
+
 def test_a_result_that_is_missing_is_named_with_the_command_that_makes_it(writer, tmp_path):
     results = tmp_path / "results"
     ignored = shutil.ignore_patterns("rivals-demo.json")
