@@ -257,3 +257,26 @@ def test_committed_results_of_every_benchmark_are_read(repository, benchmarks):
     # Those of the jobs `prior` and `demo` are not measured yet.
     unmeasured = {name for name, job in jobs.items() if job.job in ("prior", "demo")}
     assert jobs.keys() - names - unmeasured == {"machine"}
+
+
+def test_roulette_is_measured_by_time_and_noise(repository, cornell, tmp_path):
+    settings, out = tmp_path / "grid.toml", tmp_path / "rr-depth.json"
+    settings.write_text('representation = "grid"\npixels = 16\nspp = 4\n[path]\nmax_depth = 9\n')
+    done = call(
+        repository, "rr_depth.py", "--data", cornell, "--settings", settings, "--methods", "prb",
+        "--depths", 1, 5, "never", "--steps", 2, "--calls", 8, "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    result = read(out)
+    assert result["path_depth"] == 9 and "never" in done.stdout
+    rows = {row["rr_depth"]: row for row in result["rows"]}
+    assert rows.keys() == {1, 5, None}
+    for row in rows.values():
+        for unknown in ("albedo", "roughness"):
+            variance, efficiency = row["variance"][unknown], row["efficiency"][unknown]
+            assert variance > 0 and row["milliseconds"] > 0
+            assert efficiency == pytest.approx(1e3 / (variance * row["milliseconds"]))
+            relative = row["relative_efficiency"][unknown]
+            assert relative == pytest.approx(efficiency / rows[5]["efficiency"][unknown])
+    # Paths that end early at random are noisier than paths that do not.
+    assert rows[1]["variance"]["albedo"] > rows[None]["variance"]["albedo"]

@@ -147,6 +147,19 @@ class TrainingStep:
         self.plan(state)
         return self._step(self._inputs(number), state)
 
+    def gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float | mi.TensorXf]:
+        """The gradients of the unknowns φ, by name, without a step: for measurements.
+
+        Args:
+            inputs: from `prepare`.
+        """
+        terms = self._gradients(inputs, state)
+        found = {name: dr.grad(value) for name, value in state.phi.items()}
+        dr.eval(terms, found)
+        for _, optimizer in state.optimizers():
+            dr.clear_grad(dict(optimizer.items()))
+        return found
+
     def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:
         """The part of a replayed step that runs in Python."""
         state.set_learning_rates(rates)
