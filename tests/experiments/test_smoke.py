@@ -126,7 +126,12 @@ def test_fig4_longer_paths_miss_less(rows, out, scenes_dir):
         assert row["relative_rmse"] == pytest.approx((squares / size) ** 0.5)
         # No method is the reference by another name.
         assert (row["relative_rmse"] > 1e-6) == (name != "reference")
-    assert len(found) == 10 + 10 * 3 * 3
+    ours, exact = ([told[f"{name}, k = {k}"] for k in (1, 2, 4)] for name in ("ours", "exact L"))
+    # The image is the reference's with the exact light, and L_θ is hardly trained here.
+    assert column(exact, "image_error") == [0, 0, 0] and min(column(ours, "image_error")) > 0.01
+    assert not any("published_slope" in row for row in exact)
+    assert ours[0]["published_slope"] == pytest.approx(0.46, abs=0.01)
+    assert len(found) == 13 + 13 * 3 * 3
     assert picture(out / "fig4" / "pictures.png").std() > 0
 
 

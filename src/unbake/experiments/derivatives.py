@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -10,9 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.operator import attach_material, bounce
+from ..fields.radiance import RadianceField
+from ..transport.operator import Bounce, attach_albedo, attach_material, bounce
+from ..transport.path_sample import reflected_radiance
 from ..transport.render import RayGenerator, parts_of
-from ..transport.vertex import SceneView, find_vertex
+from ..transport.vertex import SceneView, Vertex, find_vertex
 
 #: Bounces before Russian roulette.
 RR_DEPTH = 3
@@ -27,13 +29,16 @@ class Estimates:
         image: with all light.
         derivative: of the image.
         cut: image and derivative by maximum path length, as Mitsuba counts (2 is direct light).
-        attached: derivative by the number k of differentiable bounces, followed by the exact L.
+        attached: derivative by the number k of differentiable bounces, followed by the exact L. The
+            image that belongs to it is the exact one.
+        cached: image and derivative by k, with L_θ after k bounces; empty without L_θ.
     """
 
     image: np.ndarray
     derivative: np.ndarray
     cut: dict[int, tuple[np.ndarray, np.ndarray]]
     attached: dict[int, np.ndarray]
+    cached: dict[int, tuple[np.ndarray, np.ndarray]]
 
 
 def estimate(
@@ -48,12 +53,14 @@ def estimate(
     max_depth: int,
     cut: Sequence[int],
     attached: Sequence[int],
+    radiance: RadianceField | None = None,
 ) -> Estimates:
     """Estimate pixels and derivatives along the same paths for all methods.
 
     Each bounce is differentiated by itself in forward mode. The product rule along a path then
     gives the estimates of all methods: of those that end paths early, and of those that
-    differentiate the first k bounces and take the incident radiance after them as constant.
+    differentiate the first k bounces and take the incident radiance after them as constant: the
+    exact one, found by following the same path further, or L_θ.
 
     Args:
         assign: sets the parameter of the scene.
@@ -65,16 +72,27 @@ def estimate(
         max_depth: maximum path length that counts as all light.
         cut: maximum path lengths of methods that end paths earlier.
         attached: numbers k of differentiable bounces.
+        radiance: L_θ of the scene with this value; it is constant.
 
     Paper: Fig. 4, Sec. 6.3.
     """
     names = ["image", "derivative"]
     names += [f"{what} {depth}" for depth in cut for what in ("cut", "cut'")]
     names += [f"attached {k}" for k in attached]
+    if radiance is not None:
+        names += [f"{what} {k}" for k in attached for what in ("cached", "cached'")]
     sums = {name: np.zeros((pixels, 3)) for name in names}
     for part, ray, part_seed in parts_of(through, pixels, spp, seed):
         estimates = _along(
-            scene_view, assign, value, ray, part_seed, max_depth, set(cut), tuple(attached)
+            scene_view,
+            assign,
+            value,
+            ray,
+            part_seed,
+            max_depth,
+            set(cut),
+            tuple(attached),
+            radiance,
         )
         for name, samples in estimates.items():
             means = [np.array(dr.block_sum(c, spp)) / spp for c in samples]
@@ -84,6 +102,7 @@ def estimate(
         sums["derivative"],
         {depth: (sums[f"cut {depth}"], sums[f"cut' {depth}"]) for depth in cut},
         {k: sums[f"attached {k}"] for k in attached},
+        {k: (sums[f"cached {k}"], sums[f"cached' {k}"]) for k in attached if radiance is not None},
     )
 
 
@@ -96,6 +115,7 @@ def _along(
     max_depth: int,
     cut: set[int],
     attached: tuple[int, ...],
+    radiance: RadianceField | None,
 ) -> dict[str, mi.Color3f]:
     """The estimates of each sample."""
     estimates: dict[str, mi.Color3f] = {}
@@ -125,13 +145,7 @@ def _along(
         dβ = {k: dr.gather(mi.Color3f, v, alive) for k, v in dβ.items()}
         _reseed(sampler, seed, number, len(alive))
 
-        parameter = mi.Float(value)
-        dr.enable_grad(parameter)
-        assign(parameter)
-        step = bounce(scene_view, attach_material(scene_view, x), sampler)
-        dr.forward(parameter)
-        d, dd = dr.detach(step.direct), dr.grad(step.direct)
-        w, dw = dr.detach(step.weight), dr.grad(step.weight)
+        step, (d, w), (dd, dw) = _differentiated(scene_view, assign, value, x, sampler)
         x, e, t = step.next, dr.detach(step.next.emitted), dr.detach(step.next.throughput)
         light, dlight = d + w * e, dd + dw * e
         for k in ks:
@@ -144,12 +158,55 @@ def _along(
         if number + 1 in cut:
             estimates[f"cut {number + 1}"] = mi.Color3f(total)
             estimates[f"cut' {number + 1}"] = mi.Color3f(dtotal[max_depth])
+        if radiance is not None and number in attached:
+            before = {"cached": (total, β), "cached'": (dtotal[number], dβ[number])}
+            ended = _ended(scene_view, radiance, x, lane, before)
+            estimates |= {f"{name} {number}": image for name, image in ended.items()}
     assign(mi.Float(value))
-    estimates["image"], estimates["derivative"] = total, dtotal[max_depth]
-    for depth in cut:  # if all paths ended earlier
-        estimates.setdefault(f"cut {depth}", total)
-        estimates.setdefault(f"cut' {depth}", dtotal[max_depth])
-    return estimates | {f"attached {k}": dtotal[k] for k in attached}
+    # What all paths ended before is complete.
+    complete = {"image": total, "derivative": dtotal[max_depth]}
+    complete |= {f"cut {depth}": total for depth in cut}
+    complete |= {f"cut' {depth}": dtotal[max_depth] for depth in cut}
+    complete |= {f"attached {k}": dtotal[k] for k in attached}
+    if radiance is not None:
+        complete |= {f"cached {k}": total for k in attached}
+        complete |= {f"cached' {k}": dtotal[k] for k in attached}
+    return complete | estimates
+
+
+def _differentiated(
+    scene_view: SceneView,
+    assign: Callable[[mi.Float], None],
+    value: float,
+    x: Vertex,
+    sampler: mi.Sampler,
+) -> tuple[Bounce, tuple[mi.Color3f, mi.Color3f], tuple[mi.Color3f, mi.Color3f]]:
+    """A bounce, with its direct light and weight, and the derivatives of both."""
+    parameter = mi.Float(value)
+    dr.enable_grad(parameter)
+    assign(parameter)
+    step = bounce(scene_view, attach_material(scene_view, x), sampler)
+    dr.forward(parameter)
+    pair = step.direct, step.weight
+    return step, dr.detach(pair), dr.grad(pair)
+
+
+def _ended(
+    scene_view: SceneView,
+    radiance: RadianceField,
+    x: Vertex,
+    lane: mi.UInt32,
+    before: Mapping[str, tuple[mi.Color3f, mi.Color3f]],
+) -> dict[str, mi.Color3f]:
+    """Sums over paths that are ended at `x` by L_θ, from the sums before and factors of L_θ."""
+    with dr.suspend_grad():
+        (L,) = reflected_radiance(radiance, attach_albedo(scene_view, x))
+        ended = {}
+        for name, (total, factor) in before.items():
+            ended[name] = mi.Color3f(total)
+            dr.scatter_add(ended[name], factor * L, lane)
+        dr.eval(ended)
+    return ended
 
 
 def _reseed(sampler: mi.Sampler, seed: int, number: int, lanes: int) -> None:

@@ -87,7 +87,7 @@ class TrainingStep:
         self.require_memory(state)
         step = self._step if self._frozen is None else self._frozen
         try:
-            with _no_garbage_collection():
+            with without_garbage_collection():
                 return step(self.prepare(state, number, rates), state)
         except RuntimeError as error:
             if not lacks_memory(error):
@@ -253,7 +253,7 @@ def _subset(config: FitConfig, inputs: Inputs) -> SampleSubset | None:
 
 
 @contextmanager
-def _no_garbage_collection() -> Iterator[None]:
+def without_garbage_collection() -> Iterator[None]:
     """Disable the garbage collector.
 
     Dr.Jit 1.5 aborts the process if a scene or a step of an earlier fit is freed while a step is
