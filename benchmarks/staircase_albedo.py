@@ -1,0 +1,272 @@
+"""How much STAIRCASE's albedo has to be raised: Figure 4's published table, by exponents of albedo.
+
+    python benchmarks/staircase_albedo.py --scenes SCENES --work FOLDER --out FILE.json
+
+The authors raised the albedo of STAIRCASE and do not say by how much. How much light paths of a
+given length leave out depends on it, and so does the error of PRB's gradients in Figure 4, which
+they published. This script applies several exponents to every albedo and measures each time
+
+- the table of Figure 4 for PRB, with fewer roughnesses and samples, against the same part of the
+  published table; for the relative L2 loss and for the plain one,
+- the mean path length of Table 1 (4.74 in the paper), with Russian roulette from the second and
+  from the fifth interaction on,
+- the share of the light that paths of a given length carry, and the mean albedo that is seen.
+
+A stopped run continues; `--minutes` ends it in time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import unbake
+
+unbake.activate()
+
+import numpy as np  # noqa: E402
+from rich.console import Console  # noqa: E402
+
+from unbake.dataset.camera import read_cameras  # noqa: E402
+from unbake.dataset.pixels import CameraRays  # noqa: E402
+from unbake.experiments import fig4, table1  # noqa: E402
+from unbake.experiments.experiment import ExperimentContext  # noqa: E402
+from unbake.experiments.jobs import Findings, Job, JobRunner  # noqa: E402
+from unbake.experiments.scenes import STAIRCASE, PaperScene  # noqa: E402
+from unbake.io import write_json  # noqa: E402
+from unbake.machine import machine  # noqa: E402
+from unbake.scene.edit import to_principled  # noqa: E402
+from unbake.scene.parse import parse  # noqa: E402
+from unbake.transport.path_tracer import path_lengths, path_traced  # noqa: E402
+from unbake.transport.render import parts_of, render_materials  # noqa: E402
+from unbake.transport.vertex import SceneView  # noqa: E402
+
+POWERS = (0.6, 0.7, 0.5, 0.55, 0.65, 0.8, 1.0)
+#: Roughnesses of the tables; some of Figure 4's.
+VALUES = fig4.VALUES[::3]
+METHODS = tuple(f"PRB {depth}" for depth in (4, 10, 15, 30))
+#: Longer paths than Figure 4's count as all light, so that a high albedo is measured fairly.
+MAX_DEPTH = 64
+#: Of 15 bounces, as Mitsuba counts.
+FIFTEEN = 16
+
+
+def main() -> None:
+    """Measure, and write the result of all powers that are done."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=Path, required=True, help="folder of published scenes")
+    parser.add_argument("--work", type=Path, required=True, help="folder of what is done so far")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--powers", type=float, nargs="+", default=POWERS)
+    parser.add_argument("--spp", type=int, default=32, help="samples per pixel of each pass")
+    parser.add_argument("--shrunk", type=int, default=16, help="resolution of the film over ours")
+    parser.add_argument("--minutes", type=float, default=9.0, help="begin no job after that")
+    args = parser.parse_args()
+    end = time.monotonic() + 60 * args.minutes
+    context = ExperimentContext("cpu", args.work, args.scenes)
+    runner = JobRunner(args.work / "jobs", Console(highlight=False), machine)
+    jobs = [job for power in args.powers for job in jobs_of(context, power, args.spp, args.shrunk)]
+    print(runner.plan(jobs), flush=True)
+    done = runner.run(jobs, until=end).findings
+    rows = [
+        row_of(context, power, args.shrunk, done)
+        for power in args.powers
+        if all(job.name in done for job in jobs_of(context, power, args.spp, args.shrunk))
+    ]
+    found = {"machine": machine(), "values": VALUES, "spp": args.spp, "max_depth": MAX_DEPTH}
+    found["published"] = {
+        method: agreement(VALUES, published(method)[1], published("reference")[1])
+        for method in METHODS
+    }
+    found["published"]["path_length"] = table1.PUBLISHED["STAIRCASE"][0]
+    write_json(args.out, found | {"powers": rows})
+    for row in rows:
+        print(told(row), flush=True)
+
+
+def scene_with(power: float) -> PaperScene:
+    """STAIRCASE with another exponent of its albedo."""
+    return dataclasses.replace(STAIRCASE, albedo_power=power)
+
+
+def jobs_of(context: ExperimentContext, power: float, spp: int, shrunk: int) -> list[Job]:
+    """The jobs of one power: one for each roughness, and one for the data set's views."""
+    known = {"spp": spp, "shrunk": shrunk, "max_depth": MAX_DEPTH}
+    jobs = [
+        Job(
+            arrays_file(context, power, value).stem,
+            known,
+            functools.partial(measure_arrays, context, power, value, spp, shrunk),
+            files=[arrays_file(context, power, value)],
+        )
+        for value in VALUES
+    ]
+    views = functools.partial(measure_views, context, power)
+    return [*jobs, Job(f"views-{power:.3f}", {"max_depth": MAX_DEPTH}, views)]
+
+
+def arrays_file(context: ExperimentContext, power: float, value: float) -> Path:
+    """Images and derivatives at one roughness."""
+    return context.work / "staircase-albedo" / f"power-{power:.3f}-value-{value:.2f}.npz"
+
+
+def measure_arrays(
+    context: ExperimentContext, power: float, value: float, spp: int, shrunk: int
+) -> Findings:
+    """Images and derivatives at one roughness, kept in a file."""
+    wood = fig4.Wood.of(scene_with(power).unpacked(context), shrunk)
+    arrays = fig4.arrays_at(wood, value, spp, MAX_DEPTH)
+    fig4.save(arrays_file(context, power, value), arrays)
+    return {"height": wood.camera.height, "width": wood.camera.width}
+
+
+def measure_views(context: ExperimentContext, power: float) -> Findings:
+    """Path lengths, shares of light and albedo in all views of the data set."""
+    pixels, spp = 32, 16
+    scene = scene_with(power)
+    parsed = parse(scene.unpacked(context))
+    to_principled(parsed)
+    scene_view = SceneView.of(parsed.instantiate(), None, 8)
+    cameras = [camera for _, camera in read_cameras(scene.cameras, pixels, pixels)]
+    rays = CameraRays.of(cameras)
+
+    def lengths(rr_depth: int) -> float:
+        each = np.concatenate(
+            [
+                np.array(
+                    path_lengths(
+                        scene_view,
+                        ray,
+                        seed,
+                        max_depth=table1.MAX_DEPTH,
+                        rr_depth=rr_depth,
+                        most_likely=table1.SURVIVAL,
+                    )
+                )
+                for _, ray, seed in parts_of(rays.through, rays.pixels, spp, 0)
+            ]
+        )
+        return float(each[each > 0].mean(dtype=np.float64))
+
+    def light(limit: int) -> float:
+        """Mean radiance in paths of limited length; the paths themselves are the same for all."""
+        parts = parts_of(rays.through, rays.pixels, spp // 4, 1)
+        followed = functools.partial(
+            path_traced, scene_view, max_depth=limit, rr_depth=5, hide_emitters=False
+        )
+        return sum(np.array(followed(ray, seed)).sum(dtype=np.float64) for _, ray, seed in parts)
+
+    values, coverage = render_materials(scene_view, rays.through, rays.pixels, spp, seed=2)
+    return {
+        "path_length_rr2": lengths(2),
+        "path_length_rr5": lengths(5),
+        "light_of_15_bounces": float(light(FIFTEEN) / light(MAX_DEPTH)),
+        "albedo": float(np.average(values["albedo"].mean(-1), weights=coverage)),
+    }
+
+
+# ------------------------------------------------------------------------------------------ result
+
+
+def row_of(
+    context: ExperimentContext, power: float, shrunk: int, done: Mapping[str, Findings]
+) -> dict[str, Any]:
+    """What was measured with one power."""
+    arrays = {}
+    for value in VALUES:
+        with np.load(arrays_file(context, power, value)) as file:
+            arrays[value] = dict(file)
+    film = done[arrays_file(context, power, VALUES[0]).stem]
+    arrays = fig4.smoothed(arrays, film["height"], film["width"], fig4.COARSE // shrunk)
+    row: dict[str, Any] = {"power": power} | done[f"views-{power:.3f}"]
+    row["light_in_own_view"] = {
+        method: sum(float(arrays[v][f"a {method} image"].sum()) for v in VALUES)
+        / sum(float(arrays[v]["a reference image"].sum()) for v in VALUES)
+        for method in METHODS
+    }
+    for loss, relative in (("relative_l2", True), ("l2", False)):
+        tables = {
+            method: fig4.gradient_table(arrays, method, relative=relative)
+            for method in ("reference", *METHODS)
+        }
+        values, reference = tables["reference"]
+        row[loss] = {m: agreement(values, tables[m][1], reference) for m in METHODS}
+        row[loss]["noise"] = noise(arrays, relative)
+        row[loss]["reference"] = {
+            "size": float(np.sqrt((reference**2).mean())),
+            "correlation_with_published": float(
+                np.corrcoef(reference.ravel(), published("reference")[1].ravel())[0, 1]
+            ),
+        }
+    return row
+
+
+def agreement(values: Any, table: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """What Figure 4 tells of a method."""
+    return fig4.agreement(list(values), table, reference)
+
+
+def published(method: str) -> tuple[list[float], np.ndarray]:
+    """The part of a published table that is measured here."""
+    values, table = fig4.published_tables()[method]
+    chosen = [values.index(value) for value in VALUES]
+    return list(VALUES), table[np.ix_(chosen, chosen)]
+
+
+def noise(arrays: Mapping[float, Mapping[str, np.ndarray]], relative: bool) -> dict[str, float]:
+    """Noise of a relative RMSE, from the two halves of the samples.
+
+    The error comes from one pass and the derivative from the other, or the other way round: two
+    estimates of one table.
+
+    Returns:
+        `reference`: of the reference, relative to its size; by method: half the difference of the
+        relative RMSEs of the two.
+    """
+    halves = [
+        {
+            method: fig4.gradient_table(arrays, method, relative=relative, passes=(order,))[1]
+            for method in ("reference", *METHODS)
+        }
+        for order in ("ab", "ba")
+    ]
+    a, b = (half["reference"] for half in halves)
+    size = np.sqrt(((0.5 * (a + b)) ** 2).mean())
+    found = {"reference": float(np.sqrt((0.25 * (a - b) ** 2).mean()) / size)}
+    for method in METHODS:
+        one, other = (
+            fig4.agreement(list(VALUES), half[method], half["reference"])["relative_rmse"]
+            for half in halves
+        )
+        found[method] = abs(one - other) / 2
+    return found
+
+
+def told(row: Mapping[str, Any]) -> str:
+    """A row as lines of text."""
+    lines = [
+        f"power {row['power']:.3f}: albedo {row['albedo']:.3f}, path length "
+        f"{row['path_length_rr2']:.2f} (roulette from 2) {row['path_length_rr5']:.2f} (from 5), "
+        f"light of 15 bounces: {100 * row['light_of_15_bounces']:.1f} %"
+    ]
+    for loss in ("relative_l2", "l2"):
+        cells = []
+        for method in METHODS:
+            cell = row[loss][method]
+            cells.append(
+                f"{method} {cell['relative_rmse']:.2f} ± {row[loss]['noise'][method]:.2f} "
+                f"(slope {cell['slope']:.2f}, sign {cell['sign_agreement']:.2f})"
+            )
+        size = row[loss]["reference"]["size"]
+        noisy = row[loss]["noise"]["reference"]
+        lines.append(f"  {loss}: {', '.join(cells)}; reference {size:.2g} ± {noisy:.0%}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
