@@ -68,7 +68,8 @@ def estimate(
         through: makes the camera rays.
         pixels: number of pixels.
         spp: samples per pixel.
-        seed: seed of all samples.
+        seed: of all samples. Paths of other values get the same random numbers with the same seed,
+            so that the difference of two images has little noise.
         max_depth: maximum path length that counts as all light.
         cut: maximum path lengths of methods that end paths earlier.
         attached: numbers k of differentiable bounces.
@@ -120,8 +121,8 @@ def _along(
     """The estimates of each sample."""
     estimates: dict[str, mi.Color3f] = {}
     lanes = dr.width(ray)
-    sampler = mi.load_dict({"type": "independent"})
-    _reseed(sampler, seed, 0, lanes)
+    lane = dr.arange(mi.UInt32, lanes)
+    sampler = _LaneSampler.of(lane, seed, 0)
     with dr.suspend_grad():
         x = find_vertex(scene_view, ray, mi.Bool(True), sampler)
     total, β = mi.Color3f(x.emitted), mi.Color3f(x.throughput)
@@ -129,7 +130,6 @@ def _along(
     ks = (max_depth, *attached)
     dβ = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
     dtotal = {k: dr.zeros(mi.Color3f, lanes) for k in ks}
-    lane = dr.arange(mi.UInt32, lanes)
     for number in range(1, max_depth):
         keep = x.valid & (dr.max(β) > 0)
         if number >= RR_DEPTH:
@@ -143,7 +143,7 @@ def _along(
         x = x.gathered(alive)
         β, lane = dr.gather(mi.Color3f, β, alive), dr.gather(mi.UInt32, lane, alive)
         dβ = {k: dr.gather(mi.Color3f, v, alive) for k, v in dβ.items()}
-        _reseed(sampler, seed, number, len(alive))
+        sampler = _LaneSampler.of(lane, seed, number)
 
         step, (d, w), (dd, dw) = _differentiated(scene_view, assign, value, x, sampler)
         x, e, t = step.next, dr.detach(step.next.emitted), dr.detach(step.next.throughput)
@@ -209,6 +209,35 @@ def _ended(
     return ended
 
 
-def _reseed(sampler: mi.Sampler, seed: int, number: int, lanes: int) -> None:
-    (value,) = np.random.SeedSequence([seed, number]).generate_state(1)
-    sampler.seed(dr.opaque(mi.UInt32, int(value)), lanes)
+@dataclass
+class _LaneSampler:
+    """Random numbers that belong to a camera sample and a bounce, whichever other paths go on.
+
+    With the same seed, paths for two values of a parameter then get the same random numbers, and
+    what is no matter of the parameter cancels in the difference of two images. Mitsuba's samplers
+    number their lanes by position, which changes with every path that ends.
+    """
+
+    rng: mi.PCG32
+
+    @staticmethod
+    def of(lane: mi.UInt32, seed: int, number: int) -> _LaneSampler:
+        """The random numbers of a bounce."""
+        (word,) = np.random.SeedSequence([seed, number]).generate_state(1)
+        state, sequence = mi.sample_tea_32(lane, dr.opaque(mi.UInt32, int(word)))
+        rng = mi.PCG32()
+        rng.seed(mi.UInt64(state), mi.UInt64(sequence))
+        return _LaneSampler(rng)
+
+    def next_1d(self) -> mi.Float:
+        """A number in [0,1)."""
+        return self.rng.next_float32()
+
+    def next_2d(self) -> mi.Point2f:
+        """Two numbers in [0,1)."""
+        x = self.next_1d()
+        return mi.Point2f(x, self.next_1d())
+
+    def schedule_state(self) -> None:
+        """Have the state evaluated with what is evaluated next."""
+        dr.schedule(self.rng)

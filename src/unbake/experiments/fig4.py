@@ -240,12 +240,12 @@ def arrays_at(
     """Images and derivatives of all methods at one roughness, as `gradient_table` reads them.
 
     There are two independent passes: the product of an error from one and a derivative from the
-    other is unbiased. The target comes from a third pass, independent of both.
+    other is unbiased. What errors are relative to comes from a third one, path traced.
 
     Args:
         wood: the scene.
         value: roughness.
-        spp: samples per pixel of a pass; the target has four times as many.
+        spp: samples per pixel of a pass.
         max_depth: maximum path length that counts as all light.
         radiance: L_θ; without it the methods with L_θ are absent.
 
@@ -258,7 +258,7 @@ def arrays_at(
         wood.scene_view,
         wood.rays.through,
         wood.rays.pixels,
-        4 * spp,
+        spp,
         seed=3,
         max_depth=max_depth,
         rr_depth=5,
@@ -356,8 +356,11 @@ def gradient_table(
     """Gradients of the L2 loss by the parameter, as estimated by a method.
 
     Args:
-        arrays: by value of the parameter and by name: `target`, and for both passes `a METHOD
-            image`, `a METHOD derivative`, `b METHOD image` and `b METHOD derivative`.
+        arrays: by value of the parameter and by name: `target`, which errors are relative to, and
+            for both passes `a METHOD image`, `a METHOD derivative`, `b METHOD image` and `b METHOD
+            derivative`. The target of the loss is the image `reference` of the same pass as the
+            current image: paths of all values have the same random numbers in it, so that what
+            does not depend on the value cancels.
         method: one of `METHODS`.
         relative: whether the loss is the relative one.
         passes: averaged over; of each, the first pass gives the error, the second the derivative.
@@ -375,7 +378,7 @@ def gradient_table(
             target = arrays[aim]["target"]
             weight = 2 / (target**2 + EPSILON) if relative else 2.0
             for one, other in passes:
-                error = here[f"{one} {method} image"] - target
+                error = here[f"{one} {method} image"] - arrays[aim][f"{one} reference image"]
                 derivative = here[f"{other} {method} derivative"]
                 table[i, j] += (weight * error * derivative).mean() / len(passes)
     return values, table
