@@ -112,8 +112,9 @@ class PathTracedRadiance:
         return dr.select(valid, followed - first.emitted, 0)
 
 
-def test_with_an_exact_radiance_field_all_is_as_with_the_exact_light(built_in):
-    """Direct light, several materials, emitters that do and do not reflect: as in real scenes."""
+@pytest.fixture(scope="module")
+def cornell(built_in):
+    """A box with several materials; the albedo of one of them is the parameter."""
     scene = parse(built_in("cornell")).instantiate()
     parameters = mi.traverse(scene)
     (key, *_) = sorted(k for k, _ in parameters if k.endswith(("reflectance.value", "color.value")))
@@ -123,7 +124,11 @@ def test_with_an_exact_radiance_field_all_is_as_with_the_exact_light(built_in):
         parameters.update()
 
     assign(mi.Float(0.7))
-    scene_view = SceneView.of(scene, None, 8)
+    return SceneView.of(scene, None, 8), assign
+
+
+def test_with_an_exact_radiance_field_all_is_as_with_the_exact_light(cornell):
+    scene_view, assign = cornell
     rays = CameraRays.of(built_in_cameras("cornell", 3))
     found = estimate(
         scene_view, assign, 0.7, rays.through, rays.pixels, 16384,
@@ -135,6 +140,21 @@ def test_with_an_exact_radiance_field_all_is_as_with_the_exact_light(built_in):
         assert image.mean(0) == pytest.approx(found.image.mean(0), rel=0.01)
         assert derivative.mean(0) == pytest.approx(found.attached[k].mean(0), rel=0.02)
         np.testing.assert_allclose(image, found.image, rtol=0.08, atol=0.02)
+
+
+def test_paths_of_two_values_share_their_noise(cornell):
+    """Whichever other paths end: random numbers stay with their camera sample."""
+    scene_view, assign = cornell
+    rays = CameraRays.of(built_in_cameras("cornell", 8))
+    images = [
+        estimate(
+            scene_view, assign, value, rays.through, rays.pixels, 16,
+            seed=seed, max_depth=40, cut=(2,), attached=(1,),
+        ).image
+        for value, seed in [(0.7, 1), (0.71, 1), (0.71, 2)]
+    ]  # fmt: skip
+    same_seed, other_seed = (np.abs(image - images[0]).mean() for image in images[1:])
+    assert 0 < same_seed < 0.1 * other_seed, (same_seed, other_seed)
 
 
 @pytest.mark.parametrize("limit", [3, 500])
