@@ -10,7 +10,7 @@ they published. This script applies several exponents to every albedo and measur
   published table; for the relative L2 loss and for the plain one,
 - the mean path length of Table 1 (4.74 in the paper), with Russian roulette from the second and
   from the fifth interaction on,
-- the share of the light that paths of a given length carry, and the mean albedo that is seen.
+- the share of the reflected light that paths of a given length carry, and the mean albedo seen.
 
 A stopped run continues; `--minutes` ends it in time.
 """
@@ -42,7 +42,8 @@ from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 from unbake.scene.edit import to_principled  # noqa: E402
 from unbake.scene.parse import parse  # noqa: E402
-from unbake.transport.path_tracer import path_lengths, path_traced  # noqa: E402
+from unbake.transport.light_by_depth import light_by_depth  # noqa: E402
+from unbake.transport.path_tracer import path_lengths  # noqa: E402
 from unbake.transport.render import parts_of, render_materials  # noqa: E402
 from unbake.transport.vertex import SceneView  # noqa: E402
 
@@ -52,8 +53,8 @@ VALUES = fig4.VALUES[::3]
 METHODS = tuple(f"PRB {depth}" for depth in (4, 10, 15, 30))
 #: Longer paths than Figure 4's count as all light, so that a high albedo is measured fairly.
 MAX_DEPTH = 64
-#: Of 15 bounces, as Mitsuba counts.
-FIFTEEN = 16
+#: Path lengths, as Mitsuba counts, of which the light is told; 16 has 15 bounces.
+DEPTHS = (4, 10, 15, 16, 30)
 
 
 def main() -> None:
@@ -153,19 +154,15 @@ def measure_views(context: ExperimentContext, power: float) -> Findings:
         )
         return float(each[each > 0].mean(dtype=np.float64))
 
-    def light(limit: int) -> float:
-        """Mean radiance in paths of limited length; the paths themselves are the same for all."""
-        parts = parts_of(rays.through, rays.pixels, spp // 4, 1)
-        followed = functools.partial(
-            path_traced, scene_view, max_depth=limit, rr_depth=5, hide_emitters=False
-        )
-        return sum(np.array(followed(ray, seed)).sum(dtype=np.float64) for _, ray, seed in parts)
-
+    ((_, ray, seed),) = parts_of(rays.through, rays.pixels, spp, 1)
+    light = light_by_depth(
+        scene_view.scene, ray, seed, max_depth=MAX_DEPTH, rr_depth=5, hide_emitters=False
+    )
     values, coverage = render_materials(scene_view, rays.through, rays.pixels, spp, seed=2)
     return {
         "path_length_rr2": lengths(2),
         "path_length_rr5": lengths(5),
-        "light_of_15_bounces": float(light(FIFTEEN) / light(MAX_DEPTH)),
+        "light": {str(depth): float(light[depth - 1]) for depth in DEPTHS},
         "albedo": float(np.average(values["albedo"].mean(-1), weights=coverage)),
     }
 
@@ -252,7 +249,7 @@ def told(row: Mapping[str, Any]) -> str:
     lines = [
         f"power {row['power']:.3f}: albedo {row['albedo']:.3f}, path length "
         f"{row['path_length_rr2']:.2f} (roulette from 2) {row['path_length_rr5']:.2f} (from 5), "
-        f"light of 15 bounces: {100 * row['light_of_15_bounces']:.1f} %"
+        f"light of 15 bounces: {100 * row['light']['16']:.1f} %"
     ]
     for loss in ("relative_l2", "l2"):
         cells = []

@@ -169,8 +169,8 @@ def _jobs(context: ExperimentContext) -> list[Job]:
 def _trainings(context: ExperimentContext) -> tuple[CacheTraining, CacheTraining]:
     """The first training of L_θ, and the further one at each roughness."""
     lanes = context.pick(256, 4096, 16384)
-    first = CacheTraining(context.pick(20, 4000, 18000), lanes, 0.008)
-    return first, replace(first, steps=context.pick(5, 600, 4000), rate=0.002)
+    first = CacheTraining(context.pick(4, 4000, 18000), lanes, 0.008)
+    return first, replace(first, steps=context.pick(1, 600, 4000), rate=0.002)
 
 
 def _shrunk(context: ExperimentContext) -> int:
