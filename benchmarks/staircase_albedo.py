@@ -12,7 +12,14 @@ they published. This script applies several exponents to every albedo and measur
   from the fifth interaction on,
 - the share of the reflected light that paths of a given length carry, and the mean albedo seen.
 
-A stopped run continues; `--minutes` ends it in time.
+The exponent in `experiments/scenes.py` is 0.7: with it PRB 10 and PRB 15 are as far from the
+reference as in the same part of the published tables, and have the right sign everywhere, as there.
+It does not meet everything. PRB 4 is worse here than published, with 0.7 and with 0.5. PRB 30 is
+better here: the published reference itself is not zero where it should be. The mean path length of
+Table 1 asks for an exponent below 0.6. The plain L2 loss fits the published tables less than the
+relative one.
+
+A stopped run continues, `--minutes` ends it in time, and what is done is told.
 """
 
 from __future__ import annotations
@@ -21,7 +28,7 @@ import argparse
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +54,7 @@ from unbake.transport.path_tracer import path_lengths  # noqa: E402
 from unbake.transport.render import parts_of, render_materials  # noqa: E402
 from unbake.transport.vertex import SceneView  # noqa: E402
 
-POWERS = (0.6, 0.7, 0.5, 0.55, 0.65, 0.8, 1.0)
+POWERS = (0.7, 0.6, 0.8, 0.5, 1.0)
 #: Roughnesses of the tables; some of Figure 4's.
 VALUES = fig4.VALUES[::3]
 METHODS = tuple(f"PRB {depth}" for depth in (4, 10, 15, 30))
@@ -64,9 +71,11 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="folder of what is done so far")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--powers", type=float, nargs="+", default=POWERS)
-    parser.add_argument("--spp", type=int, default=32, help="samples per pixel of each pass")
+    parser.add_argument("--spp", type=int, default=192, help="samples per pixel of each pass")
     parser.add_argument("--shrunk", type=int, default=16, help="resolution of the film over ours")
-    parser.add_argument("--minutes", type=float, default=9.0, help="begin no job after that")
+    parser.add_argument(
+        "--minutes", type=float, default=9.0, help="begin no further job after that"
+    )
     args = parser.parse_args()
     end = time.monotonic() + 60 * args.minutes
     context = ExperimentContext("cpu", args.work, args.scenes)
@@ -74,17 +83,10 @@ def main() -> None:
     jobs = [job for power in args.powers for job in jobs_of(context, power, args.spp, args.shrunk)]
     print(runner.plan(jobs), flush=True)
     done = runner.run(jobs, until=end).findings
-    rows = [
-        row_of(context, power, args.shrunk, done)
-        for power in args.powers
-        if all(job.name in done for job in jobs_of(context, power, args.spp, args.shrunk))
-    ]
-    found = {"machine": machine(), "values": VALUES, "spp": args.spp, "max_depth": MAX_DEPTH}
-    found["published"] = {
-        method: agreement(VALUES, published(method)[1], published("reference")[1])
-        for method in METHODS
-    }
-    found["published"]["path_length"] = table1.PUBLISHED["STAIRCASE"][0]
+    rows = [row_of(context, power, args.shrunk, done) for power in args.powers]
+    found = {"machine": machine(), "spp": args.spp, "max_depth": MAX_DEPTH}
+    found["published_path_length"] = table1.PUBLISHED["STAIRCASE"][0]
+    rows = [row for row in rows if len(row) > 1]
     write_json(args.out, found | {"powers": rows})
     for row in rows:
         print(told(row), flush=True)
@@ -173,95 +175,76 @@ def measure_views(context: ExperimentContext, power: float) -> Findings:
 def row_of(
     context: ExperimentContext, power: float, shrunk: int, done: Mapping[str, Findings]
 ) -> dict[str, Any]:
-    """What was measured with one power."""
+    """What was measured with one power, as far as it is done.
+
+    Tables are told from three roughnesses on, beside the same part of the published ones.
+    """
+    row: dict[str, Any] = {"power": power} | done.get(f"views-{power:.3f}", {})
+    files = {value: arrays_file(context, power, value) for value in VALUES}
+    values = [value for value, file in files.items() if file.stem in done]
+    if len(values) < 3:
+        return row
     arrays = {}
-    for value in VALUES:
-        with np.load(arrays_file(context, power, value)) as file:
+    for value in values:
+        with np.load(files[value]) as file:
             arrays[value] = dict(file)
-    film = done[arrays_file(context, power, VALUES[0]).stem]
-    arrays = fig4.smoothed(arrays, film["height"], film["width"], fig4.COARSE // shrunk)
-    row: dict[str, Any] = {"power": power} | done[f"views-{power:.3f}"]
-    row["light_in_own_view"] = {
-        method: sum(float(arrays[v][f"a {method} image"].sum()) for v in VALUES)
-        / sum(float(arrays[v]["a reference image"].sum()) for v in VALUES)
-        for method in METHODS
-    }
+    film = done[files[values[0]].stem]
+    block = fig4.COARSE // shrunk
+    arrays = fig4.smoothed(arrays, film["height"], film["width"], block, degree=None)
+    row["values"] = values
+    row["published"] = {method: published(method, values) for method in METHODS}
     for loss, relative in (("relative_l2", True), ("l2", False)):
-        tables = {
-            method: fig4.gradient_table(arrays, method, relative=relative)
-            for method in ("reference", *METHODS)
+        passes = {
+            name: {
+                method: fig4.gradient_table(arrays, method, relative=relative, passes=orders)[1]
+                for method in ("reference", *METHODS)
+            }
+            for name, orders in (("both", ("ab", "ba")), ("ab", ("ab",)), ("ba", ("ba",)))
         }
-        values, reference = tables["reference"]
-        row[loss] = {m: agreement(values, tables[m][1], reference) for m in METHODS}
-        row[loss]["noise"] = noise(arrays, relative)
-        row[loss]["reference"] = {
-            "size": float(np.sqrt((reference**2).mean())),
-            "correlation_with_published": float(
-                np.corrcoef(reference.ravel(), published("reference")[1].ravel())[0, 1]
-            ),
-        }
+        reference = passes["both"]["reference"]
+        row[loss] = {"size": float(np.sqrt((reference**2).mean()))}
+        half = 0.5 * (passes["ab"]["reference"] - passes["ba"]["reference"])
+        row[loss]["noise"] = float(np.sqrt((half**2).mean())) / row[loss]["size"]
+        for method in METHODS:
+            row[loss][method] = fig4.agreement(values, passes["both"][method], reference)
+            one, other = (
+                fig4.agreement(values, passes[p][method], passes[p]["reference"])["relative_rmse"]
+                for p in ("ab", "ba")
+            )
+            row[loss][method]["halves"] = [one, other]
     return row
 
 
-def agreement(values: Any, table: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """What Figure 4 tells of a method."""
-    return fig4.agreement(list(values), table, reference)
-
-
-def published(method: str) -> tuple[list[float], np.ndarray]:
-    """The part of a published table that is measured here."""
-    values, table = fig4.published_tables()[method]
-    chosen = [values.index(value) for value in VALUES]
-    return list(VALUES), table[np.ix_(chosen, chosen)]
-
-
-def noise(arrays: Mapping[float, Mapping[str, np.ndarray]], relative: bool) -> dict[str, float]:
-    """Noise of a relative RMSE, from the two halves of the samples.
-
-    The error comes from one pass and the derivative from the other, or the other way round: two
-    estimates of one table.
-
-    Returns:
-        `reference`: of the reference, relative to its size; by method: half the difference of the
-        relative RMSEs of the two.
-    """
-    halves = [
-        {
-            method: fig4.gradient_table(arrays, method, relative=relative, passes=(order,))[1]
-            for method in ("reference", *METHODS)
-        }
-        for order in ("ab", "ba")
-    ]
-    a, b = (half["reference"] for half in halves)
-    size = np.sqrt(((0.5 * (a + b)) ** 2).mean())
-    found = {"reference": float(np.sqrt((0.25 * (a - b) ** 2).mean()) / size)}
-    for method in METHODS:
-        one, other = (
-            fig4.agreement(list(VALUES), half[method], half["reference"])["relative_rmse"]
-            for half in halves
-        )
-        found[method] = abs(one - other) / 2
-    return found
+def published(method: str, values: Sequence[float]) -> dict[str, float]:
+    """What Figure 4 tells of a method, from the part of the published table with these values."""
+    tables = fig4.published_tables()
+    every = tables[method][0]
+    chosen = np.ix_(*2 * [[every.index(value) for value in values]])
+    return fig4.agreement(list(values), tables[method][1][chosen], tables["reference"][1][chosen])
 
 
 def told(row: Mapping[str, Any]) -> str:
     """A row as lines of text."""
-    lines = [
-        f"power {row['power']:.3f}: albedo {row['albedo']:.3f}, path length "
-        f"{row['path_length_rr2']:.2f} (roulette from 2) {row['path_length_rr5']:.2f} (from 5), "
-        f"light of 15 bounces: {100 * row['light']['16']:.1f} %"
-    ]
+    lines = [f"power {row['power']:.3f}"]
+    if "albedo" in row:
+        lines[0] += (
+            f": albedo {row['albedo']:.3f}, path length {row['path_length_rr2']:.2f} (roulette "
+            f"from 2) {row['path_length_rr5']:.2f} (from 5), light of 15 bounces "
+            f"{100 * row['light']['16']:.1f} %"
+        )
     for loss in ("relative_l2", "l2"):
-        cells = []
+        if loss not in row:
+            continue
+        lines.append(f"  {loss}, {len(row['values'])} roughnesses; noise {row[loss]['noise']:.0%}:")
         for method in METHODS:
-            cell = row[loss][method]
-            cells.append(
-                f"{method} {cell['relative_rmse']:.2f} ± {row[loss]['noise'][method]:.2f} "
-                f"(slope {cell['slope']:.2f}, sign {cell['sign_agreement']:.2f})"
+            here, paper = row[loss][method], row["published"][method]
+            one, other = here["halves"]
+            lines.append(
+                f"    {method}: relative RMSE {here['relative_rmse']:.2f} ({one:.2f}, {other:.2f} "
+                f"by halves; published {paper['relative_rmse']:.2f}), slope {here['slope']:.2f} "
+                f"({paper['slope']:.2f}), sign agreement {here['sign_agreement']:.2f} "
+                f"({paper['sign_agreement']:.2f})"
             )
-        size = row[loss]["reference"]["size"]
-        noisy = row[loss]["noise"]["reference"]
-        lines.append(f"  {loss}: {', '.join(cells)}; reference {size:.2g} ± {noisy:.0%}")
     return "\n".join(lines)
 
 

@@ -232,3 +232,13 @@ def test_a_rendering_of_another_size_than_the_photograph_is_named(tmp_path, monk
     fits = SceneFits(STAIRCASE, ["ours"], None, spp=1)
     with pytest.raises(UserError, match=r"a_render\.exr: the picture has 8 x 4 pixels"):
         fits.qualities(context(tmp_path), "ours", {"per_view": [{}]})
+
+
+def test_the_albedo_of_staircase_is_the_one_that_was_calibrated(repository):
+    file = repository / "benchmarks" / "results" / "staircase-albedo.json"
+    calibrated = json.loads(file.read_text())["powers"][0]
+    assert calibrated["power"] == STAIRCASE.albedo_power
+    for method in ("PRB 10", "PRB 15"):
+        here, paper = calibrated["relative_l2"][method], calibrated["published"][method]
+        assert here["relative_rmse"] == pytest.approx(paper["relative_rmse"], rel=0.25)
+        assert here["sign_agreement"] == paper["sign_agreement"] == 1

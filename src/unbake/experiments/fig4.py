@@ -132,7 +132,7 @@ def _picture(parsed: ParsedScene, node: Any) -> str:
 def _jobs(context: ExperimentContext) -> list[Job]:
     STAIRCASE.require(context)
     known = {"max_depth": MAX_DEPTH, "albedo_power": STAIRCASE.albedo_power}
-    table = {"shrunk": _shrunk(context), "spp": context.pick(4, 256, 1024)}
+    table = {"shrunk": _shrunk(context), "spp": context.pick(64, 256, 1024)}
     picture = {"shrunk": context.pick(80, 6, 2), "spp": context.pick(4, 64, 1024)}
     picture["zoom"] = context.pick(1, 3, 1)
     first, each = _trainings(context)

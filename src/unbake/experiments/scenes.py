@@ -220,7 +220,7 @@ STAIRCASE = PaperScene(
     room=True,
     views=26,
     steps=18_000,
-    albedo_power=0.5,
+    albedo_power=0.7,  # benchmarks/staircase_albedo.py
 )
 SCENES = (
     STAIRCASE,
