@@ -30,6 +30,8 @@ from unbake import activate  # noqa: E402
 
 RESULTS, KEPT = ROOT / "benchmarks" / "results", ROOT / "docs" / "reproduction"
 WIDTH = 120
+#: Headings, tables, pictures, comments and what is set in stay as they are.
+_KEPT = re.compile(r"^(\||#|!\[|<!--|\[//\]|\s{4,})", re.MULTILINE)
 #: A comment of Markdown.
 NOTE = "[//]: # (Made by scripts/write_docs.py from {}: edit that.)\n\n"
 
@@ -71,18 +73,19 @@ def filled(text: str) -> str:
 
 
 def _filled(paragraph: str) -> str:
-    if (
-        re.search(r"^(\||#|!\[|<!--|\[//\]|\s{4,})", paragraph, re.MULTILINE)
-        or not paragraph.strip()
-    ):
+    text = paragraph.strip("\n")
+    if not text.strip() or _KEPT.search(paragraph):
         return paragraph
-    head, tail = re.match(r"\n*", paragraph)[0], re.search(r"\n*$", paragraph)[0]
-    items = re.split(r"\n(?=[-*>] |\d+\. )", paragraph.strip("\n"))
+    head, tail = paragraph.split(text, 1)
+    # A line in the middle of a paragraph may begin with a number and a full stop.
+    mark = r"\d+\. " if re.match(r"\d+\. ", text) else r"[-*] "
+    items = [text] if text.startswith("> ") else re.split(rf"\n(?={mark})", text)
     return head + "\n".join(map(_filled_item, items)) + tail
 
 
 def _filled_item(item: str) -> str:
-    mark = re.match(r"(?:[-*>] |\d+\. )?", item)[0]
+    found = re.match(r"[-*>] |\d+\. ", item)
+    mark = "" if found is None else found[0]
     inner = "> " if mark == "> " else " " * len(mark)
     words = " ".join(line.removeprefix(">").strip() for line in item.removeprefix(mark).split("\n"))
     return textwrap.fill(

@@ -255,3 +255,19 @@ def test_templates_compute_what_they_print():
                 text = [c.value for c in node.find_all(jinja2.nodes.Const)]
                 bare = [t for t in text if isinstance(t, str) and re.search(r"\d\.\d|\d dB", t)]
                 assert known and not bare, f"{template.name}:{node.lineno}: a bare number {bare}"
+
+
+def test_paragraphs_are_filled_and_nothing_else_is(writer):
+    long = "word " * 40
+    text = f"# Title\n\nIt is\n6. {long}\n\n- one\n  {long}\n- two\n\n1. a\n2. b\n\n> a\n> {long}\n"
+    text += f"\n| a | b |\n|---|---|\n| {long} | 1 |\n\n```sh\n{long}\n\n{long}\n```\n"
+    filled = writer["filled"](text)
+    assert filled.count("word") == text.count("word")
+    blocks = filled.split("\n\n")
+    assert blocks[1].startswith("It is 6. word word") and len(blocks[1].split("\n")) == 2
+    assert blocks[2].startswith("- one word") and blocks[2].endswith("\n- two")
+    assert blocks[3] == "1. a\n2. b"
+    assert all(line.startswith("> ") for line in blocks[4].split("\n"))
+    assert f"| {long} | 1 |" in filled and f"```sh\n{long}\n\n{long}\n```\n" in filled
+    own = [line for block in blocks[:4] for line in block.split("\n")]
+    assert max(map(len, own)) <= 120
