@@ -58,6 +58,8 @@ def test_two_methods_side_by_side(compare, tmp_path):
         assert row["samples_per_second"] == pytest.approx(rate)
         assert 0 < row["milliseconds_per_step"] < 1e3 * row["seconds"]
         assert row["start_up_seconds"] >= 0 and row["memory_mb"] > 10
+        assert row["rate_factors"].keys() == {"albedo", "roughness"}
+        assert row["rate_factors"] == {k: config.rate_factors[k] for k in row["rate_factors"]}
         assert row["estimator"] == "split-halves" and row["representation"] == "neural"
         assert row["radiance"] == {"ours": "neural", "direct": None}[name]
         metrics = json.loads((out / name / "evaluation" / "metrics.json").read_text())

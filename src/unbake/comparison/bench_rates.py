@@ -29,6 +29,7 @@ from ..evaluation.lighting import recovered_emitters, relight_psnr
 from ..formats import check_format
 from ..io import read_object, write_json
 from ..machine import machine
+from ..quantities import QUANTITIES
 from ..training.defaults import with_defaults
 from ..training.fresh_fit import FreshFit, begin_fit
 from ..training.schedule import learning_rates
@@ -148,7 +149,10 @@ class _Search:
         if record["untrained"] is None:
             record["untrained"] = _scores(begin_fit(self._dataset, config), self._dataset)
             self._say("untrained", record["untrained"])
-        best = best_trial(_unknowns(config), _estimators(config), self._score)
+        # What photographs tell least of comes first.
+        materials = [name for name in config.unknowns if name in QUANTITIES]
+        lights = [name for name in config.unknowns if name not in QUANTITIES]
+        best = best_trial([*reversed(materials), *lights], _estimators(config), self._score)
         found = self._known(best) or {}
         if "error" in found:
             raise UserError(found["error"], self._name)
@@ -212,8 +216,6 @@ def _search(
 ) -> Row:
     """The search of a method on a data set in the record; a new one if there is none."""
     config = with_defaults(variant.settings(shared), dataset)
-    if not _unknowns(config):
-        raise UserError("nothing is unknown", "unknown")
     settings = tomllib.loads(to_toml(config))
     del settings["rate_factors"], settings["estimator"]
     camera = dataset.train[0].camera
@@ -242,13 +244,6 @@ def _search(
     search = described | {"untrained": None, "trials": [], "best": None}
     result["searches"].append(search)
     return search
-
-
-def _unknowns(config: FitConfig) -> list[str]:
-    """The unknowns whose rates are searched, in order: what photographs tell least of first."""
-    found = list(reversed(config.quantities)) if config.learns_materials else []
-    lights = {"environment": config.learns_environment, "emission": config.unknown == "emission"}
-    return [*found, *(name for name, learned in lights.items() if learned)]
 
 
 def _estimators(config: FitConfig) -> list[Estimator]:

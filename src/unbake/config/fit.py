@@ -367,6 +367,13 @@ class FitConfig:
         return self.unknown in ("lighting", "materials+lighting")
 
     @property
+    def unknowns(self) -> tuple[str, ...]:
+        """What is recovered: names of `UNKNOWNS`."""
+        found = self.quantities if self.learns_materials else ()
+        lights = {"environment": self.learns_environment, "emission": self.unknown == "emission"}
+        return (*found, *(name for name, learned in lights.items() if learned))
+
+    @property
     def material_settings(self) -> dict[str, FieldSettings]:
         """Settings of the chosen representation, by unknown quantity."""
         return {name: self.materials[name][self.representation] for name in self.quantities}

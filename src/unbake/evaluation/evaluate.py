@@ -111,10 +111,11 @@ def evaluate(
 
 
 def description(config: FitConfig) -> dict:
-    """The settings that tell runs apart: unknown, quantities, method, fields and estimator.
+    """The settings that tell runs apart: unknown, quantities, method, fields, estimator and rates.
 
     `representation` is that of the materials, None if they are known; `radiance` is that of L_θ,
-    None if the method has no radiance field; `path_depth` is that of methods that follow paths.
+    None if the method has no radiance field; `path_depth` is that of methods that follow paths;
+    `rate_factors` are multiples of the fields' rates, None in runs of earlier versions.
     """
     cached = has_radiance(config.chosen_method)
     return {
@@ -126,6 +127,7 @@ def description(config: FitConfig) -> dict:
         "representation": config.representation if config.learns_materials else None,
         "radiance": config.radiance_representation if cached else None,
         "estimator": "split-halves" if config.halves else "two-pass",
+        "rate_factors": {name: config.rate_factors[name] for name in config.unknowns},
         "path_depth": config.path.chosen_depth if config.follows_paths else None,
     }
 
