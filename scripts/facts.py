@@ -316,7 +316,12 @@ def made_by(name: str) -> str:
     benchmark = run.BENCHMARKS.get(name)
     if benchmark is not None:
         return f"python benchmarks/run.py {benchmark.job}"
-    return f"grep -rl {name} benchmarks CONTRIBUTING.md"
+    if name == "rates":
+        return "unbake bench rates --out benchmarks/results/rates.json"
+    script = f"benchmarks/{name.replace('-', '_')}.py"
+    if (ROOT / script).is_file():
+        return f"python {script}"
+    return f"git log --all -- benchmarks/results/{name}.json"
 
 
 def machine_words(found: Mapping[str, Row]) -> str:
