@@ -156,7 +156,7 @@ class Machine:
 NO_SCORES = ("--score-seconds", 0)
 COARSE_RENDERING = ("--evaluate-spp", 16)
 ABLATION = (
-    "direct", "with-biased-prior", "with-prior", "with-stop-gradient", "with-second-bounce", "ours",
+    "direct", "with-prior", "with-biased-prior", "with-stop-gradient", "with-second-bounce", "ours",
     "no-prior",
 )  # fmt: skip
 STEP_METHODS = (
@@ -469,6 +469,7 @@ def plan_equal(bench: Bench, name: str, benchmark: EqualSamples) -> Planned:
 
         settings = {"words": [str(word) for word in words], "settings": text}
         settings |= {"like": benchmark.like, "slow": benchmark.slow}
+        settings["defaults"] = method_defaults.as_json()
         # They are quicker than the slow method, by a factor that depends on the machine.
         seconds = (OVERHEAD + at_time.seconds / 3) * len(benchmark.methods)
         jobs.append(Job(folder.name, settings, work, seconds, files=[folder / "compare.json"]))

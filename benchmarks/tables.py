@@ -169,19 +169,24 @@ def spreads(*columns: tuple[str, str, float, int]) -> Callable[[dict], str]:
 
 
 def variants(names: list[str], *columns: tuple[str, str, float, int]) -> Callable[..., str]:
-    """One method with several settings, a file of results each."""
+    """One method with several settings, a file of results each; before them what they start from.
+
+    Rows of untrained fields that are the same are told once.
+    """
+
+    def cells(row: dict) -> list[str]:
+        return [spread(row, key, by, digits) for _, key, by, digits in columns]
 
     def table(*results: dict) -> str:
-        rows = [
-            [
-                name,
-                *(
-                    spread(result["methods"]["ours"], key, by, digits)
-                    for _, key, by, digits in columns
-                ),
-            ]
-            for name, result in zip(names, results, strict=True)
-        ]
+        fitted = [[n, *cells(r["methods"]["ours"])] for n, r in zip(names, results, strict=True)]
+        starts = [cells(r["untrained"]) if "untrained" in r else None for r in results]
+        if all(start == starts[0] for start in starts):
+            first = [] if starts[0] is None else [["untrained", *starts[0]]]
+            rows = [*first, *fitted]
+        else:
+            rows = []
+            for name, start, row in zip(names, starts, fitted, strict=True):
+                rows += [row] if start is None else [[f"{name}, untrained", *start], row]
         return markdown(["", *(title for title, *_ in columns)], rows) + over_seeds(results[0])
 
     return table

@@ -174,6 +174,23 @@ def test_tables_have_the_untrained_fields_first_and_tell_of_how_many_seeds(bench
     assert "SH error, aligned" in columns and "relighting, aligned" in columns
 
 
+def test_untrained_fields_of_several_files_are_told_once_if_they_are_the_same(benchmarks):
+    def result(albedo, start=None):
+        known = {} if start is None else {"untrained": {"albedo_psnr": start}}
+        return known | {"seeds": [0], "methods": {"ours": {"albedo_psnr": albedo}}}
+
+    table = benchmarks("tables")["variants"](["a", "b"], ("albedo", "albedo_psnr", 1, 1))
+
+    def rows(*results):
+        return [line for line in table(*results).splitlines()[2:] if line.startswith("|")]
+
+    assert rows(result(20.0), result(21.0)) == ["| a | 20.0 |", "| b | 21.0 |"]
+    same = rows(result(20.0, 8.0), result(21.0, 8.0))
+    assert same == ["| untrained | 8.0 |", "| a | 20.0 |", "| b | 21.0 |"]
+    other = rows(result(20.0, 8.0), result(21.0, 9.0))
+    assert other[0] == "| a, untrained | 8.0 |" and other[2] == "| b, untrained | 9.0 |"
+
+
 def test_the_time_to_a_quality_is_told_of_all_seeds(benchmarks):
     def fits(*ends):
         curves = [

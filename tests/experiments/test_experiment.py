@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from unbake.config import FitConfig
 from unbake.errors import UserError
-from unbake.experiments import Name, experiment, load
+from unbake.experiments import Name, experiment, fig6, load
 from unbake.experiments.experiment import (
     Experiment,
     ExperimentContext,
@@ -21,8 +22,9 @@ from unbake.experiments.experiment import (
 )
 from unbake.experiments.fig4 import agreement, published_tables, smoothed
 from unbake.experiments.jobs import Job, Unfinished
-from unbake.experiments.scene_fits import SceneFits, at_equal_samples
+from unbake.experiments.scene_fits import ABLATION, Fit, SceneFits, steps_of
 from unbake.experiments.scenes import SCENES, STAIRCASE
+from unbake.experiments.seeds import across_seeds, plus_minus, spread
 from unbake.experiments.tables import markdown
 from unbake.imaging.pictures import write_exr
 from unbake.training.run_folder import RunFolder
@@ -172,20 +174,86 @@ def test_camera_files_hold_the_views_that_are_stated(scene):
     assert splits.count("train") == scene.views and splits.count("heldout") == 6
 
 
-def test_scores_are_compared_at_the_samples_of_the_slowest():
-    def row(each, *scores):
-        curve = [
-            {"step": step, "albedo_psnr": psnr, "roughness_psnr": None} for step, psnr in scores
-        ]
-        return {"steps": scores[-1][0], "samples": each * scores[-1][0], "score": curve}
+def test_both_passes_of_the_slow_fit_count_at_equal_samples():
+    """Half the steps of two passes are as many samples as all steps of one."""
+    shared = FitConfig(pixels=64, spp=4)
+    quick = [dataclasses.replace(shared, method=m) for m in ("ours", "no-prior", "direct")]
+    two = dataclasses.replace(shared, method="prb", estimator="two-pass")
+    one = dataclasses.replace(shared, method="prb", estimator="split-halves")
+    assert steps_of(100 * two.samples_per_step, quick) == 200
+    assert steps_of(100 * one.samples_per_step, quick) == 100
+    assert steps_of(383, quick) == 1 and steps_of(385, quick) == 2
+    with pytest.raises(ValueError, match=r"\[256, 512\] samples cannot have the same length"):
+        steps_of(1000, [*quick, two])
 
-    found = {
-        "fast": row(10, (0, 0.0), (100, 10.0), (200, 30.0)),
-        "slow": row(10, (0, 0.0), (150, 12.0)),
-    }
-    equal = at_equal_samples(found)
-    assert equal["fast"] == {"samples": 1500, "albedo_psnr": 20.0, "roughness_psnr": None}
-    assert equal["slow"]["albedo_psnr"] == 12.0
+
+def test_estimators_are_told_with_their_scenes_if_there_are_several():
+    told = fig6._estimators
+    assert told({"A": "two-pass", "B": "two-pass"}) == "two passes"
+    mixed = told({"A": "two-pass", "B": "split-halves", "C": "two-pass"})
+    assert mixed == "two passes in A, C, split halves in B"
+
+
+@pytest.fixture
+def fits_of_views(tmp_path, monkeypatch):
+    """Fits of one view that are off by a given amount, one for each seed."""
+    view = SimpleNamespace(name="a", split="heldout", image=tmp_path / "a.exr")
+    write_exr(view.image, np.ones((4, 4, 4)))
+    monkeypatch.setattr(SceneFits, "heldout", lambda *_: [view])
+
+    def make(*albedo, **others):
+        fits = []
+        for seed, psnr in enumerate(albedo):
+            run = RunFolder(tmp_path / f"{seed}")
+            write_exr(run.picture("heldout", "a", "render"), np.full((4, 4, 4), 0.9))
+            metrics = {"albedo_psnr": psnr, "roughness_psnr": None}
+            found = {"steps": 4 + seed, "per_view": [metrics], "estimator": "two-pass"}
+            fits.append(Fit(seed, run, found | others))
+        return fits
+
+    return make
+
+
+def test_rows_of_seeds_follow_their_mean_and_spread(tmp_path, fits_of_views):
+    scene_fits = SceneFits(STAIRCASE, ["ours"], FitConfig(), spp=1, seeds=(0, 1, 2))
+    light = {"sh_error": 0.25, "relight_psnr_aligned": 30.0}
+    fits = fits_of_views(20.0, 23.0, 26.0, environment=light)
+    mean, *per_seed = scene_fits.rows(context(tmp_path), fits, method="PRB")
+    assert (mean["method"], mean["scene"]) == ("PRB", "STAIRCASE") and mean["seeds"] == 3
+    assert mean["albedo_psnr"] == 23.0 and mean["albedo_psnr_sd"] == 3.0  # n - 1
+    assert mean["render_psnr"] == pytest.approx(20.0) and mean["render_psnr_sd"] == 0
+    assert mean["steps"] == 5 and mean["sh_error"] == 0.25 and mean["relight_psnr_aligned"] == 30.0
+    assert "roughness_psnr" not in mean and mean["estimator"] == "two-pass"
+    assert [row["seed"] for row in per_seed] == [0, 1, 2]
+    assert [row["albedo_psnr"] for row in per_seed] == [20.0, 23.0, 26.0]
+    mean, _ = scene_fits.rows(context(tmp_path), fits[:1])
+    assert mean["seeds"] == 1 and mean["albedo_psnr"] == 20.0 and "albedo_psnr_sd" not in mean
+
+
+def test_a_spread_is_of_the_values_that_are_known():
+    assert spread("x", []) == {} == spread("x", [None])
+    assert spread("x", [2.0, None]) == {"x": 2.0}
+    assert spread("x", [1.0, 2.0, 3.0, 6.0]) == {"x": 3.0, "x_sd": pytest.approx((14 / 3) ** 0.5)}
+    row = across_seeds([{"x": 1.0, "y": 5}, {"x": 2.0}], ("x", "y", "z"))
+    assert row == {"x": 1.5, "x_sd": pytest.approx(0.5**0.5), "y": 5}
+    assert plus_minus(row, "x", 2) == "1.50 ± 0.71" and plus_minus(row, "y") == "5.0"
+    assert plus_minus(row, "x", 0, 100) == "150 ± 71" and plus_minus(row, "z") is None
+
+
+def test_each_seed_has_a_job_and_a_folder_of_its_own(tmp_path, monkeypatch):
+    (tmp_path / "staircase").mkdir()
+    cpu = ExperimentContext("cpu", tmp_path, tmp_path, Console(quiet=True))
+    scene_fits = SceneFits.of(cpu, STAIRCASE, ABLATION.values())
+    assert scene_fits.seeds == (0, 1, 2)
+    jobs = scene_fits.jobs(cpu)
+    assert [job.name for job in jobs] == ["staircase-data", *(f"staircase-{n}" for n in range(3))]
+    assert len({json.dumps(job.settings, sort_keys=True) for job in jobs}) == 4
+    assert len({scene_fits.runs(cpu, seed) for seed in scene_fits.seeds}) == 3
+    # Fits of other methods, or with fewer seeds, are in the same folders.
+    fewer = SceneFits.of(cpu, STAIRCASE, ["ours"], 2)
+    assert [fewer.runs(cpu, s) for s in (0, 1)] == [scene_fits.runs(cpu, s) for s in (0, 1)]
+    times = [job.seconds + job.waits for job in jobs[1:]]
+    assert times == [times[0]] * 3 and times[0] > 120 * len(ABLATION)
 
 
 def test_smoothing_keeps_cubics_and_takes_noise_away():
@@ -228,10 +296,9 @@ def test_a_rendering_of_another_size_than_the_photograph_is_named(tmp_path, monk
     write_exr(view.image, np.ones((8, 8, 4)))
     write_exr(run.picture("heldout", "a", "render"), np.ones((4, 8, 4)))
     monkeypatch.setattr(SceneFits, "heldout", lambda *_: [view])
-    monkeypatch.setattr(SceneFits, "run", lambda *_: run)
     fits = SceneFits(STAIRCASE, ["ours"], None, spp=1)
     with pytest.raises(UserError, match=r"a_render\.exr: the picture has 8 x 4 pixels"):
-        fits.qualities(context(tmp_path), "ours", {"per_view": [{}]})
+        fits.qualities(context(tmp_path), Fit(0, run, {"per_view": [{}]}))
 
 
 def test_the_albedo_of_staircase_is_the_one_that_was_calibrated(repository):

@@ -143,11 +143,43 @@ def test_fig4_longer_paths_miss_less(rows, out, scenes_dir):
 def test_every_method_is_fitted_and_shown(rows, out, scenes_dir, figure, methods):
     name = figure.EXPERIMENT.name
     found = rows(name, "--scenes", scenes_dir, figure=figure is not fig6)
-    assert {row["method"] for row in found} >= set(methods if figure is fig6 else methods.values())
-    means = [row for row in found if "steps" in row]
-    assert column(means, "steps") == [6] * len(methods)
+    told = [*methods] if figure is fig6 else [*methods.values()]
+    means = [row for row in found if "seeds" in row]
+    assert column(means, "method") == ["untrained", *told]
+    seeds = 2 if figure is fig6 else 1
+    assert set(column(means, "seeds")) == {seeds}
+    untrained, *fitted = means
+    assert column(fitted, "steps") == [6] * len(methods) and "steps" not in untrained
     assert min(column(means, "render_psnr")) > 3
+    for mean in means:
+        of_seeds = [r for r in found if r["method"] == mean["method"] and "seed" in r]
+        assert column(of_seeds, "seed") == [*range(seeds)]
+        values = column(of_seeds, "render_psnr")
+        assert mean["render_psnr"] == pytest.approx(sum(values) / seeds)
+        assert ("render_psnr_sd" in mean) == (seeds > 1)
+        if seeds > 1:
+            assert mean["render_psnr_sd"] == pytest.approx(abs(values[0] - values[1]) / 2**0.5)
+            assert values[0] != values[1] or mean is untrained
+    table = (out / name / "table.md").read_text()
+    shown = f"{means[-1]['render_psnr']:.1f}"
+    assert "untrained" in table and (f"{shown} ± " if seeds > 1 else f"{shown} |") in table
     if figure is fig6:
-        assert len(found) == 3 * len(methods)
+        assert len(found) == 5 * len(means)
         shown = picture(out / name / "dragon.png")
         assert shown.shape[1] > shown.shape[0] * 0.7 and shown.std() > 0
+        at = {row["method"]: row for row in means}
+        slow = at["PRB"]["samples_at_equal_samples"]
+        assert (
+            slow
+            == at["PRB"]["samples"]
+            == 6 * 256 * {"split-halves": 1, "two-pass": 2}[at["PRB"]["estimator"]]
+        )
+        for method in ("direct", "ours", "no prior"):
+            assert at[method]["samples_at_equal_samples"] == slow
+            assert at[method]["albedo_psnr_at_equal_samples_sd"] > 0
+        assert "albedo_psnr_at_equal_samples" not in at["AD-PT"]
+        assert f"PRB: {fig6.ESTIMATORS[at['PRB']['estimator']]}" in table
+    if figure is fig8:
+        for key in ("sh_error", "sh_error_aligned", "relight_psnr", "relight_psnr_aligned"):
+            assert len({row[key] for row in means}) > 1
+        assert "SH error, aligned" in table and "relighting, aligned" in table

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..comparison.compare import UNTRAINED
 from ..imaging.pictures import write_png
 from .experiment import Experiment, ExperimentContext, ExperimentResult
 from .jobs import Findings, Job
 from .scene_fits import ABLATION, QUALITIES, SceneFits
 from .scenes import scenes_at
-from .tables import decibels, markdown
+from .seeds import plus_minus, seeds_in_words
+from .tables import markdown
 
 #: Columns of the figure.
 METHODS = ABLATION | {"ours without prior": "no-prior"}
@@ -29,16 +31,17 @@ def _jobs(context: ExperimentContext) -> list[Job]:
 
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     scene_fits = _scene_fits(context)
-    fits = findings[scene_fits.scene.folder]
-    rows: list[dict[str, Any]] = [
-        {"step": title} | scene_fits.row(context, method, fits[method])
-        for title, method in METHODS.items()
-    ]
-    table = markdown(
-        ["step", "steps", "albedo", "roughness", "rendering"],
-        [[r["step"], r["steps"], *(decibels(r[k]) for k in QUALITIES)] for r in rows],
-    )
-    caption = f"{scene_fits.scene.label}; PSNR in dB, mean over held-out views\n\n"
+    rows: list[dict[str, Any]] = []
+    lines = []
+    for title, method in ({"untrained": UNTRAINED} | METHODS).items():
+        fits = scene_fits.fits(context, findings, method)
+        mean, *per_seed = scene_fits.rows(context, fits, step=title, method=method)
+        rows += [mean, *per_seed]
+        psnrs = (plus_minus(mean, key) for key in QUALITIES)
+        lines.append([title, f"{mean.get('steps', 0):.0f}", *psnrs])
+    table = markdown(["step", "steps", "albedo", "roughness", "rendering"], lines)
+    caption = f"{scene_fits.scene.label}; PSNR in dB, mean over held-out views, "
+    caption += f"{seeds_in_words(len(scene_fits.seeds))}\n\n"
     sheet = scene_fits.picture(context, [VIEW])
     return ExperimentResult(rows, caption + table, lambda path: write_png(path, sheet))
 

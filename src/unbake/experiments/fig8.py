@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from ..comparison.compare import UNTRAINED
 from ..dataset.lighting import true_environment
 from ..imaging.pictures import montage, read_exr, tonemap, write_png
+from ..training.run_folder import RunFolder
 from .experiment import Experiment, ExperimentContext, ExperimentResult
 from .jobs import Findings, Job
 from .scene_fits import ABLATION, SceneFits, exposure
 from .scenes import scenes_at
-from .tables import decibels, markdown
+from .seeds import plus_minus, seeds_in_words
+from .tables import markdown
 
 #: The held-out view below the maps.
 VIEW = 0
@@ -30,28 +34,38 @@ def _jobs(context: ExperimentContext) -> list[Job]:
     return _scene_fits(context).jobs(context)
 
 
+#: Columns of the table: title, key, factor.
+COLUMNS = (
+    ("SH error, %", "sh_error", 100.0),
+    ("SH error, aligned", "sh_error_aligned", 100.0),
+    ("relighting, dB", "relight_psnr", 1.0),
+    ("relighting, aligned", "relight_psnr_aligned", 1.0),
+    ("rendering, dB", "render_psnr", 1.0),
+)
+
+
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     scene_fits = _scene_fits(context)
-    rows, lines = [], []
-    for title, method in ABLATION.items():
-        fit = findings[scene_fits.scene.folder][method]
-        row = {"step": title} | scene_fits.row(context, method, fit) | fit["environment"]
-        rows.append({key: value for key, value in row.items() if value is not None})
-        error, relit = f"{100 * row['sh_error']:.1f} %", decibels(row["relight_psnr"])
-        lines.append([title, row["steps"], error, relit, decibels(row["render_psnr"])])
-    titles = ["step", "steps", "SH error", "relighting", "rendering"]
-    caption = f"{scene_fits.scene.label}, materials known; PSNR in dB, "
-    caption += "renderings: mean over held-out views\n\n"
+    rows: list[dict[str, Any]] = []
+    lines = []
+    for title, method in ({"untrained": UNTRAINED} | ABLATION).items():
+        fits = scene_fits.fits(context, findings, method)
+        mean, *per_seed = scene_fits.rows(context, fits, step=title, method=method)
+        rows += [mean, *per_seed]
+        numbers = (plus_minus(mean, key, factor=factor) for _, key, factor in COLUMNS)
+        lines.append([title, f"{mean.get('steps', 0):.0f}", *numbers])
+    caption = f"{scene_fits.scene.label}, materials known; renderings: mean over held-out views; "
+    caption += "aligned: after the best factor for each channel; "
+    caption += f"{seeds_in_words(len(scene_fits.seeds))}\n\n"
+    table = markdown(["step", "steps", *(title for title, *_ in COLUMNS)], lines)
     sheet = _picture(context, scene_fits)
-    return ExperimentResult(
-        rows, caption + markdown(titles, lines), lambda path: write_png(path, sheet)
-    )
+    return ExperimentResult(rows, caption + table, lambda path: write_png(path, sheet))
 
 
 def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
-    """The recovered maps, and a view lit by them; the truth on the right."""
-    view = scene_fits.heldout(context)[VIEW]
-    runs = [scene_fits.run(context, method) for method in ABLATION.values()]
+    """The maps of the first seed, and a view lit by them; the truth on the right."""
+    view, folder = scene_fits.heldout(context)[VIEW], scene_fits.runs(context, scene_fits.seeds[0])
+    runs = [RunFolder(folder / method) for method in ABLATION.values()]
     maps = [read_exr(run.environment()) for run in runs]
     renderings = [run.picture(view.split, view.name, "render") for run in runs]
     truth = true_environment(scene_fits.scene.data(context))

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
+import drjit as dr
 import numpy as np
 
-from ..comparison.compare import compare
+from ..comparison.compare import UNTRAINED, compare
 from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig, method_defaults
 from ..dataset.views import Dataset, View
@@ -21,16 +22,21 @@ from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import block_means, montage, read_exr, shown
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES
 from ..report.display import require_same_size, rgb
+from ..training.defaults import with_defaults
+from ..training.fresh_fit import begin_fit
 from ..training.run_folder import RunFolder
+from ..training.schedule import learning_rates
 from ..training.validation import psnr_keys
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
 from .scenes import PaperScene
+from .seeds import across_seeds
 
 #: The methods of the ablation, from direct illumination to ours, by their title.
 ABLATION = {
     "direct": "direct",
     "+ prior": "with-prior",
+    "+ prior, one squared sample (the authors' way)": "with-biased-prior",
     "+ stop gradient": "with-stop-gradient",
     "+ second bounce": "with-second-bounce",
     "+ LHS (ours)": "ours",
@@ -39,28 +45,60 @@ ABLATION = {
 ROWS = ("render", *DEFAULT_QUANTITIES)
 MATERIALS = tuple(psnr_keys(DEFAULT_QUANTITIES))
 QUALITIES = (*MATERIALS, "render_psnr")
+LENGTH = ("steps", "samples", "seconds", "milliseconds_per_step")
+
+#: Seconds that a fit takes beside its training: compiling, scores and evaluation.
+_OVERHEAD = 25.0
+#: Nothing is traced or compiled after these.
+_COMPILING_STEPS = 3
+
+
+@final
+@dataclass(frozen=True)
+class Fit:
+    """The fit of a method with a seed.
+
+    Args:
+        run: its folder.
+        found: its row of the comparison, with the metrics of each view as `per_view`.
+    """
+
+    seed: int
+    run: RunFolder
+    found: Findings
 
 
 @final
 @dataclass(frozen=True)
 class SceneFits:
-    """Fits of several methods on a scene, with their evaluation.
+    """Fits of several methods on a scene with several seeds, and their evaluation.
 
     Args:
         scene: the scene.
         methods: names of methods, in the order of the picture's columns.
-        config: settings of all fits, including their length.
+        config: settings of all fits, including their length, but for the seed.
         spp: samples per pixel of the final renderings.
+        seeds: each is a comparison of its own. Pictures are of the first.
     """
 
     scene: PaperScene
     methods: Sequence[str]
     config: FitConfig
     spp: int
+    seeds: Sequence[int] = (0,)
 
     @staticmethod
-    def of(context: ExperimentContext, scene: PaperScene, methods: Iterable[str]) -> SceneFits:
-        """Fits with the length of the scale: the paper's steps, or a time on a CPU."""
+    def of(
+        context: ExperimentContext,
+        scene: PaperScene,
+        methods: Iterable[str],
+        seeds: int | None = None,
+    ) -> SceneFits:
+        """Fits with the length of the scale: the paper's steps, or a time on a CPU.
+
+        Args:
+            seeds: number of seeds; None: three at cpu scale.
+        """
         config = dataclasses.replace(
             scene.settings(context),
             seconds=context.pick(0.0, 120.0 if scene.room else 60.0, 0.0),
@@ -68,84 +106,174 @@ class SceneFits:
             score_seconds=context.pick(0.2, 10.0, 60.0),
             checkpoint_seconds=120.0,
         )
-        return SceneFits(scene, list(methods), config, spp=context.pick(2, 32, 128))
+        numbers = range(seeds or context.pick(1, 3, 1))
+        return SceneFits(scene, list(methods), config, context.pick(2, 32, 128), tuple(numbers))
 
-    def settings(self, context: ExperimentContext) -> dict[str, Any]:
-        """Everything that the findings depend on."""
-        return self._described(context) | {"methods": list(self.methods)}
+    # -------------------------------------------------------------------------------- Jobs
 
-    def runs(self, context: ExperimentContext) -> Path:
-        """The folder of the runs. Experiments with the same settings share it."""
-        return context.work / "runs" / f"{self.scene.folder}-{digest(self._described(context))}"
+    def settings(
+        self, context: ExperimentContext, seed: int, methods: Sequence[str]
+    ) -> dict[str, Any]:
+        """Everything that the findings of a seed depend on."""
+        return self._described(context, seed) | {"methods": list(methods)}
 
-    def _described(self, context: ExperimentContext) -> dict[str, Any]:
-        fits = {"fit": asdict(self.config), "defaults": method_defaults.as_json(), "spp": self.spp}
-        return fits | self.scene.described(context)
+    def runs(self, context: ExperimentContext, seed: int) -> Path:
+        """The folder of a seed's runs. Experiments with the same settings share it."""
+        described = digest(self._described(context, self.config.seed))
+        return context.work / "runs" / f"{self.scene.folder}-{described}" / f"seed-{seed}"
+
+    def _described(self, context: ExperimentContext, seed: int) -> dict[str, Any]:
+        fits = {"fit": asdict(self._config(seed)), "defaults": method_defaults.as_json()}
+        return fits | {"spp": self.spp} | self.scene.described(context)
 
     def jobs(self, context: ExperimentContext) -> list[Job]:
-        """Jobs that render the data set, fit the methods and evaluate them."""
-        work = functools.partial(self.fitted, context)
+        """Jobs that render the data set, and fit and evaluate the methods, one for each seed."""
         count = len(self.methods)
-        # Compiling and evaluation of each method.
-        seconds = context.pick(2.0 * count, 30.0 * count, None)
-        waits = count * self.config.seconds
-        fits = Job(self.scene.folder, self.settings(context), work, seconds, waits)
-        return [self.scene.capture(context), fits]
+        beside = _OVERHEAD * (count + 1)  # with the untrained fields
+        jobs = [self.scene.capture(context)]
+        for seed in self.seeds:
+            work = functools.partial(self.fitted, context, seed)
+            settings = self.settings(context, seed, self.methods)
+            seconds = context.pick(2.0 * count, beside, None)
+            waits = count * self.config.seconds
+            jobs.append(Job(self._job(seed), settings, work, seconds, waits))
+        return jobs
 
-    def fitted(self, context: ExperimentContext) -> Findings:
+    def jobs_at_equal_samples(
+        self, context: ExperimentContext, slow: str, methods: Sequence[str]
+    ) -> list[Job]:
+        """Jobs that fit methods again, with the samples that a slow one traced; after `jobs`."""
+        jobs = []
+        for seed in self.seeds:
+            work = functools.partial(self.fitted_at_equal_samples, context, seed, slow, methods)
+            settings = self.settings(context, seed, methods) | {"samples_of": slow}
+            # How much quicker than the slow one they are depends on the scene.
+            count = len(methods)
+            fits = _OVERHEAD * (count + 1) + count * self.config.seconds / 3
+            seconds = context.pick(2.0 * count, fits, None)
+            jobs.append(Job(self._job(seed, equal=True), settings, work, seconds))
+        return jobs
+
+    def fitted(self, context: ExperimentContext, seed: int) -> Findings:
         """Fit and evaluate the methods, as `unbake compare` does.
 
         Returns:
-            By method: its row of the comparison, with the metrics of each view as `per_view`.
+            By method, and of the fields before their first step as `untrained`: its row of the
+            comparison, with the metrics of each view as `per_view`.
 
         Raises:
             UserError: a method failed. The same call continues with it.
         """
-        out = self.runs(context)
+        return self._compared(context, self.runs(context, seed), self.methods, self._config(seed))
+
+    def fitted_at_equal_samples(
+        self, context: ExperimentContext, seed: int, slow: str, methods: Sequence[str]
+    ) -> Findings:
+        """The same of methods with as many camera samples as a slow one traced in its time.
+
+        Their schedules have this length: rates decay until the last sample.
+
+        Raises:
+            UserError: a method failed, or the slow one was not fitted.
+        """
+        samples = RunFolder(self.runs(context, seed) / slow).metrics()["samples"]
+        config, dataset = self._config(seed), Dataset.load(self.scene.captured(context))
+        own = [MethodVariant.of(name).settings(config) for name in methods]
+        steps = steps_of(samples, [with_defaults(settings, dataset) for settings in own])
+        config = dataclasses.replace(config, steps=steps, seconds=0.0, score_seconds=0.0)
+        return self._compared(context, self._equal_runs(context, seed, steps), methods, config)
+
+    def _compared(
+        self, context: ExperimentContext, out: Path, methods: Sequence[str], config: FitConfig
+    ) -> Findings:
+        data, variants = self.scene.captured(context), [MethodVariant.of(name) for name in methods]
+        if config.seconds:
+            new = [v.settings(config) for v in variants if not RunFolder(out / v.name).exists]
+            compile_kernels(data, new)
+        evaluation = EvaluationSettings(spp=self.spp, train_views=0)
         result = compare(
-            self.scene.captured(context),
-            [MethodVariant.of(method) for method in self.methods],
-            out,
-            self.config,
-            evaluation=EvaluationSettings(spp=self.spp, train_views=0),
-            console=context.console,
+            data, variants, out, config, evaluation=evaluation, console=context.console
         )
-        kept = ("steps", "samples", "seconds", "milliseconds_per_step", "heldout", "score")
+        kept = (*LENGTH, "estimator", "heldout", "score", "environment")
         findings = {}
-        for method, row in result["methods"].items():
+        for name, row in {UNTRAINED: result[UNTRAINED], **result["methods"]}.items():
             if "error" in row:
-                raise UserError(f"{method} failed: {row['error']}")
-            metrics = self.run(context, method).metrics()
-            findings[method] = {k: row[k] for k in (*kept, "environment") if k in row}
-            findings[method]["per_view"] = metrics["per_view"]
+                raise UserError(f"{name} failed: {row['error']}")
+            findings[name] = {key: row[key] for key in kept if key in row}
+            findings[name]["per_view"] = RunFolder(out / name).metrics()["per_view"]
         return findings
 
-    def run(self, context: ExperimentContext, method: str) -> RunFolder:
-        """The run of a method."""
-        return RunFolder(self.runs(context) / method)
+    def _config(self, seed: int) -> FitConfig:
+        return dataclasses.replace(self.config, seed=seed)
+
+    def _job(self, seed: int, *, equal: bool = False) -> str:
+        return f"{self.scene.folder}-{seed}" + ("-equal-samples" if equal else "")
+
+    def _equal_runs(self, context: ExperimentContext, seed: int, steps: int) -> Path:
+        return self.runs(context, seed) / f"equal-samples-{steps}"
+
+    # ----------------------------------------------------------------------------- Findings
+
+    def fits(
+        self, context: ExperimentContext, findings: Mapping[str, Findings], method: str
+    ) -> list[Fit]:
+        """The fits of a method, or of "untrained", one for each seed."""
+        return [
+            Fit(s, RunFolder(self.runs(context, s) / method), findings[self._job(s)][method])
+            for s in self.seeds
+        ]
+
+    def fits_at_equal_samples(
+        self, context: ExperimentContext, findings: Mapping[str, Findings], method: str
+    ) -> list[Fit]:
+        """The fits of a method with the samples of a slow one, one for each seed."""
+        fits = []
+        for seed in self.seeds:
+            found = findings[self._job(seed, equal=True)][method]
+            folder = self._equal_runs(context, seed, found["steps"])
+            fits.append(Fit(seed, RunFolder(folder / method), found))
+        return fits
 
     def heldout(self, context: ExperimentContext) -> Sequence[View]:
         """The held-out views."""
         return Dataset.load(self.scene.data(context)).heldout
 
-    def row(self, context: ExperimentContext, method: str, fit: Findings) -> dict[str, Any]:
-        """Length of a fit and its mean PSNRs, as a row of data."""
-        length = {key: fit[key] for key in ("steps", "samples", "seconds")}
-        *_, mean = self.qualities(context, method, fit)
-        return {"method": method, "scene": self.scene.label} | length | mean
-
-    def qualities(
-        self, context: ExperimentContext, method: str, fit: Findings
+    def rows(
+        self, context: ExperimentContext, fits: Sequence[Fit], **head: object
     ) -> list[dict[str, Any]]:
-        """PSNRs of a method in each held-out view, followed by their means over the views.
+        """Length, mean PSNRs and errors of lighting of fits, as rows of data.
+
+        Args:
+            fits: of a method, one for each seed.
+            head: begins each row.
+
+        Returns:
+            First the mean over seeds, with the sample standard deviation of each number as KEY_sd
+            and the number of `seeds`; then a row for each `seed`.
+        """
+        told = dict(head) | {"scene": self.scene.label}
+        if "estimator" in fits[0].found:
+            told["estimator"] = fits[0].found["estimator"]
+        per_seed = []
+        for fit in fits:
+            *_, means = self.qualities(context, fit)
+            light = fit.found.get("environment") or {}
+            length = {key: fit.found[key] for key in LENGTH if key in fit.found}
+            per_seed.append({"seed": fit.seed} | means | light | length)
+        keys = [key for key in per_seed[0] if key not in ("seed", "views")]
+        mean = {"seeds": len(fits), "views": per_seed[0]["views"]} | across_seeds(per_seed, keys)
+        return [told | row for row in (mean, *per_seed)]
+
+    def qualities(self, context: ExperimentContext, fit: Fit) -> list[dict[str, Any]]:
+        """PSNRs of a fit in each held-out view, followed by their means over the views.
 
         Renderings are averaged over blocks of pixels, multiplied by the photograph's `exposure` and
         clipped to [0,1]. Single pixels are mostly noise in scenes with difficult light, and scenes
         may be brighter than 1 everywhere. `unbake evaluate` does neither.
         """
         rows, size = [], context.pick(1, 4, 4)
-        for view, metrics in zip(self.heldout(context), fit["per_view"], strict=True):
-            file = self.run(context, method).picture(view.split, view.name, "render")
+        for view, metrics in zip(self.heldout(context), fit.found["per_view"], strict=True):
+            file = fit.run.picture(view.split, view.name, "render")
             photograph, rendering = read_exr(view.image), read_exr(file)[..., :3]
             require_same_size(rendering, photograph, file)
             scale = exposure(photograph)
@@ -156,24 +284,24 @@ class SceneFits:
             whole = block_means(_foreground(photograph).astype(float), size) >= 1
             rows.append(
                 {"views": view.name}
-                | {key: metrics[key] for key in MATERIALS}
+                | {key: metrics[key] for key in MATERIALS if key in metrics}
                 | {"render_psnr": psnr(ours, theirs, whole) if whole.any() else None}
             )
-        mean = {key: mean_psnr(r[key] for r in rows) for key in QUALITIES}
+        mean = {key: mean_psnr(r[key] for r in rows) for key in QUALITIES if key in rows[0]}
         return [*rows, {"views": "mean of held-out"} | mean]
 
     def picture(self, context: ExperimentContext, views: Sequence[int]) -> np.ndarray:
-        """Held-out views, a column for each method and the truth on the right.
+        """Held-out views of the first seed, a column for each method and the truth on the right.
 
         Args:
             views: numbers of held-out views, each with the rows of `ROWS`.
         """
-        sheet = []
+        sheet, folder = [], self.runs(context, self.seeds[0])
         for view in (self.heldout(context)[number] for number in views):
             scale = exposure(read_exr(view.image))
             truth = {"render": view.image, **view.truth}
             for quantity in ROWS:
-                runs = (self.run(context, method) for method in self.methods)
+                runs = (RunFolder(folder / method) for method in self.methods)
                 files = [run.picture(view.split, view.name, quantity) for run in runs]
                 factor = scale if quantity == "render" else 1.0
                 columns = (*files, truth.get(quantity))
@@ -181,24 +309,30 @@ class SceneFits:
         return montage(sheet)
 
 
-def at_equal_samples(fits: Mapping[str, Findings]) -> dict[str, dict[str, float | None]]:
-    """PSNRs of all methods after the samples of the method that took the fewest.
+def steps_of(samples: int, configs: Sequence[FitConfig]) -> int:
+    """Steps in which fits trace a number of camera samples, to the nearest step.
 
-    PSNR is interpolated linearly over samples between two scores.
-
-    Returns:
-        By method: `samples`, and a PSNR by key; None if the method has no scores.
+    Raises:
+        ValueError: the fits trace different numbers of samples in a step.
     """
-    fewest = min(fit["samples"] for fit in fits.values())
-    equal: dict[str, dict[str, float | None]] = {}
-    for method, fit in fits.items():
-        each = fit["samples"] / fit["steps"]
-        equal[method] = {"samples": fewest}
-        for key in MATERIALS:
-            scores = [(p["step"] * each, p[key]) for p in fit["score"] if p.get(key) is not None]
-            x, y = zip(*scores, strict=True) if scores else ((), ())
-            equal[method][key] = float(np.interp(fewest, x, y)) if scores else None
-    return equal
+    each = {config.samples_per_step for config in configs}
+    if len(each) != 1:
+        raise ValueError(f"steps of {sorted(each)} samples cannot have the same length")
+    return max(1, round(samples / each.pop()))
+
+
+def compile_kernels(data: Path, configs: Sequence[FitConfig]) -> None:
+    """Take the first steps of fits and drop them, so that their kernels are in Dr.Jit's cache.
+
+    The time of a fit has the compilation of kernels in it that are not there. It is longest for
+    methods that follow whole paths, and the first seed would pay for all.
+    """
+    dataset = Dataset.load(data)
+    for config in configs:
+        fit = begin_fit(dataset, config)
+        for number in range(_COMPILING_STEPS):
+            fit.step(fit.state, number, learning_rates(fit.config, number, 0.0))
+        dr.sync_thread()
 
 
 def _cell(file: Path | None, quantity: str, factor: float, view: View) -> np.ndarray:
