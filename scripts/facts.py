@@ -281,13 +281,23 @@ class Facts:
         """The scenes of an experiment, in its order."""
         return list(dict.fromkeys(row["scene"] for row in self.rows(experiment)))
 
+    def methods_in(self, experiment: str) -> list[str]:
+        """The methods of an experiment, in its order."""
+        return list(dict.fromkeys(row["method"] for row in self.rows(experiment)))
+
+    def ahead(self, experiment: str, key: str, a: Row, b: Row) -> str:
+        """How far the record with the values a is above the one with the values b, as `gap`."""
+        first, second = self.where(experiment, **a), self.where(experiment, **b)
+        spread = math.hypot(*(row.get(f"{key}_sd") or 0.0 for row in (first, second)))
+        return above(first[key] - second[key], spread)
+
     def wins(self, experiment: str, key: str, a: str, b: str) -> int:
-        """The number of scenes where a is above b, as printed with one digit."""
-
-        def of(scene: str, method: str) -> float:
-            return round(self.where(experiment, scene=scene, method=method)[key], 1)
-
-        return sum(of(scene, a) > of(scene, b) for scene in self.by_scene(experiment))
+        """The number of scenes where method a is above b, and not level."""
+        pairs = [
+            ({"scene": scene, "method": a}, {"scene": scene, "method": b})
+            for scene in self.by_scene(experiment)
+        ]
+        return sum(self.ahead(experiment, key, *pair).startswith("+") for pair in pairs)
 
     def experiments_machine(self) -> str:
         """The one machine of all experiments, in words."""
@@ -389,5 +399,5 @@ def context(facts: Facts) -> dict[str, Any]:
     from unbake.training.path_depth import SHARE
 
     settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
-    functions = {"above": above, "reached": reached}
+    functions = {"reached": reached}
     return {name: getattr(facts, name) for name in public} | functions | settings
