@@ -190,7 +190,8 @@ def literals(source: str, page: str, entries: list[Allowed]) -> tuple[list[str],
     used = set()
     for entry in entries:
         if any(Path(page).match(name) for name in entry.pages):
-            text, count = re.subn(entry.pattern, blank, text)
+            # A line may end wherever there is a space.
+            text, count = re.subn(entry.pattern.replace(" ", r"\s+"), blank, text)
             used |= {entry.pattern} if count else set()
     found = [
         f"{page}:{number}: {match[0].strip()!r} in: {line.strip()[:100]}"
