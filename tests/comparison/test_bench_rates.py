@@ -1,6 +1,7 @@
 """`unbake bench rates`: it keeps each trial, goes on where it was stopped, and gives defaults."""
 
 import json
+import math
 import shutil
 
 import pytest
@@ -43,7 +44,8 @@ def test_each_rate_is_tried_and_the_best_is_noted(rates, tmp_path):
         assert trial["score"] == pytest.approx(mean)
     # Fits with other rates come to other values, all from the same start.
     assert len({trial["score"] for trial in trials}) == len(trials)
-    assert all(t["steps"] == 2 and t["seconds"] > 0 and t["machine"]["cores"] for t in trials)
+    fits = [fit for trial in trials for fit in trial["per_seed"]]
+    assert all(f["steps"] == 2 and f["seconds"] > 0 and f["machine"]["cores"] for f in fits)
     assert {t["estimator"] for t in trials} == {"split-halves"}
     kept = {key: search["best"][key] for key in ("factors", "estimator", "score")}
     assert any(kept.items() <= trial.items() for trial in trials)
@@ -73,6 +75,35 @@ def test_a_search_goes_on_with_the_trials_that_it_has(rates, tmp_path, monkeypat
     monkeypatch.setattr(module, "begin_fit", None)
     assert rates("direct").status == 0
     assert searches(tmp_path) == [ended]
+
+
+def test_scores_are_means_over_seeds_which_may_become_more(rates, tmp_path, monkeypatch):
+    made = []
+
+    def scores(fit, dataset):
+        made.append(fit.config.seed)
+        step = math.log(fit.config.rate_factors["albedo"] or 1.0, 2.5)
+        # With the first seed alone, a larger rate is better, by luck.
+        return {"score": 20 - abs(step - 1) if fit.config.seed == 0 else 20 - 3 * abs(step + 1)}
+
+    monkeypatch.setattr(module, "_scores", scores)
+    monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
+    assert rates("direct").status == 0
+    (lucky,) = searches(tmp_path)
+    assert lucky["best"]["factors"]["albedo"] > 2 and set(made) == {0}
+    made.clear()
+    assert rates("direct", extra=("--seeds", 0, 1)).status == 0
+    (search,) = searches(tmp_path)
+    assert search["best"]["factors"]["albedo"] < 1 and search["seeds"] == [0, 1]
+    known = {json.dumps(trial["factors"]) for trial in lucky["trials"]}
+    for trial in search["trials"]:
+        own = [fit["seed"] for fit in trial["per_seed"]]
+        mean = sum(fit["score"] for fit in trial["per_seed"]) / len(own)
+        assert trial["score"] == pytest.approx(mean)
+        assert own == [0, 1] or json.dumps(trial["factors"]) in known
+    assert made.count(0) < made.count(1), "the fits of the first seed are kept"
+    outcome = rates("direct")
+    assert outcome.status == 2 and "has more seeds. Give --seeds 0 1" in outcome.err
 
 
 def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, monkeypatch):

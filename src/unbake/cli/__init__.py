@@ -260,6 +260,7 @@ def bench(
     methods: Annotated[tuple[str, ...], arg(metavar="METHODS")] = ("ours",),
     steps: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
     seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
+    seeds: Annotated[tuple[int, ...], arg(metavar="SEEDS", help_behavior_hint="")] = (),
     preset: Preset = None,
     settings: File = None,
     out: File = None,
@@ -281,6 +282,7 @@ def bench(
         steps: Steps to take the median of, after warm-up (default: 100). For rates, the length of a
             fit (default: as in the settings).
         seconds: For rates, the length of a fit in seconds of training, instead of steps.
+        seeds: For rates, seeds of the fits whose scores are averaged, such as 0 1 2 (default: 0).
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
@@ -292,10 +294,11 @@ def bench(
     if what == "rates":
         length = {"steps": steps, "seconds": seconds}
         chosen = with_length(chosen, {k: v for k, v in length.items() if v is not None})
-        _bench_rates(data, methods, chosen, out)
+        _bench_rates(data, methods, chosen, out, seeds or (0,))
         return
-    if seconds is not None:
-        raise UserError("is an option of rates", "--seconds")
+    for option, given_value in {"seconds": seconds, "seeds": seeds or None}.items():
+        if given_value is not None:
+            raise UserError("is an option of rates", f"--{option}")
     if len(data) > 1:
         raise UserError(f"{what} takes one data set", "--data", "Or: unbake bench rates")
     steps = 100 if steps is None else steps
@@ -317,7 +320,11 @@ def bench(
 
 
 def _bench_rates(
-    data: tuple[Path, ...], methods: tuple[str, ...], chosen: FitConfig, out: Path | None
+    data: tuple[Path, ...],
+    methods: tuple[str, ...],
+    chosen: FitConfig,
+    out: Path | None,
+    seeds: tuple[int, ...],
 ) -> None:
     for option, value in {"data": data, "out": out}.items():
         if not value:
@@ -329,8 +336,10 @@ def _bench_rates(
     from ..comparison.method_variant import MethodVariant
 
     assert out is not None
+    for seed in seeds:
+        require("seeds", seed, 0)
     variants = [MethodVariant.of(method) for method in methods]
-    bench_rates(data, variants, chosen, out, Console(highlight=False))
+    bench_rates(data, variants, chosen, out, Console(highlight=False), seeds)
     _say(f"wrote {out}")
 
 

@@ -10,7 +10,7 @@ import gc
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
@@ -54,7 +54,7 @@ DEFINITIONS = {
     "factors": "multiples of the learning rates of the fields, by unknown",
     "score": "mean of the numbers in dB of a trial: PSNRs of materials over all held-out views, "
     f"PSNR of balls that are relit by the environment, -20 log10 of the relative error of lights; "
-    f"{SPP} samples a pixel",
+    f"{SPP} samples a pixel; mean over the seeds",
     "best": f"from the fields' own rates, one unknown after the other is moved by factors of "
     f"{STEP} for as long as the score grows by {MARGIN} dB or more; then the other estimator "
     "needs as much; and once again if anything moved",
@@ -70,12 +70,13 @@ def bench_rates(
     shared: FitConfig,
     out: Path | str,
     console: Console,
+    seeds: Sequence[int] = (0,),
 ) -> Row:
     """Search the learning rates of methods, and the estimator of those that follow paths.
 
     A search begins with the fields' own rates; see `best_trial`. Its trials are fits of the length
-    that the settings say, scored at their end. The same call goes on after the trials that `out`
-    has.
+    that the settings say, one for each seed, scored at their end. The same call goes on after the
+    fits that `out` has.
 
     Args:
         data: folders of data sets, each with true materials or light.
@@ -84,6 +85,7 @@ def bench_rates(
             than `auto` is not searched.
         out: JSON file to write; searches of other methods and data sets that it has are kept.
         console: shows progress and a table.
+        seeds: of the fits of a trial, whose scores are averaged. More of them may be given later.
 
     Returns:
         The content of the file.
@@ -97,8 +99,10 @@ def bench_rates(
     datasets = [Dataset.load(Path(folder)) for folder in data]
     if not datasets:
         raise UserError("no data set given", "--data")
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise UserError("give each seed once", "--seeds", "Such as: 0 1 2")
     planned = [(d, variant) for d in datasets for variant in variants]
-    searches = [_search(result, dataset, variant, shared, out) for dataset, variant in planned]
+    searches = [_search(result, d, variant, shared, seeds, out) for d, variant in planned]
     for (dataset, variant), search in zip(planned, searches, strict=True):
         _Search(dataset, variant, shared, search, result, out, console).run()
     print_rates(searches, console)
@@ -146,54 +150,84 @@ class _Search:
     def run(self) -> None:
         """Make the trials that are missing, and note the best one."""
         config, record = self._config, self._record
-        if record["untrained"] is None:
-            record["untrained"] = _scores(begin_fit(self._dataset, config), self._dataset)
-            self._say("untrained", record["untrained"])
+        self._complete(record["untrained"], lambda fit: {}, "untrained")
         # What photographs tell least of comes first.
         materials = [name for name in config.unknowns if name in QUANTITIES]
         lights = [name for name in config.unknowns if name not in QUANTITIES]
         best = best_trial([*reversed(materials), *lights], _estimators(config), self._score)
-        found = self._known(best) or {}
+        found = self._row(best)
         if "error" in found:
             raise UserError(found["error"], self._name)
         record["best"] = {key: found[key] for key in ("factors", "estimator", "score")}
-        write_json(self._out, self._result, allow_nan=False)
+        self._write()
 
     def _score(self, trial: Trial) -> float:
-        found = self._known(trial)
-        if found is None:
-            found = self._fitted(trial)
-            self._record["trials"].append(found)
-            write_json(self._out, self._result, allow_nan=False)
-            factors = ", ".join(f"{name} x {by:g}" for name, by in trial.factors.items())
-            self._say(f"{factors}, {trial.estimator}", found)
+        factors = ", ".join(f"{name} x {by:g}" for name, by in trial.factors.items())
+        found = self._row(trial)
+        self._complete(found, _learned, f"{factors}, {trial.estimator}", trial)
         return LEAST if found["score"] is None else found["score"]
 
-    def _known(self, trial: Trial) -> Row | None:
+    def _row(self, trial: Trial) -> Row:
         """The trial's line of the record."""
         same = {"factors": trial.factors, "estimator": trial.estimator}
-        return next((row for row in self._record["trials"] if same.items() <= row.items()), None)
+        for row in self._record["trials"]:
+            if same.items() <= row.items():
+                return row
+        self._record["trials"].append(same | {"score": None, "per_seed": []})
+        return self._record["trials"][-1]
 
-    def _fitted(self, trial: Trial) -> Row:
-        """Fit with the settings of a trial, and score the result."""
-        described: Row = {"factors": trial.factors, "estimator": trial.estimator}
-        config = replace(self._config, rate_factors=trial.factors, estimator=trial.estimator)
+    def _complete(
+        self, row: Row, learn: Callable[[FreshFit], Row], what: str, trial: Trial | None = None
+    ) -> None:
+        """Make the fits of a line for the seeds that it lacks, and average them."""
+        seeds = self._record["seeds"]
+        missing = [seed for seed in seeds if seed not in {f["seed"] for f in row["per_seed"]}]
+        for seed in missing:
+            if "error" in row:
+                break
+            row["per_seed"].append({"seed": seed} | self._fitted(seed, learn, trial))
+            row.update(_mean(row["per_seed"]))
+            self._write()
+        if missing:
+            self._say(what, row)
+
+    def _fitted(self, seed: int, learn: Callable[[FreshFit], Row], trial: Trial | None) -> Row:
+        """A fit with the settings of a trial, scored."""
+        config = replace(self._config, seed=seed)
+        if trial is not None:
+            config = replace(config, rate_factors=trial.factors, estimator=trial.estimator)
         try:
             fit = begin_fit(self._dataset, config)
-            steps, seconds = _learn(fit)
-            scores = _scores(fit, self._dataset)
+            effort = learn(fit)
+            return _scores(fit, self._dataset) | effort
         except UserError as error:
-            return described | {"score": None, "error": str(error)}
+            if trial is None:
+                raise
+            return {"score": None, "error": str(error)}
         finally:
             gc.collect()
             dr.flush_malloc_cache()
-        return described | scores | {"steps": steps, "seconds": seconds, "machine": machine()}
+
+    def _write(self) -> None:
+        write_json(self._out, self._result, allow_nan=False)
 
     def _say(self, what: str, row: Row) -> None:
         values = [f"{k} {'—' if v is None else f'{v:.2f}'}" for k, v in row.items() if _is_score(k)]
         text = row.get("error") or ", ".join(values)
         line = f"{self._name}: {what}: {text}"
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _mean(fits: Sequence[Row]) -> Row:
+    """Means of the scores over seeds, or the error of the fit that failed."""
+    for fit in fits:
+        if "error" in fit:
+            return {"score": None, "error": fit["error"]}
+    means: Row = {}
+    for key in filter(_is_score, fits[0]):
+        values = [fit[key] for fit in fits]
+        means[key] = None if None in values else sum(values) / len(values)
+    return means
 
 
 def _is_score(key: str) -> bool:
@@ -212,12 +246,18 @@ def _read(out: Path) -> Row:
 
 
 def _search(
-    result: Row, dataset: Dataset, variant: MethodVariant, shared: FitConfig, out: Path
+    result: Row,
+    dataset: Dataset,
+    variant: MethodVariant,
+    shared: FitConfig,
+    seeds: Sequence[int],
+    out: Path,
 ) -> Row:
     """The search of a method on a data set in the record; a new one if there is none."""
     config = with_defaults(variant.settings(shared), dataset)
     settings = tomllib.loads(to_toml(config))
-    del settings["rate_factors"], settings["estimator"]
+    for key in ("rate_factors", "estimator", "seed"):
+        del settings[key]
     camera = dataset.train[0].camera
     described: Row = {
         "method": variant.name,
@@ -228,7 +268,6 @@ def _search(
         "heldout": len(dataset.heldout),
         "resolution": [camera.width, camera.height],
         "follows_paths": config.follows_paths,
-        "seed": config.seed,
         "settings": settings,
     }
     same = ("method", "data", "unknown")
@@ -240,8 +279,13 @@ def _search(
             if other:
                 what = f"the search of {variant.name} in this file differs in {', '.join(other)}"
                 raise UserError(what, out, "Give another --out")
+            if set(seeds) < set(search["seeds"]):
+                what = f"the search of {variant.name} in this file has more seeds"
+                raise UserError(what, out, f"Give --seeds {' '.join(map(str, search['seeds']))}")
+            search["seeds"] = list(dict.fromkeys([*search["seeds"], *seeds]))
             return search
-    search = described | {"untrained": None, "trials": [], "best": None}
+    search = described | {"seeds": list(seeds), "untrained": {"per_seed": []}, "trials": []}
+    search["best"] = None
     result["searches"].append(search)
     return search
 
@@ -251,6 +295,12 @@ def _estimators(config: FitConfig) -> list[Estimator]:
     if config.estimator != "auto":
         return ["split-halves" if config.halves else "two-pass"]
     return ["split-halves", "two-pass"] if config.follows_paths else ["split-halves"]
+
+
+def _learned(fit: FreshFit) -> Row:
+    """Take the steps of a fit; how many, and how long they took."""
+    steps, seconds = _learn(fit)
+    return {"steps": steps, "seconds": seconds, "machine": machine()}
 
 
 def _learn(fit: FreshFit) -> tuple[int, float]:
