@@ -181,7 +181,7 @@ class Facts:
             factors = ", ".join(f"{name} x {by:g}" for name, by in best["factors"].items())
             chosen = best["estimator"].replace("-", " ") if search["follows_paths"] else ""
             scene = f"{search['kind']}s", search["unknown"], search["data"]
-            fits = len(search["trials"])
+            fits = sum(len(trial["per_seed"]) for trial in search["trials"])
             rows.append([f"`{search['method']}`", *scene, factors, chosen, fits])
         titles = [
             "method",

@@ -81,7 +81,7 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
         made[f"prior-{case}"] = content | {"methods": few}
     best = {"factors": {"albedo": 2.5}, "estimator": "two-pass"}
     search = {"method": "prb", "kind": "room", "data": "box", "unknown": "materials"}
-    search |= {"follows_paths": True, "trials": [{}, {}], "best": best}
+    search |= {"follows_paths": True, "trials": [{"per_seed": [{}, {}]}], "best": best}
     made["rates"] = {"machine": content["machine"], "searches": [search]}
     for name, result in made.items():
         (results / f"{name}.json").write_text(json.dumps(result))
