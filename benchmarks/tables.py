@@ -96,7 +96,7 @@ def targets(end: dict, runs: dict) -> list[dict]:
 
     Returns:
         For each quantity and target: `psnr`; seconds after which the other method (`rival`) and
-        ours stay at or above it; `times`, their ratio. Numbers of ours are means over seeds, with
+        ours first have it; `times`, their ratio. Numbers of ours are means over seeds, with
         `KEY_sd`, and absent where a seed does not get there; `never` counts those.
     """
     name, curve = next((n, c) for n, r in methods_of(end) for c in scores(r) if len(c) > 1)
@@ -126,7 +126,7 @@ def time_to_quality(end: dict, runs: dict) -> str:
             [*cells, never if ours is None else f"{ours} s", plus_minus(row, "times", 1) or ""]
         )
     name = f"`{found[0]['name']}`" if found else "rival"
-    titles = ["", "quality", "PSNR", f"{name} keeps it after", "`ours` after", "times sooner"]
+    titles = ["", "quality", "PSNR", f"{name} has it after", "`ours` after", "times sooner"]
     return markdown(titles, rows)
 
 

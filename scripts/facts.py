@@ -23,6 +23,7 @@ from summary import phases_of, read, roofline_of  # noqa: E402
 
 from unbake.comparison.rate_search import STEP  # noqa: E402
 from unbake.config import PAPER_DEPTH  # noqa: E402
+from unbake.evaluation.convergence import WINDOW  # noqa: E402
 from unbake.experiments.seeds import plus_minus  # noqa: E402
 from unbake.experiments.tables import markdown  # noqa: E402
 
@@ -128,7 +129,7 @@ class Facts:
         return markdown(["`ours` against", *titles], rows)
 
     def time_to(self, end: str, runs: str, quantity: str, below: float) -> Row:
-        """When the method of a long run and ours keep a quality; a mean over seeds of ours.
+        """When the method of a long run and ours have a quality; a mean over seeds of ours.
 
         Returns:
             `psnr` in dB, `rival` and `ours` in seconds, `times`: the ratio. `ours` is None where
@@ -399,5 +400,6 @@ def context(facts: Facts) -> dict[str, Any]:
     from unbake.training.path_depth import SHARE
 
     settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
+    settings["score_window"] = WINDOW
     functions = {"reached": reached}
     return {name: getattr(facts, name) for name in public} | functions | settings

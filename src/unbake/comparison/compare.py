@@ -14,7 +14,12 @@ from rich.console import Console
 from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
-from ..evaluation.convergence import milliseconds_per_step, score_curve, time_to_quality
+from ..evaluation.convergence import (
+    WINDOW,
+    milliseconds_per_step,
+    score_curve,
+    time_to_quality,
+)
 from ..evaluation.evaluate import description, evaluate
 from ..evaluation.settings import EvaluationSettings
 from ..io import write_json
@@ -39,10 +44,10 @@ DEFINITIONS = {
     "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
     "untrained": "the fields that all methods start from, with the shared representation and seed",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
-    "time_to_quality": "psnr: the last score of a run, and 1 and 2 dB below it, for each unknown "
-    "of the materials; seconds: training time after which a run stays at or above it for good, "
-    "interpolated linearly between scores; null: never. Targets that a run has before its first "
-    "step are left out",
+    "time_to_quality": "psnr: where the scores of a run end, and 1 and 2 dB below that, for each "
+    "unknown of the materials; seconds: training time after which a run first has it, interpolated "
+    "linearly between scores; null: never. Scores of all runs are smoothed by a running median of "
+    f"{WINDOW} (shorter at the ends). Targets that a run has before its first step are left out",
 }
 #: Of compare.json; 1 had the last albedo alone in `time_to_quality`, and no key `format`.
 COMPARISON_FORMAT = 2

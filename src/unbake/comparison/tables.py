@@ -98,7 +98,7 @@ def _print_time_to_quality(targets: list[Row], console: Console) -> None:
     if len(numbers) < 2:
         return
     for quantity in dict.fromkeys(target["quantity"] for target in targets):
-        table = _table("end of", title=f"Seconds to {quantity} PSNR")
+        table = _table("end of", title=f"Seconds to {quantity} PSNR, smoothed")
         _add_numbers(table, "dB", *numbers.values())
         for target in targets:
             if target["quantity"] != quantity:

@@ -12,8 +12,10 @@ import numpy as np
 
 from ..quantities import DEFAULT_QUANTITIES
 
-#: How far below the last score of a run further targets are, in dB: one score alone is noisy.
+#: How far below the end of a run further targets are, in dB.
 BELOW = (0.0, 1.0, 2.0)
+#: Scores that a running median is taken over. A curve with fewer is left as it is.
+WINDOW = 5
 #: The first steps trace and compile; intervals of the log that begin before are left out.
 WARM_UP = 4
 
@@ -23,11 +25,11 @@ Log = Sequence[Mapping[str, Any]]
 @final
 @dataclass(frozen=True)
 class Target:
-    """A score, and the time from which each run stays at or above it."""
+    """A score, and the time after which each run has it."""
 
-    run: str  #: the run whose last score sets it
+    run: str  #: the run whose end sets it
     quantity: str  #: what is scored: `albedo`
-    below: float  #: dB below that last score
+    below: float  #: dB below that end
     psnr: float  #: dB, over all held-out views
     seconds: dict[str, float | None]  #: of training by run; None: never
 
@@ -56,12 +58,32 @@ def score_curve(log: Log) -> list[dict[str, float | None]]:
     ]
 
 
+def smoothed(values: Sequence[float]) -> list[float]:
+    """The running median of a score curve, over `WINDOW` scores.
+
+    A single score off the curve has no weight. Windows are shorter at the ends: the first score,
+    before any training, is kept; its neighbour and the last two have the median of three.
+
+    Args:
+        values: scores in dB, in order; fewer than `WINDOW` are returned as they are.
+    """
+    count = len(values)
+    if count < WINDOW:
+        return list(values)
+    centres = [min(i, count - 2) for i in range(count)]
+    reaches = [min(WINDOW // 2, i, count - 1 - i) for i in centres]
+    return [
+        float(np.median(values[i - reach : i + reach + 1]))
+        for i, reach in zip(centres, reaches, strict=True)
+    ]
+
+
 def seconds_to(
     curve: Sequence[Mapping[str, Any]], target: float, quantity: str = "albedo"
 ) -> float | None:
-    """The time from which a score curve stays at or above a target: its last upward crossing.
+    """The time after which a score curve, smoothed by a running median, first has a target.
 
-    Scores are interpolated linearly.
+    The smoothed scores are interpolated linearly.
 
     Args:
         curve: as `score_curve` gives it.
@@ -69,20 +91,20 @@ def seconds_to(
         quantity: what is scored.
 
     Returns:
-        Seconds of training, None if the curve ends below the target.
+        Seconds of training, None if the curve never gets there.
     """
     points = _points(curve, quantity)
-    below = [i for i, (_, value) in enumerate(points) if value < target]
-    if not points or below[-1:] == [len(points) - 1]:
+    reached = next((i for i, (_, value) in enumerate(points) if value >= target), None)
+    if reached is None:
         return None
-    if not below:
+    if reached == 0:
         return points[0][0]
-    (t0, v0), (t1, v1) = points[below[-1]], points[below[-1] + 1]
+    (t0, v0), (t1, v1) = points[reached - 1], points[reached]
     return t0 + (t1 - t0) * (target - v0) / (v1 - v0)
 
 
 def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Target]:
-    """Targets for every scored quantity: the last score of each run, and scores below it.
+    """Targets for every scored quantity: the end of each run's smoothed curve, and below it.
 
     A run sets no target that it has before its first step.
 
@@ -114,8 +136,10 @@ def _scored(curves: Iterable[Sequence[Mapping[str, Any]]]) -> list[str]:
 
 
 def _points(curve: Sequence[Mapping[str, Any]], quantity: str) -> list[tuple[float, float]]:
-    scored = [(point["seconds"], point.get(f"{quantity}_psnr")) for point in curve]
-    return [(t, v) for t, v in scored if isinstance(v, int | float) and math.isfinite(v)]
+    """Seconds and smoothed scores."""
+    pairs = [(point["seconds"], point.get(f"{quantity}_psnr")) for point in curve]
+    scored = [(t, v) for t, v in pairs if isinstance(v, int | float) and math.isfinite(v)]
+    return list(zip([t for t, _ in scored], smoothed([v for _, v in scored]), strict=True))
 
 
 def _timed(record: Mapping[str, Any]) -> bool:

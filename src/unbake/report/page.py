@@ -13,7 +13,7 @@ import numpy as np
 
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
-from unbake.evaluation.convergence import score_curve, time_to_quality
+from unbake.evaluation.convergence import WINDOW, score_curve, time_to_quality
 from unbake.fields.registry import representation, representations
 from unbake.imaging import pictures
 from unbake.io import write_text
@@ -136,6 +136,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
             losses=_loss_charts(loaded),
             scores=_score_charts(loaded),
             race=_race(loaded),
+            window=WINDOW,
             trained=[i for i, run in enumerate(loaded) if not run.untrained],
             validation=_validation_charts(loaded),
             validated=sorted(
