@@ -27,11 +27,12 @@ class MethodDefaults:
 
 
 #: By method and kind of scene. Methods that are not listed have the fields' own rates.
-METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {}
+METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {
+    "prb": {"room": MethodDefaults({"roughness": 2.5, "albedo": 1.0}, "split-halves")},
+}
 
-
-#: Methods without a search of their own: the method whose defaults they have, which estimates the
-#: same gradient from the same paths.
+#: Methods without a search of their own: the method whose defaults they have, whose gradient has
+#: the same expectation.
 SAME_AS: Mapping[str, str] = {"ad-pt": "prb"}
 
 
