@@ -10,6 +10,7 @@ from unbake.comparison import bench_rates as module
 from unbake.comparison.bench_rates import found_defaults
 from unbake.config import method_defaults
 from unbake.config.method_defaults import MethodDefaults
+from unbake.experiments.scenes import SCENES
 from unbake.transport.methods import METHODS
 
 
@@ -17,8 +18,9 @@ from unbake.transport.methods import METHODS
 def rates(unbake, cornell, tiny, tmp_path):
     """`rates("direct")` into the file `rates.json`."""
 
-    def run(*methods, data=cornell, steps=2, extra=()):
-        return unbake("bench", "rates", "--data", data, "--methods", *methods, "--steps", steps,
+    def run(*methods, data=cornell, steps=2, extra=(), seconds=None):
+        length = ("--steps", steps) if seconds is None else ("--seconds", seconds)
+        return unbake("bench", "rates", "--data", data, "--methods", *methods, *length,
                       "--settings", tiny, "--out", tmp_path / "rates.json", *extra)  # fmt: skip
 
     return run
@@ -116,7 +118,18 @@ def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, mon
 
     monkeypatch.setattr(module, "_scores", scores)
     monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
-    assert rates("prb").status == 0
+    # Two passes trace more samples in as many steps: such a choice would be no fair one.
+    outcome = rates("prb")
+    assert outcome.status == 2 and "compared at equal time" in outcome.err
+    assert "prb:neural:split-halves" in outcome.err and outcome.err.count("\n") == 1
+    compiled = []
+    monkeypatch.setattr(
+        module,
+        "compile_kernels",
+        lambda _, configs: compiled.append([c.estimator for c in configs]),
+    )
+    assert rates("prb", seconds=5).status == 0
+    assert compiled == [["split-halves", "two-pass"]], "before the first trial's clock starts"
     (search,) = searches(tmp_path)
     assert search["trials"][0]["estimator"] == "split-halves"
     assert search["best"]["estimator"] == "two-pass"
@@ -175,6 +188,20 @@ def test_other_settings_are_not_mixed_in(rates, cornell, tmp_path):
     assert (tmp_path / "rates.json").read_bytes() == before
 
 
+def test_data_sets_of_the_same_name_are_not_confused(rates, cornell, unbake, tiny, tmp_path):
+    other = shutil.copytree(cornell, tmp_path / "other" / cornell.name)
+    words = ("--methods", "direct", "--steps", 2, "--settings", tiny, "--out", tmp_path / "r.json")
+    outcome = unbake("bench", "rates", "--data", cornell, other, *words)
+    assert outcome.status == 2 and "two data sets have the same name" in outcome.err
+
+
+def test_two_searches_of_a_kind_of_scene_give_no_default():
+    search = {"method": "prb", "kind": "room", "follows_paths": True}
+    best = {"factors": {"albedo": 1.0}, "estimator": "two-pass"}
+    with pytest.raises(ValueError, match="prb was searched in two scenes"):
+        found_defaults({"searches": [search | {"best": best}, search | {"best": best}]})
+
+
 def test_without_truth_there_is_nothing_to_judge_by(rates, cornell, tmp_path):
     data = shutil.copytree(cornell, tmp_path / "data")
     shutil.rmtree(data / "truth")
@@ -186,7 +213,11 @@ def test_without_truth_there_is_nothing_to_judge_by(rates, cornell, tmp_path):
 def test_the_defaults_of_methods_are_those_that_were_found(repository):
     """The table in the code repeats the committed search, and is empty without one."""
     file = repository / "benchmarks" / "results" / "rates.json"
-    found = found_defaults(json.loads(file.read_text())) if file.is_file() else {}
+    record = json.loads(file.read_text()) if file.is_file() else {"searches": []}
+    # No scene of a table: its rates would be chosen by the result that they are judged by.
+    judged = {"demo", "staircase", *(scene.folder for scene in SCENES)}
+    assert not judged & {search["data"] for search in record["searches"]}
+    found = found_defaults(record)
     # The fields' rates were chosen for ours, whatever its own search says.
     found.pop("ours", None)
     assert method_defaults.METHOD_DEFAULTS == found

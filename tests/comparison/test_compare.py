@@ -313,3 +313,15 @@ def test_samples_of_both_passes_count(compare, tmp_path):
         assert json.loads(log[-1])["samples"] == row["samples"]
         rate = 1e3 * row["samples"] / row["steps"] / row["milliseconds_per_step"]
         assert row["samples_per_second"] == pytest.approx(rate)
+
+
+def test_true_materials_that_are_not_known_are_missed_before_anything_is_fitted(
+    compare, cornell, tmp_path
+):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    del content["render"]
+    (data / "transforms.json").write_text(json.dumps(content))
+    outcome = compare("direct", data=data, extra=("--evaluate-truth",))
+    assert outcome.status == 2 and "does not hold its true materials" in outcome.err
+    assert not (tmp_path / "out").exists()

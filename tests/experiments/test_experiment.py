@@ -28,6 +28,7 @@ from unbake.experiments.scenes import SCENES, STAIRCASE
 from unbake.experiments.seeds import across_seeds, plus_minus, spread
 from unbake.experiments.tables import markdown
 from unbake.imaging.pictures import write_exr
+from unbake.training.fresh_fit import compile_kernels
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
 
@@ -277,7 +278,7 @@ def test_a_few_steps_of_each_method_are_taken_to_compile_them(cornell, tiny, mon
     monkeypatch.setattr(TrainingStep, "__call__", counted)
     shared = read_toml(tiny)
     configs = [dataclasses.replace(shared, method=method) for method in ("ours", "direct")]
-    scene_fits_module.compile_kernels(cornell, configs)
+    compile_kernels(cornell, configs)
     assert steps == [(method, number) for method in ("ours", "direct") for number in range(3)]
 
 

@@ -150,3 +150,46 @@ def test_a_run_of_an_earlier_version_goes_on_as_it_was(table, unbake, cornell, t
     rate = config.material_settings["albedo"].learning_rate
     last = [line["learning_rate"] for line in folder.log() if "validation" not in line][-1]
     assert last == pytest.approx(0.2 * rate * 0.05**0.5, rel=1e-4)
+
+
+def test_settings_of_a_started_run_do_not_leak_into_another_method(
+    table, unbake, cornell, tiny, tmp_path
+):
+    """The rates, the estimator and the warm-up of a run's method are not those of another one."""
+    for method in ("prb", "ours"):
+        words = ("--out", tmp_path / method, "--settings", tiny, "--method", method, "--steps", 0)
+        assert unbake("fit", cornell, *words).status == 0
+    of_prb, of_ours = (RunFolder(tmp_path / name).settings() for name in ("prb", "ours"))
+    assert of_prb.warm_up == 0 and of_prb.rate_factors["roughness"] == 4.0
+    ours = MethodVariant("ours").settings(of_prb)
+    assert ours.estimator == "auto" and ours.warm_up == FitConfig().warm_up
+    assert set(ours.rate_factors.values()) == {None}
+    prb = MethodVariant("prb").settings(of_ours)
+    assert with_method_defaults(prb, "object").estimator == "two-pass"
+    assert with_method_defaults(prb, "room").rate_factors["roughness"] == 4.0
+    # The command line changes the method in the same way.
+    words = ("--settings", RunFolder(tmp_path / "prb").config_file, "--method", "ours")
+    assert unbake("fit", cornell, "--out", tmp_path / "again", *words, "--steps", 0).status == 0
+    again = RunFolder(tmp_path / "again").settings()
+    assert again.rate_factors == of_ours.rate_factors and again.estimator == "split-halves"
+
+
+def test_factors_that_a_user_gives_are_those_of_all_methods(table):
+    shared = from_toml("[rate_factors]\nroughness = 1.5\n")
+    for method in ("direct", "prb", "ours"):
+        found = with_method_defaults(MethodVariant(method).settings(shared), "room")
+        assert found.rate_factors["roughness"] == 1.5
+    assert (
+        with_method_defaults(MethodVariant("prb").settings(shared), "room").rate_factors["albedo"]
+        == 2.0
+    )
+
+
+def test_the_prior_of_an_earlier_version_is_the_squared_one(unbake, cornell, tiny, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    words = ("--settings", tiny, "--method", "with-prior", "--steps", 0)
+    assert unbake("fit", cornell, "--out", folder.path, *words).status == 0
+    assert folder.settings().method == "with-prior"
+    before, _, after = folder.config_file.read_text().partition("[rate_factors]\n")
+    folder.config_file.write_text(before + after[after.index("[") :])
+    assert folder.settings().method == "with-biased-prior"

@@ -63,7 +63,8 @@ def test_an_explicit_depth_is_kept(data):
     dataset = Dataset.load(data([0, 0.5, 0.9, 1]))
     config = FitConfig(method="prb", path=PathConfig(max_depth=2))
     assert with_path_depth(config, dataset) is config
-    assert "depth 2 and carry 50.0 % of the light" in told_depth(config, dataset)
+    told = told_depth(config, dataset)
+    assert "depth 2 and carry 50.0 % of the light; path.max_depth = 0 chooses" in told
 
 
 def test_without_word_from_the_data_set_it_is_15(data):

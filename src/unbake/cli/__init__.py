@@ -298,7 +298,7 @@ def bench(
         return
     for option, given_value in {"seconds": seconds, "seeds": seeds or None}.items():
         if given_value is not None:
-            raise UserError("is an option of rates", f"--{option}")
+            raise UserError("is an option of rates", f"--{option}", "Or: unbake bench rates")
     if len(data) > 1:
         raise UserError(f"{what} takes one data set", "--data", "Or: unbake bench rates")
     steps = 100 if steps is None else steps
@@ -328,7 +328,8 @@ def _bench_rates(
 ) -> None:
     for option, value in {"data": data, "out": out}.items():
         if not value:
-            raise UserError("is needed for rates", f"--{option}")
+            remedy = "unbake bench rates --data FOLDER [FOLDER ...] --methods prb --out rates.json"
+            raise UserError("is needed for rates", f"--{option}", remedy)
     if not chosen.steps and not chosen.seconds:
         raise UserError("must be 1 or more, not 0", "--steps")
     backend.activate()

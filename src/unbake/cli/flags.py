@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 from tyro.conf import FlagCreatePairsOff, arg
 
 from .. import config
-from ..config import Flag
+from ..config import FitConfig, Flag, with_method
 from ..errors import UserError
 
 Settings = TypeVar("Settings")
@@ -143,6 +143,9 @@ def with_options(settings: Settings, values: Mapping[str, Any]) -> Settings:
     # The method first: whether other options make sense depends on it.
     for name, value in sorted(values.items(), key=lambda item: item[0] != "method"):
         try:
+            if name == "method" and isinstance(settings, FitConfig):
+                settings = with_method(settings, value)
+                continue
             settings = _replaced(settings, known[name].path, value)
         except UserError as error:
             problems.append(UserError(error.what, f"--{name}", error.remedy))

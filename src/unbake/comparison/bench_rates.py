@@ -31,7 +31,7 @@ from ..io import read_object, write_json
 from ..machine import machine
 from ..quantities import QUANTITIES
 from ..training.defaults import with_defaults
-from ..training.fresh_fit import FreshFit, begin_fit
+from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
 from ..training.schedule import learning_rates
 from ..training.validation import Score
 from .method_variant import MethodVariant
@@ -58,7 +58,7 @@ DEFINITIONS = {
     "best": f"from the fields' own rates, one unknown after the other is moved by factors of "
     f"{STEP} for as long as the score grows by {MARGIN} dB or more; then the other estimator "
     "needs as much; and once again if anything moved",
-    "seconds": "of the steps, with the compilation of the first ones",
+    "seconds": "of the steps, whose kernels were compiled before",
 }
 
 Row = dict[str, Any]
@@ -98,9 +98,13 @@ def bench_rates(
     result = _read(out)
     datasets = [Dataset.load(Path(folder)) for folder in data]
     if not datasets:
-        raise UserError("no data set given", "--data")
+        raise UserError("no data set given", "--data", "Give --data FOLDER [FOLDER ...]")
     if not seeds or len(set(seeds)) < len(seeds):
         raise UserError("give each seed once", "--seeds", "Such as: 0 1 2")
+    if len({dataset.folder.resolve().name for dataset in datasets}) < len(datasets):
+        raise UserError("two data sets have the same name", "--data", "Rename the folder of one")
+    if not shared.seconds:
+        _require_one_estimator(variants, shared)
     planned = [(d, variant) for d in datasets for variant in variants]
     searches = [_search(result, d, variant, shared, seeds, out) for d, variant in planned]
     for (dataset, variant), search in zip(planned, searches, strict=True):
@@ -112,7 +116,11 @@ def bench_rates(
 def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
     """The best rates and estimators of a file, by method and kind of scene.
 
-    Searches of other unknowns of the same method and kind belong together.
+    Searches of other unknowns of the same method and kind belong together; the estimator is that of
+    the first.
+
+    Raises:
+        ValueError: an unknown was searched twice for a method and a kind of scene.
     """
     found: dict[str, dict[SceneKind, MethodDefaults]] = {}
     for search in result["searches"]:
@@ -120,6 +128,8 @@ def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
         if best is None:
             continue
         before = kinds.get(search["kind"], MethodDefaults())
+        if before.factors.keys() & best["factors"].keys():
+            raise ValueError(f"{search['method']} was searched in two scenes: {search['kind']}")
         estimator = before.estimator or (best["estimator"] if search["follows_paths"] else None)
         kinds[search["kind"]] = MethodDefaults({**before.factors, **best["factors"]}, estimator)
     return {method: kinds for method, kinds in found.items() if kinds}
@@ -154,6 +164,9 @@ class _Search:
         # What photographs tell least of comes first.
         materials = [name for name in config.unknowns if name in QUANTITIES]
         lights = [name for name in config.unknowns if name not in QUANTITIES]
+        if config.seconds and record["best"] is None:
+            variants = [replace(config, estimator=name) for name in _estimators(config)]
+            compile_kernels(self._dataset.folder, variants)
         best = best_trial([*reversed(materials), *lights], _estimators(config), self._score)
         found = self._row(best)
         if "error" in found:
@@ -288,6 +301,15 @@ def _search(
     search["best"] = None
     result["searches"].append(search)
     return search
+
+
+def _require_one_estimator(variants: Sequence[MethodVariant], shared: FitConfig) -> None:
+    """Refuse to choose between estimators by fits of equal steps: two passes would trace more."""
+    for variant in variants:
+        if len(_estimators(variant.settings(shared))) > 1:
+            what = f"estimators of {variant.name} are compared at equal time"
+            other = f"{variant.method}:{shared.representation}:split-halves"
+            raise UserError(what, "--steps", f"Give --seconds, or one estimator, such as {other}")
 
 
 def _estimators(config: FitConfig) -> list[Estimator]:

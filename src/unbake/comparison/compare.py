@@ -20,7 +20,7 @@ from ..evaluation.convergence import (
     score_curve,
     time_to_quality,
 )
-from ..evaluation.evaluate import description, evaluate
+from ..evaluation.evaluate import description, evaluate, require_true_materials
 from ..evaluation.settings import EvaluationSettings
 from ..io import write_json
 from ..machine import machine
@@ -109,6 +109,8 @@ def compare(
     if UNTRAINED in names:
         raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
     dataset = Dataset.load(data)
+    if evaluation.truth:
+        require_true_materials(dataset)
     config = with_path_depth(config, dataset)
     chosen = {v.name: with_defaults(v.settings(config), dataset) for v in variants}
     untrained = with_defaults(_CHEAPEST.settings(config), dataset)

@@ -6,10 +6,10 @@ import typing
 from dataclasses import dataclass, replace
 from typing import final
 
-from ..config import Estimator, FitConfig
+from ..config import Estimator, FitConfig, with_method
 from ..errors import UserError, require_name
 from ..fields.registry import representations
-from ..transport.methods import METHODS, method_named
+from ..transport.methods import METHODS
 
 
 @final
@@ -53,15 +53,9 @@ class MethodVariant:
         return "-".join(filter(None, (self.method, self.representation, self.estimator)))
 
     def settings(self, shared: FitConfig) -> FitConfig:
-        """The shared settings with this method, without the options that it does not take.
-
-        Factors of learning rates are of one method: another one has its own, which a fit chooses
-        when it starts.
-        """
-        takes_options = method_named(self.method).takes_options
-        own = shared if takes_options else replace(shared, bounces=1, prior="extra-bounce")
+        """The shared settings with this method; see `with_method`."""
+        own = with_method(shared, self.method)
         representation = self.representation or shared.representation
-        estimator = self.estimator or shared.estimator
-        if self.method != shared.method:
-            own = replace(own, rate_factors={})
-        return replace(own, method=self.method, representation=representation, estimator=estimator)
+        return replace(
+            own, representation=representation, estimator=self.estimator or own.estimator
+        )

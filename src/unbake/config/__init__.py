@@ -25,7 +25,7 @@ from .fit import (
     Unknown,
 )
 from .flag import Flag
-from .presets import preset
+from .presets import preset, with_method
 from .tables import update
 from .toml import from_toml, read_toml, to_toml
 
@@ -54,4 +54,5 @@ __all__ = [
     "read_toml",
     "to_toml",
     "update",
+    "with_method",
 ]

@@ -8,6 +8,7 @@ from typing import Any, get_args
 from ..errors import UserError
 from ..fields.settings import GridConfig, NetworkConfig
 from ..quantities import QUANTITIES
+from ..transport.methods import method_named
 from .fit import FitConfig, LightingConfig, PresetName
 
 
@@ -72,6 +73,30 @@ def _release_lighting() -> FitConfig:
         spp=8,
         lighting=dataclasses.replace(release.lighting, learning_rate=1e-3),
     )
+
+
+def with_method(config: FitConfig, name: str) -> FitConfig:
+    """The settings with another method, without what belongs to the method that they name.
+
+    Settings of a run that was started have the rates, the estimator and the warm-up of its method
+    filled in. Another method has its own, which a fit chooses when it starts. What a user gives in
+    settings that leave some of it open stays.
+
+    Args:
+        config: settings, as a user gives them or of a run.
+        name: of the method.
+
+    Raises:
+        UserError: there is no such method.
+    """
+    if name == config.method:
+        return config
+    if not method_named(name).takes_options:
+        config = dataclasses.replace(config, bounces=1, prior="extra-bounce")
+    if None not in config.rate_factors.values():
+        warm_up = preset(config.preset).warm_up
+        config = dataclasses.replace(config, rate_factors={}, estimator="auto", warm_up=warm_up)
+    return dataclasses.replace(config, method=name)
 
 
 def preset(name: PresetName) -> FitConfig:

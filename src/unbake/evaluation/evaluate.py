@@ -12,7 +12,7 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.pixels import CameraRays
-from ..dataset.views import View
+from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
@@ -132,12 +132,21 @@ def description(config: FitConfig) -> dict:
     }
 
 
-def _true_scene(recovered: Recovered) -> SceneView:
-    """The scene that the photographs were rendered from, as the data set holds it."""
-    dataset = recovered.dataset
+def require_true_materials(dataset: Dataset) -> None:
+    """Check that the scene of a data set has its true materials.
+
+    Raises:
+        UserError: they are not known.
+    """
     if not dataset.render:
         known = "unbake capture SCENE --out DATA makes one that does"
         raise UserError("the data set does not hold its true materials", dataset.folder, known)
+
+
+def _true_scene(recovered: Recovered) -> SceneView:
+    """The scene that the photographs were rendered from, as the data set holds it."""
+    dataset = recovered.dataset
+    require_true_materials(dataset)
     parsed = parse(dataset.scene)
     edit.to_principled(parsed)
     specular = recovered.config.transport.max_specular

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
-import drjit as dr
 import numpy as np
 
 from ..comparison.compare import UNTRAINED, compare
@@ -23,9 +22,8 @@ from ..imaging.pictures import block_means, montage, read_exr, shown
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES
 from ..report.display import require_same_size, rgb
 from ..training.defaults import with_defaults
-from ..training.fresh_fit import begin_fit
+from ..training.fresh_fit import compile_kernels
 from ..training.run_folder import RunFolder
-from ..training.schedule import learning_rates
 from ..training.validation import psnr_keys
 from .experiment import ExperimentContext
 from .jobs import Findings, Job, digest
@@ -49,8 +47,6 @@ LENGTH = ("steps", "samples", "seconds", "milliseconds_per_step")
 
 #: Seconds that a fit takes beside its training: compiling, scores and evaluation.
 _OVERHEAD = 25.0
-#: Nothing is traced or compiled after these.
-_COMPILING_STEPS = 3
 
 
 @final
@@ -319,20 +315,6 @@ def steps_of(samples: int, configs: Sequence[FitConfig]) -> int:
     if len(each) != 1:
         raise ValueError(f"steps of {sorted(each)} samples cannot have the same length")
     return max(1, round(samples / each.pop()))
-
-
-def compile_kernels(data: Path, configs: Sequence[FitConfig]) -> None:
-    """Take the first steps of fits and drop them, so that their kernels are in Dr.Jit's cache.
-
-    The time of a fit has the compilation of kernels in it that are not there. It is longest for
-    methods that follow whole paths, and the first seed would pay for all.
-    """
-    dataset = Dataset.load(data)
-    for config in configs:
-        fit = begin_fit(dataset, config)
-        for number in range(_COMPILING_STEPS):
-            fit.step(fit.state, number, learning_rates(fit.config, number, 0.0))
-        dr.sync_thread()
 
 
 def _cell(file: Path | None, quantity: str, factor: float, view: View) -> np.ndarray:

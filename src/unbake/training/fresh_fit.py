@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
 
 from ..config import FitConfig
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from .defaults import with_defaults
 from .problem import Problem, make_problem, training_pixels
+from .schedule import learning_rates
 from .state import State, initial_state
 from .step import TrainingStep
+
+#: Steps after which nothing is compiled any more.
+_COMPILING_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -33,3 +42,20 @@ def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))
+
+
+def compile_kernels(data: Path, configs: Sequence[FitConfig]) -> None:
+    """Take the first steps of fits and drop them, so that their kernels are in Dr.Jit's cache.
+
+    The time of a fit has the compilation of kernels in it that are not there. It is longest for
+    methods that follow whole paths, and the first of several fits would pay for all.
+    """
+    dataset = Dataset.load(data)
+    for config in configs:
+        fit = begin_fit(dataset, config)
+        for number in range(_COMPILING_STEPS):
+            fit.step(fit.state, number, learning_rates(fit.config, number, 0.0))
+        dr.sync_thread()
+        del fit
+        gc.collect()
+        dr.flush_malloc_cache()

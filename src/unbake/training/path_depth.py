@@ -34,6 +34,8 @@ def told_depth(config: FitConfig, dataset: Dataset) -> str:
     if carried is None:
         return f"paths end at depth {depth}; the data set does not say how much light they carry"
     text = f"paths end at depth {depth} and carry {100 * carried:.1f} % of the light"
+    if carried < SHARE:
+        text += "; path.max_depth = 0 chooses a depth that carries more"
     if depth == PAPER_DEPTH:
         return text
     return f"{text} (depth {PAPER_DEPTH}: {100 * (dataset.light_of_depth(PAPER_DEPTH) or 0):.1f} %)"

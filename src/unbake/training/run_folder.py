@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -142,7 +142,11 @@ class RunFolder:
         Raises:
             UserError: they are missing or damaged.
         """
-        return read_toml(self.config_file)
+        config = read_toml(self.config_file)
+        if config.method == "with-prior" and not any(config.rate_factors.values()):
+            # Version 0.1 had no factors, and squared the residuals of this method.
+            config = replace(config, method="with-biased-prior")
+        return config
 
     def settings_table(self) -> dict[str, Any]:
         """The settings as tables, with today's names, also where a value is none of today's.

@@ -153,6 +153,7 @@ class TrainingStep:
         Args:
             inputs: from `prepare`.
         """
+        self.plan(state)
         terms = self._gradients(inputs, state)
         found = {name: dr.grad(value) for name, value in state.phi.items()}
         dr.eval(terms, found)

@@ -104,8 +104,9 @@ class PathSampler(Protocol):
 class BounceSampler:
     """A few bounces, then L_θ: the method of the paper and its ablations.
 
-    For methods that follow paths to their end, as many bounces as the longest path has, in all
-    lanes and without Russian roulette; `KeptPathSampler` is faster.
+    A method of one's own that names this sampler and follows paths to their end has as many bounces
+    as the longest path, in all lanes and without Russian roulette; `KeptPathSampler`, of `ad-pt`,
+    is faster.
     """
 
     can_be_recorded = True
