@@ -54,9 +54,10 @@ def render(template: Path, facts: Facts) -> str:
     )
     environment.filters |= FILTERS
     scenes = {scene.folder: scene.label for scene in SCENES}
+    power = next(scene.albedo_power for scene in SCENES if scene.label == "STAIRCASE")
     try:
         page = environment.from_string(template.read_text(encoding="utf-8"))
-        text = page.render(**context(facts), scenes=scenes)
+        text = page.render(**context(facts), scenes=scenes, staircase_power=power)
     except (Unfounded, jinja2.TemplateError) as error:
         line = _line(error)
         raise Unfounded(f"{template.relative_to(ROOT)}{line}: {error}") from None

@@ -73,6 +73,7 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
         unseen = {f"{k}_psnr_unseen": 33.25 for k in ("albedo", "render")}
         seen = {f"{k}_psnr_seen": row[f"{k}_psnr"] for k in ("albedo", "roughness", "render")}
         row |= unseen | seen
+    content["untrained"] = dict(content["methods"]["ours"])
     content["methods"]["no-prior"] |= {"render_psnr_unseen": 11.0}
     few = {k: v for k, v in content["methods"].items() if k in ("ours", "no-prior")}
     two = {k: v for k, v in content["methods"].items() if k in ("ours", "direct")}
@@ -82,6 +83,9 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     best = {"factors": {"albedo": 2.5}, "estimator": "two-pass"}
     search = {"method": "prb", "kind": "room", "data": "box", "unknown": "materials"}
     search |= {"follows_paths": True, "trials": [{"per_seed": [{}, {}]}], "best": best}
+    search |= {"seeds": [0, 1], "settings": {"steps": 2400, "seconds": 30.0}}
+    equal = {k: v for k, v in content["methods"].items() if k in ("ours", "prb")}
+    made["equal-demo"] = content | {"methods": equal}
     made["rates"] = {"machine": content["machine"], "searches": [search]}
     for name, result in made.items():
         (results / f"{name}.json").write_text(json.dumps(result))
@@ -91,7 +95,27 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     assert "in a room behind a door +22.2 dB" in " ".join(readme.split())
     assert "`prior-half`" in page and "+22.2 dB" in page
     assert "| `prb` | rooms | materials | box | albedo x 2.5 | two pass | 2 |" in page
+    words = " ".join(page.split())
+    assert "Searched so far: `prb` for rooms (box; 2 seeds, 30 s a fit). What was not" in words
+    assert "Ours is searched too" not in words
+    assert "two passes for rooms, two passes elsewhere, as in Mitsuba" in words
+    assert "as many camera samples as `prb` traces in" in words
+    assert "`untrained` is no method" in words
     assert "`rivals-demo.json`" not in page and "`rivals-staircase.json`" in page
+
+
+def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, tmp_path):
+    """Signs of gradients were counted with the exact light in the place of a network."""
+    sentence = "Ours with k = 1 has the right sign"
+    kept = tmp_path / "reproduction"
+    shutil.copytree(ROOT / "docs" / "reproduction", kept)
+    file = kept / "fig4" / "about.json"
+    about = json.loads(file.read_text())
+    about.pop("made_with", None)
+    for older in ({}, {"made_with": "Made with the exact light."}):
+        file.write_text(json.dumps(about | older))
+        page = writer["pages"](kept=kept)[ROOT / "docs" / "reproduction.md"]
+        assert (sentence in page) != bool(older)
 
 
 def test_a_result_that_is_missing_is_named_with_the_command_that_makes_it(writer, tmp_path):

@@ -212,7 +212,10 @@ def compare(
     *,
     compare: OmitArgPrefixes[CompareFlags],
 ) -> int:
-    """Fit several methods with the same settings, and compare their quality over time.
+    """Fit several methods to the same photographs, and compare their quality over time.
+
+    Fields, batches, seed and length are the same for all. Learning rates, estimator and warm-up are
+    each method's own, unless the settings give them.
 
     Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. OUT/untrained has
     the fields before the first step: a method is worth what it adds to these. The same command

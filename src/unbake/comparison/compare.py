@@ -1,4 +1,4 @@
-"""Several methods on the same data set with the same settings."""
+"""Several methods on the same data set, each with its own rates, estimator and warm-up."""
 
 from __future__ import annotations
 

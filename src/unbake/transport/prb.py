@@ -21,7 +21,8 @@ def path_replay(max_depth: int, rr_depth: int, hide_emitters: bool) -> mi.CppADI
 
     Args:
         max_depth: longest path in bounces, plus one.
-        rr_depth: bounces before Russian roulette.
+        rr_depth: Mitsuba's. With 5, the seventh interaction is the first that Russian roulette may
+            take away (3.9.1).
         hide_emitters: whether cameras see neither environment nor lights, as in photographs whose
             background is hidden.
 

@@ -48,7 +48,8 @@ class PathLimits:
     Args:
         max_depth: number of bounces followed, plus one (Mitsuba's meaning: 1 is emission only).
             Specular interactions are not counted.
-        rr_depth: bounces before Russian roulette.
+        rr_depth: bounces that no path loses to Russian roulette: with 5, the sixth interaction is
+            the first that it may take away. (With Mitsuba's `prb`, 3.9.1, it is the seventh.)
         hide_emitters: whether cameras see neither environment nor area emitters.
     """
 
