@@ -105,7 +105,7 @@ if TYPE_CHECKING:
     from .transport.vertex import SceneView as SceneView
     from .transport.vertex import Vertex as Vertex
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 # The public names by module. A new one goes here and, for type checkers, into the block above.
 _MODULES: dict[str, tuple[str, ...]] = {
