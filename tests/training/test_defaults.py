@@ -99,6 +99,19 @@ def test_what_a_user_says_stays(table):
         assert published.estimator == "two-pass"
 
 
+def test_factors_that_were_found_with_networks_are_for_networks(table, monkeypatch):
+    """Other representations keep their own rates; an environment map has none of them."""
+    lit = {"room": MethodDefaults({"albedo": 2.0, "environment": 3.0}, "split-halves")}
+    monkeypatch.setattr(module, "METHOD_DEFAULTS", TABLE | {"prb": lit})
+    for form in ("grid", "triplane", "bitmap"):
+        found = defaults("prb", representation=form)
+        assert found.rate_factors["albedo"] == found.rate_factors["roughness"] == 1.0
+        assert found.rate_factors["environment"] == 3.0 and found.estimator == "split-halves"
+        given = defaults("prb", representation=form, rate_factors={"albedo": 1.5})
+        assert given.rate_factors["albedo"] == 1.5
+    assert defaults("prb", representation="neural").rate_factors["albedo"] == 2.0
+
+
 def test_each_method_of_a_comparison_has_its_own_rates(table):
     shared = defaults("prb")
     own = with_method_defaults(MethodVariant("direct").settings(shared), "room")

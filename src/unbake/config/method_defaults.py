@@ -1,7 +1,8 @@
 """Learning rates and estimators of methods: what `unbake bench rates` found best.
 
 The table repeats `benchmarks/results/rates.json`, where the scores of all trials are; a test
-compares the two. It holds for the preset `cpu`.
+compares the two. It holds for the preset `cpu`; factors of materials hold for neural fields
+alone, with which they were found.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from ..config import FitConfig
 from ..config.method_defaults import MethodDefaults, method_defaults
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
+from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
 from .path_depth import with_path_depth
 
@@ -24,7 +25,8 @@ def with_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
     """The settings with the method's own learning rates, estimator and warm-up.
 
-    Factors of learning rates and an estimator that are given stay. A method without L_θ has no
+    Factors of learning rates and an estimator that are given stay. Factors of materials were found
+    with networks: other representations keep the fields' own rates. A method without L_θ has no
     warm-up. A run is started with these settings and its `config.toml` has them, so that it goes on
     with the same ones, whatever a later version finds better.
 
@@ -37,8 +39,11 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
     """
     # The factors were found with the fields and batches of this preset.
     found = method_defaults(config.method, kind) if config.preset == "cpu" else MethodDefaults()
+    known = found.factors
+    if config.representation != "neural":
+        known = {name: factor for name, factor in known.items() if name not in QUANTITIES}
     factors = {
-        name: found.factors.get(name, 1.0) if given is None else given
+        name: known.get(name, 1.0) if given is None else given
         for name, given in config.rate_factors.items()
     }
     estimator = config.estimator
