@@ -33,6 +33,8 @@ TAKE_OVER = "python scripts/write_docs.py --results reproduction --scenes scenes
 VERSION_0_1 = """made with version 0.1, where PRB and AD-PT had the learning rates that were found
 for ours and their warm-up, paths of 15 interactions at most (no Russian roulette for AD-PT), and
 mostly one seed. They are being made anew."""
+STEPS_OF_0_1 = """step times of version 0.1, where PRB and AD-PT followed paths of 15 interactions
+at most, AD-PT without Russian roulette. They are being measured anew."""
 NOT_SEARCHED = """The search has not been run yet (`unbake bench rates`): all methods have the rates
 of the fields, which were found for ours."""
 #: What a template may call a number, where it has another key in a file of results.
@@ -155,17 +157,14 @@ class Facts:
     def older(self, *names: str) -> str:
         """A warning where results were made before every method had settings of its own.
 
-        Files of version 0.1 hold no numbers of single seeds.
+        Comparisons of version 0.1 hold no numbers of single seeds, its step times no depth of
+        paths, and its steps by phase call the phases parts.
         """
-        old = [
-            name
-            for name in names
-            if any("per_seed" not in row for row in self.result(name)["methods"].values())
-        ]
-        if not old:
-            return ""
-        files = ", ".join(f"`{name}.json`" for name in old)
-        return f"> **Older results.** {files}: {VERSION_0_1}\n"
+        told = []
+        for words, old in ((VERSION_0_1, _old_fits), (STEPS_OF_0_1, _old_steps)):
+            files = ", ".join(f"`{name}.json`" for name in names if old(self.result(name)))
+            told += [f"{files}: {words}"] if files else []
+        return f"> **Older results.** {' '.join(told)}\n" if told else ""
 
     def searched(self, method: str) -> bool:
         """Whether the learning rates of a method were searched."""
@@ -318,6 +317,23 @@ def part(row: Mapping[str, Any], key: str, where: str) -> Any:
     if row.get(key) is None:
         raise Unfounded(f"{where} has no {key!r}. It has: {', '.join(map(str, row))}")
     return row[key]
+
+
+def _old_fits(result: Row) -> bool:
+    """Whether a comparison is of version 0.1."""
+    rows = result.get("methods", {})
+    return any("per_seed" not in row and "error" not in row for row in rows.values())
+
+
+def _old_steps(result: Row) -> bool:
+    """Whether step times, of several methods or of a machine, are of version 0.1."""
+    if "unbake" in result:
+        return False
+    followed = (row for row in result.get("rows", ()) if row["method"] in ("prb", "ad-pt"))
+    steps = result["steps"] if isinstance(result.get("steps"), list) else []
+    return any(row.get("path_depth") is None for row in followed) or any(
+        "unbake" not in step and "phases" not in step for step in steps
+    )
 
 
 def made_by(name: str) -> str:

@@ -118,6 +118,43 @@ def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, t
         assert (sentence in page) != bool(older)
 
 
+def test_step_times_of_version_0_1_are_marked(writer, tmp_path):
+    """They have no depth of paths; those that tell a version are as this page says."""
+    results, names = tmp_path / "results", ("methods-demo", "methods-staircase")
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    facts = runpy.run_path(str(ROOT / "scripts" / "facts.py"))["Facts"]
+    for name in names:
+        file = results / f"{name}.json"
+        content = json.loads(file.read_text())
+        content.pop("unbake", None)
+        for row in content["rows"]:
+            row.pop("path_depth", None)
+        file.write_text(json.dumps(content))
+    machine = facts(results, tmp_path).machine_file()
+    content = json.loads((results / f"{machine}.json").read_text())
+    for step in content["steps"]:
+        step.pop("unbake", None)
+        step["parts"] = step.pop("phases", None) or step.get("parts")
+    (results / f"{machine}.json").write_text(json.dumps(content))
+    names = (*names, machine)
+    told = facts(results, tmp_path).older(*names)
+    assert all(f"`{name}.json`" in told for name in names) and "step times of version 0.1" in told
+    written = writer["pages"](results=results)
+    for page, name in (("comparison.md", "methods-demo"), ("performance.md", machine)):
+        assert f"`{name}.json`" in " ".join(written[ROOT / "docs" / page].split())
+    assert f"`{machine}.json`" in " ".join(written[ROOT / "README.md"].split())
+
+    with_depth = json.loads((results / "methods-demo.json").read_text())
+    for row in with_depth["rows"]:
+        row["path_depth"] = 15 if row["method"] in ("prb", "ad-pt") else None
+    (results / "methods-demo.json").write_text(json.dumps(with_depth))
+    with_version = json.loads((results / "methods-staircase.json").read_text())
+    (results / "methods-staircase.json").write_text(json.dumps(with_version | {"unbake": "0.2.0"}))
+    content["steps"] = [step | {"unbake": "0.2.0"} for step in content["steps"]]
+    (results / f"{machine}.json").write_text(json.dumps(content))
+    assert facts(results, tmp_path).older(*names) == ""
+
+
 def test_a_result_that_is_missing_is_named_with_the_command_that_makes_it(writer, tmp_path):
     results = tmp_path / "results"
     ignored = shutil.ignore_patterns("rivals-demo.json")

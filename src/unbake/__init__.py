@@ -18,6 +18,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+import unbake.version as _version
+
 from .errors import UserError as UserError
 
 if TYPE_CHECKING:
@@ -105,7 +107,7 @@ if TYPE_CHECKING:
     from .transport.vertex import SceneView as SceneView
     from .transport.vertex import Vertex as Vertex
 
-__version__ = "0.2.0.dev0"
+__version__ = _version.VERSION
 
 # The public names by module. A new one goes here and, for type checkers, into the block above.
 _MODULES: dict[str, tuple[str, ...]] = {

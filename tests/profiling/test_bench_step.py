@@ -7,6 +7,7 @@ from support import TINY
 
 from unbake.comparison import bench_methods
 from unbake.errors import UserError
+from unbake.version import VERSION
 
 
 def bench(unbake, what, data, tiny, out, *methods):
@@ -19,7 +20,9 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
     named = ("ours", "prb:grid:split-halves", "prb:grid", "ad-pt", "direct:bitmap")
     done = bench(unbake, "methods", cornell, tiny, out, *named)
     assert done.status == 0, done.err
-    rows = json.loads(out.read_text())["rows"]
+    written = json.loads(out.read_text())
+    rows = written["rows"]
+    assert written["unbake"] == VERSION
     said = [(r["method"], r["representation"], r["radiance"], r["estimator"]) for r in rows]
     assert said == [
         ("ours", "neural", "neural", "split-halves"),
@@ -73,6 +76,7 @@ def test_one_method_is_taken_apart(unbake, cornell, tiny, tmp_path, method, more
     done = bench(unbake, "step", cornell, tiny, out, method)
     assert done.status == 0, done.err
     result = json.loads(out.read_text())
+    assert result["unbake"] == VERSION
     assert result["method"] == method and result["compiled"] == 0 and result["launches"] > 0
     phases = result["phases"]
     wanted = PHASES | more if method != "prb" else more | {"batch", "gradients", "optimiser"}

@@ -19,6 +19,7 @@ from ..machine import machine
 from ..training.defaults import with_defaults
 from ..training.fresh_fit import begin_fit
 from ..training.schedule import learning_rates
+from ..version import VERSION
 from .method_variant import MethodVariant
 from .tables import print_step_times
 
@@ -82,7 +83,8 @@ def bench_methods(
         row["samples_per_second"] = config.samples_per_step / median
         row["times_the_first"] = None if 0 in errors else median / statistics.median(seconds[0])
         rows.append(row)
-    result = {"machine": machine(), "steps": steps, "data": dataset.folder.name, "rows": rows}
+    result = {"unbake": VERSION, "machine": machine(), "steps": steps}
+    result |= {"data": dataset.folder.name, "rows": rows}
     print_step_times(rows, console)
     if out is not None:
         write_json(out, result)

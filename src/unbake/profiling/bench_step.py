@@ -28,6 +28,7 @@ from ..training.memory import memory_mb
 from ..training.schedule import learning_rates
 from ..training.state import State
 from ..training.step import TrainingStep
+from ..version import VERSION
 from .phases import Phases, kernel_history, milliseconds
 from .roofline import roofline
 
@@ -77,7 +78,7 @@ def bench_step(
     dataset = Dataset.load(data)
     fit = begin_fit(dataset, config)
     config = fit.config
-    result = {"machine": machine(), "data": dataset.folder.name}
+    result = {"unbake": VERSION, "machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(fit.step, fit.state, config, steps)
     result["phases"] = _phases(fit.step, fit.state)
