@@ -212,6 +212,7 @@ SUSPECTS = re.compile(
     )
 )
 #: Parts of a page that are no claims: code, comments, targets of links, front matter of references.
+#: Code on a line that has a number with a unit is no code: see `blank`.
 EXEMPT = re.compile(
     r"```.*?```|`[^`\n]*`|<!--.*?-->|\]\([^)]*\)|<https?:[^>]*>|"
     r"\b(?:Eqs?|Secs?|Figs?|Figures?|Tables?)\.? \d[\d.]*(?:(?:, | and | to |–)\d[\d.]*)*",
@@ -242,6 +243,9 @@ def sources() -> list[Path]:
 
 def blank(match: re.Match) -> str:
     """Something that is no number and has as many lines."""
+    if re.fullmatch("`[^`]+`", match[0]) and re.search(NUMBER + UNITS, match[0]):
+        # Whoever writes a measured number as code claims it all the same.
+        return match[0]
     return "⟦⟧" + "\n" * match[0].count("\n")
 
 
@@ -282,6 +286,7 @@ def test_no_page_holds_a_measured_number_that_it_does_not_read_from_a_result():
         "in a third more samples", "| ours | 29.3 | 4 |", "| ours | 29.3 ± 0.1 |", "within 0.5",
         "below 20 launches", "1.4 GB", "a step of {{ ms(x) }} and 12 ms", "22 or 23 times",
         "3.6x faster", "A launch costs 20 µs.", "more than 40 of them",
+        "`29.3 dB`", "`ours` has `29.3 dB`, `prb` less", "a step (`12 ms`)",
     ],
 )  # fmt: skip
 def test_a_measured_number_is_found(sentence):
@@ -294,6 +299,7 @@ def test_a_measured_number_is_found(sentence):
     [
         "{{ db('a', 'ours', 'albedo') }} and {{ 100 * x | number(1) }} dB", "Figures 1 and 6",
         "`--seconds 120`", "```sh\nfit --seconds 120\n```", "<!-- 12 dB -->", "Sec. 5.2, Eq. 12",
+        "`0.62`, `fig8` and `[0, 0.62, 1]`",
         "[the paper](https://a.b/3.14)", "x₁ and L_θ lie in [0,1]", "a map of 64 x 64 texels",
         "{% if 2.5 > x %}nearer{% endif %}",
     ],
