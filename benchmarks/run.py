@@ -2,12 +2,13 @@
 
     python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
 
-Jobs: machine steps demo rivals equal long ablation lighting emission sparse prior (default: all;
-hours). STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
-(docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
-that the same command continues what was stopped. Results go to --results; `python
-benchmarks/tables.py` prints them as tables. Methods are compared over three seeds: results have the
-mean of a number, and its sample standard deviation as NUMBER_sd.
+Jobs: machine steps demo rivals equal long ablation lighting emission sparse prior rates (default:
+all; hours). What `rates` finds changes the other jobs when it is in `METHOD_DEFAULTS`. STAIRCASE
+takes part where --staircase, or STAIRCASE of the environment, names its data set (docs/staircase.md
+says how to make it). Data sets, runs and records of jobs are kept in --out, so that the same
+command continues what was stopped. Results go to --results; `python benchmarks/tables.py` prints
+them as tables. Methods are compared over three seeds: results have the mean of a number, and its
+sample standard deviation as NUMBER_sd.
 """
 
 from __future__ import annotations
@@ -80,6 +81,9 @@ DATA = {
     # Cameras at x > 2 m that look towards +x; held-out ones look both ways by turns.
     "half": Capture("demo", views=12, held_out=8, cameras="prior/half.json"),
     "annex": Capture("annex", views=16, held_out=6, resolution=96, spp=625),
+    # A room and an object to search for rates.
+    "cornell": Capture("cornell", views=12, held_out=4, resolution=96, spp=128),
+    "small-still": Capture("still", views=12, held_out=4, resolution=96, spp=128),
 }
 
 
@@ -153,6 +157,29 @@ class Machine:
     cases: Sequence[tuple[str, str, str | None, int]]
 
 
+@dataclass(frozen=True)
+class Rates:
+    """`unbake bench rates`: a search for each method, all in one file.
+
+    Args:
+        job: the job that it belongs to.
+        data: keys of `DATA`; each is searched by itself.
+        methods: as `unbake bench rates` reads them.
+        seconds: length of each fit; 0 if `steps` is given.
+        steps: length of each fit.
+        seeds: of the fits whose scores are averaged.
+    """
+
+    job: str
+    data: Sequence[str]
+    methods: Sequence[str]
+    seconds: int = 0
+    steps: int = 0
+    seeds: Sequence[int] = SEEDS
+
+
+Benchmark = Compare | EqualSamples | Steps | Machine | Rates
+
 NO_SCORES = ("--score-seconds", 0)
 COARSE_RENDERING = ("--evaluate-spp", 16)
 ABLATION = (
@@ -172,7 +199,7 @@ RIVALS = (*ROOM_RIVALS, "prb:bitmap")
 ROOM = "staircase.toml"
 
 #: By the name of the file of results; that of `machine` is named after the machine.
-BENCHMARKS: dict[str, Compare | EqualSamples | Steps | Machine] = {
+BENCHMARKS: dict[str, Benchmark] = {
     "machine": Machine(
         "machine",
         (
@@ -238,13 +265,14 @@ BENCHMARKS: dict[str, Compare | EqualSamples | Steps | Machine] = {
         )
         for data in ("demo", "few", "three", "half", "annex")
     },
+    "rates": Rates(
+        "rates", ("cornell", "small-still"), ("prb", "ours", "no-prior", "direct"), seconds=30
+    ),
 }  # fmt: skip
 JOBS = tuple(dict.fromkeys(benchmark.job for benchmark in BENCHMARKS.values()))
 
 
-def at_smoke_scale(
-    benchmark: Compare | EqualSamples | Steps | Machine,
-) -> Compare | EqualSamples | Steps | Machine:
+def at_smoke_scale(benchmark: Benchmark) -> Benchmark:
     """The same in seconds: two methods, few steps."""
     match benchmark:
         case EqualSamples():
@@ -253,6 +281,9 @@ def at_smoke_scale(
             return replace(benchmark, cases=[(*case[:3], 10) for case in benchmark.cases[::5]])
         case Steps():
             return replace(benchmark, methods=benchmark.methods[:2])
+        case Rates():
+            methods, seeds = benchmark.methods[-2:], benchmark.seeds[:1]
+            return replace(benchmark, methods=methods, seconds=0, steps=2, seeds=seeds)
     return replace(
         benchmark,
         methods=benchmark.methods[:2],
@@ -401,6 +432,48 @@ def plan_steps(bench: Bench, name: str, benchmark: Steps) -> Planned:
     return Planned([*bench.capture(benchmark.data), job], write)
 
 
+#: Fits of a search with one seed, about, and seconds of each beside the fit itself.
+TRIALS, SCORING = 7, 6.0
+
+
+def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
+    """Searches for learning rates, a job for each method; they share the file that is their record.
+
+    The file keeps what was fitted when a job is stopped. With other settings there is another one.
+    """
+    options, text = bench.settings(None)
+    options += ["--seconds", benchmark.seconds] if benchmark.seconds else []
+    options += ["--steps", benchmark.steps] if benchmark.steps else []
+    folders = [bench.data(data) for data in benchmark.data]
+    described = {"settings": text, "data": [str(folder) for folder in folders]}
+    described |= {"seconds": benchmark.seconds, "steps": benchmark.steps}
+    file = bench.work / "rates" / digest(described) / f"{name}.json"
+    jobs = [job for data in benchmark.data for job in bench.capture(data)]
+    fits = TRIALS * len(folders) * len(benchmark.seeds)
+    for method in benchmark.methods:
+        words = ["bench", "rates", "--data", *folders, "--methods", method, *options]
+        words += ["--seeds", *benchmark.seeds, "--out", file]
+        # Defaults of methods are what is searched: no search depends on them.
+        settings = described | {"method": method, "seeds": list(benchmark.seeds)}
+        command = partial(unbake, *words, until=bench.until)
+        jobs.append(
+            Job(
+                f"{name}-{method}",
+                settings,
+                lambda command=command: command() or {},
+                SCORING * fits,
+                benchmark.seconds * fits,
+                [file],
+            )
+        )
+
+    def write() -> Path:
+        write_json(bench.results / f"{name}.json", read(file))
+        return bench.results / f"{name}.json"
+
+    return Planned(jobs, write)
+
+
 def steps_of(bench: Bench) -> int:
     """Steps to take the median of."""
     return 10 if bench.scale == "smoke" else 100
@@ -543,6 +616,8 @@ def planned(bench: Bench, names: Sequence[str]) -> list[Planned]:
                     plans.append(plan_machine(bench, benchmark))
                 case EqualSamples():
                     plans.append(plan_equal(bench, name, benchmark))
+                case Rates():
+                    plans.append(plan_rates(bench, name, benchmark))
                 case _ if not bench.has(benchmark.data):
                     print(f"STAIRCASE is not set: {name} is left out", flush=True)
                 case Steps():

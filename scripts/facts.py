@@ -343,8 +343,6 @@ def made_by(name: str) -> str:
     benchmark = run.BENCHMARKS.get(name)
     if benchmark is not None:
         return f"python benchmarks/run.py {benchmark.job}"
-    if name == "rates":
-        return "unbake bench rates --out benchmarks/results/rates.json"
     script = f"benchmarks/{name.replace('-', '_')}.py"
     if (ROOT / script).is_file():
         return f"python {script}"

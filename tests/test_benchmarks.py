@@ -77,6 +77,45 @@ def test_quick_methods_get_the_samples_of_the_slow_one(repository, tmp_path):
     assert again.returncode == 0 and "all 5 jobs are done" in again.stdout, again.stdout
 
 
+@pytest.mark.slow
+def test_searches_of_rates_share_a_record_that_goes_on(repository, tmp_path):
+    words = ("rates", "--scale", "smoke", "--out", tmp_path)
+    done = call(repository, "run.py", *words)
+    assert done.returncode == 0, done.stderr[-3000:]
+    result = tmp_path / "smoke" / "results" / "rates.json"
+    said = [
+        (search["method"], search["data"], search["kind"]) for search in read(result)["searches"]
+    ]
+    assert said == [
+        (method, *data)
+        for method in ("no-prior", "direct")
+        for data in (("cornell", "room"), ("small-still", "object"))
+    ]
+    assert all(search["best"] and search["seeds"] == [0] for search in read(result)["searches"])
+    fitted = [search["trials"] for search in read(result)["searches"]]
+    # A job that was stopped repeats no fit.
+    (tmp_path / "smoke" / "jobs" / "rates-direct.json").unlink()
+    result.unlink()
+    again = call(repository, "run.py", *words)
+    assert again.returncode == 0 and "3 of 4 jobs are done" in again.stdout, again.stdout
+    assert [search["trials"] for search in read(result)["searches"]] == fitted
+
+
+def test_searches_of_rates_have_a_job_a_method(repository, benchmarks, tmp_path):
+    done = call(repository, "run.py", "rates", "--plan", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "0 of 6 jobs are done, the others take about" in done.stdout
+    jobs = done.stdout.splitlines()[1:]
+    searches = [f"  rates-{method}" for method in ("prb", "ours", "no-prior", "direct")]
+    assert jobs == ["  data-cornell", "  data-small-still", *searches]
+    run, facts = benchmarks("run"), read(repository / "benchmarks" / "results" / "rates.json")
+    # The numbers of the search that is committed.
+    data, search = run["DATA"]["cornell"], facts["searches"][0]
+    assert (data.views, data.held_out) == (search["views"], search["heldout"])
+    assert [data.resolution] * 2 == search["resolution"]
+    assert run["BENCHMARKS"]["rates"].seconds == search["settings"]["seconds"]
+
+
 def test_a_plan_tells_what_is_left_and_what_is_left_out(repository, tmp_path):
     done = call(repository, "run.py", "long", "--plan", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
