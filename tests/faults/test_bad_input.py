@@ -312,7 +312,7 @@ def test_a_damaged_mesh(refused_fit, data):
 
 def test_an_unknown_scene(refuses, tmp_path):
     line = refuses("capture", "dmeo", "--out", tmp_path / "data")
-    assert "no such scene: 'dmeo'. Give an XML file or one of demo, still, cornell" in line
+    assert "no such scene: 'dmeo'. Give an XML file or one of demo, annex, still, cornell" in line
 
 
 def test_a_missing_scene_file(refuses, tmp_path):

@@ -17,7 +17,7 @@ def bench(unbake, what, data, tiny, out, *methods):
 
 def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
     out = tmp_path / "deep" / "methods.json"
-    named = ("ours", "prb:grid:split-halves", "prb:grid", "ad-pt", "direct:bitmap")
+    named = ("ours", "prb:grid:split-halves", "prb:grid:two-pass", "ad-pt", "direct:bitmap")
     done = bench(unbake, "methods", cornell, tiny, out, *named)
     assert done.status == 0, done.err
     written = json.loads(out.read_text())
@@ -28,7 +28,7 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
         ("ours", "neural", "neural", "split-halves"),
         ("prb", "grid", None, "split-halves"),
         ("prb", "grid", None, "two-pass"),
-        ("ad-pt", "neural", None, "two-pass"),
+        ("ad-pt", "neural", None, "split-halves"),
         ("direct", "bitmap", None, "split-halves"),
     ]
     first = rows[0]["milliseconds_per_step"]

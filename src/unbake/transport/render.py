@@ -14,8 +14,9 @@ from .operator import attach_material
 from .path_tracer import path_traced
 from .vertex import SceneView, find_vertex
 
-#: Camera rays through pixels: pixel numbers and positions inside the pixels to world space rays.
-RayGenerator = Callable[[mi.UInt32, mi.Point2f], mi.Ray3f]
+#: Camera rays through pixels: pixel numbers and positions inside the pixels to world space rays. In
+#: quotes, because Mitsuba has no such types before a variant is set.
+RayGenerator = Callable[["mi.UInt32", "mi.Point2f"], "mi.Ray3f"]
 
 #: Camera samples in flight at once; bounds the memory.
 WAVEFRONT = 1 << 20
