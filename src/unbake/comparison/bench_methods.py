@@ -26,7 +26,7 @@ from .tables import print_step_times
 #: Steps of a method before the measurement.
 WARM_UP = 6
 #: How often each method is measured: a machine whose speed changes then affects all of them.
-TURNS = 2
+TURNS = 4
 
 
 def bench_methods(
