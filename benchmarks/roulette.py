@@ -57,20 +57,23 @@ class Contestant:
     sums: list[np.ndarray] = field(default_factory=list)  # of gradients, and of their squares
     count: int = 0
 
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates of nothing: the fields stay."""
+        return dict.fromkeys(self.config.quantities, 0.0)
+
     def step(self, number: int) -> None:
         """Take a step that changes nothing, and note how long it takes."""
-        rates = dict.fromkeys(self.config.quantities, 0.0)
         start = time.perf_counter()
-        self.fit.step(self.fit.state, number, rates)
+        self.fit.step(self.fit.state, number, self.rates)
         dr.sync_thread()
         self.seconds.append(time.perf_counter() - start)
 
     def observe(self, number: int) -> None:
         """Add the albedo's gradient in a step."""
         step, state = self.fit.step, self.fit.state
-        step._gradients(step._inputs(number, self.config.pixels), state)
-        parts = [np.ravel(dr.grad(v)) for k, v in state.phi.items() if k.startswith("albedo")]
-        dr.clear_grad(dict(state.phi.items()))
+        found = step.gradients(step.prepare(state, number, self.rates), state)
+        parts = [np.ravel(value) for name, value in found.items() if name.startswith("albedo")]
         gradient = np.concatenate(parts).astype(np.float64)
         new = [gradient, gradient**2]
         self.sums = [a + b for a, b in zip(self.sums, new, strict=True)] if self.sums else new

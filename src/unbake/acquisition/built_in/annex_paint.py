@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from . import demo_paint, patterns
 from .demo_paint import Maps
 from .patterns import (
     checks,
@@ -38,9 +39,7 @@ def planks(width: float, depth: float) -> Maps:
 
 def white(width: float, depth: float) -> Maps:
     """A white ceiling with a grey cast that comes and goes."""
-    x, y = grid(width, depth, 48)
-    color = tint(noise(x, y, 0.9, 36), (0.86, 0.85, 0.82), (0.76, 0.76, 0.74))
-    return color, mix(noise(x, y, 0.7, 37), 0.5, 0.9)
+    return demo_paint.ceiling(width, depth, ((0.86, 0.85, 0.82), (0.76, 0.76, 0.74)), seed=36)
 
 
 def panelling(width: float, height: float) -> Maps:
@@ -56,19 +55,13 @@ def panelling(width: float, height: float) -> Maps:
 
 def plaster(width: float, height: float) -> Maps:
     """Mottled pale plaster above a sage dado with a waved edge."""
-    x, y = grid(width, height)
-    upper = tint(noise(x, y, 0.45, 33), (0.72, 0.72, 0.7), (0.86, 0.84, 0.78))
-    lower = tint(stripes(x, 0.4), (0.42, 0.54, 0.42), (0.56, 0.66, 0.54))
-    above = step(y - 0.8 - 0.05 * np.sin(2 * np.pi * x / 0.8))
-    return tint(above, lower, upper), mix(above, 0.35, mix(noise(x, y, 0.5, 34), 0.5, 0.9))
+    upper, dado = ((0.72, 0.72, 0.7), (0.86, 0.84, 0.78)), ((0.42, 0.54, 0.42), (0.56, 0.66, 0.54))
+    return demo_paint.plaster(width, height, upper, dado, seed=33)
 
 
 def striped(width: float, height: float) -> Maps:
     """Pale blue and white stripes, each with its own gloss."""
-    x, y = grid(width, height)
-    amount = stripes(x, 0.5)
-    color = tint(amount, (0.84, 0.82, 0.78), (0.5, 0.6, 0.7))
-    return color, mix(amount, 0.8, 0.35) + 0.12 * (noise(x, y, 0.5, 35) - 0.5)
+    return demo_paint.striped(width, height, ((0.84, 0.82, 0.78), (0.5, 0.6, 0.7)), seed=35)
 
 
 def spotted(width: float, height: float) -> Maps:
@@ -99,9 +92,7 @@ def mosaic(width: float, height: float) -> Maps:
     pick = per_cell(i, j, 24)
     color = np.where((pick < 0.4)[..., None], (0.86, 0.26, 0.16), (0.9, 0.58, 0.16))
     color = np.where((pick > 0.78)[..., None], (0.74, 0.22, 0.5), color)
-    near = np.minimum(np.mod(x, size), np.mod(y, size))
-    near = np.minimum(near, np.minimum(size - np.mod(x, size), size - np.mod(y, size)))
-    body = step(near - 0.014)
+    body = patterns.tiles(x, y, size, 0.014)
     return tint(body, (0.8, 0.7, 0.5), color), mix(body, 0.85, mix(per_cell(i, j, 25), 0.22, 0.6))
 
 
@@ -124,9 +115,7 @@ def lozenges(width: float, depth: float) -> Maps:
 
 def sky(width: float, depth: float) -> Maps:
     """A ceiling between white and sky blue."""
-    x, y = grid(width, depth, 48)
-    color = tint(noise(x, y, 0.7, 28), (0.9, 0.88, 0.84), (0.64, 0.78, 0.9))
-    return color, mix(noise(x, y, 0.7, 29), 0.5, 0.9)
+    return demo_paint.ceiling(width, depth, ((0.9, 0.88, 0.84), (0.64, 0.78, 0.9)), 0.7, 28)
 
 
 def bands(width: float, height: float) -> Maps:

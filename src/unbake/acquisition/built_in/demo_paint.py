@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from . import patterns
 from .patterns import (
     checks,
     diamonds,
@@ -48,29 +49,43 @@ def _rug(x: np.ndarray, y: np.ndarray, color: np.ndarray, roughness: np.ndarray)
     return tint(inside, color, rug), mix(inside, roughness, mix(noise(x, y, 0.4, 5), 0.75, 0.9))
 
 
-def ceiling(width: float, depth: float) -> Maps:
-    """White with a warm cast that comes and goes."""
+def ceiling(
+    width: float,
+    depth: float,
+    colours: tuple[Colour, Colour] = ((0.84, 0.8, 0.72), (0.82, 0.74, 0.6)),
+    cell: float = 0.9,
+    seed: int = 6,
+) -> Maps:
+    """White with a cast, a warm one by default, that comes and goes in clouds of `cell` metres."""
     x, y = grid(width, depth, 48)
-    color = tint(noise(x, y, 0.9, 6), (0.84, 0.8, 0.72), (0.82, 0.74, 0.6))
-    return color, mix(noise(x, y, 0.7, 7), 0.5, 0.9)
+    return tint(noise(x, y, cell, seed), *colours), mix(noise(x, y, 0.7, seed + 1), 0.5, 0.9)
 
 
-def plaster(width: float, height: float) -> Maps:
-    """Mottled ochre plaster above a green dado with a waved edge."""
+def plaster(
+    width: float,
+    height: float,
+    plaster: tuple[Colour, Colour] = ((0.84, 0.58, 0.24), (0.86, 0.7, 0.42)),
+    dado: tuple[Colour, Colour] = ((0.3, 0.46, 0.28), (0.4, 0.56, 0.34)),
+    seed: int = 8,
+) -> Maps:
+    """Mottled plaster, ochre by default, above a striped dado with a waved edge."""
     x, y = grid(width, height)
-    cloud = noise(x, y, 0.45, 8)
-    upper = tint(cloud, (0.84, 0.58, 0.24), (0.86, 0.7, 0.42))
-    lower = tint(stripes(x, 0.4), (0.3, 0.46, 0.28), (0.4, 0.56, 0.34))
+    upper, lower = tint(noise(x, y, 0.45, seed), *plaster), tint(stripes(x, 0.4), *dado)
     above = step(y - 0.8 - 0.05 * np.sin(2 * np.pi * x / 0.8))
-    return tint(above, lower, upper), mix(above, 0.35, mix(noise(x, y, 0.5, 9), 0.5, 0.9))
+    return tint(above, lower, upper), mix(above, 0.35, mix(noise(x, y, 0.5, seed + 1), 0.5, 0.9))
 
 
-def striped(width: float, height: float) -> Maps:
-    """Terracotta and cream stripes, every colour with its own gloss."""
+def striped(
+    width: float,
+    height: float,
+    colours: tuple[Colour, Colour] = ((0.84, 0.74, 0.58), (0.76, 0.36, 0.22)),
+    seed: int = 10,
+) -> Maps:
+    """Stripes, terracotta and cream by default, every colour with its own gloss."""
     x, y = grid(width, height)
     amount = stripes(x, 0.5)
-    color = tint(amount, (0.84, 0.74, 0.58), (0.76, 0.36, 0.22))
-    return color, mix(amount, 0.8, 0.35) + 0.12 * (noise(x, y, 0.5, 10) - 0.5)
+    gloss = mix(amount, 0.8, 0.35) + 0.12 * (noise(x, y, 0.5, seed) - 0.5)
+    return tint(amount, *colours), gloss
 
 
 def tiles(width: float, height: float) -> Maps:
@@ -81,9 +96,7 @@ def tiles(width: float, height: float) -> Maps:
     color = tint(checks(x, y, size), (0.82, 0.74, 0.6), (0.24, 0.52, 0.54))
     accent = per_cell(i, j, 11) > 0.78
     color = np.where(accent[..., None], np.array((0.84, 0.56, 0.16)), color)
-    near = np.minimum(np.mod(x, size), np.mod(y, size))
-    near = np.minimum(near, np.minimum(size - np.mod(x, size), size - np.mod(y, size)))
-    body = step(near - 0.012)
+    body = patterns.tiles(x, y, size, 0.012)
     gloss = mix(per_cell(i, j, 12), 0.22, 0.6)
     return tint(body, (0.7, 0.62, 0.5), color), mix(body, 0.85, gloss)
 

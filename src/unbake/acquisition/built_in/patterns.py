@@ -74,6 +74,13 @@ def checks(x: np.ndarray, y: np.ndarray, size: float) -> np.ndarray:
     return 0.5 * (1 + a * b)
 
 
+def tiles(x: np.ndarray, y: np.ndarray, size: float, joint: float) -> np.ndarray:
+    """1 on square tiles of `size` metres, 0 in the joints of half-width `joint` between them."""
+    near = np.minimum(np.mod(x, size), np.mod(y, size))
+    near = np.minimum(near, np.minimum(size - np.mod(x, size), size - np.mod(y, size)))
+    return step(near - joint)
+
+
 def dots(x: np.ndarray, y: np.ndarray, spacing: float, radius: float) -> np.ndarray:
     """Discs in staggered rows."""
     row = np.floor(y / spacing)
