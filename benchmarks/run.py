@@ -17,7 +17,7 @@ import argparse
 import os
 import statistics
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -164,18 +164,17 @@ class Rates:
     Args:
         job: the job that it belongs to.
         data: keys of `DATA`; each is searched by itself.
-        methods: as `unbake bench rates` reads them.
-        seconds: length of each fit; 0 if `steps` is given.
-        steps: length of each fit.
+        seconds: by method, as `unbake bench rates` reads it, the length of each fit. A search that
+            chooses between estimators needs equal time.
+        steps: by method, the length of each fit of the others.
         seeds: of the fits whose scores are averaged.
     """
 
     job: str
     data: Sequence[str]
-    methods: Sequence[str]
-    seconds: int = 0
-    steps: int = 0
-    seeds: Sequence[int] = SEEDS
+    seconds: Mapping[str, int]
+    steps: Mapping[str, int]
+    seeds: Sequence[int] = (0, 1)
 
 
 Benchmark = Compare | EqualSamples | Steps | Machine | Rates
@@ -266,7 +265,7 @@ BENCHMARKS: dict[str, Benchmark] = {
         for data in ("demo", "few", "three", "half", "annex")
     },
     "rates": Rates(
-        "rates", ("cornell", "small-still"), ("prb", "ours", "no-prior", "direct"), seconds=30
+        "rates", ("cornell", "small-still"), {"prb": 30}, {"no-prior": 1600, "direct": 1600}
     ),
 }  # fmt: skip
 JOBS = tuple(dict.fromkeys(benchmark.job for benchmark in BENCHMARKS.values()))
@@ -282,8 +281,8 @@ def at_smoke_scale(benchmark: Benchmark) -> Benchmark:
         case Steps():
             return replace(benchmark, methods=benchmark.methods[:2])
         case Rates():
-            methods, seeds = benchmark.methods[-2:], benchmark.seeds[:1]
-            return replace(benchmark, methods=methods, seconds=0, steps=2, seeds=seeds)
+            steps = dict.fromkeys(benchmark.steps, 2)
+            return replace(benchmark, seconds={}, steps=steps, seeds=benchmark.seeds[:1])
     return replace(
         benchmark,
         methods=benchmark.methods[:2],
@@ -432,8 +431,8 @@ def plan_steps(bench: Bench, name: str, benchmark: Steps) -> Planned:
     return Planned([*bench.capture(benchmark.data), job], write)
 
 
-#: Fits of a search with one seed, about, and seconds of each beside the fit itself.
-TRIALS, SCORING = 7, 6.0
+#: Fits of a search with one seed, about; seconds of each beside the fit itself, and of a step.
+TRIALS, SCORING, STEP = 7, 6.0, 0.008
 
 
 def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
@@ -442,17 +441,17 @@ def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
     The file keeps what was fitted when a job is stopped. With other settings there is another one.
     """
     options, text = bench.settings(None)
-    options += ["--seconds", benchmark.seconds] if benchmark.seconds else []
-    options += ["--steps", benchmark.steps] if benchmark.steps else []
     folders = [bench.data(data) for data in benchmark.data]
     described = {"settings": text, "data": [str(folder) for folder in folders]}
     described |= {"seconds": benchmark.seconds, "steps": benchmark.steps}
     file = bench.work / "rates" / digest(described) / f"{name}.json"
     jobs = [job for data in benchmark.data for job in bench.capture(data)]
     fits = TRIALS * len(folders) * len(benchmark.seeds)
-    for method in benchmark.methods:
-        words = ["bench", "rates", "--data", *folders, "--methods", method, *options]
-        words += ["--seeds", *benchmark.seeds, "--out", file]
+    lengths = [(method, "--seconds", n) for method, n in benchmark.seconds.items()]
+    lengths += [(method, "--steps", n) for method, n in benchmark.steps.items()]
+    for method, option, length in lengths:
+        words = ["bench", "rates", "--data", *folders, "--methods", method, option, length]
+        words += [*options, "--seeds", *benchmark.seeds, "--out", file]
         # Defaults of methods are what is searched: no search depends on them.
         settings = described | {"method": method, "seeds": list(benchmark.seeds)}
         command = partial(unbake, *words, until=bench.until)
@@ -461,8 +460,8 @@ def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
                 f"{name}-{method}",
                 settings,
                 lambda command=command: command() or {},
-                SCORING * fits,
-                benchmark.seconds * fits,
+                (SCORING + STEP * length * (option == "--steps")) * fits,
+                length * fits * (option == "--seconds"),
                 [file],
             )
         )
