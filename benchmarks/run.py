@@ -2,13 +2,13 @@
 
     python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
 
-Jobs: machine steps demo rivals equal long ablation lighting emission sparse prior rates (default:
-all; hours). What `rates` finds changes the other jobs when it is in `METHOD_DEFAULTS`. STAIRCASE
-takes part where --staircase, or STAIRCASE of the environment, names its data set (docs/staircase.md
-says how to make it). Data sets, runs and records of jobs are kept in --out, so that the same
-command continues what was stopped. Results go to --results; `python benchmarks/tables.py` prints
-them as tables. Methods are compared over three seeds: results have the mean of a number, and its
-sample standard deviation as NUMBER_sd.
+Jobs: machine steps demo rivals equal long ablation lighting emission sparse prior rates rates-check
+(default: all; hours). What `rates` finds changes the other jobs when it is in `METHOD_DEFAULTS`.
+STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
+(docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
+that the same command continues what was stopped. Results go to --results; `python
+benchmarks/tables.py` prints them as tables. Methods are compared over three seeds, over two at
+equal time: results have the mean of a number, and its sample standard deviation as NUMBER_sd.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ STAIRCASE = "staircase"
 
 #: Of every comparison of methods.
 SEEDS = (0, 1, 2)
+#: Of those at equal time, which take longest.
+SEEDS_AT_TIME = (0, 1)
 
 
 @dataclass(frozen=True)
@@ -218,9 +220,10 @@ BENCHMARKS: dict[str, Benchmark] = {
         options=(*NO_SCORES, "--evaluate-spp", 64, "--evaluate-truth"),
     ),
     # Equal time, and equal samples.
-    "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=60),
+    "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=60, seeds=SEEDS_AT_TIME),
     "rivals-staircase": Compare(
-        "rivals", STAIRCASE, ROOM_RIVALS, seconds=120, options=COARSE_RENDERING, settings=ROOM
+        "rivals", STAIRCASE, ROOM_RIVALS, seconds=120, seeds=SEEDS_AT_TIME,
+        options=COARSE_RENDERING, settings=ROOM,
     ),
     "equal-demo": EqualSamples("equal", ("ours", "no-prior", "direct"), "rivals-demo", "prb"),
     # What PRB has after 20 minutes; `rivals` shows when ours has it.
@@ -265,8 +268,25 @@ BENCHMARKS: dict[str, Benchmark] = {
         for data in ("demo", "few", "three", "half", "annex")
     },
     "rates": Rates(
-        "rates", ("cornell", "small-still"), {"prb": 30}, {"no-prior": 1600, "direct": 1600}
+        "rates", ("cornell", "small-still"), {"prb": 30},
+        {"ours": 1600, "no-prior": 1600, "direct": 1600},
     ),
+    # Whether what was found in the Cornell box serves another room.
+    "rates-prb-own": Compare(
+        "rates-check", "demo", ("prb",), seconds=60, seeds=SEEDS_AT_TIME, options=NO_SCORES,
+        settings="rates/own.toml",
+    ),
+    "rates-own": Compare(
+        "rates-check", "demo", ("ours", "no-prior"), steps=2400, options=NO_SCORES,
+        settings="rates/own.toml",
+    ),
+    **{
+        f"rates-{method}": Compare(
+            "rates-check", "demo", (method,), steps=2400, options=NO_SCORES,
+            settings=f"rates/{method}.toml",
+        )
+        for method in ("ours", "no-prior")
+    },
 }  # fmt: skip
 JOBS = tuple(dict.fromkeys(benchmark.job for benchmark in BENCHMARKS.values()))
 

@@ -27,9 +27,17 @@ class MethodDefaults:
     estimator: Literal["split-halves", "two-pass"] | None = None
 
 
-#: By method and kind of scene. Methods that are not listed have the fields' own rates.
+#: By method and kind of scene. Methods that are not listed have the fields' own rates, which were
+#: chosen for methods with a radiance network: what one room finds for those is worse in another.
 METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {
-    "prb": {"room": MethodDefaults({"roughness": 2.5, "albedo": 1.0}, "split-halves")},
+    "prb": {
+        "room": MethodDefaults({"roughness": 2.5, "albedo": 1.0}, "split-halves"),
+        "object": MethodDefaults({"roughness": 1.0, "albedo": 1.0}, "two-pass"),
+    },
+    "direct": {
+        "room": MethodDefaults({"roughness": 1.0, "albedo": 1.0}),
+        "object": MethodDefaults({"roughness": 0.16, "albedo": 1.0}),
+    },
 }
 
 #: Methods without a search of their own: the method whose defaults they have, whose gradient has
