@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -117,15 +118,20 @@ class Facts:
         return above(difference, spread)
 
     def versus(self, demo: str, room: str) -> str:
-        """What ours is ahead of each rival in two comparisons, the demo's first."""
-        rivals = [name for name in self.result(room)["methods"] if name != "ours"]
+        """What ours is ahead of each rival in two comparisons; blank where one lacks the rival."""
+        known = {name: self.result(name)["methods"] for name in (demo, room)}
         quantities = ("albedo", "roughness", "rendering")
         rows = [
             [
                 f"`{rival}`",
-                *(self.gap(n, "ours", rival, q) for q in quantities for n in (demo, room)),
+                *(
+                    self.gap(name, "ours", rival, q) if rival in methods else ""
+                    for q in quantities
+                    for name, methods in known.items()
+                ),
             ]
-            for rival in rivals
+            for rival in dict.fromkeys(chain.from_iterable(known.values()))
+            if rival != "ours"
         ]
         titles = [f"{q}, {scene}" for q in quantities for scene in ("demo", "STAIRCASE")]
         return markdown(["`ours` against", *titles], rows)
@@ -182,7 +188,9 @@ class Facts:
             chosen = best["estimator"].replace("-", " ") if search["follows_paths"] else ""
             scene = f"{search['kind']}s", search["unknown"], search["data"]
             fits = sum(len(trial["per_seed"]) for trial in search["trials"])
-            rows.append([f"`{search['method']}`", *scene, factors, chosen, fits])
+            own = search["trials"][0]  # a search begins with the fields' rates
+            scores = [f"{row['score']:.1f}" for row in (search["untrained"], own, best)]
+            rows.append([f"`{search['method']}`", *scene, factors, chosen, *scores, fits])
         titles = [
             "method",
             "for",
@@ -190,6 +198,9 @@ class Facts:
             "found on",
             "factors of the rates",
             "estimator",
+            "untrained",
+            "own rates",
+            "best",
             "fits",
         ]
         return markdown(titles, rows)

@@ -67,9 +67,7 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     content["seeds"] = [0, 1]
     for name, row in content["methods"].items():
         row |= {f"{k}_psnr_sd": 0.1 for k in ("albedo", "roughness", "render")}
-        row |= {"true_render_psnr": 24.75, "per_seed": [{"seed": 0}, {"seed": 1}]}
-        if name == "ours":
-            row["per_seed"] = [{"seed": i, "score": row["score"]} for i in (0, 1)]
+        row |= {"true_render_psnr": 24.75}
         unseen = {f"{k}_psnr_unseen": 33.25 for k in ("albedo", "render")}
         seen = {f"{k}_psnr_seen": row[f"{k}_psnr"] for k in ("albedo", "roughness", "render")}
         row |= unseen | seen
@@ -82,7 +80,8 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
         made[f"prior-{case}"] = content | {"methods": few}
     best = {"factors": {"albedo": 2.5}, "estimator": "two-pass"}
     search = {"method": "prb", "kind": "room", "data": "box", "unknown": "materials"}
-    search |= {"follows_paths": True, "trials": [{"per_seed": [{}, {}]}], "best": best}
+    search |= {"follows_paths": True, "trials": [{"score": 22.1, "per_seed": [{}, {}]}]}
+    search |= {"untrained": {"score": 13.5}, "best": best | {"score": 24.2}}
     search |= {"seeds": [0, 1], "settings": {"steps": 2400, "seconds": 30.0}}
     equal = {k: v for k, v in content["methods"].items() if k in ("ours", "prb")}
     made["equal-demo"] = content | {"methods": equal}
@@ -94,10 +93,10 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     assert "| the true materials, rendered alike |  |  |  | 24.8 |" in readme
     assert "in a room behind a door +22.2 dB" in " ".join(readme.split())
     assert "`prior-half`" in page and "+22.2 dB" in page
-    assert "| `prb` | rooms | materials | box | albedo x 2.5 | two pass | 2 |" in page
+    assert "| `prb` | rooms | materials | box | albedo x 2.5 | two pass | 13.5 | 22.1 | 24.2 | 2 |" in page
     words = " ".join(page.split())
     assert "Searched so far: `prb` for rooms (box; 2 seeds, 30 s a fit). What was not" in words
-    assert "Ours is searched too" not in words
+    assert "Ours and `no-prior` are searched too" not in words
     assert "two passes for rooms, two passes elsewhere, as in Mitsuba" in words
     assert "as many camera samples as `prb` traces in" in words
     assert "`untrained` is no method" in words
