@@ -305,7 +305,7 @@ def test_files_of_steps_become_one_of_the_machine(benchmarks, tmp_path):
 
 
 #: Results that are not committed yet.
-UNMEASURED = {"prior-demo", "prior-few", "prior-three", "prior-half", "prior-annex"}
+UNMEASURED: set[str] = set()
 
 
 def test_committed_results_of_every_benchmark_are_read(repository, benchmarks):

@@ -28,7 +28,8 @@ class MethodDefaults:
 
 
 #: By method and kind of scene. Methods that are not listed have the fields' own rates, which were
-#: chosen for methods with a radiance network: what one room finds for those is worse in another.
+#: chosen for methods with a radiance network: what one room finds best for those gains little in
+#: another.
 METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {
     "prb": {
         "room": MethodDefaults({"roughness": 2.5, "albedo": 1.0}, "split-halves"),
