@@ -39,6 +39,7 @@ unbake.activate()
 import numpy as np  # noqa: E402
 from rich.console import Console  # noqa: E402
 
+from unbake.config import PAPER_DEPTH  # noqa: E402
 from unbake.dataset.camera import read_cameras  # noqa: E402
 from unbake.dataset.pixels import CameraRays  # noqa: E402
 from unbake.experiments import fig4, table1  # noqa: E402
@@ -146,7 +147,7 @@ def measure_views(context: ExperimentContext, power: float) -> Findings:
                         scene_view,
                         ray,
                         seed,
-                        max_depth=table1.MAX_DEPTH,
+                        max_depth=PAPER_DEPTH,
                         rr_depth=rr_depth,
                         most_likely=table1.SURVIVAL,
                     )
