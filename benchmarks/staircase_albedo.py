@@ -12,12 +12,11 @@ they published. This script applies several exponents to every albedo and measur
   from the fifth interaction on,
 - the share of the reflected light that paths of a given length carry, and the mean albedo seen.
 
-The exponent in `experiments/scenes.py` is 0.7: with it PRB 10 and PRB 15 are as far from the
-reference as in the same part of the published tables, and have the right sign everywhere, as there.
-It does not meet everything. PRB 4 is worse here than published, with 0.7 and with 0.5. PRB 30 is
-better here: the published reference itself is not zero where it should be. The mean path length of
-Table 1 asks for an exponent below 0.6. The plain L2 loss fits the published tables less than the
-relative one.
+The exponent in `experiments/scenes.py` is 0.7: of those measured it is the one with which PRB 15
+has the right sign everywhere, as in the published tables; with 0.6 it has not. It does not meet
+everything. PRB 4 and PRB 10 are worse here than published. PRB 30 is better here: the published
+reference itself is not zero where it should be. The mean path length of Table 1 asks for an
+exponent below 0.6. The plain L2 loss fits the published tables less than the relative one.
 
 A stopped run continues, `--minutes` ends it in time, and what is done is told.
 """

@@ -347,7 +347,8 @@ def test_the_albedo_of_staircase_is_the_one_that_was_calibrated(repository):
     file = repository / "benchmarks" / "results" / "staircase-albedo.json"
     calibrated = json.loads(file.read_text())["powers"][0]
     assert calibrated["power"] == STAIRCASE.albedo_power
-    for method in ("PRB 10", "PRB 15"):
-        here, paper = calibrated["relative_l2"][method], calibrated["published"][method]
-        assert here["relative_rmse"] == pytest.approx(paper["relative_rmse"], rel=0.25)
-        assert here["sign_agreement"] == paper["sign_agreement"] == 1
+    here, paper = (calibrated[key]["PRB 15"] for key in ("relative_l2", "published"))
+    # As far as its noise tells: the halves of the samples have the published error between them.
+    least, most = sorted(here["halves"])
+    assert least < paper["relative_rmse"] < most
+    assert here["sign_agreement"] == paper["sign_agreement"] == 1
