@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
+
+#: Characters that are shown of a name, and of each part of a message.
+_LONGEST_NAME, _LONGEST_PART = 80, 1000
 
 
 class UserError(Exception):
@@ -23,8 +27,43 @@ class UserError(Exception):
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        text = self.what if self.where is None else f"{self.where}: {self.what}"
-        return text if self.remedy is None else f"{text}. {self.remedy}"
+        what = _one_line(self.what)
+        text = what if self.where is None else f"{_one_line(self.where)}: {what}"
+        return text if self.remedy is None else f"{text}. {_one_line(self.remedy)}"
+
+
+def printable(name: object, longest: int = _LONGEST_NAME) -> str:
+    """A name on one line of a terminal, whatever it is.
+
+    Args:
+        name: from a file that others may have written.
+        longest: characters to show; a longer name loses its middle.
+
+    Returns:
+        The name, with control characters, those that turn the direction of writing, and bytes that
+        are not UTF-8 as escape sequences.
+    """
+    text = str(name)
+    if len(text) > 2 * longest:  # so that a name of megabytes is not escaped as a whole
+        text = f"{text[:longest]}{text[-longest:]}"
+    text = "".join(c if c.isprintable() else _escaped(c) for c in text)
+    if len(text) <= longest:
+        return text
+    head = longest // 2
+    return f"{text[:head]}…{text[head + 1 - longest :]}"
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    # Python decodes a byte of a path that is not UTF-8 to this code
+    return f"\\x{code - 0xDC00:02x}" if 0xDC80 <= code <= 0xDCFF else ascii(character)[1:-1]
+
+
+def _one_line(text: str) -> str:
+    """A part of a message, with the names in it shortened; folders and files are names each."""
+    text = re.sub(r"\s*\n\s*", " ", text)
+    words = re.compile(rf"[^\s/]{{{_LONGEST_NAME + 1},}}")
+    return printable(words.sub(lambda match: printable(match[0]), text), _LONGEST_PART)
 
 
 def require_name(name: str, known: Collection[str], what: str, where: object | None = None) -> None:
