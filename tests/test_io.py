@@ -6,10 +6,13 @@ import os
 
 import pytest
 
+from unbake import io
 from unbake.errors import UserError
 from unbake.formats import check_format
 from unbake.io import (
     inside,
+    number,
+    read_json,
     read_object,
     read_text,
     relative,
@@ -101,10 +104,45 @@ def test_what_is_not_text_or_no_object_is_named(tmp_path):
     file.write_bytes(b"\xff{}")
     with pytest.raises(UserError, match=r"a\.json: the file is not UTF-8 text"):
         read_text(file)
-    with pytest.raises(UserError, match=r"a\.json: the file is not readable JSON"):
+    with pytest.raises(UserError, match=r"a\.json: the file is not UTF-8 text"):
         read_object(file)
     with pytest.raises(UserError, match=r"cannot be read .Is a directory"):
         read_text(tmp_path)
+
+
+def test_a_json_file_is_neither_endless_nor_deep(tmp_path, monkeypatch):
+    file = tmp_path / "a.json"
+    for depth, fine in ((64, True), (65, False), (900, False), (100_000, False)):
+        file.write_text("[" * depth + "]" * depth)
+        if fine:
+            read_json(file)
+        else:
+            with pytest.raises(UserError, match="not readable JSON"):
+                read_json(file)
+    monkeypatch.setattr(io, "LONGEST_TEXT", 1000)
+    file.write_text(" " * 1001)
+    with pytest.raises(UserError, match=r"has 0 MB, more than the 0 MB that are read"):
+        read_json(file)
+
+
+@pytest.mark.parametrize("content", ["NaN", "Infinity", "-Infinity", "1e999", "1" * 400])
+def test_numbers_are_finite(content, tmp_path):
+    (tmp_path / "a.json").write_text(f'{{"x": {content}}}')
+    with pytest.raises(UserError, match=r"'x' is (too large|nan|inf|-inf)"):
+        number(read_object(tmp_path / "a.json"), "x", "here")
+
+
+def test_nothing_is_written_through_a_link_that_waits_at_the_temporary_name(tmp_path):
+    """It was `.a.txt.PID.tmp`, and a folder of someone else's may have links at all of them."""
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    folder = tmp_path / "data"
+    folder.mkdir()
+    (folder / f".a.txt.{os.getpid()}.tmp").symlink_to(victim)
+    (folder / "a.txt").symlink_to(victim)
+    write_text(folder / "a.txt", "new")
+    assert victim.read_text() == "mine"
+    assert (folder / "a.txt").read_text() == "new" and not (folder / "a.txt").is_symlink()
 
 
 def test_a_format_is_the_first_unless_it_says_another():

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
+import secrets
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,11 @@ from typing import Any
 import numpy as np
 
 from .errors import UserError
+
+#: Longest text file that is read, in bytes: the poses of some 50,000 views.
+LONGEST_TEXT = 64 << 20
+#: How deep objects and lists of a JSON file may be nested.
+DEEPEST_JSON = 64
 
 # ------------------------------------------------------------------------------------------ writing
 
@@ -35,7 +43,7 @@ def write_atomically(
         UserError: the folder cannot be made or written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
@@ -49,6 +57,11 @@ def write_atomically(
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def temporary_beside(path: Path) -> Path:
+    """A name in the folder of a file that nobody can foresee, and so none that a link waits at."""
+    return path.with_name(f".{path.name[:40]}.{secrets.token_hex(8)}.tmp")
 
 
 def remove_unfinished(folder: Path) -> None:
@@ -75,7 +88,9 @@ def write_json(path: Path, content: Any, *, allow_nan: bool = True, durable: boo
 # -------------------------------------------------------------------------------------------- paths
 
 
-def inside(folder: Path, name: str, where: str, what: str = "folder") -> Path:
+def inside(
+    folder: Path, name: str, where: str, what: str = "folder", *, allow_outside: bool = False
+) -> Path:
     """The file of a folder that a text names, relative to the folder, which it must not leave.
 
     Args:
@@ -83,17 +98,24 @@ def inside(folder: Path, name: str, where: str, what: str = "folder") -> Path:
         name: from a file that others may have written.
         where: the file and entry that `name` was found in.
         what: what the folder is, for the error message.
+        allow_outside: accept files that lie elsewhere.
 
     Raises:
         UserError: `name` is not a path, or leads out of the folder.
     """
     try:
+        # Mitsuba takes no other names
+        name.encode()
         resolved = (folder / name).resolve()
         contained = resolved.is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):
         raise UserError(f"{name!r} is not a path", where, "Correct it") from None
-    if not contained:
-        raise UserError(f"{name!r} lies outside the {what}", where, f"Move the file into {folder}")
+    if not contained and not allow_outside:
+        raise UserError(
+            f"{name!r} lies outside the {what}",
+            where,
+            f"Move the file into {folder}, or pass --allow-outside",
+        )
     return folder / name
 
 
@@ -109,6 +131,38 @@ def relative(folder: Path, path: Path, what: str = "folder") -> str:
     return resolved.relative_to(root).as_posix()
 
 
+def require_utf8(path: Path, what: str) -> None:
+    """Raise a `UserError` if the name of a file or folder is not UTF-8, as Mitsuba needs it.
+
+    Args:
+        what: what lies there, for the error message.
+    """
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        raise UserError(f"the path of the {what} is not UTF-8", path, "Rename it") from None
+
+
+def require_file(path: Path, what: str = "file", remedy: str | None = None) -> None:
+    """Raise a `UserError` unless there is a regular file, which can be opened without waiting.
+
+    Args:
+        what: what the file is, for the error message.
+        remedy: what the user can do.
+    """
+    try:
+        mode = Path(path).stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"the {what} does not exist", path, remedy) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"the {what} cannot be read ({reason})", path, remedy) from None
+    if stat.S_ISDIR(mode):
+        raise UserError(f"the {what} cannot be read (Is a directory)", path, remedy)
+    if not stat.S_ISREG(mode):
+        raise UserError(f"the {what} cannot be read (it is a pipe or a device)", path, remedy)
+
+
 # ------------------------------------------------------------------------------------ text and JSON
 
 
@@ -121,10 +175,13 @@ def read_text(path: Path, remedy: str | None = None) -> str:
     Raises:
         UserError: the file is missing, unreadable, or not UTF-8.
     """
+    require_file(path, remedy=remedy or "Check the path")
     try:
+        size = Path(path).stat().st_size
+        if size > LONGEST_TEXT:
+            said = f"the file has {size / 1e6:.0f} MB, more than the {LONGEST_TEXT / 1e6:.0f} MB"
+            raise UserError(f"{said} that are read", path, remedy or "Repair it")
         return Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise UserError("the file does not exist", path, remedy or "Check the path") from None
     except OSError as error:
         said = f"the file cannot be read ({error.strerror})"
         raise UserError(said, path, remedy or "Check the path") from None
@@ -141,14 +198,26 @@ def read_json(path: Path, remedy: str | None = None) -> Any:
     Raises:
         UserError: the file is missing, unreadable, or not JSON.
     """
+    content = read_text(path, remedy)
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError("the file does not exist", path, remedy or "Check the path") from None
-    except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        said = f"the file is not readable JSON ({reason})"
-        raise UserError(said, path, remedy or "Repair it") from None
+        parsed = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise UserError(
+            f"the file is not readable JSON ({error})", path, remedy or "Repair it"
+        ) from None
+    if _depth(parsed) > DEEPEST_JSON:
+        said = f"the file is not readable JSON (nested deeper than {DEEPEST_JSON} levels)"
+        raise UserError(said, path, remedy or "Repair it")
+    return parsed
+
+
+def _depth(content: object) -> int:
+    """How deep objects and lists are nested: 0 for a number or a text."""
+    depth, level = 0, [content]
+    while level := [x for x in level if isinstance(x, dict | list)]:
+        depth += 1
+        level = [y for x in level for y in (x.values() if isinstance(x, dict) else x)]
+    return depth
 
 
 def read_object(path: Path, remedy: str | None = None) -> dict[str, Any]:
@@ -164,14 +233,17 @@ def read_object(path: Path, remedy: str | None = None) -> dict[str, Any]:
 
 
 def number(keys: dict[str, Any], key: str, where: str) -> float:
-    """The number at a key; `where` (file and entry) goes into the error message."""
+    """The number at a key, finite; `where` (file and entry) goes into the error message."""
     value = _value(keys, key, where)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise UserError(f"{key!r} is not a number", where, f"It is a {type(value).__name__}")
     try:
-        return float(value)
+        result = float(value)
     except OverflowError:
         raise UserError(f"{key!r} is too large", where, "Correct it") from None
+    if not math.isfinite(result):
+        raise UserError(f"{key!r} is {result}, not a finite number", where, "Correct it")
+    return result
 
 
 def integer(keys: dict[str, Any], key: str, where: str) -> int:

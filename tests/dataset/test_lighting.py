@@ -99,7 +99,7 @@ def test_damaged_strengths_are_told_in_one_line(content, message, truth):
 
 def test_strengths_that_are_no_text_are_told_in_one_line(truth):
     (truth / "emission.json").write_bytes(b"\xff\xfe\x00[")
-    with pytest.raises(UserError, match=r"emission.json: the file is not readable JSON"):
+    with pytest.raises(UserError, match=r"emission.json: the file is not UTF-8 text"):
         true_emission(truth.parent)
 
 
@@ -173,3 +173,16 @@ def test_the_picture_is_what_mitsuba_would_load(truth, tmp_path):
     # The picture has sharp edges, which two grids that do not coincide blur.
     assert np.median(np.abs(found - true)) < 0.01
     assert np.abs(found - true).mean() < 0.05
+
+
+@pytest.mark.parametrize("name", ["environment.exr", "emission.json"])
+def test_true_lighting_is_not_read_through_a_link_out_of_the_folder(name, built_in, tmp_path):
+    data = tmp_path / "data"
+    (data / "truth").mkdir(parents=True)
+    write_true_lighting(built_in("still" if name == "environment.exr" else "cornell"), data)
+    moved = (data / "truth" / name).rename(tmp_path / name)
+    (data / "truth" / name).symlink_to(moved)
+    read = true_environment if name == "environment.exr" else true_emission
+    with pytest.raises(UserError, match=f"'truth/{name}' lies outside the data folder"):
+        read(data)
+    assert len(read(data, allow_outside=True))

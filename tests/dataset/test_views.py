@@ -1,6 +1,7 @@
 """Data folders: what is written is read back, and every mistake is one clear error."""
 
 import json
+import os
 
 import mitsuba as mi
 import numpy as np
@@ -184,9 +185,10 @@ NAN_POSE = [[float("nan")] * 4] * 4
         (set_frame("file_path", "other/train_000.exr"), "two frames are named 'train_000'"),
         (set_frame("file_path", "../../a.exr"), "'../../a.exr' lies outside"),
         (set_frame("file_path", "a\0.exr"), "is not a path"),
+        (set_frame("file_path", "images/\ud800.exr"), "is not a path"),
         (set_frame("file_path", "file:///a.exr"), "the image does not exist"),
         (set_frame("file_path", "C:\\a.exr"), "the image does not exist"),
-        (set_frame("file_path", "images"), "the image does not exist"),
+        (set_frame("file_path", "images"), "images: the image cannot be read .Is a directory"),
         (set_frame("split", "val"), r"frame 1 \(train_001.exr\): unknown split 'val'"),
         (set_frame("transform_matrix", MIRRORED), r"\(train_001.exr\): the pose is left-handed"),
         (set_frame("transform_matrix", NAN_POSE), "the pose has NaN"),
@@ -209,7 +211,7 @@ def test_a_wrong_entry_is_one_clear_error(folder, edit, message):
 @pytest.mark.parametrize("content", ["", "{", "[1]", "\x80", "[" * 100000])
 def test_a_file_that_is_no_json_object_is_refused(folder, content):
     (folder / "transforms.json").write_text(content, encoding="latin-1")
-    refused(folder, "transforms.json: the file (is not readable JSON|does not hold)")
+    refused(folder, "transforms.json: the file (is not|does not hold)")
 
 
 def test_a_missing_folder_or_file_is_named(folder, tmp_path):
@@ -222,7 +224,43 @@ def test_a_link_out_of_the_folder_is_refused(folder, tmp_path):
     write_exr(tmp_path / "secret.exr", picture(0))
     (folder / "images" / "train_001.exr").unlink()
     (folder / "images" / "train_001.exr").symlink_to(tmp_path / "secret.exr")
-    refused(folder, "lies outside the data folder")
+    assert "--allow-outside" in refused(folder, "lies outside the data folder").remedy
+    assert len(Dataset.load(folder, allow_outside=True).views) == 3
+
+
+@pytest.mark.parametrize("place", ["truth", "truth/albedo", "truth/albedo/train_000.exr"])
+def test_no_truth_is_read_through_a_link_out_of_the_folder(folder, tmp_path, place):
+    moved = (folder / place).rename(tmp_path / "elsewhere")
+    (folder / place).symlink_to(moved)
+    message = "'truth/(albedo|roughness)/train_000.exr' lies outside the data folder"
+    assert "--allow-outside" in refused(folder, message).remedy
+    loaded = Dataset.load(folder, allow_outside=True)
+    assert loaded.allow_outside and loaded.views[0].truth["albedo"].is_file()
+
+
+def test_links_within_the_folder_are_followed(folder):
+    (folder / "truth").rename(folder / "materials")
+    (folder / "truth").symlink_to("materials")
+    assert Dataset.load(folder).views[0].truth["albedo"].is_file()
+
+
+def test_transforms_that_are_a_link_out_of_the_folder_are_refused(folder, tmp_path):
+    moved = (folder / "transforms.json").rename(tmp_path / "poses.json")
+    (folder / "transforms.json").symlink_to(moved)
+    refused(folder, "'transforms.json' lies outside the data folder")
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "images/train_001.exr", "scene/scene.xml"])
+def test_a_pipe_in_the_place_of_a_file_is_refused_at_once(folder, name):
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    refused(folder, f"{name}: the .*cannot be read .it is a pipe or a device")
+
+
+def test_a_folder_whose_path_is_not_utf8_is_refused(folder):
+    odd = folder.rename(folder.with_name("d\udcffta"))
+    error = refused(odd, "the path of the data folder is not UTF-8")
+    assert f"d\\xffta: {error.what}" in str(error)
 
 
 @pytest.mark.parametrize("name", ["photo.png", "photo.JPG", "photo.tiff"])

@@ -22,7 +22,7 @@ from typing import Any, final
 
 from ..errors import UserError
 from ..formats import check_format
-from ..io import inside, read_object, relative, write_json
+from ..io import inside, read_object, relative, require_utf8, write_json
 
 #: The file that makes a folder a data set.
 TRANSFORMS = "transforms.json"
@@ -40,9 +40,11 @@ class DataFolder:
 
     Args:
         path: the folder; it need not exist yet.
+        allow_outside: read files that lie elsewhere, by their path or through links.
     """
 
     path: Path
+    allow_outside: bool = False
 
     @property
     def transforms_file(self) -> Path:
@@ -101,7 +103,18 @@ class DataFolder:
         Raises:
             UserError: `name` is not a path, or leads out of the folder.
         """
-        return inside(self.path, name, where, _KIND)
+        return inside(self.path, name, where, _KIND, allow_outside=self.allow_outside)
+
+    def known(self, file: Path) -> bool:
+        """Whether there is such a file of the truth.
+
+        Raises:
+            UserError: it is a link that leads out of the folder.
+        """
+        if not file.is_file():
+            return False
+        self.inside(file.relative_to(self.path).as_posix(), str(self.path))
+        return True
 
     def relative(self, file: Path) -> str:
         """How `transforms.json` names a file of the folder.
@@ -117,14 +130,15 @@ class DataFolder:
         Raises:
             UserError: there is no data set, or the file is damaged or of a newer version.
         """
+        require_utf8(self.path, _KIND)
         if self.path.is_file():
             raise UserError("is a file, not a data folder", self.path, _MAKE_DATA)
         if not self.path.is_dir():
             raise UserError("the data folder does not exist", self.path, "Check the path")
         file = self.transforms_file
-        if not file.is_file():
+        if not file.exists():
             raise UserError(f"no {TRANSFORMS} in the folder", self.path, "Is this a data folder?")
-        content = read_object(file)
+        content = read_object(self.inside(TRANSFORMS, str(self.path)))
         check_format(content, FORMAT, file)
         return content
 

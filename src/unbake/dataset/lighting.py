@@ -37,8 +37,12 @@ def write_true_lighting(scene: Path, data: Path) -> None:
         write_exr(folder.environment_file, np.dstack([picture, np.ones(picture.shape[:2])]))
 
 
-def true_environment(data: Path) -> np.ndarray | None:
+def true_environment(data: Path, *, allow_outside: bool = False) -> np.ndarray | None:
     """The true environment of a data set, in the layout of `latlong`; None without a file.
+
+    Args:
+        data: the data set's folder.
+        allow_outside: follow a link out of the folder.
 
     Returns:
         Linear RGB radiance, float32, shape (ROWS, 2 ROWS, 3).
@@ -46,8 +50,9 @@ def true_environment(data: Path) -> np.ndarray | None:
     Raises:
         UserError: the file cannot be read or has another size.
     """
-    file = DataFolder(data).environment_file
-    if not file.is_file():
+    folder = DataFolder(data, allow_outside)
+    file = folder.environment_file
+    if not folder.known(file):
         return None
     try:
         # A recovered map is never negative, so neither is the truth that it is compared with.
@@ -57,14 +62,19 @@ def true_environment(data: Path) -> np.ndarray | None:
     return picture.reshape(ROWS, 2 * ROWS, 4)[..., :3]
 
 
-def true_emission(data: Path) -> dict[str, np.ndarray]:
+def true_emission(data: Path, *, allow_outside: bool = False) -> dict[str, np.ndarray]:
     """True strengths (3,) of a data set's emitters by name, linear RGB; unknown ones left out.
+
+    Args:
+        data: the data set's folder.
+        allow_outside: follow a link out of the folder.
 
     Raises:
         UserError: the file is damaged.
     """
-    file = DataFolder(data).emission_file
-    if not file.is_file():
+    folder = DataFolder(data, allow_outside)
+    file = folder.emission_file
+    if not folder.known(file):
         return {}
     entries = read_json(file)
     if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):

@@ -16,7 +16,7 @@ from unbake.dataset.camera import Camera, camera_from_frame, read_split
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError
-from unbake.io import text
+from unbake.io import require_file, text
 from unbake.quantities import QUANTITIES
 from unbake.scene import free_space
 from unbake.transport.light_by_depth import depth_of_light, light_of_depth
@@ -66,6 +66,7 @@ class Dataset:
         light_by_depth: shares of the light that surfaces reflect to the training views on paths of
             depth 1, 2, … at most (Mitsuba's meaning: 2 is direct illumination), not decreasing;
             deeper paths add nothing. Empty if unknown.
+        allow_outside: whether files may lie outside the folder.
     """
 
     folder: Path
@@ -75,6 +76,7 @@ class Dataset:
     render: dict[str, Any]
     coverage: float | None
     light_by_depth: tuple[float, ...] = ()
+    allow_outside: bool = False
 
     def depth_of_light(self, share: float) -> int | None:
         """The smallest depth of paths that carry this share of the light; None if unknown."""
@@ -100,29 +102,30 @@ class Dataset:
         return tuple(view for view in self.views if view.split == "heldout")
 
     @classmethod
-    def load(cls, folder: Path) -> Dataset:
+    def load(cls, folder: Path, *, allow_outside: bool = False) -> Dataset:
         """Read a data folder and check all of it but the pixels: those when they are read.
 
         Args:
             folder: has a nerfstudio `transforms.json`; frames without "split" are for training.
+            allow_outside: read files that lie outside the folder, by their path or through links.
 
         Raises:
             UserError: anything is missing, malformed, outside the folder, or not a valid camera,
                 or an image is not HDR or of another size than its frame says. It names the file
                 and the remedy.
         """
-        data = DataFolder(Path(folder))
+        data = DataFolder(Path(folder), allow_outside)
         top, file = data.read_transforms(), data.transforms_file
         scene = data.inside(text(top, "scene", str(file)), f"{file}: 'scene'")
-        if not scene.is_file():
-            raise UserError("the scene file does not exist", scene, f"Set 'scene' in {file}")
+        require_file(scene, "scene file", f"Set 'scene' in {file}")
         views = _read_views(data, file, top)
         for view in views:
             for image in (view.image, *view.truth.values()):
                 _check_header(image, view.camera.width, view.camera.height)
         render, seen = _provenance(top, file)
         light = _light_by_depth(top, file)
-        return cls(data.path, scene, _background(top, file), views, render, seen, light)
+        background = _background(top, file)
+        return cls(data.path, scene, background, views, render, seen, light, allow_outside)
 
     def save(self, folder: Path) -> None:
         """Write `transforms.json` into a folder, atomically; images are not touched.
@@ -224,7 +227,7 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
         split,
         camera,
         image,
-        {name: file for name, file in known.items() if file.is_file()},
+        {name: file for name, file in known.items() if data.known(file)},
     )
 
 
@@ -250,8 +253,7 @@ def _check_header(path: Path, width: int, height: int) -> None:
     """Refuse what cannot be an HDR image of that size, without reading its pixels."""
     if path.suffix.lower() in _LDR_SUFFIXES:
         raise UserError("the image is low dynamic range", path, _NEED_HDR)
-    if not path.is_file():
-        raise UserError("the image does not exist", path, _REPLACE)
+    require_file(path, "image", _REPLACE)
     if path.suffix.lower() not in _HDR_SUFFIXES:
         raise UserError(f"unknown image format {path.suffix!r}", path, _NEED_HDR)
     try:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..io import write_atomically
+from ..io import require_file, write_atomically
 
 #: How values become a picture: colours through the sRGB curve, other data without a curve.
 Display = Literal["colour", "data"]
@@ -39,8 +39,7 @@ def read_exr(path: Path) -> np.ndarray:
         UserError: the file is missing, is not OpenEXR, or is cut off.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError("there is no such picture", path)
+    require_file(path, "picture")
     try:
         bitmap = mi.Bitmap(str(path), mi.Bitmap.FileFormat.OpenEXR)
     except RuntimeError as error:
