@@ -1,4 +1,4 @@
-"""Memory that a step takes, and memory that this process can still have."""
+"""Memory that a step takes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,8 @@ import mitsuba as mi
 import psutil
 
 from ..backend import CUDA_VARIANT
-from ..errors import UserError
 
 _PROCESS = Path("/proc/self")
-#: Limit and use of a control group, such as a container: psutil 7 knows those of the machine only.
-_LIMITS = (
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-)
 
 
 def peak_bytes(work: Callable[[], None]) -> int | None:
@@ -56,20 +50,6 @@ def memory_mb() -> float:
     return psutil.Process().memory_info().rss / 1e6
 
 
-def free_bytes() -> int | None:
-    """Memory that this process can still take, within its control group; None without /proc."""
-    try:
-        free = psutil.virtual_memory().available
-    except OSError:
-        return None
-    for limit, used in _LIMITS:
-        try:
-            free = min(free, int(Path(limit).read_text()) - int(Path(used).read_text()))
-        except (OSError, ValueError):  # no such group, or one without a limit
-            continue
-    return max(0, free)
-
-
 def _peak_resident() -> int:
     lines = (_PROCESS / "status").read_text().splitlines()
     return 1024 * int(next(x for x in lines if x.startswith("VmHWM:")).split()[1])
@@ -102,21 +82,3 @@ def forecast_bytes(probe: Callable[[int], None], pixels: int, spp: int) -> float
     if fewer is None or more is None:
         return None
     return more + max(0, more - fewer) * (pixels / few - 2)
-
-
-def require_memory(need: float | None, method: str, paths: int) -> None:
-    """Raise an error if a step would need more memory than there is free.
-
-    Args:
-        need: bytes; None where that is not known.
-        method: its name, for the message.
-        paths: of the step.
-
-    Raises:
-        UserError: the step would need more.
-    """
-    free = free_bytes()
-    if need is not None and free is not None and need > free:
-        what = f"{method} needs about {need / 1e9:.1f} GB of memory for a step of"
-        what += f" {paths} paths, {free / 1e9:.1f} GB are free"
-        raise UserError(what, None, SMALLER)

@@ -19,11 +19,12 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
 from ..errors import UserError
+from ..memory import require_memory
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
 from .loss_scaling import gradients_are_finite, next_scale
-from .memory import SMALLER, forecast_bytes, lacks_memory, require_memory
+from .memory import SMALLER, forecast_bytes, lacks_memory
 from .problem import Problem
 from .regularizers import regularization_terms
 from .state import State
@@ -123,7 +124,10 @@ class TrainingStep:
         """
         if self._fits_memory:
             return
-        require_memory(self.bytes_needed(state), self._config.method, self._config.samples_per_pass)
+        paths, method = self._config.samples_per_pass, self._config.method
+        require_memory(
+            self.bytes_needed(state), f"a step of {paths} paths by {method} needs", SMALLER
+        )
         self._fits_memory = True
 
     def bytes_needed(self, state: State) -> float | None:
