@@ -6,12 +6,13 @@ What is wrong with a file becomes a `UserError`.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
 import os
 import secrets
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,25 @@ def remove_unfinished(folder: Path) -> None:
     """Delete the temporary files that a killed `write_atomically` left in a folder."""
     for temporary in folder.glob(".*.tmp"):
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[bool]:
+    """Hold a folder, after waiting for other processes that do; the lock ends with the process.
+
+    Yields:
+        Whether it is held: some network file systems have no locks.
+    """
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX)
+            held = True
+        except OSError:
+            held = False
+        yield held
+    finally:
+        os.close(number)
 
 
 def write_text(path: Path, content: str, *, durable: bool = False) -> None:

@@ -2,6 +2,9 @@
 
 import json
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -9,6 +12,7 @@ import pytest
 
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
+from unbake.dataset.outliers import told_outliers, without_outliers
 from unbake.dataset.photographs import DARKEST_BLUR, Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.dataset.views import Dataset, View
@@ -191,7 +195,18 @@ def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
 
 @pytest.mark.parametrize(
     "change",
-    ["another image", "clipped", "interrupted", "damaged key", "odd key", "cut table", "old blur"],
+    [
+        "another image",
+        "clipped",
+        "interrupted",
+        "damaged key",
+        "odd key",
+        "cut table",
+        "spoilt table",
+        "spoilt numbers",
+        "pipe",
+        "old blur",
+    ],
 )
 def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch, change):
     made = dataset()
@@ -213,6 +228,16 @@ def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch,
         (made.folder / ".cache" / "key.json").write_text(json.dumps(key))
     elif change == "cut table":
         os.truncate(made.folder / ".cache" / "photographs.npy", 40)
+    elif change == "spoilt table":
+        table = np.lib.format.open_memmap(made.folder / ".cache" / "photographs.npy", "r+")
+        table[3] = np.nan
+        table.flush()
+        os.utime(made.folder / ".cache" / "photographs.npy")
+    elif change == "spoilt numbers":
+        np.save(made.folder / ".cache" / "foreground.npy", np.full(70, 10**6, np.uint32))
+    elif change == "pipe":
+        (made.folder / ".cache" / "photographs.npy").unlink()
+        os.mkfifo(made.folder / ".cache" / "photographs.npy")
     read = []
     decode = module.read_image
     monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))
@@ -238,4 +263,157 @@ def test_no_room_for_the_file_is_told_in_one_line(dataset, on_disk, monkeypatch)
     with pytest.raises(UserError, match=r"cannot be written .No space left") as caught:
         Photographs.load(made, False)
     assert "Make room" in caught.value.remedy
-    assert not list(made.folder.glob("**/photographs.npy"))
+    assert not (made.folder / ".cache").exists()
+
+
+def test_a_disk_that_is_too_small_is_told_with_both_numbers(dataset, on_disk, monkeypatch):
+    made = dataset()
+    usage = module.shutil.disk_usage(made.folder)
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=100))
+    with pytest.raises(UserError, match=r"take 0\.0 GB, 0\.0 GB are free"):
+        Photographs.load(made, False)
+    assert not (made.folder / ".cache").exists()
+
+
+def test_a_refused_image_leaves_nothing_behind(dataset, on_disk):
+    made = dataset()
+    made.train[2].image.write_bytes(b"no image")
+    with pytest.raises(UserError):
+        Photographs.load(made, False)
+    assert not (made.folder / ".cache").exists()
+
+
+def other_image(made):
+    mi.Bitmap(np.full((HEIGHT, WIDTH, 4), 0.5, np.float32)).write(str(made.train[1].image))
+    os.utime(made.train[1].image, ns=(1, 1))
+
+
+def test_a_file_that_a_fit_has_mapped_stays_as_it_is(dataset, on_disk):
+    """A second fit remade it in place: the first one read other pixels, or died by SIGBUS."""
+    made = dataset()
+    Photographs.load(made, False)
+    first = Photographs.load(made, False)
+    before = first.table.copy(), first.chosen.copy()
+    other_image(made)
+    second = Photographs.load(made, False)
+    np.testing.assert_array_equal(first.table, before[0])
+    np.testing.assert_array_equal(first.chosen, before[1])
+    assert (second.table[WIDTH * HEIGHT, :3] == 0.5).all()
+
+
+def test_two_fits_at_once_decode_once(dataset, on_disk, monkeypatch):
+    made, read, decode = dataset(), [], module.read_image
+
+    def slowly(*arguments):
+        read.append(arguments)
+        time.sleep(0.1)
+        return decode(*arguments)
+
+    monkeypatch.setattr(module, "read_image", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: Photographs.load(made, False), range(4)))
+    assert len(read) == len(made.train)
+    for one in found:
+        np.testing.assert_array_equal(one.table, found[0].table)
+    assert sorted(p.name for p in (made.folder / ".cache").iterdir()) == [
+        "foreground.npy",
+        "key.json",
+        "photographs.npy",
+    ]
+
+
+def test_fits_of_other_settings_at_once_each_have_their_own(dataset, on_disk):
+    made = dataset()
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda i: Photographs.load(made, bool(i % 2)), range(12)))
+    for one in found:
+        np.testing.assert_array_equal(one.table[:, :3], rgba(made)[:, :3])
+
+
+def test_what_a_killed_fit_has_left_is_removed(dataset, on_disk):
+    made = dataset()
+    (made.folder / ".cache").mkdir()
+    (made.folder / ".cache" / ".photographs.npy.0123456789abcdef.tmp").write_bytes(b"half")
+    Photographs.load(made, False)
+    assert not list((made.folder / ".cache").glob(".*"))
+
+
+@pytest.mark.parametrize("name", ["photographs.npy", "foreground.npy", "key.json"])
+def test_nothing_is_written_through_a_link_in_the_cache(dataset, on_disk, name):
+    made = dataset()
+    victim = made.folder / "victim"
+    victim.write_text("mine")
+    (made.folder / ".cache").mkdir()
+    (made.folder / ".cache" / name).symlink_to(victim)
+    found = Photographs.load(made, False)
+    np.testing.assert_array_equal(found.table[:, :3], rgba(made)[:, :3])
+    assert victim.read_text() == "mine" and not (made.folder / ".cache" / name).is_symlink()
+
+
+def test_a_cache_that_is_a_link_is_refused(dataset, on_disk, tmp_path):
+    made = dataset()
+    (tmp_path / "elsewhere").mkdir()
+    (made.folder / ".cache").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="cache: the cache is a link") as caught:
+        Photographs.load(made, False)
+    assert "--allow-outside" in caught.value.remedy
+    assert not list((tmp_path / "elsewhere").iterdir())
+    Photographs.load(replace(made, allow_outside=True), False)
+    assert len(list((tmp_path / "elsewhere").iterdir())) == 3
+
+
+def test_more_pixels_than_there_are_numbers_are_refused(dataset):
+    made = dataset()
+    huge = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, 65_000, 65_000)
+    views = [replace(view, camera=huge) for view in made.views]
+    with pytest.raises(UserError, match=r"have 12,675,000,000 pixels, more than 4,294,967,295"):
+        Photographs.load(replace(made, views=views), False)
+
+
+# ------------------------------------------------------------------------------------- Outliers
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_a_pixel_that_is_far_too_bright_is_told_and_made_as_dark_as_others(
+    tmp_path, monkeypatch, where
+):
+    if where == "disk":
+        monkeypatch.setattr(module, "IN_MEMORY", 0)
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, 20, 16)
+    rng = np.random.default_rng(1)
+    views = []
+    for i in range(5):
+        rgba = np.ones((16, 20, 4), np.float32)
+        rgba[..., :3] = rng.uniform(0.1, 0.9, (16, 20, 3))
+        if i != 3:
+            rgba[7, 11, :3] = 1e8, 5e7, 0
+        mi.Bitmap(rgba).write(str(tmp_path / f"{i}.exr"))
+        views.append(View(f"{i}", "train", camera, tmp_path / f"{i}.exr", {}))
+    made = Dataset(tmp_path, tmp_path / "s.xml", "visible", views, {}, None)
+    for _ in range(2):  # decoded, and from the cache
+        found = Photographs.load(made, False)
+        pixel, limit = found.table[7 * 20 + 11], found.outliers[0].limit
+        assert 0.8 < limit < 0.9 and 0.4 < found.mean < 0.6
+        np.testing.assert_allclose(pixel[:3], [limit, limit / 2, 0], rtol=1e-5)
+        assert found.table[:, 3:].max() < 1
+        assert [o.view for o in found.outliers] == ["0", "1", "2", "4"]
+        line = told_outliers(found.outliers)
+        assert line.startswith(
+            "4 pixels are over 10,000 times as bright as the others: "
+            f"0 at (11, 7): 1e+08, taken as {limit:.3g}; 1 at (11, 7)"
+        )
+        assert line.endswith("; and 1 more")
+
+
+def test_a_lamp_in_a_dark_room_is_no_outlier():
+    rng = np.random.default_rng(1)
+    pixels = np.c_[rng.uniform(0.001, 0.01, (4096, 3)), np.ones(4096)].astype(np.float32)
+    pixels[:3, :3] = 50
+    kept, found = without_outliers(pixels, np.ones(4096, bool), "a", 64)
+    assert kept is pixels and found is None
+    # Nor is the background that is not trained on, nor anything in a black photograph
+    pixels[3, :3] = 1e9
+    counted = np.arange(4096) != 3
+    assert without_outliers(pixels, counted, "a", 64)[1] is None
+    pixels[4:, :3] = 0
+    assert without_outliers(pixels, np.ones(4096, bool), "a", 64)[1] is None

@@ -116,6 +116,15 @@ class DataFolder:
         self.inside(file.relative_to(self.path).as_posix(), str(self.path))
         return True
 
+    def require_own_cache(self) -> None:
+        """Raise a `UserError` if the cache would be written through a link."""
+        if self.cache.is_symlink() and not self.allow_outside:
+            raise UserError(
+                "the cache is a link, and nothing is written through it",
+                self.cache,
+                "Remove it, or pass --allow-outside",
+            )
+
     def relative(self, file: Path) -> str:
         """How `transforms.json` names a file of the folder.
 

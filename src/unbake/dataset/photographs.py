@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
+import shutil
+import stat
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from ..errors import UserError
-from ..io import read_object, write_json
+from ..io import locked, read_object, remove_unfinished, temporary_beside, write_json
 from .camera import Camera
 from .data_folder import DataFolder
+from .outliers import Outliers, without_outliers
 from .views import Dataset, View, read_image
 
 #: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
@@ -28,6 +33,8 @@ _RADIUS = 2
 #: blur is there against noise, and noise does not make a pixel four times as bright as the mean
 #: around it. A brighter one is a firefly, which weighed up to 25² = 625 times as much.
 DARKEST_BLUR = 0.25
+#: Pixels are numbered in 32 bits.
+_MOST_PIXELS = (1 << 32) - 1
 
 
 @final
@@ -42,6 +49,7 @@ class Photographs:
             background pixels say nothing about the scene and only those with alpha > 0 are taken
             (the paper: at least half of them).
         mean: mean radiance of the pixels to train on.
+        outliers: pixels that were too bright and are not as in the images, by view.
 
     Paper: Sec. 5.4.
     """
@@ -49,6 +57,7 @@ class Photographs:
     table: np.ndarray
     chosen: np.ndarray | None
     mean: float
+    outliers: tuple[Outliers, ...] = ()
 
     @property
     def count(self) -> int:
@@ -103,10 +112,13 @@ class Photographs:
         views = dataset.train
         hidden = dataset.background == "hidden"
         count = sum(view.camera.width * view.camera.height for view in views)
+        if count > _MOST_PIXELS:
+            what = f"the training views have {count:,} pixels, more than {_MOST_PIXELS:,}"
+            raise UserError(what, dataset.folder, "Use fewer views, or smaller images")
         columns = _WITH_BLURRED if smoothed else _COLUMNS
         if 4 * columns * count <= IN_MEMORY:
             table = np.empty((count, columns), np.float32)
-            return _fill(table, _decoded(views, clip_negative), hidden)
+            return _decode_into(table, views, clip_negative, hidden)
         return _cached(dataset, views, count, columns, clip_negative, hidden)
 
 
@@ -114,10 +126,23 @@ def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:
     return np.split(pixels, np.cumsum([c.width * c.height for c in cameras])[:-1])
 
 
-def _decoded(views: Sequence[View], clip_negative: bool) -> Iterator[tuple[Camera, np.ndarray]]:
-    for view in views:
-        camera = view.camera
-        yield camera, read_image(view.image, camera.width, camera.height, clip_negative)
+def _decode_into(
+    table: np.ndarray, views: Sequence[View], clip_negative: bool, foreground_only: bool
+) -> Photographs:
+    """Put the images of views into a table, but for what is too bright in them."""
+    outliers: list[Outliers] = []
+
+    def images() -> Iterator[tuple[Camera, np.ndarray]]:
+        for view in views:
+            camera = view.camera
+            pixels = read_image(view.image, camera.width, camera.height, clip_negative)
+            counted = pixels[:, 3] > 0 if foreground_only else np.ones(len(pixels), bool)
+            pixels, found = without_outliers(pixels, counted, view.name, camera.width)
+            if found is not None:
+                outliers.append(found)
+            yield camera, pixels
+
+    return replace(_fill(table, images(), foreground_only), outliers=tuple(outliers))
 
 
 def _fill(
@@ -176,7 +201,7 @@ def _cached(
     hidden: bool,
 ) -> Photographs:
     """Photographs in a file that is made where it is missing, or made from other images."""
-    data = DataFolder(dataset.folder)
+    data = DataFolder(dataset.folder, dataset.allow_outside)
     key = {
         "images": [[str(v.image), v.image.stat().st_mtime_ns] for v in views if v.image.is_file()],
         "pixels": count,
@@ -186,57 +211,135 @@ def _cached(
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": _RADIUS, "darkest": DARKEST_BLUR, "within": "pixels to train on"},
     }
+    data.require_own_cache()
+    found = _find_cache(data, key)
+    if found is not None:
+        return found
+    try:
+        with locked(data.path) as alone:
+            # Another fit may have made it meanwhile
+            return _find_cache(data, key) or _write_cache(data, views, key, sweep=alone)
+    except OSError as error:
+        raise UserError(
+            f"the decoded photographs cannot be written ({error.strerror})",
+            data.cache,
+            f"They take {_size(key) / 1e9:.1f} GB. Make room, or the folder writable",
+        ) from None
+
+
+def _find_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
+    """The cached photographs of these images, if there are any."""
     found = _open_cache(data, key)
-    if found is None and columns < _WITH_BLURRED:
+    if found is None and key["columns"] < _WITH_BLURRED:
         # A fit that asked for more has left a file that will do.
         found = _open_cache(data, key | {"columns": _WITH_BLURRED})
         if found is not None:
-            found = replace(found, table=found.table[:, :columns])
-    if found is None:
-        try:
-            _write_cache(data, views, key)
-        except OSError as error:
-            raise UserError(
-                f"the decoded photographs cannot be written ({error.strerror})",
-                data.cache,
-                f"They take {4 * columns * count / 1e9:.1f} GB. Make room, or the folder writable",
-            ) from None
-        found = _open_cache(data, key)
-    if found is None:
-        raise UserError("the decoded photographs cannot be read back", data.cache, "Remove it")
+            found = replace(found, table=found.table[:, : key["columns"]])
     return found
 
 
-def _open_cache(data: DataFolder, key: dict) -> Photographs | None:
-    """The cached photographs, if the files are complete and of these images."""
+def _open_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
+    """The cached photographs, if the files are complete and as they were written."""
     try:
-        stored = read_object(data.cache_key)
-        if stored != {"key": key, "mean": stored["mean"]}:
+        if _stamp(data.cache_key) is None:
             return None
-        table, chosen = np.load(data.cached_photographs, mmap_mode="r"), None
+        stored = read_object(data.cache_key)
+        if stored["key"] != key or not math.isfinite(stored["mean"]):
+            return None
+        shape = (key["pixels"], key["columns"])
+        table, chosen = _mapped(data.cached_photographs, stored["table"], np.float32, shape), None
         if key["foreground_only"]:
-            chosen = np.load(data.cached_foreground, mmap_mode="r")
-    except (UserError, OSError, ValueError, KeyError):
+            shape = (stored["foreground_pixels"],)
+            chosen = _mapped(data.cached_foreground, stored["foreground"], np.uint32, shape)
+            if chosen.max(initial=0) >= len(table):
+                return None
+        outliers = tuple(Outliers(**entry) for entry in stored["outliers"])
+    except (UserError, OSError, ValueError, KeyError, TypeError):
         return None
-    return Photographs(table, chosen, stored["mean"])
+    return Photographs(table, chosen, float(stored["mean"]), outliers)
 
 
-def _write_cache(data: DataFolder, views: Sequence[View], key: dict) -> None:
+def _mapped(path: Path, stamp: list[int], kind: type, shape: tuple[int, ...]) -> np.ndarray:
+    """An array in a file, if it is the one that has this stamp; a `ValueError` otherwise."""
+    if _stamp(path) != stamp:
+        raise ValueError(path)
+    array = np.load(path, mmap_mode="r")
+    # Another fit may have replaced the file in between
+    if _stamp(path) != stamp or array.dtype != kind or array.shape != shape:
+        raise ValueError(path)
+    return array
+
+
+def _stamp(path: Path) -> list[int] | None:
+    """Size and time of a file, which change when it is written to; None for links and pipes."""
+    found = path.lstat()
+    return [found.st_size, found.st_mtime_ns] if stat.S_ISREG(found.st_mode) else None
+
+
+def _write_cache(
+    data: DataFolder, views: Sequence[View], key: dict[str, Any], *, sweep: bool
+) -> Photographs:
+    """Decode photographs into new files, which then take their names.
+
+    Files are never written anew in place: other fits may have mapped them, and those that map a
+    file that shrinks die by SIGBUS.
+
+    Args:
+        sweep: remove what killed fits have left, as no other one writes.
+    """
     data.cache.mkdir(exist_ok=True)
-    # The key is written last: without it the rest is taken for unfinished.
-    data.cache_key.unlink(missing_ok=True)
-    path = data.cached_photographs
-    table = np.lib.format.open_memmap(path, "w+", np.float32, (key["pixels"], key["columns"]))
+    files = data.cached_photographs, data.cached_foreground
+    table_file, foreground_file = map(temporary_beside, files)
     try:
-        _reserve(path)
-    except OSError:
-        path.unlink()
-        raise
-    made = _fill(table, _decoded(views, key["clip_negative"]), key["foreground_only"])
-    table.flush()
-    if made.chosen is not None:
-        np.save(data.cached_foreground, made.chosen)
-    write_json(data.cache_key, {"key": key, "mean": made.mean})
+        if sweep:
+            remove_unfinished(data.cache)
+        # What is there is of other images: its room comes free when no fit uses it any more
+        for file in (data.cache_key, *files):
+            file.unlink(missing_ok=True)
+        _require_disk(data.cache, _size(key))
+        shape = (key["pixels"], key["columns"])
+        table = np.lib.format.open_memmap(table_file, "w+", np.float32, shape)
+        _reserve(table_file)
+        made = _decode_into(table, views, key["clip_negative"], key["foreground_only"])
+        table.flush()
+        stored = {"key": key, "mean": made.mean, "table": _stamp(table_file)}
+        if made.chosen is not None:
+            with foreground_file.open("xb") as file:
+                np.save(file, made.chosen)
+                file.flush()
+                os.fsync(file.fileno())
+            stored |= {
+                "foreground": _stamp(foreground_file),
+                "foreground_pixels": len(made.chosen),
+            }
+            made = replace(made, chosen=np.load(foreground_file, mmap_mode="r"))
+            foreground_file.rename(data.cached_foreground)
+        table_file.rename(data.cached_photographs)
+        # The key is written last: without it the rest is taken for unfinished.
+        outliers = [asdict(found) for found in made.outliers]
+        write_json(data.cache_key, stored | {"outliers": outliers}, durable=True)
+    finally:
+        for file in (table_file, foreground_file):
+            file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            data.cache.rmdir()  # if nothing was made
+    table.flags.writeable = False
+    return made
+
+
+def _size(key: dict[str, Any]) -> int:
+    """Bytes that the files take at most."""
+    return 4 * key["pixels"] * (key["columns"] + key["foreground_only"])
+
+
+def _require_disk(folder: Path, need: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if need > free:
+        raise UserError(
+            f"the decoded photographs take {need / 1e9:.1f} GB, {free / 1e9:.1f} GB are free",
+            folder,
+            "Make room, or use fewer or smaller images",
+        )
 
 
 def _reserve(path: Path) -> None:

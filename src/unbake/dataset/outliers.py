@@ -1,0 +1,87 @@
+"""Pixels of photographs that are too bright to be measurements, such as fireflies of a renderer.
+
+One such pixel is most of the mean radiance of all photographs, and of every batch that it is in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import printable
+
+#: A pixel is an outlier if it is so many times as bright as the brightest of the others. A lamp
+#: that is seen in a dark room is some hundred times as bright as the room.
+EXTREME = 1e4
+#: How many of the brightest pixels of a view may be outliers: a share, but some of a small view.
+_SHARE, _LEAST = 1e-3, 8
+#: Views that are told; of more there is the number.
+_TOLD = 3
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """The outliers of a view.
+
+    Args:
+        view: its name.
+        count: of outliers.
+        column, row: of the brightest, from the top left.
+        value: of the brightest: its largest channel, linear.
+        limit: what the largest channel of outliers was set to.
+    """
+
+    view: str
+    count: int
+    column: int
+    row: int
+    value: float
+    limit: float
+
+
+def without_outliers(
+    pixels: np.ndarray, counted: np.ndarray, view: str, width: int
+) -> tuple[np.ndarray, Outliers | None]:
+    """The pixels of a view, the outliers as dark as the brightest of the others.
+
+    Args:
+        pixels: linear RGB and alpha, row by row, shape (pixels, 4).
+        counted: the pixels to train on, shape (pixels,).
+        view: its name.
+        width: of the view, in pixels.
+
+    Returns:
+        The same array if there are no outliers; else a copy, with the outliers' hue as it was.
+    """
+    brightness = pixels[:, :3].max(axis=1)
+    known = brightness[counted]
+    few = max(_LEAST, int(_SHARE * len(known)))
+    if len(known) <= 2 * few:
+        return pixels, None
+    limit = float(np.partition(known, len(known) - 1 - few)[len(known) - 1 - few])
+    over = counted & (brightness > EXTREME * limit)
+    if limit <= 0 or not over.any():
+        return pixels, None
+    row, column = divmod(int(np.argmax(np.where(over, brightness, 0))), width)
+    pixels = pixels.copy()
+    pixels[over, :3] *= limit / brightness[over, None]
+    value = float(brightness[row * width + column])
+    return pixels, Outliers(view, int(over.sum()), column, row, value, limit)
+
+
+def told_outliers(found: Iterable[Outliers]) -> str | None:
+    """One line on the outliers of all views; None where there are none."""
+    views = list(found)
+    if not views:
+        return None
+    told = [
+        f"{printable(o.view)} at ({o.column}, {o.row}): {o.value:.3g}, taken as {o.limit:.3g}"
+        for o in views[:_TOLD]
+    ]
+    if len(views) > _TOLD:
+        told.append(f"and {len(views) - _TOLD} more")
+    count = sum(o.count for o in views)
+    pixels = "1 pixel is" if count == 1 else f"{count} pixels are"
+    return f"{pixels} over {EXTREME:,.0f} times as bright as the others: " + "; ".join(told)
