@@ -192,10 +192,13 @@ STEP_METHODS = (
     "prb:neural:two-pass", "prb:neural:split-halves", "ours:bitmap", "prb:bitmap:two-pass",
     "prb:bitmap:split-halves", "ours:grid", "prb:grid:two-pass", "prb:grid:split-halves",
 )  # fmt: skip
-#: The estimator of PRB that is not its default in rooms.
+#: The estimator of PRB and AD-PT that is not their default in rooms.
 _OF_PRB = method_defaults.method_defaults("prb", "room").estimator
 OTHER_ESTIMATOR = "two-pass" if _OF_PRB == "split-halves" else "split-halves"
-ROOM_RIVALS = ("ours", "prb", f"prb:neural:{OTHER_ESTIMATOR}", "ad-pt", "direct", "no-prior")
+ROOM_RIVALS = (
+    "ours", "prb", f"prb:neural:{OTHER_ESTIMATOR}", "ad-pt", f"ad-pt:neural:{OTHER_ESTIMATOR}",
+    "direct", "no-prior",
+)  # fmt: skip
 RIVALS = (*ROOM_RIVALS, "prb:bitmap")
 ROOM = "staircase.toml"
 

@@ -50,7 +50,7 @@ def summary(folders: Sequence[Path], groups: Sequence[str] = ()) -> Row:
     """
     comparisons = [read(folder / "compare.json") for folder in folders]
     for folder, comparison in zip(folders, comparisons, strict=True):
-        for name, row in comparison["methods"].items():
+        for name, row in {"untrained": comparison["untrained"], **comparison["methods"]}.items():
             if groups and "error" not in row:
                 row["heldout"] |= _of_groups(RunFolder(folder / name).metrics(), groups)
     return summarized(comparisons)

@@ -114,6 +114,55 @@ def targets(end: dict, runs: dict) -> list[dict]:
     return rows
 
 
+def at_end(result: dict, quantity: str) -> list[dict]:
+    """When ours has what each rival has at the end of its time, seed by seed, in equal schedules.
+
+    Returns:
+        For each rival with scores: `name`; `psnr` of its smoothed end in dB, `seconds` that its
+        fit took, `ours`: seconds after which ours first has it, `times`: the ratio; means over
+        seeds, with KEY_sd. `seeds` of them, `never` without ours, and `level`, the number whose
+        rival ends no higher than it began. `ours` and `times` are absent where one of these is not
+        zero.
+    """
+    rows, ours = [], scores(result["methods"]["ours"])
+    for name, row in result["methods"].items():
+        curves = [] if name == "ours" or "error" in row else scores(row)
+        pairs = [{name: a, "ours": b} for a, b in zip(curves, ours, strict=False)]
+        ends = [
+            target
+            for pair in pairs
+            for target in convergence.time_to_quality(pair)
+            if (target.run, target.quantity, target.below) == (name, quantity, 0.0)
+        ]
+        if not ends:
+            continue
+        times = [target.seconds["ours"] for target in ends]
+        level = sum(target.seconds[name] == 0 for target in ends)
+        found = {"name": name, "quantity": quantity, "seeds": len(ends), "level": level}
+        found |= {"never": times.count(None), "seconds": row["seconds"]}
+        found |= spread_of("psnr", [target.psnr for target in ends])
+        if None not in times and not level:
+            ratios = [row["seconds"] / t for t in times if t]
+            found |= spread_of("ours", times) | spread_of("times", ratios)
+        rows.append(found)
+    return rows
+
+
+def equal_schedules(result: dict) -> str:
+    """`at_end` of albedo and roughness as a table."""
+    rows = []
+    for row in (row for quantity in ("albedo", "roughness") for row in at_end(result, quantity)):
+        if "ours" in row:
+            told = f"{plus_minus(row, 'ours', 1)} s", plus_minus(row, "times", 1)
+        elif row["level"]:
+            told = f"untrained fields have it in {row['level']} of {row['seeds']} runs", ""
+        else:
+            told = f"not in {row['never']} of {row['seeds']} runs", ""
+        rows.append([row["quantity"], f"`{row['name']}`", f"{plus_minus(row, 'psnr')} dB", *told])
+    titles = ["", "rival", "its end", "`ours` after", "times sooner"]
+    return markdown(titles, rows) + over_seeds(result)
+
+
 def time_to_quality(end: dict, runs: dict) -> str:
     """`targets` as a table."""
     found, rows = targets(end, runs), []
@@ -196,11 +245,13 @@ def prior(*results: dict) -> str:
     """The same fits with and without the prior, by what the training cameras see."""
     rows = []
     for case, result in zip(PRIOR.values(), results, strict=True):
-        for name, row in result["methods"].items():
+        for name, row in methods_of(result):
             if "error" in row:
                 rows.append([case, f"`{name}`", row["error"], *[""] * 4])
                 continue
-            seen = "_seen" if "albedo_psnr_seen" in row else ""
+            seen = "_seen" if "albedo_psnr_seen" in result["methods"]["ours"] else ""
+            if f"albedo_psnr{seen}" not in row:
+                continue  # untrained fields, whose groups of views were not scored apart
             keys = [f"{key}_psnr{seen}" for key in ("albedo", "roughness", "render")]
             keys += ["albedo_psnr_unseen", "render_psnr_unseen"]
             rows.append([case, f"`{name}`", *(spread(row, key, 1, 1) for key in keys)])
@@ -249,6 +300,8 @@ TABLES = (
     ("Equal time, demo", ("rivals-demo",), quality),
     ("Equal time, STAIRCASE", ("rivals-staircase",), quality),
     ("Equal samples, demo", ("equal-demo",), quality),
+    ("Equal schedules, demo", ("rivals-demo",), equal_schedules),
+    ("Equal schedules, STAIRCASE", ("rivals-staircase",), equal_schedules),
     ("Time to quality, demo", ("long-demo", "rivals-demo"), time_to_quality),
     ("Time to quality, STAIRCASE", ("long-staircase", "rivals-staircase"), time_to_quality),
     ("Ablation, materials", ("ablation-materials",), spreads(*PSNR)),

@@ -10,7 +10,7 @@ import csv
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -32,10 +32,11 @@ Row = dict[str, Any]
 
 TAKE_OVER = "python scripts/write_docs.py --results reproduction --scenes scenes"
 VERSION_0_1 = """made with version 0.1, where PRB and AD-PT had the learning rates that were found
-for ours and their warm-up, paths of 15 interactions at most (no Russian roulette for AD-PT), and
-mostly one seed. They are being made anew."""
+for ours and their warm-up, and paths of 15 interactions at most (no Russian roulette for AD-PT);
+one seed."""
+OURS_OF_0_1 = "made with version 0.1, without the untrained fields."
 STEPS_OF_0_1 = """step times of version 0.1, where PRB and AD-PT followed paths of 15 interactions
-at most, AD-PT without Russian roulette. They are being measured anew."""
+at most, AD-PT without Russian roulette."""
 NOT_SEARCHED = """The search has not been run yet (`unbake bench rates`): all methods have the rates
 of the fields, which were found for ours."""
 #: What a template may call a number, where it has another key in a file of results.
@@ -117,36 +118,40 @@ class Facts:
         spread = math.hypot(*(row.get(f"{key}_sd") or 0.0 for row in (first, second)))
         return above(difference, spread)
 
-    def versus(self, demo: str, room: str) -> str:
-        """What ours is ahead of each rival in two comparisons; blank where one lacks the rival."""
-        known = {name: self.result(name)["methods"] for name in (demo, room)}
-        quantities = ("albedo", "roughness", "rendering")
-        rows = [
-            [
-                f"`{rival}`",
-                *(
-                    self.gap(name, "ours", rival, q) if rival in methods else ""
-                    for q in quantities
-                    for name, methods in known.items()
-                ),
-            ]
-            for rival in dict.fromkeys(chain.from_iterable(known.values()))
-            if rival != "ours"
-        ]
-        titles = [f"{q}, {scene}" for q in quantities for scene in ("demo", "STAIRCASE")]
-        return markdown(["`ours` against", *titles], rows)
+    def versus(self, *names: str) -> str:
+        """What ours is ahead of each rival in comparisons; blank where one lacks the rival."""
+        rivals = {n: [r for r in self.known(n) if r not in ("ours", "untrained")] for n in names}
+        return side_by_side("`ours` against", rivals, lambda n, r, q: self.gap(n, "ours", r, q))
 
-    def time_to(self, end: str, runs: str, quantity: str, below: float) -> Row:
-        """When the method of a long run and ours have a quality; a mean over seeds of ours.
+    def scores(self, *names: str) -> str:
+        """What all methods have in comparisons, after the untrained fields."""
+        known = {name: self.known(name) for name in names}
+        return side_by_side("", known, lambda n, run, q: plus_minus(known[n][run], KEYS[q]) or "")
 
-        Returns:
-            `psnr` in dB, `rival` and `ours` in seconds, `times`: the ratio. `ours` is None where
-            a seed does not get there.
-        """
-        for row in benchmark_tables.targets(self.result(end), self.result(runs)):
-            if (row["quantity"], row["below"]) == (quantity, below):
+    def known(self, name: str) -> dict[str, Row]:
+        """The rows of a comparison that did not fail, after that of the untrained fields."""
+        rows = benchmark_tables.methods_of(self.result(name))
+        return {run: row for run, row in rows if "error" not in row}
+
+    def seeds(self, name: str) -> str:
+        """How many seeds a comparison is of, in words."""
+        count = len(self.result(name)["seeds"])
+        return "one seed" if count == 1 else f"{count} seeds"
+
+    def best_of(self, name: str, method: str, quantity: str) -> str:
+        """The run of a method with networks, with either estimator, that comes nearest."""
+        runs = {method, *(f"{method}-neural-{e}" for e in ("two-pass", "split-halves"))}
+        found = [run for run in self.known(name) if run in runs]
+        if not found:
+            raise Unfounded(f"{name}.json has no {method}")
+        return max(found, key=lambda run: self.of(name, run, quantity))
+
+    def at_end(self, name: str, rival: str, quantity: str) -> Row:
+        """When ours has what a rival has at the end of its time, in an equal schedule."""
+        for row in benchmark_tables.at_end(self.result(name), quantity):
+            if row["name"] == rival:
                 return row
-        raise Unfounded(f"{end}.json has no {quantity} {below:g} dB below its end")
+        raise Unfounded(f"{name}.json has no scores of {rival}")
 
     def step(self, name: str, method: str, materials: str = "neural", spp: str = "") -> Row:
         """A row of `unbake bench methods`, the first that fits."""
@@ -167,18 +172,30 @@ class Facts:
         paths, and its steps by phase call the phases parts.
         """
         told = []
-        for words, old in ((VERSION_0_1, _old_fits), (STEPS_OF_0_1, _old_steps)):
+        for words, old in (
+            (VERSION_0_1, _old_rivals),
+            (OURS_OF_0_1, lambda result: _old_fits(result) and not _old_rivals(result)),
+            (STEPS_OF_0_1, _old_steps),
+        ):
             files = ", ".join(f"`{name}.json`" for name in names if old(self.result(name)))
             told += [f"{files}: {words}"] if files else []
-        return f"> **Older results.** {' '.join(told)}\n" if told else ""
+        again = " They are to be made anew." if told else ""
+        return f"> **Older results.** {' '.join(told)}{again}\n" if told else ""
 
     def searched(self, method: str) -> bool:
         """Whether the learning rates of a method were searched."""
         searches = self.result("rates")["searches"] if self.has("rates") else []
         return any(search["method"] == method for search in searches)
 
+    def search_gain(self, method: str, kind: str) -> str:
+        """What a search found better than the fields' own rates, in dB."""
+        for search in self.result("rates")["searches"]:
+            if (search["method"], search["kind"]) == (method, kind):
+                return above(search["best"]["score"] - search["trials"][0]["score"])
+        raise Unfounded(f"rates.json has no search of {method} in {kind}s")
+
     def rates_table(self) -> str:
-        """What the search for learning rates found; that there was none, if there is no file."""
+        """What is taken of searches for learning rates; that there was none, without a file."""
         if not self.has("rates"):
             return NOT_SEARCHED
         rows = []
@@ -200,7 +217,7 @@ class Facts:
             "estimator",
             "untrained",
             "own rates",
-            "best",
+            "taken",
             "fits",
         ]
         return markdown(titles, rows)
@@ -336,6 +353,16 @@ def _old_fits(result: Row) -> bool:
     return any("per_seed" not in row and "error" not in row for row in rows.values())
 
 
+def _old_rivals(result: Row) -> bool:
+    """The same with methods that follow paths."""
+    return _old_fits(result) and any(map(_follows_paths, result["methods"]))
+
+
+def _follows_paths(name: str) -> bool:
+    """Whether a run of a comparison is of PRB or AD-PT, by its name."""
+    return name.startswith(("prb", "ad-pt"))
+
+
 def _old_steps(result: Row) -> bool:
     """Whether step times, of several methods or of a machine, are of version 0.1."""
     if "unbake" in result:
@@ -378,6 +405,24 @@ def number_or_text(text: str) -> float | str | None:
     return float(text) if _NUMBER.fullmatch(text) else text
 
 
+def side_by_side(
+    title: str, runs: Mapping[str, Collection[str]], cell: Callable[[str, str, str], str]
+) -> str:
+    """A table of the comparisons of the demo and of STAIRCASE, with two columns a quantity.
+
+    Args:
+        title: of the first column, the names of runs.
+        runs: by the name of the comparison.
+        cell: what is told of a comparison, a run and a quantity.
+    """
+    titles = [f"{q}, {scene}" for q in KEYS for scene in ("demo", "STAIRCASE")]
+    rows = [
+        [f"`{run}`", *(cell(n, run, q) if run in runs[n] else "" for q in KEYS for n in runs)]
+        for run in dict.fromkeys(chain.from_iterable(runs.values()))
+    ]
+    return markdown([title, *titles], rows)
+
+
 def above(difference: float, spread: float = 0.0, digits: int = 1) -> str:
     """A difference of PSNRs: `+2.4 dB`, `−0.3 dB` or `level`."""
     shown = f"{abs(difference):.{digits}f}"
@@ -386,11 +431,11 @@ def above(difference: float, spread: float = 0.0, digits: int = 1) -> str:
     return f"{'+' if difference > 0 else '−'}{shown} dB"
 
 
-def reached(target: Row) -> str:
-    """When ours reached a target of the time to quality, in words."""
-    if "ours" in target:
-        return f"{plus_minus(target, 'ours', 0)} s ({target['times']:.0f} times sooner)"
-    return f"never in {target['never']} of {target['seeds']} runs"
+def sooner(row: Row) -> str:
+    """When ours has what a rival has at its end, in words."""
+    if "ours" in row:
+        return f"after {plus_minus(row, 'ours', 1)} s, {row['times']:.0f} times sooner"
+    return "before its first step" if row["level"] else f"never in {row['never']} runs"
 
 
 def unit(form: str, factor: float = 1.0) -> Callable[[float, int], str]:
@@ -426,5 +471,5 @@ def context(facts: Facts) -> dict[str, Any]:
 
     settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
     settings["score_window"] = WINDOW
-    functions = {"reached": reached}
+    functions = {"sooner": sooner}
     return {name: getattr(facts, name) for name in public} | functions | settings

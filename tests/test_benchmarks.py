@@ -247,13 +247,32 @@ def test_the_time_to_a_quality_is_told_of_all_seeds(benchmarks):
     assert "not in 1 of 2 runs" in rows[0] and "not in" not in rows[1]
 
 
+def test_equal_schedules_tell_what_untrained_fields_have_as_well(benchmarks):
+    def fits(start, *ends):
+        curves = [
+            [{"seconds": 0.0, "albedo_psnr": start}, {"seconds": 60.0, "albedo_psnr": end}]
+            for end in ends
+        ]
+        per_seed = [{"seed": i, "score": curve} for i, curve in enumerate(curves)]
+        return {"per_seed": per_seed, "seconds": 60.0}
+
+    methods = {"ours": fits(8.0, 20.0, 32.0), "prb": fits(8.0, 14.0, 14.0)}
+    methods |= {"direct": fits(8.0, 9.0, 7.0), "no-prior": fits(8.0, 21.0, 10.0)}
+    methods["ad-pt"] = {"error": "no memory"}
+    result = {"seeds": [0, 1], "methods": methods}
+    rows = benchmarks("tables")["equal_schedules"](result).splitlines()
+    assert rows[2] == "| albedo | `prb` | 14.0 ± 0.0 dB | 22.5 ± 10.6 s | 3.0 ± 1.4 |"
+    assert "untrained fields have it in 1 of 2 runs" in rows[3] and "`direct`" in rows[3]
+    assert "not in 1 of 2 runs" in rows[4] and "`no-prior`" in rows[4] and len(rows) == 7
+
+
 def test_groups_of_held_out_views_are_scored_apart(benchmarks, tmp_path):
     """They take turns; views without a score, and those learned from, do not count."""
     folders = [comparison(tmp_path / f"{seed}", seed, 20.0) for seed in (0, 1)]
     for seed, folder in enumerate(folders):
         values = [("train", 90.0), *(("heldout", v) for v in (30 + seed, 10.0, 32 + seed, None))]
         views = [{"split": split, "albedo_psnr": value} for split, value in values]
-        for method in ("ours", "prb"):
+        for method in ("untrained", "ours", "prb"):
             (folder / method / "evaluation").mkdir(parents=True)
             metrics = {"format": 1, "per_view": views}
             (folder / method / "evaluation" / "metrics.json").write_text(json.dumps(metrics))
@@ -264,9 +283,10 @@ def test_groups_of_held_out_views_are_scored_apart(benchmarks, tmp_path):
     assert ours["albedo_psnr_seen_sd"] == pytest.approx(0.5**0.5)
     assert "render_psnr_seen" not in ours
     assert ours["per_seed"][1]["albedo_psnr_seen"] == 32.0
+    assert result["untrained"]["albedo_psnr_seen"] == 31.5
 
     apart = benchmarks("tables")["prior"](*[result] * 5)
-    assert apart.count("| 31.5 ± 0.7 |") == 10 and apart.count("| 10.0 ± 0.0 |") == 10
+    assert apart.count("| 31.5 ± 0.7 |") == 15 and apart.count("| 10.0 ± 0.0 |") == 15
     whole = benchmarks("tables")["prior"](*[benchmarks("summary")["summary"](folders)] * 5)
     assert whole.count("| 20.0 ± 0.0 |") == 10 and "31.5" not in whole
 

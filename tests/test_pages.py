@@ -79,8 +79,9 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     for case in ("demo", "few", "three", "half", "annex"):
         made[f"prior-{case}"] = content | {"methods": few}
     best = {"factors": {"albedo": 2.5}, "estimator": "two-pass"}
+    first = {"score": 22.1, "estimator": "two-pass", "per_seed": [{}, {}]}
     search = {"method": "prb", "kind": "room", "data": "box", "unknown": "materials"}
-    search |= {"follows_paths": True, "trials": [{"score": 22.1, "per_seed": [{}, {}]}]}
+    search |= {"follows_paths": True, "trials": [first]}
     search |= {"untrained": {"score": 13.5}, "best": best | {"score": 24.2}}
     search |= {"seeds": [0, 1], "settings": {"steps": 2400, "seconds": 30.0}}
     equal = {k: v for k, v in content["methods"].items() if k in ("ours", "prb")}
@@ -91,17 +92,58 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     written = writer["pages"](results=results)
     readme, page = written[ROOT / "README.md"], written[ROOT / "docs" / "comparison.md"]
     assert "| the true materials, rendered alike |  |  |  | 24.8 |" in readme
-    assert "in a room behind a door +22.2 dB" in " ".join(readme.split())
+    assert "in a room behind a door +22.2 dB. [Where" in " ".join(readme.split())
     assert "`prior-half`" in page and "+22.2 dB" in page
     found = "| `prb` | rooms | materials | box | albedo x 2.5 | two pass | 13.5 | 22.1 | 24.2 | 2 |"
     assert found in page
     words = " ".join(page.split())
-    assert "over 2 seeds; fits of methods that follow paths take 30 s." in words
+    assert "over 2 seeds; fits of `prb` take 30 s." in words
     assert "Ours and `no-prior` are searched too" not in words
-    assert "two passes for rooms, two passes elsewhere, as in Mitsuba" in words
+    assert "| two passes, as in Mitsuba | no |" in words
     assert "as many camera samples as `prb` traces in" in words
-    assert "`untrained` is no method" in words
+    assert "`untrained` is no method" in words and "Behind the door" not in words
     assert "`rivals-demo.json`" not in page and "`rivals-staircase.json`" in page
+
+
+def test_grey_fields_that_nobody_beats_are_told(written):
+    """Renderings of both rooms of the annex, where cameras saw one."""
+    annex = json.loads((ROOT / "benchmarks" / "results" / "prior-annex.json").read_text())
+    grey = annex["untrained"]["render_psnr"]
+    assert all(grey > row["render_psnr"] for row in annex["methods"].values())
+    readme, page = (
+        " ".join(written[ROOT / p].split()) for p in ("README.md", "docs/comparison.md")
+    )
+    assert f"come nearer still ({grey:.1f} dB over" in readme
+    assert f"renderings of the untrained fields have {grey:.1f} dB" in page
+
+
+def test_a_search_that_finds_split_halves_better_is_told(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "rates.json").read_text())
+    content["searches"][0]["best"]["estimator"] = "split-halves"
+    (results / "rates.json").write_text(json.dumps(content))
+    page = writer["pages"](results=results)[ROOT / "docs" / "comparison.md"]
+    assert "| two passes, as in Mitsuba; split halves for rooms | no |" in page
+
+
+def test_the_headline_is_of_the_better_estimator_and_of_equal_schedules(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "rivals-demo.json").read_text())
+    rows = content["methods"]
+    rows["ours"] |= {"albedo_psnr": 40.0, "albedo_psnr_sd": 0.0}
+    curve = [{"seconds": 0.0, "albedo_psnr": 0.0, "roughness_psnr": 0.0}]
+    end = {"seconds": 50.0, "albedo_psnr": 40.0, "roughness_psnr": 40.0}
+    rows["ours"]["per_seed"] = [{"seed": seed, "score": [*curve, end]} for seed in (0, 1)]
+    for name, psnr in (("prb", 10.0), ("prb-neural-split-halves", 20.0)):
+        rows[name] |= {"albedo_psnr": psnr, "albedo_psnr_sd": 0.0, "seconds": 50.0}
+        score = [*curve, end | {"albedo_psnr": psnr}]
+        rows[name]["per_seed"] = [{"seed": seed, "score": score} for seed in (0, 1)]
+    (results / "rivals-demo.json").write_text(json.dumps(content))
+    readme = " ".join(writer["pages"](results=results)[ROOT / "README.md"].split())
+    assert "ahead by +20.0 dB in albedo" in readme
+    assert "ours has after 25.0 ± 0.0 s, 2 times sooner" in readme
 
 
 def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, tmp_path):

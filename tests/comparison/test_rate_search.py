@@ -2,7 +2,7 @@
 
 import pytest
 
-from unbake.comparison.rate_search import LEAST, MARGIN, Trial, best_trial
+from unbake.comparison.rate_search import LEAST, MARGIN, Trial, beats, best_trial
 
 NAMES = ["roughness", "albedo"]
 
@@ -59,12 +59,20 @@ def test_a_trial_that_fails_is_never_the_best():
     assert search(lambda trial: LEAST)[0].powers == (0, 0)
 
 
-def test_the_cheaper_estimator_is_taken_unless_the_other_is_better():
-    both = ("split-halves", "two-pass")
+def test_the_first_estimator_is_taken_unless_the_other_is_better():
+    both = ("two-pass", "split-halves")
     best, made = search(lambda trial: 20.0, both)
-    assert best.estimator == "split-halves" and len(made) == 6
-    best, _ = search(lambda trial: 20.0 + (trial.estimator == "two-pass"), both)
-    assert best.estimator == "two-pass"
+    assert best.estimator == "two-pass" and len(made) == 6
+    best, _ = search(lambda trial: 20.0 + (trial.estimator == "split-halves"), both)
+    assert best.estimator == "split-halves"
+
+
+def test_what_is_better_is_so_by_more_than_the_seeds_differ():
+    assert beats([21.0, 21.2], [20.0, 20.2])
+    assert not beats([20.0, 20.2], [21.0, 21.2])
+    assert not beats([21.0, 23.0], [20.0, 22.0]), "the seeds differ by more"
+    assert not beats([20.1, 20.1], [20.0, 20.0]), "less than the margin"
+    assert beats([21.0], [20.0]) and not beats([20.0], [20.0])
 
 
 def test_factors_are_powers_of_the_step():

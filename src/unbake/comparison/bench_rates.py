@@ -35,7 +35,7 @@ from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
 from ..training.schedule import learning_rates
 from ..training.validation import Score
 from .method_variant import MethodVariant
-from .rate_search import LEAST, MARGIN, STEP, Estimator, Trial, best_trial
+from .rate_search import LEAST, MARGIN, STEP, Estimator, Trial, beats, best_trial
 from .tables import print_rates
 
 if sys.version_info >= (3, 11):
@@ -47,6 +47,8 @@ else:
 FORMAT = 1
 #: Camera samples a pixel of a score.
 SPP = 16
+#: The estimator of methods that follow paths where they were published, and in Mitsuba.
+PUBLISHED: Estimator = "two-pass"
 #: Steps between looks at the clock, which wait for the machine.
 TIME_EVERY = 4
 
@@ -57,7 +59,9 @@ DEFINITIONS = {
     f"{SPP} samples a pixel; mean over the seeds",
     "best": f"from the fields' own rates, one unknown after the other is moved by factors of "
     f"{STEP} for as long as the score grows by {MARGIN} dB or more; then the other estimator "
-    "needs as much; and once again if anything moved",
+    "needs as much; and once again if anything moved. Of the trial that is found, the estimator "
+    "and then the rates are taken if they are better than the published estimator and the fields' "
+    "own rates by more than the standard deviation of the difference over seeds",
     "seconds": "of the steps, whose kernels were compiled before",
 }
 
@@ -135,6 +139,28 @@ def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
     return {method: kinds for method, kinds in found.items() if kinds}
 
 
+def settled(trials: Sequence[Row], best: Row) -> Row:
+    """What a method takes of a search: only what is better by more than the seeds differ.
+
+    Ties keep the published estimator of methods that follow paths, and the fields' own rates. The
+    rule is the same for all methods.
+
+    Args:
+        trials: of the search, the one of the fields' own rates first.
+        best: the one of them that `best_trial` found.
+    """
+    same = (row for row in trials if row["factors"] == best["factors"])
+    published = next((row for row in same if row["estimator"] == PUBLISHED), best)
+    chosen = best if beats(_per_seed(best), _per_seed(published)) else published
+    return chosen if beats(_per_seed(chosen), _per_seed(trials[0])) else trials[0]
+
+
+def _per_seed(trial: Row) -> list[float]:
+    """Scores of a trial, one for each seed."""
+    scores = [fit["score"] for fit in trial["per_seed"]]
+    return [LEAST if score is None else score for score in scores]
+
+
 @final
 class _Search:
     """One method on one data set."""
@@ -171,7 +197,8 @@ class _Search:
         found = self._row(best)
         if "error" in found:
             raise UserError(found["error"], self._name)
-        record["best"] = {key: found[key] for key in ("factors", "estimator", "score")}
+        taken = settled(record["trials"], found)
+        record["best"] = {key: taken[key] for key in ("factors", "estimator", "score")}
         self._write()
 
     def _score(self, trial: Trial) -> float:
@@ -313,10 +340,10 @@ def _require_one_estimator(variants: Sequence[MethodVariant], shared: FitConfig)
 
 
 def _estimators(config: FitConfig) -> list[Estimator]:
-    """The estimators to choose from, the cheapest first."""
+    """The estimators to choose from, the published one first."""
     if config.estimator != "auto":
         return ["split-halves" if config.halves else "two-pass"]
-    return ["split-halves", "two-pass"] if config.follows_paths else ["split-halves"]
+    return [PUBLISHED, "split-halves"] if config.follows_paths else ["split-halves"]
 
 
 def _learned(fit: FreshFit) -> Row:

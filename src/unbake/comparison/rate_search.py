@@ -5,6 +5,8 @@ It knows no fits: whoever calls it scores the trials.
 
 from __future__ import annotations
 
+import math
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, final
@@ -60,7 +62,7 @@ def best_trial(
 
     Args:
         unknowns: whose rates are searched, in this order.
-        estimators: to choose from; the first one is taken unless another is better.
+        estimators: to choose from, the published one first; it is taken unless another is better.
         score: of a trial in dB, higher is better; `LEAST` if it failed. It is asked for some trials
             more than once.
     """
@@ -74,6 +76,18 @@ def best_trial(
         if best == before:
             break
     return best
+
+
+def beats(first: Sequence[float], second: Sequence[float]) -> bool:
+    """Whether scores are better than others by `MARGIN`, and by more than seeds differ.
+
+    Args:
+        first: in dB, one for each seed.
+        second: those of other settings.
+    """
+    difference = statistics.fmean(first) - statistics.fmean(second)
+    several = [scores for scores in (first, second) if len(scores) > 1]
+    return difference >= max(MARGIN, math.hypot(*map(statistics.stdev, several)))
 
 
 def _along(unknown: str, start: Trial, score: Callable[[Trial], float]) -> Trial:
