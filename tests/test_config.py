@@ -15,6 +15,7 @@ from unbake.config import (
     FitConfig,
     GridConfig,
     NetworkConfig,
+    PathConfig,
     PresetName,
     TransportConfig,
     from_toml,
@@ -138,7 +139,7 @@ def test_settings_cannot_be_changed_in_place():
         ("spp = 5", "spp: must be an even number, 2 or more, not 5"),
         ("seed = -1", "seed: must be 0 or more"),
         ("warm_up = -1", "warm_up: must be 0 or more"),
-        ("loss_epsilon = 0.0", "loss_epsilon: must be positive"),
+        ("loss_epsilon = 0.0", "loss_epsilon: must be 1e-12 or more, not 0.0"),
         (
             'preset = "fast"',
             "preset: must be one of cpu, paper, release, release-lighting, not 'fast'",
@@ -151,28 +152,102 @@ def test_settings_cannot_be_changed_in_place():
         ("[radiance.neural]\nwidth = 0", r"radiance.neural.width: must be 1 or more"),
         ("[radiance.neural]\nhidden = 0", r"radiance.neural.hidden: must be 1 or more"),
         ("[radiance.neural.grid]\nlevels = 0", r"radiance.neural.grid.levels: must be 1 or more"),
-        ("[radiance.neural.grid]\nlevels = 99", r"radiance.neural.grid.levels: must be such that"),
+        ("[radiance.neural.grid]\nlevels = 30", r"radiance.neural.grid.levels: must be such that"),
         (
             "[radiance.neural.grid]\nfeatures = 3",
             r"radiance.neural.grid.features: must be 2, 4 or 8, not 3",
         ),
         (
             "[radiance.neural.grid]\ntable_log2 = 60",
-            r"radiance.neural.grid.table_log2: must be 4 to 28",
+            r"radiance.neural.grid.table_log2: must be 28 or less, not 60",
         ),
         (
             "[radiance.neural.grid]\nbase_resolution = 0",
             r"radiance.neural.grid.base_resolution: must be 1 or more",
         ),
         ("[radiance.neural.grid]\ngrowth = 0.5", r"radiance.neural.grid.growth: must be 1 or more"),
-        ("[radiance.neural.grid]\ngrowth = nan", r"radiance.neural.grid.growth: must be 1 or more"),
-        ("[radiance.neural.grid]\ngrowth = inf", r"radiance.neural.grid.levels: must be such that"),
+        (
+            "[radiance.neural.grid]\ngrowth = nan",
+            r"radiance.neural.grid.growth: must be a finite number",
+        ),
+        (
+            "[radiance.neural.grid]\ngrowth = inf",
+            r"radiance.neural.grid.growth: must be a finite number",
+        ),
         ("[transport]\nmax_specular = -1", r"transport.max_specular: must be 0 or more"),
     ],
 )
 def test_a_mistake_is_named_with_its_key(text, message):
     with pytest.raises(UserError, match=f"^here.toml: {message}"):
         from_toml(text, "here.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"steps = {10**10}", "steps: must be 1000000000 or less, not 10000000000"),
+        (f"pixels = {10**9}", "pixels: must be 67108864 or less"),
+        (
+            f"spp = {10**9}",
+            r"pixels: pixels \* spp must be 67108864 or less, not 1024000000000. "
+            "Lower spp to 65536$",
+        ),
+        (
+            "pixels = 60000000\nspp = 8",
+            r"pixels: pixels \* spp must be .* Lower pixels \(--batch\) to 8388608$",
+        ),
+        (f"seed = {1 << 63}", "seed: must be 9223372036854775807 or less"),
+        ("seconds = 1e300", "seconds: must be 1000000000 or less"),
+        ("final_learning_rate = 1e300", "final_learning_rate: must be 1000.0 or less"),
+        ("loss_epsilon = 1e-300", "loss_epsilon: must be 1e-12 or more"),
+        ("rate_factors.albedo = inf", "rate_factors.albedo: must be positive and 10000 or less"),
+        (f"[path]\nmax_depth = {10**10}", "path.max_depth: must be 10000 or less"),
+        (f"[path]\nrr_depth = {10**10}", "path.rr_depth: must be 10000 or less"),
+        (f"[transport]\nmax_specular = {10**10}", "transport.max_specular: must be 10000 or less"),
+        ("[lighting]\nlearning_rate = inf", "lighting.learning_rate: must be a finite number"),
+        ("[lighting]\nlearning_rate = 1e300", "lighting.learning_rate: must be 10.0 or less"),
+        ("[lighting]\ninitial_radiance = 1e38", r"lighting.initial_radiance: must be 1e\+20 or l"),
+        ("[lighting]\nanchor = inf", "lighting.anchor: must be a finite number"),
+        ("[regularization]\nradius = inf", "regularization.radius: must be a finite number"),
+        (
+            "[radiance.neural]\nlearning_rate = 1e300",
+            "radiance.neural.learning_rate: must be 10.0 o",
+        ),
+        ("[radiance.neural]\nwidth = 1000000000", "radiance.neural.width: must be 1024 or less"),
+        ("[radiance.neural]\nhidden = 300", "radiance.neural.hidden: must be 32 or less, not 300"),
+        (
+            "[radiance.neural.grid]\nlevels = 1000000\ngrowth = 1.0",
+            "radiance.neural.grid.levels: must be 32 or less, not 1000000",
+        ),
+        ("[radiance.triplane]\nhidden = 300", "radiance.triplane.hidden: must be 32 or less"),
+        ("[materials.albedo.grid]\ncells = 513", "materials.albedo.grid.cells: must be 512 or le"),
+        # All of a table at once
+        (
+            "steps = -1\npixels = 0\nseconds = nan",
+            "seconds: must be a finite number, not nan; steps: must be 0 or more, not -1; "
+            "pixels: must be 1 or more, not 0$",
+        ),
+        # What a method needs
+        (
+            'method = "ad-pt"\npath.max_depth = 1',
+            "path.max_depth: must be 2 or more for the method ad-pt: .*, not 1$",
+        ),
+        (
+            'method = "ad-pt"\npath.max_depth = 9999',
+            r"path.max_depth: must be 256 or less for the method ad-pt, .*prb.*, not 9999$",
+        ),
+    ],
+)
+def test_what_no_machine_could_do_is_refused(text, message):
+    with pytest.raises(UserError, match=f"^here.toml: {message}"):
+        from_toml("format = 2\n" + text, "here.toml")
+
+
+def test_depths_are_those_of_methods_that_follow_paths():
+    path = PathConfig(max_depth=1)
+    assert dataclasses.replace(FitConfig(), path=path).path == path
+    deep = PathConfig(max_depth=9999)
+    assert dataclasses.replace(FitConfig(method="prb"), path=deep).path == deep
 
 
 def test_a_file_that_is_no_text_or_missing_is_named(tmp_path):
@@ -273,7 +348,7 @@ def test_a_file_without_a_format_may_have_keys_of_today():
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),
         ("[grid]\nalbdo = 1", "grid.albdo: unknown key. Known keys: albedo, roughness, radiance, "),
         ("learning_rate = 1.0\nalbedo = 3", "materials.albedo.neural: must be a table|albedo: "),
-        ("[bitmap]\nalbedo = 0", "materials.albedo.bitmap.resolution: must be 1 to 8192, not 0"),
+        ("[bitmap]\nalbedo = 0", "materials.albedo.bitmap.resolution: must be 1 or more, not 0"),
         ("[roughness]\nwidth = 0", "materials.roughness.neural.width: must be 1 or more, not 0"),
     ],
 )

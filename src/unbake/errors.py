@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Collection
+import sys
+from collections.abc import Collection, Mapping
 
 #: Characters that are shown of a name, and of each part of a message.
 _LONGEST_NAME, _LONGEST_PART = 80, 1000
+
+#: The least of a range of numbers that must be positive.
+POSITIVE = sys.float_info.min
 
 
 class UserError(Exception):
@@ -83,3 +88,30 @@ def require(good: bool, key: str, wanted: str, value: object) -> None:
     """Raise a `UserError` that says what a setting must be, unless it is good."""
     if not good:
         raise UserError(f"must be {wanted}, not {value!r}", where=key)
+
+
+def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raise a `UserError` that names all numbers of some settings that are out of range.
+
+    Args:
+        settings: an object with the numbers as attributes.
+        ranges: the least and the most of each, by its name.
+    """
+    wrong = []
+    for key, (least, most) in ranges.items():
+        value = getattr(settings, key)
+        wanted = _wanted(value, least, most)
+        if wanted is not None:
+            wrong.append((key, f"must be {wanted}, not {value!r}"))
+    if wrong:
+        (key, first), *others = wrong
+        raise UserError("; ".join([first, *(f"{k}: {told}" for k, told in others)]), where=key)
+
+
+def _wanted(value: float, least: float, most: float) -> str | None:
+    """What a number should be; None where it is in range."""
+    if not math.isfinite(value):
+        return "a finite number"
+    if value < least:
+        return "positive" if least == POSITIVE else f"{least} or more"
+    return f"{most} or less" if value > most else None

@@ -292,7 +292,7 @@ def test_planes_have_a_value_of_their_own_at_every_corner(settings):
         ({"features": 3}, "features: must be 2, 4 or 8, not 3"),
         ({"base_resolution": 1}, "base_resolution: must be 2 or more, not 1"),
         ({"levels": 10}, r"levels: must be such that base_resolution \* 2\^\(levels - 1\) is 81"),
-        ({"levels": 99999}, "levels: must be such that"),
+        ({"levels": 13}, "levels: must be such that"),
         ({"width": 0}, "width: must be 1 or more"),
         ({"learning_rate": 0.0}, "learning_rate: must be positive"),
     ],

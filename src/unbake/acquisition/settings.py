@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from ..config.fit import DEEPEST
 from ..config.flag import Flag
-from ..errors import require
+from ..errors import require_ranges
 
 #: Pixels of the training views, chosen at random, and samples of each, that measure how much light
 #: paths carry by their depth.
 LIGHT_PIXELS, LIGHT_SAMPLES = 16384, 16
+#: Views of each kind, and pixels along an edge of their images.
+MOST_VIEWS, LARGEST_IMAGE = 10_000, 16_384
+#: Samples of a pixel are all in flight at once; see `transport/render.py`.
+MOST_SAMPLES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -18,7 +23,7 @@ class CaptureSettings:
     """How a data set is rendered.
 
     Raises:
-        UserError: a number is too small.
+        UserError: a number is out of range.
     """
 
     #: Without a camera file.
@@ -37,7 +42,15 @@ class CaptureSettings:
     seed: Annotated[int, Flag("Seed of all random numbers")] = 0
 
     def __post_init__(self) -> None:
-        least = {"held_out": 0, "resolution": 2, "seed": 0}
-        for name, value in vars(self).items():
-            smallest = least.get(name, 1)
-            require(value >= smallest, name, f"{smallest} or more", value)
+        require_ranges(
+            self,
+            {
+                "views": (1, MOST_VIEWS),
+                "held_out": (0, MOST_VIEWS),
+                "resolution": (2, LARGEST_IMAGE),
+                "spp": (1, MOST_SAMPLES),
+                "max_depth": (1, DEEPEST),
+                "rr_depth": (1, DEEPEST),
+                "seed": (0, (1 << 31) - 1),  # of Mitsuba's samplers
+            },
+        )

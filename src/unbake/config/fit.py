@@ -5,16 +5,15 @@ Every field cites the section of the paper (or says that the choice is ours).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from ..errors import UserError, require, require_name
+from ..errors import POSITIVE, UserError, require, require_name, require_ranges
 from ..fields.registry import representation, representations
-from ..fields.settings import FieldSettings, require_rate
+from ..fields.settings import RATES, FieldSettings
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
-from ..transport.methods import METHODS, Method
+from ..transport.methods import METHODS, PATH_REPLAY, Method
 from .flag import Flag
 from .tables import update
 
@@ -27,6 +26,18 @@ Precision = Literal["single", "half"]
 PresetName = Literal["cpu", "paper", "release", "release-lighting"]
 
 
+#: The longest paths that can be asked for.
+DEEPEST = 10_000
+#: The longest paths that can be kept in memory, each bounce with a kernel of its own: with 256, the
+#: first step compiled for two minutes on two cores.
+DEEPEST_KEPT = 256
+#: Counts and times that no fit reaches: a billion steps, or seconds.
+_ENDLESS = 10**9
+#: The most camera samples of a pass: an array of Dr.Jit has fewer than 2^32 entries, and products
+#: of matrices have one for each sample and neuron.
+MOST_SAMPLES = 1 << 26
+
+
 @dataclass(frozen=True)
 class TransportConfig:
     """How light is sampled (Sec. 4.2, 7)."""
@@ -34,7 +45,7 @@ class TransportConfig:
     max_specular: int = 8  #: longest chain of mirrors, glass and cut-outs followed (Sec. 7)
 
     def __post_init__(self) -> None:
-        require(self.max_specular >= 0, "max_specular", "0 or more", self.max_specular)
+        require_ranges(self, {"max_specular": (0, DEEPEST)})
 
 
 #: The depth of paths in the paper (Sec. 6).
@@ -59,8 +70,7 @@ class PathConfig:
     rr_depth: int = 5
 
     def __post_init__(self) -> None:
-        require(self.max_depth >= 0, "max_depth", "0 or more", self.max_depth)
-        require(self.rr_depth >= 1, "rr_depth", "1 or more", self.rr_depth)
+        require_ranges(self, {"max_depth": (0, DEEPEST), "rr_depth": (1, DEEPEST)})
 
     @property
     def chosen_depth(self) -> int:
@@ -93,13 +103,10 @@ class LightingConfig:
     def __post_init__(self) -> None:
         known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
         require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
-        start = self.initial_radiance
-        start_known = math.isfinite(start) and start >= 0
-        require(start_known, "initial_radiance", "0 or more", start)
         require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
-        anchored = math.isfinite(self.anchor) and self.anchor >= 0
-        require(anchored, "anchor", "0 or more", self.anchor)
-        require_rate(self.learning_rate)
+        # The map is up to e^20 times as bright as it starts: `fields/envmap.py`.
+        ranges = {"initial_radiance": (0, 1e20), "anchor": (0, 1e6), "learning_rate": RATES}
+        require_ranges(self, ranges)
 
 
 @dataclass(frozen=True)
@@ -112,12 +119,8 @@ class RegularizationConfig:
     similarity: float = 0.1  #: distance of albedos (linear RGB) that still count as similar
 
     def __post_init__(self) -> None:
-        for name in ("roughness_smoothness", "albedo_ties_roughness"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, "0 or more", value)
-        for name in ("radius", "similarity"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, name, "positive", value)
+        weights = dict.fromkeys(("roughness_smoothness", "albedo_ties_roughness"), (0, 1e6))
+        require_ranges(self, weights | dict.fromkeys(("radius", "similarity"), (POSITIVE, 1e3)))
 
 
 #: What a fit can recover, each with a learning rate of its own.
@@ -256,23 +259,26 @@ class FitConfig:
     score_seconds: float = 0.0  #: time between scores on all held-out views (0: never)
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, float):
-                require(math.isfinite(value), name, "a finite number", value)
+        times = ("seconds", "checkpoint_seconds", "preview_seconds", "score_seconds")
+        require_ranges(
+            self,
+            dict.fromkeys((*times, "steps", "warm_up"), (0, _ENDLESS))
+            | {
+                "seed": (0, (1 << 63) - 1),  # as TOML has them
+                "pixels": (1, MOST_SAMPLES),
+                "final_learning_rate": (POSITIVE, 1e3),
+                "loss_epsilon": (1e-12, 1e20),  # its inverse is a weight, in single precision
+            },
+        )
         require(self.spp >= 2 and self.spp % 2 == 0, "spp", "an even number, 2 or more", self.spp)
         few = self.radiance_spp
         require(few >= 0 and few % 2 == 0, "radiance_spp", "an even number, 0 or more", few)
-        require(self.pixels >= 1, "pixels", "1 or more", self.pixels)
-        require(
-            self.final_learning_rate > 0,
-            "final_learning_rate",
-            "positive",
-            self.final_learning_rate,
-        )
-        times = ("seconds", "checkpoint_seconds", "preview_seconds", "score_seconds")
-        for name in (*times, "steps", "warm_up", "seed"):
-            require(getattr(self, name) >= 0, name, "0 or more", getattr(self, name))
-        require(self.loss_epsilon > 0, "loss_epsilon", "positive", self.loss_epsilon)
+        if self.samples_per_pass > MOST_SAMPLES:
+            what = f"pixels * spp must be {MOST_SAMPLES} or less, not {self.samples_per_pass}"
+            pixels, spp = MOST_SAMPLES // self.spp, MOST_SAMPLES // self.pixels // 2 * 2
+            fewer = [f"pixels (--batch) to {pixels}"] if pixels else []
+            fewer += [f"spp to {spp}"] if spp else []
+            raise UserError(what, "pixels", f"Lower {' or '.join(fewer)}")
         require(
             1 <= self.bounces <= MOST_BOUNCES,
             "bounces",
@@ -284,7 +290,20 @@ class FitConfig:
             require(self.bounces == 1, "bounces", f"1 for the method {self.method}", self.bounces)
             only = f"extra-bounce for the method {self.method}"
             require(self.prior == "extra-bounce", "prior", only, self.prior)
+        if self.follows_paths:
+            self._check_depth()
         self._complete_fields()
+
+    def _check_depth(self) -> None:
+        """Check the depth of paths that are followed to their end."""
+        depth, of_method = self.path.max_depth, f"for the method {self.method}"
+        few = f"2 or more {of_method}: shorter paths meet no material"
+        require(depth != 1, "path.max_depth", few, depth)
+        if METHODS[self.method].sampler != PATH_REPLAY:
+            kept = (
+                f"{DEEPEST_KEPT} or less {of_method}, which keeps paths (prb follows longer ones)"
+            )
+            require(depth <= DEEPEST_KEPT, "path.max_depth", kept, depth)
 
     def _complete_fields(self) -> None:
         """Check quantities and representations, and fill in the field settings not given."""
@@ -317,8 +336,8 @@ class FitConfig:
         factors = dict(self.rate_factors)
         for name, factor in factors.items():
             require_name(name, UNKNOWNS, "unknown", "rate_factors")
-            good = factor is None or (math.isfinite(factor) and factor > 0)
-            require(good, f"rate_factors.{name}", "a positive number", factor)
+            good = factor is None or 0 < factor <= 1e4
+            require(good, f"rate_factors.{name}", "positive and 10000 or less", factor)
         factors = {name: factors.get(name) for name in UNKNOWNS}
         of_radiance = {form: representation(form).radiance for form in representations()}
         radiance = _completed(self.radiance, {f: s for f, s in of_radiance.items() if s})

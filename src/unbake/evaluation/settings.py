@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from ..config.fit import DEEPEST
 from ..config.flag import Flag
-from ..errors import require
+from ..errors import require_ranges
+
+#: Samples of a pixel are all in flight at once; see `transport/render.py`.
+MOST_SAMPLES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -14,7 +18,7 @@ class EvaluationSettings:
     """How the recovered scene is rendered.
 
     Raises:
-        UserError: a number is too small.
+        UserError: a number is out of range.
     """
 
     #: Camera samples a pixel.
@@ -38,6 +42,6 @@ class EvaluationSettings:
     ] = False
 
     def __post_init__(self) -> None:
-        for name in ("spp", "max_depth", "rr_depth", "train_views", "material_spp"):
-            smallest = 0 if name == "train_views" else 1
-            require(getattr(self, name) >= smallest, name, f"{smallest} or more", vars(self)[name])
+        samples = dict.fromkeys(("spp", "material_spp"), (1, MOST_SAMPLES))
+        depths = dict.fromkeys(("max_depth", "rr_depth"), (1, DEEPEST))
+        require_ranges(self, samples | depths | {"train_views": (0, 10**6)})
