@@ -147,6 +147,7 @@ def activate(variant: str | None = None) -> str:
 
     import mitsuba as mi
 
+    _forget_working_folder()
     gpu = gpu_possible and _has_cuda()
     if wanted == CUDA_VARIANT and not gpu:
         raise _no_cuda()
@@ -157,6 +158,26 @@ def activate(variant: str | None = None) -> str:
         mi.set_variant(wanted)
     _keep_two_threads()
     return wanted
+
+
+def _forget_working_folder() -> None:
+    """Let Mitsuba search its own folder alone.
+
+    Mitsuba 3.9 searches the folder it was imported in first, also for its plugins: it would run the
+    code of a `plugins/path.so` that lies there.
+    """
+    import mitsuba as mi
+
+    resolver = mi.file_resolver()
+    resolver.clear()
+    resolver.append(str(mitsuba_folder()))
+
+
+def mitsuba_folder() -> Path:
+    """The folder of Mitsuba's package, in which its plugins lie."""
+    import mitsuba as mi
+
+    return Path(mi.__file__).resolve().parent
 
 
 def _keep_two_threads() -> None:

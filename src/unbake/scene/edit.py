@@ -11,7 +11,22 @@ import mitsuba as mi
 from ..errors import UserError
 from ..fields.texture import painted_meshes_without_uv
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
-from .parse import ParsedScene, referenced
+from .parse import ParsedScene, is_reference, referenced
+
+#: Properties of the BSDFs that become `principled`.
+_PROPERTIES = {
+    "diffuse": {"reflectance"},
+    "roughplastic": {
+        "alpha",
+        "diffuse_reflectance",
+        "distribution",
+        "ext_ior",
+        "int_ior",
+        "nonlinear",
+        "sample_visible",
+        "specular_reflectance",
+    },
+}
 
 
 def to_principled(scene: ParsedScene) -> int:
@@ -22,16 +37,26 @@ def to_principled(scene: ParsedScene) -> int:
 
     Returns:
         The number of BSDFs changed.
+
+    Raises:
+        UserError: one has a property that its plugin does not know, or no width that is a number.
     """
     changed = 0
     for node in scene.state.nodes:
         props = node.props
+        unknown = sorted(set(props) - _PROPERTIES.get(props.plugin_name(), set(props)))
+        if unknown:
+            raise UserError(
+                f"{props.plugin_name()} has no property {' or '.join(map(repr, unknown))}",
+                mi.parser.file_location(scene.state, node),
+                f"It has {', '.join(sorted(_PROPERTIES[props.plugin_name()]))}",
+            )
         match props.plugin_name():
             case "diffuse":
                 colour, roughness = props.get("reflectance", 0.5), 0.9
             case "roughplastic":
                 colour = props.get("diffuse_reflectance", 0.5)
-                roughness = math.sqrt(props.get("alpha", 0.1))
+                roughness = math.sqrt(_alpha(scene, node))
             case _:
                 continue
         for key in list(props.keys()):
@@ -41,6 +66,19 @@ def to_principled(scene: ParsedScene) -> int:
         props["roughness"] = roughness
         changed += 1
     return changed
+
+
+def _alpha(scene: ParsedScene, node: mi.parser.SceneNode) -> float:
+    """The width of the microfacets of rough plastic."""
+    alpha = node.props.get("alpha", 0.1)
+    if isinstance(alpha, int | float) and alpha >= 0:
+        return alpha
+    given = "a texture" if is_reference(alpha) else repr(alpha)[:80]
+    raise UserError(
+        f"'alpha' of roughplastic is {given}, not a number from 0",
+        mi.parser.file_location(scene.state, node),
+        "Use a principled BSDF, whose roughness is the square root of alpha",
+    )
 
 
 def material_names(scene: ParsedScene) -> list[str]:

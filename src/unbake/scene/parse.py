@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..backend import mitsuba_folder
 from ..errors import UserError
+from .files import find
+from .preflight import check_xml
+
+_PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]+", re.ASCII)
+_LIBRARY = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+#: Where copies of files go, by what names them.
+_FOLDERS = {
+    mi.ObjectType.Shape: "meshes",
+    mi.ObjectType.Texture: "textures",
+    mi.ObjectType.Emitter: "textures",
+}
 
 
 @dataclass
@@ -19,6 +33,7 @@ class ParsedScene:
     """A scene before it is instantiated: nodes that `edit` can change."""
 
     path: Path
+    root: Path  #: folder that holds all its files
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
 
@@ -32,17 +47,18 @@ class ParsedScene:
             UserError: Mitsuba cannot instantiate the scene.
         """
         try:
+            self._forget_queries()
             mi.parser.transform_merge_equivalent(self.config, self.state)
-            mi.parser.transform_merge_meshes(self.config, self.state)
+            self._merge_meshes()
             scene = mi.parser.instantiate(self.config, self.state)
-        except RuntimeError as error:
+        except (RuntimeError, ValueError, MemoryError) as error:
             # Mitsuba 3.9: emitters that were made although their shapes were not crash the process
             # in the next virtual call. They live as long as the nodes, which this error keeps.
             self.state = mi.parser.ParserState()
             reason = _reason(error)
             if "not been instantiated" in reason:
                 # Mitsuba 3.9 loads in parallel and may report an error that another one caused.
-                reason = _serial_reason(self.path) or reason
+                reason = _serial_reason(self.path, self.root) or reason
             raise UserError(f"Mitsuba cannot make this scene: {reason}", self.path) from None
         scene = scene[0] if isinstance(scene, list) else scene
         box = np.ravel([scene.bbox().min, scene.bbox().max])
@@ -50,30 +66,69 @@ class ParsedScene:
             raise UserError("the scene has no shapes, or one without end", self.path)
         return scene
 
+    def _forget_queries(self) -> None:
+        """Let Mitsuba find misspelt properties: reading one has marked it as known."""
+        for node in self.state.nodes:
+            for key in list(node.props):
+                node.props.mark_queried(key, False)
+
+    def _merge_meshes(self) -> None:
+        """Merge meshes of one material; those with flipped normals among themselves.
+
+        Mitsuba 3.9 would merge the two kinds, and fails: "Mesh::merge(): the two meshes are
+        incompatible".
+        """
+        mi.parser.transform_merge_meshes(self.config, self.state)
+        nodes, root = self.state.nodes, self.state.root.props
+        merged = nodes[len(nodes) - 1].props
+        if merged.plugin_name() != "merge":
+            return
+        every = list(merged)
+        inward = [k for k in every if nodes[merged[k].index()].props.get("flip_normals", False)]
+        if not 0 < len(inward) < len(every):
+            return
+        flipped = mi.parser.SceneNode()
+        flipped.type = mi.ObjectType.Shape
+        flipped.props.set_plugin_name("merge")
+        for key in inward:
+            flipped.props[key] = merged[key]
+            del merged[key]
+        root["flipped meshes"] = mi.Properties.ResolvedReference(len(nodes))
+        nodes.append(flipped)
+
     def principled_nodes(self) -> list:
         """The BSDF nodes whose textures can be replaced."""
         return [n for n in self.state.nodes if n.props.plugin_name() == "principled"]
 
 
-def parse(path: Path) -> ParsedScene:
+def parse(path: Path, root: Path | None = None) -> ParsedScene:
     """Parse a Mitsuba XML scene and resolve its references.
 
+    Nothing that the scene names is loaded yet, plugins least of all.
+
+    Args:
+        path: the scene.
+        root: folder that the scene's files must not leave, links resolved; None: the scene's own.
+
     Raises:
-        UserError: the file is missing or is not a Mitsuba scene, or has a number that is not
-            finite.
+        UserError: the file is missing or is not a Mitsuba scene, has a number that is not finite,
+            or names a plugin that is not Mitsuba's or a file that is missing, damaged or outside.
     """
     if not path.is_file():
         raise UserError("no such scene file", where=path)
+    root = path.parent if root is None else root
+    folders = check_xml(path, root)
     config = mi.parser.ParserConfig(mi.variant())
     try:
         state = mi.parser.parse_file(config, str(path))
         mi.parser.transform_upgrade(config, state)
         mi.parser.transform_resolve(config, state)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise UserError(f"not a scene that Mitsuba can read: {_reason(error)}", path) from None
-    scene = ParsedScene(path, config, state)
+    scene = ParsedScene(path, root, config, state)
+    _require_own_plugins(scene)
     _require_finite(scene)
-    _resolve_files(scene)
+    _resolve_files(scene, folders)
     return scene
 
 
@@ -81,14 +136,31 @@ def write(scene: ParsedScene, folder: Path) -> Path:
     """Write the scene and copies of all its files into a folder, as `scene.xml`.
 
     Raises:
-        UserError: a file that the scene names is missing.
+        UserError: a file cannot be copied.
     """
+    copies: dict[str, str] = {}
     try:
-        mi.parser.transform_relocate(scene.config, scene.state, str(folder))
+        for node in scene.state.nodes:
+            if "filename" in node.props:
+                source = node.props["filename"]
+                if source not in copies:
+                    copies[source] = _copy(Path(source), folder, _FOLDERS.get(node.type, "assets"))
+                node.props["filename"] = copies[source]
         mi.parser.write_file(scene.state, str(folder / "scene.xml"))
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise UserError(f"cannot be copied: {_reason(error)}", scene.path) from None
     return folder / "scene.xml"
+
+
+def _copy(source: Path, folder: Path, kind: str) -> str:
+    """Copy a file into a folder's folder; its path in there, with a number where it is taken."""
+    (folder / kind).mkdir(exist_ok=True)
+    target, number = folder / kind / source.name, 0
+    while target.exists():
+        number += 1
+        target = target.with_name(f"{source.stem} ({number}){source.suffix}")
+    shutil.copyfile(source, target)
+    return target.relative_to(folder).as_posix()
 
 
 def referenced(scene: ParsedScene, value: Any) -> Any | None:
@@ -101,32 +173,48 @@ def is_reference(value: object) -> bool:
     return isinstance(value, mi.Properties.ResolvedReference)
 
 
-def _serial_reason(path: Path) -> str | None:
+def _serial_reason(path: Path, root: Path) -> str | None:
     """The error of instantiating a scene on one thread; None if there is none."""
-    scene = parse(path)
+    scene = parse(path, root)
     scene.config.parallel = False
     try:
         mi.parser.instantiate(scene.config, scene.state)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, MemoryError) as error:
         scene.state = mi.parser.ParserState()
         return _reason(error)
     return None
 
 
-def _resolve_files(scene: ParsedScene) -> None:
-    """Make file names absolute: Mitsuba would look for them in the working directory."""
-    folder = scene.path.parent.resolve()
+def _require_own_plugins(scene: ParsedScene) -> None:
+    """Raise a `UserError` where Mitsuba would run code that is not its own."""
+    own = mitsuba_folder() / "plugins"
+    for name in sorted({node.props.plugin_name() for node in scene.state.nodes}):
+        named = _PLUGIN_NAME.fullmatch(name) is not None
+        if named:
+            # Where Mitsuba has no plugin of that name, it takes one of the working folder.
+            library = Path(str(mi.file_resolver().resolve(f"plugins/{name}{_LIBRARY}")))
+            named = not library.exists() or library.resolve().parent == own
+        if not named:
+            node = next(n for n in scene.state.nodes if n.props.plugin_name() == name)
+            where = mi.parser.file_location(scene.state, node)
+            raise UserError(f"the type {name[:80]!r} is no plugin of Mitsuba", where, "Correct it")
+
+
+def _resolve_files(scene: ParsedScene, folders: list[Path]) -> None:
+    """Make file names absolute: Mitsuba would look for them in the working directory.
+
+    Args:
+        folders: to search, after that of the file that has the name, and the scene's.
+    """
+    own = scene.path.parent.resolve()
     for node in scene.state.nodes:
-        for key in list(node.props):
-            value = node.props[key]
-            if not isinstance(value, str):
-                continue
-            file = folder / value
-            if value and file.is_file():
-                node.props[key] = str(file)
-            elif key == "filename":
-                where = mi.parser.file_location(scene.state, node)
-                raise UserError(f"the file {value!r} does not exist", where=where)
+        value = node.props.get("filename", None)
+        if not isinstance(value, str):
+            continue
+        where = mi.parser.file_location(scene.state, node)
+        beside = Path(str(scene.state.files[node.file_index])).parent.resolve()
+        file = find(value, [beside, own, *folders], scene.root, where)
+        node.props["filename"] = str(file.absolute())
 
 
 def _require_finite(scene: ParsedScene) -> None:
