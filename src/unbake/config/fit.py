@@ -119,8 +119,16 @@ class RegularizationConfig:
     similarity: float = 0.1  #: distance of albedos (linear RGB) that still count as similar
 
     def __post_init__(self) -> None:
-        weights = dict.fromkeys(("roughness_smoothness", "albedo_ties_roughness"), (0, 1e6))
-        require_ranges(self, weights | dict.fromkeys(("radius", "similarity"), (POSITIVE, 1e3)))
+        weight, distance = (0, 1e6), (POSITIVE, 1e3)
+        require_ranges(
+            self,
+            {
+                "roughness_smoothness": weight,
+                "albedo_ties_roughness": weight,
+                "radius": distance,
+                "similarity": distance,
+            },
+        )
 
 
 #: What a fit can recover, each with a learning rate of its own.
