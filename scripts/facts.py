@@ -327,6 +327,18 @@ class Facts:
         ]
         return sum(self.ahead(experiment, key, *pair).startswith("+") for pair in pairs)
 
+    def best_in(self, experiment: str, scene: str, key: str) -> str:
+        """The method that has most of something in a scene; untrained fields are none."""
+        trained = [m for m in self.methods_in(experiment) if m != "untrained"]
+        found = {m: self.where(experiment, scene=scene, method=m)[key] for m in trained}
+        return max(found, key=lambda method: found[method])
+
+    def published_is_smaller(self, experiment: str, method: str) -> bool:
+        """Whether a method's published multiple of ours is below its own in every scene."""
+        rows = [row for row in self.rows(experiment) if row["method"] == method]
+        pairs = [(row.get("published_times_ours"), row["times_ours"]) for row in rows]
+        return all(published < own for published, own in pairs if published is not None)
+
     def experiments_machine(self) -> str:
         """The one machine of all experiments, in words."""
         found = {

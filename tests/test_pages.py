@@ -1,5 +1,6 @@
 """Pages with measured numbers are made from committed results, and hold no other number."""
 
+import csv
 import json
 import re
 import runpy
@@ -158,6 +159,35 @@ def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, t
         file.write_text(json.dumps(about | older))
         page = writer["pages"](kept=kept)[ROOT / "docs" / "reproduction.md"]
         assert (sentence in page) != bool(older)
+
+
+def test_estimators_are_told_as_the_data_have_them(writer, tmp_path):
+    """Two passes of a rival beside one pass of ours are no equal estimators."""
+    kept = tmp_path / "reproduction"
+    shutil.copytree(ROOT / "docs" / "reproduction", kept)
+
+    def page():
+        return " ".join(writer["pages"](kept=kept)[ROOT / "docs" / "reproduction.md"].split())
+
+    for figure, title, both in (
+        ("fig3", "PRB", "shown with both estimators"),
+        ("fig5", "PRB, one kernel", "Both are shown with two passes"),
+    ):
+        file = kept / figure / "data.csv"
+        with open(file, encoding="utf-8", newline="") as text:
+            rows = list(csv.DictReader(text))
+        two = [row for row in rows if not row["method"].endswith("split halves")]
+        halves = [row for row in two if row["method"] == title]
+        halves = [row | {"method": f"{title}, split halves", "times_ours": 1.5} for row in halves]
+        for data in (two, two + halves):
+            with open(file, "w", encoding="utf-8", newline="") as text:
+                table = csv.DictWriter(text, rows[0])
+                table.writeheader()
+                table.writerows(data)
+            assert (both in page()) == (len(data) > len(two)), figure
+            assert ("two passes here where ours has one" in page()) == (
+                figure == "fig3" and data is two
+            )
 
 
 def test_step_times_of_version_0_1_are_marked(writer, tmp_path):
