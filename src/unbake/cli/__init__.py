@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from .. import backend, experiments
+from .. import backend, experiments, signals
 from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig
 from ..errors import UserError
@@ -48,7 +48,10 @@ else:
 
 
 def main() -> None:
-    """Entry point of `unbake`; exits with 2 on bad input and 130 if interrupted."""
+    """Read the words of the command line and run a command; exits with its status.
+
+    2 on bad input; 130, 143, 129 or 141 if a signal or a closed pipe ended it (`signals.py`).
+    """
     commands = {
         "capture": capture,
         "fit": fit,
@@ -60,13 +63,17 @@ def main() -> None:
         "doctor": doctor,
     }
     try:
+        signals.begin()
         status = tyro.extras.subcommand_cli_from_dict(
             commands,
             prog="unbake",
             description="Recovers the materials or the lighting of a scene with known geometry "
             "from posed HDR photographs, with the global illumination taken out.\n\n"
             "From nothing to a result: unbake capture demo --out DATA; unbake fit DATA --out RUN; "
-            "unbake evaluate RUN; unbake report RUN --out report.html",
+            "unbake evaluate RUN; unbake report RUN --out report.html\n\n"
+            "Exit status: 0; 1 where a part failed; 2 on bad input or a full disk; ended early, "
+            "with what was done saved: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 (closed "
+            "pipe). A second Ctrl-C ends at once.",
         )
     except UserError as error:
         _fail(str(error))
@@ -74,8 +81,7 @@ def main() -> None:
         # A full disk, a file taken away: nothing that a traceback would explain.
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}")
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+        _interrupted()
     sys.exit(status or 0)
 
 
@@ -118,7 +124,8 @@ def fit(
 ) -> int:
     """Recover materials or lighting from the photographs of a data set.
 
-    Ctrl-C stops after the present step and writes a checkpoint; --resume continues from it.
+    Ctrl-C, SIGTERM, SIGHUP and a closed pipe stop it after the present step, with a checkpoint;
+    --resume continues from it. A second Ctrl-C ends it at once.
 
     Args:
         data: Folder of the data set, with its transforms.json.
@@ -147,7 +154,7 @@ def fit(
     console = Console(highlight=False)
     progress = run(data, out, chosen, resume=resume, clip_negative=clip_negative, console=console)
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
-        return 130
+        return signals.status()
     if not progress.step:
         _say(f"nothing was learned: the fields are untrained; next: unbake evaluate {out}")
         return 0
@@ -390,8 +397,15 @@ def _say(line: str) -> None:
     print(line, flush=True)
 
 
+def _interrupted() -> NoReturn:
+    print("interrupted", file=sys.stderr)
+    sys.exit(signals.status())
+
+
 def _fail(message: str) -> NoReturn:
     """Tell what is wrong, on one line whatever the width of the terminal, and exit."""
+    if signals.received():  # native code may turn an interruption into an error of its own
+        _interrupted()
     line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
     Console(stderr=True).print(line, soft_wrap=True)
     sys.exit(2)

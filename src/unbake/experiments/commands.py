@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..errors import UserError
+from ..signals import STOPPING
 from .jobs import Job, JobRunner, Outcome, Unfinished
 
 #: Seconds that a command has to write what it needs to continue, after SIGTERM.
@@ -23,8 +24,8 @@ _GRACE = 120.0
 #: Seconds between looks for a signal: one that another thread of this process received does not end
 #: the wait by itself.
 _LOOK = 0.5
-#: Exit status of commands that were stopped; `unbake` exits with 130.
-_STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)
+#: Exit status of commands that were stopped: that of `unbake`, and that of the signal itself.
+_STOPPED = {status for n in STOPPING for status in (128 + n, -n)}
 
 
 def unbake(*words: object, until: float | None = None, log: Path | None = None) -> None:

@@ -21,6 +21,7 @@ from rich.console import Console
 
 from ..errors import UserError
 from ..io import write_json
+from ..signals import interrupt
 
 #: What a job finds. It must be serializable as JSON.
 Findings = dict[str, Any]
@@ -214,9 +215,6 @@ def _interrupted_by_sigterm() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
 
     previous = signal.signal(signal.SIGTERM, interrupt)
     try:
