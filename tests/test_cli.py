@@ -71,6 +71,7 @@ def check_data(data: Path) -> None:
 
 def check_run(run: Path) -> None:
     entries = {"config.toml", "origin.json", "log.jsonl", "checkpoints", "previews", "evaluation"}
+    entries |= {".lock"}
     assert {p.name for p in run.iterdir()} == entries
     config = read_toml(run / "config.toml")
     assert (
@@ -79,7 +80,7 @@ def check_run(run: Path) -> None:
         config.method,
         config.materials["albedo"]["neural"].width,
     ) == (30, 3, "ours", 8)
-    assert [p.name for p in (run / "checkpoints").iterdir()] == ["step-0000030.safetensors"]
+    assert [p.name for p in (run / "checkpoints").iterdir()] == ["step-000000030"]
     assert [p.name for p in (run / "previews").iterdir()] == ["step-000030.png"]
     lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     steps = [line for line in lines if "validation" not in line]

@@ -136,9 +136,9 @@ def test_a_newer_checkpoint_is_refused_rather_than_an_older_one_taken(run, monke
     recovered = load_run(run.path)
     state = initial_state(recovered.problem)
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "FORMAT", 2)
+        patch.setattr(checkpoint, "FORMAT", 3)
         checkpoint.save_checkpoint(run, state, checkpoint.Progress(61))
-    said = NEWER.format(file="step-0000061.safetensors", version=2, known=1)
+    said = NEWER.format(file="step-000000061", version=3, known=2)
     with pytest.raises(UserError, match=said):
         load_run(run.path)
     assert len(run.written_checkpoints()) == 2

@@ -50,7 +50,7 @@ def started(cornell, tiny, tmp_path):
         env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    while len(list((run / "checkpoints").glob("*.safetensors"))) < 3:
+    while len(list((run / "checkpoints").glob("step-*"))) < 3:
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
     yield process
@@ -64,11 +64,15 @@ def steps_logged(run):
 
 
 def checkpoints(run):
-    return sorted((run / "checkpoints").iterdir())
+    return sorted((run / "checkpoints").glob("step-*"))
 
 
 def step_of(checkpoint):
-    return int(checkpoint.stem.removeprefix("step-"))
+    return int(checkpoint.name.removeprefix("step-"))
+
+
+def state_of(checkpoint):
+    return load_file(checkpoint / "state.safetensors")
 
 
 def interrupt_at(monkeypatch, step):
@@ -104,12 +108,12 @@ def one_thread(monkeypatch):
             dr.set_thread_count(threads)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_fit_with_a_checkpoint(number, started, fit, tmp_path):
     run = tmp_path / "run"
     started.send_signal(number)
     out, err = started.communicate(timeout=60)
-    assert started.returncode == 130 and err == ""
+    assert started.returncode == 128 + number and err == ""
     last = step_of(checkpoints(run)[-1])
     assert f"stopped at step {last}; go on with --resume" in out
     assert steps_logged(run)[-1] == last
@@ -125,15 +129,18 @@ def test_a_killed_fit_goes_on(started, fit, tmp_path):
     run = tmp_path / "run"
     started.kill()
     started.communicate()
-    (run / "checkpoints" / "step-9999999.partial").write_bytes(b"half a checkpoint")
+    unfinished = run / "checkpoints" / ".step-999999999.17.tmp"
+    unfinished.mkdir()
+    (unfinished / "state.safetensors").write_bytes(b"half a checkpoint")
+    (run / ".config.toml.17.tmp").write_text("half")
     with (run / "log.jsonl").open("a") as log:
         log.write('{"step": 99999, "sec')
-    last = step_of([p for p in checkpoints(run) if p.suffix == ".safetensors"][-1])
+    last = step_of(checkpoints(run)[-1])
     outcome = fit("--resume", "--steps", last + 3)
     assert outcome.status == 0 and f"going on after step {last}" in outcome.out
     logged = steps_logged(run)
     assert logged[-1] == last + 3 and sorted(set(logged)) == logged
-    assert all(p.suffix == ".safetensors" for p in checkpoints(run))
+    assert not list(run.rglob("*.tmp"))
 
 
 @pytest.mark.parametrize(
@@ -157,7 +164,7 @@ def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(
     assert outcome.status == 130 and "stopped at step 7" in outcome.out
     with one_thread(monkeypatch):
         assert fit("--resume", name="parts").status == 0
-    whole, parts = (load_file(checkpoints(tmp_path / name)[-1]) for name in ("whole", "parts"))
+    whole, parts = (state_of(checkpoints(tmp_path / name)[-1]) for name in ("whole", "parts"))
     assert whole.keys() == parts.keys() and len(whole) >= 8
     for key in whole:
         assert np.array_equal(whole[key], parts[key]), key
@@ -216,7 +223,8 @@ def test_a_resumed_fit_keeps_its_photographs(unbake, fit, cornell, tmp_path):
     write_exr(image, read_exr(image) * [2, 2, 2, 1])
     outcome = unbake("fit", other, "--out", tmp_path / "run", "--resume", "--steps", 2)
     assert outcome.status == 2
-    assert "other: these are not the photographs that the run" in outcome.err
+    assert "other: this is not the data set that the run" in outcome.err
+    assert "was started with: other photographs. Give" in outcome.err
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip"])
@@ -224,12 +232,13 @@ def test_a_damaged_checkpoint_costs_only_the_steps_after_the_one_before(damage, 
     assert fit("--steps", 4).status == 0
     assert fit("--resume", "--steps", 6).status == 0
     older, newest = checkpoints(tmp_path / "run")
-    content = bytearray(newest.read_bytes())
+    state = newest / "state.safetensors"
+    content = bytearray(state.read_bytes())
     if damage == "cut":
         del content[-100:]
     else:
         content[-100] ^= 1
-    newest.write_bytes(content)
+    state.write_bytes(content)
     outcome = fit("--resume", "--steps", 8)
     assert outcome.status == 0 and f"going on after step {step_of(older)}" in outcome.out
     assert step_of(checkpoints(tmp_path / "run")[-1]) == 8
@@ -237,7 +246,7 @@ def test_a_damaged_checkpoint_costs_only_the_steps_after_the_one_before(damage, 
 
 def test_no_checkpoint_that_can_be_read_is_an_error(unbake, fit, tmp_path):
     assert fit("--steps", 1).status == 0
-    checkpoints(tmp_path / "run")[0].write_bytes(b"")
+    (checkpoints(tmp_path / "run")[0] / "manifest.json").write_bytes(b"")
     outcome = fit("--resume", "--steps", 2)
     assert outcome.status == 2
     assert "checkpoints: no checkpoint in this folder can be read" in outcome.err
@@ -247,7 +256,7 @@ def test_no_checkpoint_that_can_be_read_is_an_error(unbake, fit, tmp_path):
 
 def test_a_full_disk_is_one_line_and_older_checkpoints_stay(fit, tmp_path, monkeypatch):
     assert fit("--steps", 2).status == 0
-    before = checkpoints(tmp_path / "run")[0].read_bytes()
+    before = (checkpoints(tmp_path / "run")[0] / "state.safetensors").read_bytes()
 
     def full(number):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -258,7 +267,7 @@ def test_a_full_disk_is_one_line_and_older_checkpoints_stay(fit, tmp_path, monke
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert "the checkpoint cannot be written (No space left on device)" in outcome.err
     (kept,) = checkpoints(tmp_path / "run")
-    assert kept.read_bytes() == before
+    assert (kept / "state.safetensors").read_bytes() == before
     outcome = fit("--resume", "--steps", 4)
     assert outcome.status == 0 and "going on after step 2" in outcome.out
 

@@ -70,7 +70,7 @@ def test_a_fit_of_no_steps_has_untrained_fields(unbake, cornell, tiny, tmp_path)
     config = run.settings()
     assert config.steps == 0
     expected = start(cornell / "scene" / "scene.xml", config)
-    stored = load_file(checkpoint)
+    stored = load_file(checkpoint / "state.safetensors")
     for name, value in expected.items():
         assert np.array_equal(stored[f"phi.{name}"], value), name
 

@@ -1,33 +1,44 @@
 """Checkpoints: written whole or not at all, and found again after any crash.
 
-A checkpoint is one safetensors file with the parameters, the optimisers' moments and the counters.
-It is written under another name, flushed to disk, and renamed. The newest file that can be read
-counts.
+    checkpoints/step-NNNNNNNNN/
+      state.safetensors     parameters, the optimisers' moments, the scale of the loss
+      manifest.json         step and time, the run, seed and settings, size and SHA-256 of the state
+
+Both are written to a temporary folder and flushed to disk before the folder takes its name. The
+newest checkpoint of the run that is as its manifest says counts. Version 0.1 wrote one safetensors
+file, which is read, too.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import shutil
+import stat
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..formats import check_format
-from ..io import write_atomically
-from .run_folder import RunFolder
+from .run_folder import MANIFEST, STATE, SUFFIX_OF_VERSION_0_1, RunFolder, require_no_link
 from .state import State
 
-#: The newest format that can be read, and the one that is written.
-FORMAT = 1
+#: The newest format that can be read, and the one that is written. 1 is that of version 0.1.
+FORMAT = 2
 _NAME = "unbake-checkpoint-"
+#: Bytes of a manifest, which has the settings in it, and of what a state has beside its arrays.
+_MOST_TEXT = 16 << 20
 
 
 @dataclass
@@ -39,12 +50,88 @@ class Progress:
     samples: int = 0  #: from the camera, traced in all passes
 
 
-def save_checkpoint(run: RunFolder, state: State, progress: Progress) -> Path:
+class _Damaged(Exception):
+    """A checkpoint that cannot be used; an older one may."""
+
+
+def save_checkpoint(
+    run: RunFolder, state: State, progress: Progress, about: Mapping[str, Any] | None = None
+) -> Path:
     """Write a checkpoint and delete all but the newest few.
+
+    Args:
+        about: what the manifest says of the run, as JSON; `run` is the run's identity
+            (`Origin.run`), without which it is read only as that of a run without one.
+
+    Returns:
+        Its folder.
 
     Raises:
         UserError: it cannot be written; older checkpoints are untouched.
     """
+    content = save(_arrays(state))
+    manifest = {
+        "format": FORMAT,
+        "step": progress.step,
+        "seconds": progress.seconds,
+        "samples": progress.samples,
+        **(about or {}),
+        "files": {STATE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
+    }
+    manifest["sha256"] = _digest(manifest)
+    path = run.checkpoint(progress.step)
+    text = (json.dumps(manifest, indent=1) + "\n").encode()
+    require_no_link(run.checkpoints)
+    try:
+        _write_folder(path, {STATE: content, MANIFEST: text})
+    except OSError as error:
+        what = f"the checkpoint cannot be written ({error.strerror or error})"
+        raise UserError(what, path, "Make room, or the folder writable") from error
+    run.tidy_checkpoints(path)
+    return path
+
+
+def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
+    """Put the newest good checkpoint of the run into the state; None if none was written yet.
+
+    Raises:
+        UserError: the checkpoint belongs to other settings or was written by a newer version, or
+            none can be used.
+    """
+    written = run.written_checkpoints()
+    identity = run.origin().run if run.origin_file.exists() else None
+    expected = _arrays(state)
+    most = 2 * sum(array.nbytes for array in expected.values()) + _MOST_TEXT
+    others = 0
+    for path in written:
+        try:
+            arrays, manifest = _read(path, most)
+            progress = Progress(
+                int(manifest["step"]), float(manifest["seconds"]), int(manifest["samples"])
+            )
+            if not all(np.isfinite(array).all() for array in arrays.values()):
+                raise _Damaged("a number is not finite")
+        except (_Damaged, OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError):
+            continue
+        if manifest.get("run") != identity:
+            others += 1
+            continue
+        _require_fit(arrays, expected, path)
+        _restore(state, arrays)
+        return progress
+    if others:
+        what = "the checkpoints in this folder are of another run"
+        raise UserError(what, run.checkpoints, "Put the right ones back, or fit again")
+    if written:
+        raise UserError("no checkpoint in this folder can be read", run.checkpoints, "Fit again")
+    return None
+
+
+# ------------------------------------------------------------------------------------------ writing
+
+
+def _arrays(state: State) -> dict[str, np.ndarray]:
+    """All numbers of a state by name."""
     arrays = {}
     for name, optimizer in state.optimizers():
         for key, (value, _, _, extra) in optimizer.state.items():
@@ -55,48 +142,115 @@ def save_checkpoint(run: RunFolder, state: State, progress: Progress) -> Path:
             arrays[f"{name}.{key}:t"] = np.asarray(count).astype(np.uint32).ravel()[:1]
     if state.scale is not None:
         arrays["scale"] = np.array(state.scale)
-    metadata = {
-        "format": f"{_NAME}{FORMAT}",
-        "step": str(progress.step),
-        "seconds": repr(progress.seconds),
-        "samples": str(progress.samples),
-    }
-    metadata["crc"] = str(_checksum(arrays, metadata))
-    path, content = run.checkpoint(progress.step), save(arrays, metadata)
-    write_atomically(path, lambda p: p.write_bytes(content), durable=True, what="checkpoint")
-    run.tidy_checkpoints()
-    return path
+    return arrays
 
 
-def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
-    """Put the newest readable checkpoint into the state; None if none was written yet.
+def _write_folder(path: Path, files: Mapping[str, bytes]) -> None:
+    """Write a folder of files so that it is whole once it has its name, also after a power cut."""
+    new = not path.parent.is_dir()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if new:
+        _flush(path.parent.parent)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir()
+        for name, content in files.items():
+            with open(temporary / name, "xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        _flush(temporary)
+        if os.path.lexists(path):  # a damaged one, of steps that were taken again
+            old = path.with_name(f".{path.name}.{os.getpid()}.old.tmp")
+            os.replace(path, old)
+            os.replace(temporary, path)
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.unlink()
+        else:
+            os.replace(temporary, path)
+        _flush(path.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _flush(folder: Path) -> None:
+    """Flush the names in a folder to disk; Windows has no such call."""
+    if os.name == "nt":
+        return
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+def _digest(manifest: Mapping[str, Any]) -> str:
+    """SHA-256 of all that a manifest says, but for this number."""
+    said = {key: value for key, value in manifest.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+# ------------------------------------------------------------------------------------------ reading
+
+
+def _read(path: Path, most: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the manifest of a checkpoint.
 
     Raises:
-        UserError: the checkpoint belongs to other settings or was written by a newer version, or
-            all checkpoints are damaged.
+        UserError: it was written by a newer version.
+        _Damaged, OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError: it is not
+            a whole checkpoint.
     """
-    written = run.written_checkpoints()
-    for path in written:
-        try:
-            with safe_open(path, "numpy") as file:
-                metadata = file.metadata() or {}
-                arrays = {key: file.get_tensor(key) for key in file.keys()}
-        except (SafetensorError, OSError, ValueError, TypeError, MemoryError):
-            continue
-        crc = metadata.pop("crc", None)
-        version = metadata.get("format", "").removeprefix(_NAME)
-        if crc != str(_checksum(arrays, metadata)) or not version.isdecimal():
-            continue
-        check_format({"format": int(version)}, FORMAT, path)
-        _restore(state, arrays, path)
-        return Progress(int(metadata["step"]), float(metadata["seconds"]), int(metadata["samples"]))
-    if written:
-        raise UserError("no checkpoint in this folder can be read", run.checkpoints, "Fit again")
-    return None
+    if path.suffix == SUFFIX_OF_VERSION_0_1:
+        return _read_version_0_1(path, most)
+    if path.is_symlink():
+        raise _Damaged("is a link")
+    manifest = json.loads(_content(path / MANIFEST, _MOST_TEXT))
+    if not isinstance(manifest, dict) or manifest.get("sha256") != _digest(manifest):
+        raise _Damaged("the manifest was changed")
+    check_format(manifest, FORMAT, path)
+    content, told = _content(path / STATE, most), manifest["files"][STATE]
+    if hashlib.sha256(content).hexdigest() != told["sha256"]:
+        raise _Damaged("the state was changed")
+    try:
+        return load(content), manifest
+    except SafetensorError as error:
+        raise _Damaged("the state cannot be read") from error
+
+
+def _content(path: Path, most: int) -> bytes:
+    """The content of a plain file. Links, pipes, devices and too large files are not read."""
+    flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    number = os.open(path, os.O_RDONLY | flags | getattr(os, "O_BINARY", 0))
+    with open(number, "rb") as file:
+        about = os.fstat(number)
+        if not stat.S_ISREG(about.st_mode) or about.st_size > most:
+            raise _Damaged("is not a plain file of this size")
+        return file.read(most + 1)
+
+
+def _read_version_0_1(path: Path, most: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    about = path.lstat()
+    if not stat.S_ISREG(about.st_mode) or about.st_size > most:
+        raise _Damaged("is not a plain file of this size")
+    try:
+        with safe_open(path, "numpy") as file:
+            metadata = file.metadata() or {}
+            arrays = {key: file.get_tensor(key) for key in file.keys()}
+    except SafetensorError as error:
+        raise _Damaged("cannot be read") from error
+    checksum = metadata.pop("crc", None)
+    version = metadata.get("format", "").removeprefix(_NAME)
+    if checksum != str(_checksum(arrays, metadata)) or not version.isdecimal():
+        raise _Damaged("was changed")
+    check_format({"format": int(version)}, 1, path)
+    return arrays, metadata
 
 
 def _checksum(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> int:
-    """CRC-32 of all that a checkpoint holds: safetensors itself would not notice a flipped bit."""
+    """CRC-32 of all that a checkpoint of version 0.1 holds."""
     crc = zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
     for key in sorted(arrays):
         crc = zlib.crc32(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode(), crc)
@@ -104,18 +258,27 @@ def _checksum(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> int:
     return crc
 
 
-def _restore(state: State, arrays: dict[str, np.ndarray], path: Path) -> None:
+def _require_fit(
+    arrays: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], path: Path
+) -> None:
+    for name, wanted in expected.items():
+        found = arrays.get(name)
+        if found is None and name == "scale":  # of a fit in single precision
+            continue
+        if found is None or (found.shape, found.dtype) != (wanted.shape, wanted.dtype):
+            raise UserError(
+                f"does not fit the settings: {name} is missing or has another shape",
+                where=path,
+                remedy="Resume with the settings that the run was started with",
+            )
+
+
+def _restore(state: State, arrays: Mapping[str, np.ndarray]) -> None:
     if state.scale is not None and "scale" in arrays:
         state.scale = dr.opaque(mi.Float, float(arrays["scale"][0]))
     for name, optimizer in state.optimizers():
         for key, (value, promoted, rate, _) in list(optimizer.state.items()):
             full = f"{name}.{key}"
-            if full not in arrays or arrays[full].shape != tuple(value.shape):
-                raise UserError(
-                    f"does not fit the settings: {full} is missing or has another shape",
-                    where=path,
-                    remedy="Resume with the settings that the run was started with",
-                )
             first, second = (from_numpy(mi.Float, arrays[f"{full}:{x}"]) for x in "mv")
             count = dr.opaque(mi.UInt32, int(arrays[f"{full}:t"][0]))
             new = from_numpy(mi.Float, arrays[full])

@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import uuid
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 from rich.console import Console
 
-from ..config import FitConfig
+from ..config import FitConfig, to_toml
+from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.views import Dataset
 from ..errors import UserError
-from .checkpoint import Progress, load_checkpoint, save_checkpoint
+from ..signals import deferred
+from .checkpoint import Progress, load_checkpoint
 from .defaults import with_defaults
 from .memory import memory_mb
 from .monitor import Monitor
 from .path_depth import told_depth, with_path_depth
 from .preview import Preview
-from .problem import camera_warnings, make_problem, training_pixels
+from .problem import Problem, camera_warnings, make_problem, training_pixels
 from .run_folder import Origin, RunFolder
+from .run_lock import RunLock
+from .saving import Saving
 from .schedule import learning_rates
-from .state import initial_state
+from .state import State, initial_state
 from .step import TrainingStep
 from .validation import Score
 
@@ -40,7 +43,7 @@ TIME_EVERY = 4
 GIVE_UP_AFTER = 100
 
 
-def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
+def fit(
     data: Path | str,
     run: Path | str,
     config: FitConfig,
@@ -53,38 +56,81 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
 
     Args:
         data: a data set's folder, with `transforms.json`.
-        run: the folder to write: settings, log, checkpoints and previews.
+        run: the folder to write: settings, log, checkpoints and previews. It is locked meanwhile.
         config: what to do; ignored, but for `steps` and `seconds`, when resuming. With no steps
             and no seconds the run has untrained fields.
         resume: go on with the run's newest checkpoint.
         clip_negative: take negative pixels as zero.
 
     Returns:
-        How far the fit came. Ctrl-C ends it early, with a checkpoint.
+        How far the fit came. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it early, with a checkpoint.
 
     Raises:
-        UserError: the data set or the run's folder cannot be used, or the loss does not stay
-            finite.
+        UserError: the data set or the run's folder cannot be used, what was learned cannot be
+            saved, or the loss does not stay finite.
 
     Paper: Sec. 4, 5.4.
     """
     console = console or Console()
-    data, run = Path(data), Path(run)
-    folder = RunFolder(run)
-    if resume:
-        config = _resumed_config(folder, config)
-    else:
-        folder.require_new()
+    folder = RunFolder(Path(run))
+    with ExitStack() as held:
+        if resume:
+            folder.require_resumable()
+            lock = held.enter_context(folder.lock())
+            begun = _begin(Path(data), folder, _resumed_config(folder, config), console, resume)
+        else:
+            folder.require_new()
+            begun = _begin(Path(data), folder, config, console, resume, clip_negative)
+            # Here all input is known to be good, and the folder is made.
+            lock = held.enter_context(folder.lock())
+            folder.require_new()
+        stop = held.enter_context(deferred())
+        progress = _train(begun, folder, lock, stop, console)
+    if stop:
+        console.print(f"stopped at step {progress.step}; go on with --resume", highlight=False)
+    return progress
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A fit before its first step, or before it goes on."""
+
+    config: FitConfig
+    origin: Origin
+    problem: Problem
+    step: TrainingStep
+    state: State
+    restored: Progress | None  #: of the checkpoint that it goes on with
+    preview: Preview
+    score: Score | None
+
+
+def _begin(
+    data: Path,
+    folder: RunFolder,
+    config: FitConfig,
+    console: Console,
+    resume: bool,
+    clip_negative: bool = False,
+) -> _Begun:
+    """Read all input, and check it; nothing is written but the cache of the data set."""
     dataset = Dataset.load(data)
+    before = folder.origin() if resume else None
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
-    clip_negative = clip_negative or (resume and folder.origin().clip_negative)
+    clip_negative = clip_negative or (before is not None and before.clip_negative)
     pixels = training_pixels(
         dataset, clip_negative=clip_negative, smoothed=config.loss_reference == "smoothed"
     )
-    mean_radiance = pixels.photographs.mean
-    if resume:
-        _require_same_photographs(folder, data, mean_radiance)
-    problem = make_problem(dataset.scene, dataset.background, config, mean_radiance)
+    origin = Origin(
+        data=str(data.resolve()),
+        mean_radiance=pixels.photographs.mean,
+        clip_negative=clip_negative,
+        run=uuid.uuid4().hex if before is None else before.run,
+        fingerprint=fingerprint(dataset),
+    )
+    if before is not None:
+        _require_same_data(folder, before, origin)
+    problem = make_problem(dataset.scene, dataset.background, config, origin.mean_radiance)
     for warning in camera_warnings(dataset, problem.scene_view.scene):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
@@ -95,51 +141,66 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
     step = TrainingStep(problem, pixels, config)
     step.plan(state)
     restored = load_checkpoint(folder, state) if resume else None
-    progress = restored or Progress()
-    if resume:
-        console.print(f"going on after step {progress.step}", highlight=False)
     preview = Preview(problem, dataset, folder)
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
     step.require_memory(state)
-    # Here all input is known to be good, and the folder is made.
-    folder.write_origin(Origin(str(data.resolve()), mean_radiance, clip_negative))
-    folder.write_settings(config)
+    return _Begun(config, origin, problem, step, state, restored, preview, score)
+
+
+def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
+    begun: _Begun, folder: RunFolder, lock: RunLock, stop: list[int], console: Console
+) -> Progress:
+    """Take the steps that are left.
+
+    Args:
+        stop: fills at any moment, when the fit should end.
+    """
+    config, problem, state, score = begun.config, begun.problem, begun.state, begun.score
+    progress = begun.restored or Progress()
+    if begun.restored is not None:
+        console.print(f"going on after step {progress.step}", highlight=False)
+    folder.sweep()
     folder.forget_after(progress.step)
+    folder.write_origin(begun.origin)
+    folder.write_settings(config)  # from here on there is a run, which can be resumed
 
     unknown = next(iter(state.phi)).partition(".")[0]  # the first one, whose rate is logged
     total = config.seconds or config.steps
-    saved_at = shown_at = scored_at = progress.seconds
+    about = {"run": begun.origin.run, "seed": config.seed, "data": begun.origin.fingerprint}
+    about["settings"] = to_toml(config)
+    saving = Saving(folder, lock, about, config.checkpoint_seconds, progress.seconds)
+    shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
     skipped = 0
-    with Monitor(folder.log_file, console, total) as monitor, _stop_on_interrupt() as stop:
+    failures: list[UserError] = []  # to write what was due last
+    with Monitor(folder.log_file, console, total) as monitor:
         if score is not None and not progress.step:
             monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
         clock = time.perf_counter() - progress.seconds
         # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
         last = _done(config, progress) >= total
-        if last and restored is None:  # nothing to learn: the untrained fields are the result
-            save_checkpoint(folder, state, progress)
-            state.publish(problem)
-            for line in preview.show(progress):
-                monitor.validation(line)
+        if last and begun.restored is None:  # nothing to learn: the untrained fields are the result
+            failures = [*saving.save(state, progress), *_show(begun, monitor, progress)]
         while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
             done = _done(config, progress) / total
             rates = learning_rates(config, progress.step, done)
-            recent.append(step(state, progress.step, rates))
+            recent.append(begun.step(state, progress.step, rates))
             progress.step += 1
             progress.samples = progress.step * config.samples_per_step
             last = _done(config, progress) >= total or bool(stop)
 
             full = len(recent) >= READ_EVERY
             timed = config.seconds or score is not None
-            if full or last or (timed and progress.step % TIME_EVERY == 0):
+            # This clock does not wait for the machine, so that slow steps are saved in time, too.
+            save = saving.due(time.perf_counter() - clock)
+            if full or last or save or (timed and progress.step % TIME_EVERY == 0):
                 dr.sync_thread()
                 progress.seconds = time.perf_counter() - clock
                 last = last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
-            if not (full or last or due):
+            if not (full or last or due or save):
                 continue
 
             entry = _log_entry(recent, progress, rates[unknown])
@@ -150,25 +211,36 @@ def fit(  # noqa: C901, PLR0912, PLR0915 - the loop in one piece, top to bottom
                 state.publish(problem)
                 entry["score"] = score.measure()
                 scored_at = progress.seconds
+            lock.require_held()
             monitor.record(_done(config, progress), entry)
             if skipped >= GIVE_UP_AFTER:
                 raise UserError(
                     f"the loss was not finite in the last {skipped} steps",
-                    where=run,
+                    where=folder.path,
                     remedy="Lower the learning rates, or look for extreme pixels in the images",
                 )
-            if last or progress.seconds - saved_at >= config.checkpoint_seconds:
-                save_checkpoint(folder, state, progress)
-                saved_at = progress.seconds
+            failures = saving.save(state, progress) if save or last else []
             if last or progress.seconds - shown_at >= config.preview_seconds:
-                state.publish(problem)
-                for line in preview.show(progress):
-                    monitor.validation(line)
+                failures += _show(begun, monitor, progress)
                 shown_at = progress.seconds
+            for failure in () if last else failures:
+                monitor.say(f"warning: {failure}; the fit goes on, and tries again later")
             clock = time.perf_counter() - progress.seconds
-    if stop:
-        console.print(f"stopped at step {progress.step}; go on with --resume", highlight=False)
+    for failure in [*failures, *monitor.failures]:
+        raise failure
     return progress
+
+
+def _show(begun: _Begun, monitor: Monitor, progress: Progress) -> list[UserError]:
+    """Show a preview, or return why it cannot be written."""
+    begun.state.publish(begun.problem)
+    try:
+        lines = begun.preview.show(progress)
+    except UserError as error:
+        return [error]
+    for line in lines:
+        monitor.validation(line)
+    return []
 
 
 def _done(config: FitConfig, progress: Progress) -> float:
@@ -199,40 +271,18 @@ def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: floa
 
 def _resumed_config(run: RunFolder, config: FitConfig) -> FitConfig:
     """The settings a run was started with, but for how long it should go on."""
-    run.require_resumable()
     return dataclasses.replace(run.settings(), steps=config.steps, seconds=config.seconds)
 
 
-def _require_same_photographs(run: RunFolder, data: Path, mean_radiance: float) -> None:
-    """Refuse other photographs than those of the run; the data set may have moved."""
-    origin = run.origin()
-    if not math.isclose(origin.mean_radiance, mean_radiance, rel_tol=1e-4):
+def _require_same_data(run: RunFolder, before: Origin, now: Origin) -> None:
+    """Refuse another data set than that of the run; its folder may have moved."""
+    differing = changed(before.fingerprint, now.fingerprint)
+    if not math.isclose(before.mean_radiance, now.mean_radiance, rel_tol=1e-4):
+        differing = differing or ["photographs"]
+    if differing:
+        what = "this is not the data set that the run {} was started with: other {}"
         raise UserError(
-            f"these are not the photographs that the run {run.path} was started with",
-            where=data,
-            remedy=f"Give {origin.data}, or start another run",
+            what.format(run.path, ", ".join(differing)),
+            where=now.data,
+            remedy=f"Give {before.data} as it was, or start another run",
         )
-
-
-@contextmanager
-def _stop_on_interrupt() -> Iterator[list[bool]]:
-    """A list that fills on Ctrl-C or SIGTERM; a second Ctrl-C ends the program at once.
-
-    In another thread than the main one signals cannot be handled, and the list stays empty.
-    """
-    stop: list[bool] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def handler(number: int, frame: object) -> None:
-        if stop:
-            raise KeyboardInterrupt
-        stop.append(True)
-
-    previous = {s: signal.signal(s, handler) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for s, old in previous.items():
-            signal.signal(s, old)

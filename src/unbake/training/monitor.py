@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -26,9 +27,12 @@ class Monitor:
     """Shows progress and appends to the log; a context manager.
 
     A bar with loss terms, samples/s, time left and memory on a terminal, plain lines elsewhere.
+    Lines of the log that cannot be written, on a full disk, wait for the next one; `failures` tells
+    of those that were not written in the end.
     """
 
     def __init__(self, log: Path, console: Console, total: float) -> None:
+        self.failures: list[UserError] = []
         self._path = log
         self._file: IO[str]  # opened by `__enter__`
         self._console = console
@@ -51,7 +55,8 @@ class Monitor:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        self._file.close()
+        with suppress(OSError):  # it is in `failures`
+            self._file.close()
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
@@ -90,8 +95,12 @@ class Monitor:
 
     def _write(self, entry: dict) -> None:
         rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in entry.items()}
+        told, self.failures = self.failures, []
         try:
             self._file.write(json.dumps(rounded) + "\n")
             self._file.flush()
-        except OSError as error:
-            raise UserError(f"the log cannot be written ({error.strerror})", self._path) from None
+        except OSError as error:  # what was not written stays in the file's buffer
+            what = f"the log cannot be written ({error.strerror})"
+            self.failures = [UserError(what, self._path, "Make room")]
+            if not told:
+                self.say(f"warning: {self.failures[0]}; the fit goes on")

@@ -4,11 +4,12 @@
       config.toml                      settings
       origin.json                      the data set that the run was fit to
       log.jsonl                        losses and scores, one line every few steps
-      checkpoints/step-NNNNNNN.safetensors
+      checkpoints/step-NNNNNNNNN/      state, manifest (`checkpoint.py`)
       previews/step-NNNNNN.png
       evaluation/metrics.json          what `unbake evaluate` measured
       evaluation/SPLIT/VIEW_QUANTITY.exr, .png
       evaluation/environment.exr, .png
+      .lock                            the process that fits (`run_lock.py`)
 
 No other module names these files.
 """
@@ -16,9 +17,11 @@ No other module names these files.
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -26,7 +29,9 @@ from ..config import FitConfig, read_toml, to_toml
 from ..config.migration import migrated
 from ..errors import UserError
 from ..formats import check_format
-from ..io import read_object, read_text, remove_unfinished, write_json, write_text
+from ..io import read_object, read_text, write_json, write_text
+from . import run_numbers
+from .run_lock import RunLock
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -38,6 +43,11 @@ ORIGIN_FORMAT = 1
 METRICS_FORMAT = 1
 #: Checkpoints kept in a run folder.
 KEEP = 3
+#: The files of a checkpoint.
+STATE, MANIFEST = "state.safetensors", "manifest.json"
+#: A checkpoint of version 0.1 is a file.
+SUFFIX_OF_VERSION_0_1 = ".safetensors"
+_CHECKPOINT = re.compile(r"step-(\d{1,18})(\.safetensors)?", re.ASCII)
 _GIVE_RUN = "Give the folder of a run"
 
 
@@ -46,9 +56,13 @@ _GIVE_RUN = "Give the folder of a run"
 class Origin:
     """The input of a run, beside its settings."""
 
-    data: str  # the data set's folder; a relative path starts at the run folder
-    mean_radiance: float  # of its training pixels; the scale of the radiance field
+    data: str  #: the data set's folder; a relative path starts at the run folder
+    mean_radiance: float  #: of its training pixels; the scale of the radiance field
     clip_negative: bool
+    #: Chosen at the start of a run; its checkpoints name it, too. None: begun by version 0.1.
+    run: str | None = None
+    #: Of the data set (`dataset/fingerprint.py`); empty: begun by version 0.1.
+    fingerprint: Mapping[str, str] = field(default_factory=dict)
 
 
 @final
@@ -105,10 +119,10 @@ class RunFolder:
     # ------------------------------------------------------------------ settings and origin
 
     def require_new(self) -> None:
-        """Refuse a folder that holds a run already, so that no two runs are mixed.
+        """Refuse a folder that holds a run or what is left of one, so that no two are mixed.
 
         Raises:
-            UserError: there is a run.
+            UserError: there is one.
         """
         if self.config_file.exists():
             raise UserError(
@@ -116,6 +130,32 @@ class RunFolder:
                 where=self.path,
                 remedy="Go on with --resume, or give another --out",
             )
+        left = [x.name for x in (self.checkpoints, self.previews, self.evaluation) if _filled(x)]
+        if self.log_file.is_symlink() or (self.log_file.exists() and self.log_file.stat().st_size):
+            left.append(self.log_file.name)
+        if left:
+            raise UserError(
+                f"holds parts of another run ({', '.join(left)}), but not its config.toml",
+                where=self.path,
+                remedy="Remove them, or give another --out",
+            )
+
+    def lock(self, doing: str = "fits") -> RunLock:
+        """The lock of the folder, which whoever writes to it must hold.
+
+        Raises:
+            UserError: a part of the run lies elsewhere, behind a symbolic link; on entering,
+                another process has the lock.
+        """
+        for part in (self.log_file, self.checkpoints, self.previews):
+            require_no_link(part)
+        return RunLock(self.path, doing)
+
+    def lock_evaluation(self) -> RunLock:
+        """The lock of the folder of the evaluation; errors as in `lock`."""
+        for part in (self.evaluation, *self.evaluation.glob("*/")):
+            require_no_link(part)
+        return RunLock(self.evaluation, "evaluates")
 
     def require_resumable(self) -> None:
         """Refuse a folder without a run.
@@ -180,11 +220,17 @@ class RunFolder:
         except UserError:
             raise UserError("cannot be read", self.origin_file, again) from None
         check_format(facts, ORIGIN_FORMAT, self.origin_file)
-        try:
-            radiance, clip = float(facts["mean_radiance"]), bool(facts["clip_negative"])
-            return Origin(str(facts["data"]), radiance, clip)
-        except (ValueError, KeyError, TypeError):
-            raise UserError("cannot be read", self.origin_file, again) from None
+        match facts:
+            case {
+                "data": str(data),
+                "mean_radiance": int(radiance) | float(radiance),
+                "clip_negative": bool(clip),
+            } if data and "\0" not in data and 0 < radiance < sys.float_info.max:
+                run, fingerprint = facts.get("run"), facts.get("fingerprint", {})
+                texts = fingerprint.values() if isinstance(fingerprint, dict) else (None,)
+                if isinstance(run, str | None) and all(isinstance(x, str) for x in texts):
+                    return Origin(data, float(radiance), clip, run, fingerprint)
+        raise UserError("cannot be read", self.origin_file, again)
 
     def write_origin(self, origin: Origin) -> None:
         """Write the input of the run."""
@@ -209,11 +255,16 @@ class RunFolder:
         lines = []
         for number, text in enumerate(texts, start=1):
             try:
-                lines.append(json.loads(text))
-            except ValueError as error:
+                line = json.loads(text)
+            except (ValueError, RecursionError) as error:
                 if number < len(texts):
                     raise UserError(f"line {number} is not JSON", file) from error
-        return [line for line in lines if isinstance(line, dict)]
+                continue
+            wrong = run_numbers.wrong_in_log(line)
+            if wrong:
+                raise UserError(f"line {number}: {wrong}", file, "Remove the line")
+            lines.append(line)
+        return lines
 
     def forget_after(self, step: int) -> None:
         """Drop the lines of the log after a step, and lines that a killed fit left half-written.
@@ -221,29 +272,47 @@ class RunFolder:
         A resumed fit takes those steps again.
         """
         log, kept = self.log_file, []
+        require_no_link(log)
         lines = log.read_bytes().splitlines() if log.is_file() else ()
         for line in (line.decode("utf-8", "replace") for line in lines):
             try:
                 if json.loads(line)["step"] <= step:
                     kept.append(line + "\n")
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 continue
         write_text(log, "".join(kept))
 
     def checkpoint(self, step: int) -> Path:
-        """The file of the checkpoint after a number of steps."""
-        return self.checkpoints / f"step-{step:07d}.safetensors"
+        """The folder of the checkpoint after a number of steps."""
+        return self.checkpoints / f"step-{step:09d}"
 
     def written_checkpoints(self) -> list[Path]:
-        """The existing checkpoints, the newest first."""
-        return sorted(self.checkpoints.glob("step-*.safetensors"), reverse=True)
+        """The existing checkpoints, whole or not, the newest first; of version 0.1 they are files.
 
-    def tidy_checkpoints(self) -> None:
-        """Delete all but the newest checkpoints, and files that a killed fit left unfinished."""
-        remove_unfinished(self.checkpoints)
-        # Version 0.1 wrote checkpoints under this name before it renamed them.
-        for old in [*self.written_checkpoints()[KEEP:], *self.checkpoints.glob("step-*.partial")]:
-            old.unlink(missing_ok=True)
+        Names count as numbers: as texts, step 10,000,000 would come before step 9,999,999.
+        """
+        if not self.checkpoints.is_dir():
+            return []
+        found = ((_CHECKPOINT.fullmatch(path.name), path) for path in self.checkpoints.iterdir())
+        numbered = [(int(match[1]), path) for match, path in found if match]
+        return [path for _, path in sorted(numbered, reverse=True)]
+
+    def tidy_checkpoints(self, newest: Path) -> None:
+        """Delete all checkpoints but this one, which is good, and the newest few before it.
+
+        Those after it are damaged, or of steps that were taken again.
+        """
+        written = self.written_checkpoints()
+        at = written.index(newest)
+        for path in written[:at] + written[at + KEEP :]:
+            _remove(path)
+
+    def sweep(self) -> None:
+        """Delete what a killed process left unfinished; only with the lock."""
+        for folder in (self.path, self.checkpoints, self.previews):
+            # Version 0.1 wrote checkpoints under the name of `*.partial`.
+            for path in [*folder.glob(".*.tmp"), *folder.glob("step-*.partial")]:
+                _remove(path)
 
     def preview(self, step: int) -> Path:
         """The preview after a number of steps."""
@@ -272,6 +341,9 @@ class RunFolder:
         """
         metrics = read_object(self.metrics_file, self.evaluate_again)
         check_format(metrics, METRICS_FORMAT, self.metrics_file)
+        wrong = run_numbers.wrong_in_metrics(metrics)
+        if wrong:
+            raise UserError(wrong, self.metrics_file, self.evaluate_again)
         return metrics
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
@@ -282,3 +354,27 @@ class RunFolder:
     def evaluate_again(self) -> str:
         """The remedy where an evaluation is missing or damaged."""
         return f"Run `unbake evaluate {self.path}`"
+
+
+def require_no_link(path: Path) -> None:
+    """Refuse a symbolic link: what is written to a run stays in its folder.
+
+    Raises:
+        UserError: it is one.
+    """
+    if path.is_symlink():
+        raise UserError("is a symbolic link", path, "Put what it names in its place")
+
+
+def _filled(folder: Path) -> bool:
+    """Whether there is something other than an empty folder."""
+    if folder.is_symlink() or not folder.is_dir():
+        return folder.is_symlink() or folder.exists()
+    return any(folder.iterdir())
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
