@@ -5,6 +5,7 @@ Import it from test modules alone, which are read once the Mitsuba variant is se
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from statistics import NormalDist
 
@@ -18,10 +19,12 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
 from unbake.quantities import QUANTITIES
+from unbake.transport.methods import method_named
 from unbake.transport.operator import attach_material, bounce
 from unbake.transport.path_sample import Requirements
 from unbake.transport.path_tracer import path_traced
-from unbake.transport.vertex import find_vertex
+from unbake.transport.samplers import PathSampler, SamplerContext, make_sampler
+from unbake.transport.vertex import SceneView, find_vertex
 
 #: The smallest network that still has a hash table and a hidden layer.
 TINY = NetworkConfig(
@@ -190,6 +193,14 @@ class ConstantMaterials:
         self.albedo, self.roughness = mi.Color3f(albedo), mi.Float(roughness)
         self.metallic = None if metallic is None else mi.Float(metallic)
 
+    def stand_alone(self) -> None:
+        """As `Materials` do: textures evaluate the materials themselves from now on."""
+        self.carried = False
+
+    def values(self) -> tuple:
+        """Its fields: none."""
+        return ()
+
     def __iter__(self):
         names = ("albedo", "roughness", "metallic")
         return iter(names if self.metallic is not None else names[:2])
@@ -238,6 +249,36 @@ class PathTracedRadiance:
             return dr.select(valid, total - sees.emitted, 0)
 
 
+def planned_sampler(
+    method: str,
+    scene_view: SceneView,
+    ray: mi.Ray3f,
+    spp: int,
+    *,
+    max_depth: int,
+    bounces: int = 1,
+    radiance: object = None,
+    read_by_scene: Callable[[], dict] = dict,
+) -> PathSampler:
+    """The path sampler of a method, without Russian roulette, planned with these camera rays."""
+    context = SamplerContext(
+        method_named(method),
+        scene_view,
+        radiance,
+        hide_emitters=False,
+        spp=spp,
+        bounces=bounces,
+        max_depth=max_depth,
+        rr_depth=max_depth,
+        read_by_scene=read_by_scene,
+    )
+    sampler = make_sampler(context)
+    if sampler.keeps_paths:
+        with sampler.prepared():
+            sampler.plan(scene_view.scene, ray, seeded(0, dr.width(ray)))
+    return sampler
+
+
 # ------------------------------------------------------------------------------------ statistics
 
 
@@ -247,6 +288,7 @@ def stock_path(
     seed: int,
     *,
     max_depth: int,
+    rr_depth: int = 5,
     hide_emitters: bool = False,
     integrator: str = "path",
 ) -> mi.Color3f:
@@ -256,7 +298,12 @@ def stock_path(
         integrator: `volpath` where opacities are fractions: see `path_integrator`.
     """
     integrator = mi.load_dict(
-        {"type": integrator, "max_depth": max_depth, "rr_depth": 5, "hide_emitters": hide_emitters}
+        {
+            "type": integrator,
+            "max_depth": max_depth,
+            "rr_depth": rr_depth,
+            "hide_emitters": hide_emitters,
+        }
     )
     with dr.suspend_grad():
         ray = mi.RayDifferential3f(ray)

@@ -21,13 +21,6 @@ ALBEDO, ROUGHNESS = (0.6, 0.3, 0.45), 0.35
 SPP, DEPTH = 16, 4
 
 
-class StandIn(ConstantMaterials):
-    """Constant materials that textures may ask themselves."""
-
-    def stand_alone(self):
-        self.carried = False
-
-
 @pytest.fixture(scope="module")
 def held_plugin():
     """Register the BSDF that samples as one material and evaluates as another."""
@@ -109,7 +102,7 @@ def test_gradient_is_the_derivative_of_the_estimator(held_plugin, built_in, meth
     ray = pixel_rays(built_in_cameras(name, 12), SPP, seed=1)
     sampler = seeded(2, dr.width(ray))
 
-    materials = StandIn(mi.Color3f(*ALBEDO), ROUGHNESS)
+    materials = ConstantMaterials(mi.Color3f(*ALBEDO), ROUGHNESS)
     parameters = {"albedo": materials.albedo, "roughness": materials.roughness}
     textures = material_textures(materials)
     scene = with_bsdf(built_in(name), "principled", **textures)
@@ -146,7 +139,7 @@ def test_gradient_is_the_derivative_of_the_estimator(held_plugin, built_in, meth
 @pytest.mark.parametrize("method", ["prb", "ad-pt"])
 def test_the_whole_gradient_of_the_furnace(built_in, method, albedo):
     """With paths of up to d vertices, I = Σ ρⁱ for i < d, and ∂I/∂ρ = Σ i ρⁱ⁻¹."""
-    materials = StandIn(albedo)
+    materials = ConstantMaterials(albedo)
     parsed = parse(built_in("furnace"))
     texture = material_textures(materials)["base_color"]
     for node in parsed.state.nodes:

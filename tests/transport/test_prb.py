@@ -141,11 +141,6 @@ def test_hidden_lights_are_those_of_the_photographs(tmp_path):
     np.testing.assert_allclose(image, photographs, atol=0.1)
 
 
-class Everywhere(ConstantMaterials):
-    def stand_alone(self):
-        self.carried = False
-
-
 # ------------------------------------------------------------------------------------ cut-outs
 
 
@@ -180,7 +175,7 @@ def test_cut_outs_are_those_of_mitsubas_volumetric_path_tracer(tmp_path, instanc
 def test_gradients_through_cut_outs_are_finite_differences(tmp_path, instanced):
     """Neither the material nor the cut-out samples by albedo: the same paths show its effect."""
     path, camera = leaves(tmp_path, instanced=instanced)
-    materials = Everywhere(0.5, 0.6)
+    materials = ConstantMaterials(0.5, 0.6)
     parsed = parse(path)
     edit.set_textures(parsed, material_textures(materials))
     scene = parsed.instantiate()
@@ -207,7 +202,7 @@ def test_gradients_through_cut_outs_are_finite_differences(tmp_path, instanced):
 
 
 def test_split_halves_and_two_passes_have_one_expectation(built_in):
-    materials = Everywhere(0.6, 0.4)
+    materials = ConstantMaterials(0.6, 0.4)
     parsed = parse(built_in("cornell"))
     edit.to_principled(parsed)
     edit.set_textures(parsed, material_textures(materials))
