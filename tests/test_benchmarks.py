@@ -5,9 +5,11 @@ import os
 import runpy
 import subprocess
 import sys
+import time
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 
@@ -361,3 +363,85 @@ def test_roulette_is_measured_by_time_and_noise(repository, cornell, tmp_path):
             assert relative == pytest.approx(efficiency / rows[5]["efficiency"][unknown])
     # Paths that end early at random are noisier than paths that do not.
     assert rows[1]["variance"]["albedo"] > rows[None]["variance"]["albedo"]
+
+
+# ------------------------------------------------------------------------------------------- soak
+
+
+@pytest.fixture(scope="module")
+def soak(repository):
+    return runpy.run_path(str(repository / "benchmarks" / "soak.py"))
+
+
+def watched(soak, count=60, memory=lambda i: 400.0, files=lambda i: 9, variables=lambda i: 300):
+    """What a soak finds in samples every 500 steps."""
+    samples = [
+        soak["Sample"](500 * i, 30.0 * i, memory(i), files(i), 5, variables(i))
+        for i in range(count)
+    ]
+    found = soak["growth"](samples)
+    return found, soak["problems"](found)
+
+
+def test_a_soak_that_stays_flat_has_no_problem(soak):
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0, 0.5, 60)
+    # The warm-up may grow, and what comes and goes is none.
+    found, problems = watched(
+        soak,
+        memory=lambda i: 400 - 6 / (1 + i) ** 2 + noise[i],
+        files=lambda i: 9 + i % 3,
+        variables=lambda i: 300 + 40 * (i % 7 == 0),
+    )
+    assert problems == []
+    low, high = found["slope_range"]
+    assert low < 0 < high and high - low < 0.2
+
+
+@pytest.mark.parametrize(
+    ("grows", "said"),
+    [
+        ({"memory": lambda i: 400 + 0.6 * i}, "memory rises by 1.20 MB in 1,000 steps"),
+        ({"files": lambda i: 9 + i // 10}, "files rise from"),
+        ({"variables": lambda i: 300 + i}, "variables rise from"),
+        ({"count": 3}, "too few samples"),
+    ],
+)
+def test_a_soak_tells_what_grows(soak, grows, said):
+    _, problems = watched(soak, **grows)
+    assert len(problems) == 1 and said in problems[0]
+
+
+def test_neighbouring_samples_that_resemble_each_other_count_as_fewer(soak):
+    rng = np.random.default_rng(1)
+    steps, alone = rng.normal(0, 1, 400), rng.normal(0, 1, 400)
+    alike = np.convolve(steps, np.ones(10) / 10**0.5, "same")
+    widths = []
+    for noise in (alone, alike):
+        low, high = watched(soak, 400, lambda i, n=noise: 400 + n[i])[0]["slope_range"]
+        widths.append(high - low)
+    assert widths[1] > 2 * widths[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_soak_writes_what_it_has_seen(repository, ended, tmp_path):
+    out = tmp_path / "soak.json"
+    words = ["--steps", 100_000 if ended else 120, "--every", 20, "--resolution", 16, "--out", out]
+    process = subprocess.Popen(
+        [sys.executable, str(repository / "benchmarks" / "soak.py"), *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    while ended and not (out.exists() and len(read(out)["samples"]) >= 8):
+        assert process.poll() is None
+        time.sleep(0.2)
+    if ended:
+        process.terminate()
+    printed, _ = process.communicate(timeout=200)
+    result = read(out)
+    assert result["complete"] is not ended, printed
+    assert result["taken_steps"] >= 120 and len(result["samples"]) >= 6
+    assert result["files"]["after"] > 0 and result["variables"]["after"] > 0
+    assert process.returncode == (1 if result["problems"] else 0)
