@@ -1,7 +1,7 @@
 # One command a job; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev lint test test-fast test-slow docs demo bench clean distclean
+.PHONY: help setup setup-dev lint test test-fast test-slow fuzz soak docs demo bench clean distclean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-complete
@@ -54,6 +54,12 @@ test-fast: setup-dev ## tests of single functions, under a minute
 test-slow: setup-dev ## every test, minutes; those for a GPU run where there is one
 	@$(PYTEST) --timeout 1800 $(ARGS)
 
+fuzz: setup-dev ## damage files of every format, N of them (10000): each is read or refused in one line
+	@$(BIN)/python benchmarks/fuzz.py --count $(or $(N),10000) $(ARGS)
+
+soak: setup ## a fit of HOURS (2) in one process, watched for memory and files that grow
+	@$(BIN)/python benchmarks/soak.py --hours $(or $(HOURS),2) $(ARGS)
+
 docs: setup-dev ## the documentation site, into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
@@ -64,7 +70,7 @@ bench: setup ## where the time of a step goes here, into benchmarks/results (STA
 	@$(BIN)/python benchmarks/run.py machine --again
 
 clean: ## remove the demo, builds and caches
-	rm -rf demo build dist site src/*.egg-info .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf demo build dist site src/*.egg-info .hypothesis .pytest_cache .ruff_cache .import_linter_cache
 	find src tests scripts -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean ## the same and .venv

@@ -1,0 +1,376 @@
+"""The table of formats: for each file that unbake reads, examples, mutations, and what reads it.
+
+A new format is one entry of `FORMATS`. Readers are called as commands are: an error that the
+command line tells in one line is good, and so is a file that is read.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from . import mutations
+from .mutations import Mutation
+
+ROOT = Path(__file__).parents[2]
+#: A data set and a run that version 0.1 wrote.
+FIRST = ROOT / "tests" / "data" / "version-0.1"
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file.
+
+    Args:
+        file: where the damaged file lies in the folder that is read.
+        samples: whole files, which are damaged.
+        mutations: how; what is named twice is twice as likely.
+        read: reads the folder, as a command does.
+        prepare: fills the folder with the files around the damaged one.
+        weight: how many inputs it gets, compared to others.
+        makes: files that `read` may make when it succeeds.
+    """
+
+    file: str
+    samples: Callable[[], Sequence[bytes]]
+    mutations: tuple[Mutation, ...]
+    read: Callable[[Path], object]
+    prepare: Callable[[Path], object] = lambda folder: None
+    weight: float = 1.0
+    makes: tuple[str, ...] = ()
+
+
+def _files(*names: str) -> Callable[[], Sequence[bytes]]:
+    """Files of the first version as samples."""
+    return lambda: [(FIRST / name).read_bytes() for name in names]
+
+
+def _texts(*texts: str) -> Callable[[], Sequence[bytes]]:
+    return lambda: [text.encode() for text in texts]
+
+
+# --------------------------------------------------------------------------------------- data sets
+
+
+def _data_set(folder: Path) -> None:
+    shutil.copytree(FIRST / "data", folder, dirs_exist_ok=True)
+
+
+def _data_set_of_pfm(folder: Path) -> None:
+    """A data set one of whose photographs is a PFM."""
+    _data_set(folder)
+    file = folder / "transforms.json"
+    file.write_text(file.read_text().replace("train_001.exr", "train_001.pfm"))
+
+
+def _load_data(folder: Path) -> None:
+    from unbake.dataset.views import Dataset
+
+    Dataset.load(folder)
+
+
+def _read_cameras(folder: Path) -> None:
+    from unbake.dataset.camera import read_cameras
+
+    read_cameras(folder / "cameras.json", 8, 8)
+
+
+def _load_photographs(folder: Path) -> None:
+    from unbake.dataset.views import Dataset
+    from unbake.training.problem import training_pixels
+
+    training_pixels(Dataset.load(folder), clip_negative=True)
+
+
+def _read_picture(folder: Path) -> None:
+    from unbake.imaging.pictures import read_exr
+
+    read_exr(folder / "picture.exr")
+
+
+def _read_emission(folder: Path) -> None:
+    from unbake.dataset.lighting import true_emission
+
+    true_emission(folder)
+
+
+CAMERAS = json.dumps(
+    {
+        "cameras": [
+            {"name": "train_000", "split": "train", "origin": [0, -3, 1], "target": [0, 0, 1.5],
+             "up": [0, 0, 1], "fov": 45.0},
+            {"origin": [0.5, -3, 1], "target": [0, 0, 1], "up": [0, 0, 1], "fov": 60},
+            {"split": "heldout", "w": 16, "h": 16, "fl_x": 20, "transform_matrix":
+             [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]},
+        ]
+    }
+)  # fmt: skip
+
+
+def _floats(count: int) -> bytes:
+    """Pixels of a picture in little-endian float32."""
+    import numpy as np
+
+    return np.linspace(0.1, 2, count, dtype="<f4").tobytes()
+
+
+def _pfm() -> Sequence[bytes]:
+    return [b"PF\n16 16\n-1.0\n" + _floats(768), b"Pf\n16 16\n-1.0\n" + _floats(256)]
+
+
+# ------------------------------------------------------------------------------------------ scenes
+
+_LIGHT = (
+    '<shape type="rectangle" id="lamp"><transform name="to_world"><translate z="3"/></transform>'
+    '<emitter type="area"><rgb name="radiance" value="4 3 2"/></emitter></shape>'
+)
+_SCENE = '<scene version="3.0.0">{}</scene>'
+_MATERIALS = _SCENE.format(
+    _LIGHT + '<shape type="sphere"><point name="center" x="1" y="0" z="0"/>'
+    '<float name="radius" value="0.5"/><bsdf type="twosided" id="red"><bsdf type="diffuse">'
+    '<rgb name="reflectance" value="0.6 0.3 0.1"/></bsdf></bsdf></shape>'
+    '<shape type="cube"><bsdf type="roughplastic" id="plastic">'
+    '<rgb name="diffuse_reflectance" value="0.1 0.3 0.6"/><float name="alpha" value="0.1"/>'
+    '<float name="int_ior" value="1.5"/><boolean name="nonlinear" value="false"/></bsdf></shape>'
+    '<shape type="disk"><transform name="to_world"><rotate x="1" angle="90"/>'
+    '<scale value="2"/></transform><bsdf type="mask"><float name="opacity" value="0.7"/>'
+    '<bsdf type="principled"><float name="roughness" value="0.2"/></bsdf></bsdf></shape>'
+)
+_LIT_BY_ALL = _SCENE.format(
+    '<default name="size" value="16"/>'
+    '<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">'
+    '<lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm">'
+    '<integer name="width" value="$size"/><integer name="height" value="$size"/></film></sensor>'
+    '<emitter type="constant"><rgb name="radiance" value="1 1 1"/></emitter>'
+    '<emitter type="point"><spectrum name="intensity" value="400:1, 700:2"/>'
+    '<point name="position" x="0" y="2" z="0"/></emitter>'
+    '<bsdf type="bumpmap" id="rough"><texture type="bitmap" name="bump">'
+    '<string name="filename" value="bump.exr"/></texture><bsdf type="principled">'
+    '<texture type="bitmap" name="base_color"><string name="filename" value="bump.exr"/></texture>'
+    "</bsdf></bsdf>"
+    '<shape type="shapegroup" id="group"><shape type="sphere"><ref id="rough"/></shape></shape>'
+    '<shape type="instance"><ref id="group"/><transform name="to_world"><translate x="2"/>'
+    "</transform></shape>"
+    '<shape type="ply"><string name="filename" value="mesh.ply"/><ref id="rough"/></shape>'
+)
+_ROOM = _SCENE.format(
+    _LIGHT + '<shape type="{kind}"><string name="filename" value="mesh.{kind}"/>'
+    '<bsdf type="diffuse" id="grey"/></shape>'
+)
+_ASCII_PLY = """ply
+format ascii 1.0
+comment a square
+element vertex 4
+property float x
+property float y
+property float z
+property float nx
+property float ny
+property float nz
+property float u
+property float v
+element face 2
+property list uchar int vertex_indices
+end_header
+0 0 0 0 0 1 0 0
+1 0 0 0 0 1 1 0
+1 1 0 0 0 1 1 1
+0 1 0 0 0 1 0 1
+3 0 1 2
+3 0 2 3
+"""
+_OBJ = """# a square
+o square
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+vt 0 0
+vt 1 0
+vt 1 1
+vn 0 0 1
+f 1/1/1 2/2/1 3/3/1
+f 1//1 3//1 4//1
+"""
+_TINY = """
+steps = 2
+pixels = 8
+[materials.albedo.neural]
+width = 8
+hidden = 1
+grid = { levels = 2, table_log2 = 8, base_resolution = 2 }
+[materials.roughness.neural]
+width = 8
+hidden = 1
+grid = { levels = 2, table_log2 = 8, base_resolution = 2 }
+[radiance.neural]
+width = 8
+hidden = 1
+grid = { levels = 2, table_log2 = 8, base_resolution = 2 }
+"""
+
+
+@cache
+def _tiny_settings():
+    from unbake.config.toml import from_toml
+
+    return from_toml(_TINY)
+
+
+@cache
+def _camera():
+    from unbake.dataset.camera import Camera
+
+    return Camera.look_at((0, -3, 1), (0, 0, 0), (0, 0, 1), 45, 8, 8)
+
+
+def _make_scene(folder: Path) -> None:
+    """Make the problem of a fit, and look around in its scene."""
+    from unbake.dataset.views import check_cameras
+    from unbake.training.problem import make_problem
+
+    problem = make_problem(folder / "scene.xml", "visible", _tiny_settings(), 0.3)
+    check_cameras(problem.scene_view.scene, {"view": _camera()})
+
+
+def _around_scene(text: str) -> Callable[[Path], None]:
+    def prepare(folder: Path) -> None:
+        (folder / "scene.xml").write_text(text)
+        (folder / "mesh.ply").write_text(_ASCII_PLY)
+        shutil.copy(FIRST / "data" / "images" / "train_000.exr", folder / "bump.exr")
+
+    return prepare
+
+
+# -------------------------------------------------------------------------------------------- runs
+
+
+def _run(folder: Path) -> None:
+    """A run and its data set, with nothing in the log that a page would draw."""
+    shutil.copytree(FIRST, folder, dirs_exist_ok=True)
+    (folder / "run" / "log.jsonl").write_text('{"step": 60, "seconds": 1.0}\n')
+
+
+def _report(folder: Path) -> None:
+    from unbake.report.page import write_report
+
+    write_report([folder / "run"], folder / "page.html")
+
+
+def _read_settings(folder: Path) -> None:
+    from unbake.config.toml import read_toml, to_toml
+
+    to_toml(read_toml(folder / "settings.toml"))
+
+
+def _read_run_settings(folder: Path) -> None:
+    from unbake.training.run_folder import RunFolder
+
+    RunFolder(folder / "run").settings()
+    RunFolder(folder / "run").settings_table()
+
+
+def _read_origin(folder: Path) -> None:
+    from unbake.training.run_folder import RunFolder
+
+    run = RunFolder(folder / "run")
+    run.data(run.origin().data).is_dir()
+
+
+def _load_run(folder: Path) -> None:
+    from unbake.training.recovered import load_run
+
+    load_run(folder / "run")
+
+
+_LOG = "".join(
+    json.dumps(row) + "\n"
+    for row in (
+        {"step": 20, "seconds": 0.5, "samples": 2560, "photometric": 0.3, "skipped": 0,
+         "samples_per_second": 5120.0, "memory_mb": 300.0, "learning_rate": 0.001},
+        {"step": 40, "seconds": 1.0, "samples": 5120, "photometric": 0.2, "skipped": 1,
+         "samples_per_second": 5120.0, "memory_mb": 300.0, "learning_rate": 0.001},
+        {"step": 60, "seconds": 1.5, "score": {"views": 1, "albedo_psnr": 20.5}},
+        {"step": 60, "seconds": 1.5, "validation": {"split": "heldout", "albedo_psnr": 20.5}},
+    )
+)  # fmt: skip
+_SEARCHES = json.dumps(
+    {
+        "format": 1,
+        "definitions": {},
+        "searches": [{"method": "ours", "data": "room", "unknown": "materials", "trials": []}],
+    }
+)
+
+
+def _read_searches(folder: Path) -> None:
+    from unbake.comparison.bench_rates import _read
+
+    _read(folder / "rates.json")
+
+
+# ---------------------------------------------------------------------------------------- the table
+
+FORMATS: dict[str, Format] = {
+    "transforms.json": Format(
+        "transforms.json", _files("data/transforms.json"), mutations.JSON, _load_data, _data_set, 3
+    ),
+    "cameras": Format("cameras.json", _texts(CAMERAS), mutations.JSON, _read_cameras, weight=3),
+    "emission.json": Format(
+        "truth/emission.json", _files("data/truth/emission.json"), mutations.JSON, _read_emission,
+        _data_set, 2,
+    ),
+    "settings": Format(
+        "settings.toml", _files("run/config.toml"), mutations.TOML, _read_settings, weight=3
+    ),
+    "config.toml": Format(
+        "run/config.toml", _files("run/config.toml"), mutations.TOML, _read_run_settings, _run
+    ),
+    "origin.json": Format(
+        "run/origin.json", _files("run/origin.json"), mutations.JSON, _read_origin, _run
+    ),
+    "log.jsonl": Format(
+        "run/log.jsonl", _texts(_LOG), mutations.JSON_LINES, _report, _run, 0.1, ("page.html",)
+    ),
+    "metrics.json": Format(
+        "run/evaluation/metrics.json", _files("run/evaluation/metrics.json"), mutations.JSON,
+        _report, _run, 0.6, ("page.html",),
+    ),
+    "rates.json": Format("rates.json", _texts(_SEARCHES), mutations.JSON, _read_searches),
+    "checkpoint": Format(
+        "run/checkpoints/step-0000060.safetensors",
+        _files("run/checkpoints/step-0000060.safetensors"), mutations.SAFETENSORS, _load_run, _run,
+        0.7,
+    ),
+    "photograph": Format(
+        "images/train_001.exr", _files("data/images/train_001.exr"), mutations.IMAGE,
+        _load_photographs, _data_set, 3,
+    ),
+    "photograph pfm": Format(
+        "images/train_001.pfm", _pfm, mutations.IMAGE, _load_photographs, _data_set_of_pfm
+    ),
+    "picture": Format(
+        "picture.exr", _files("data/images/train_001.exr"), mutations.IMAGE, _read_picture, weight=2
+    ),
+    "scene.xml": Format(
+        "scene.xml", _texts(_MATERIALS, _LIT_BY_ALL), mutations.XML, _make_scene, _around_scene(""),
+        2.5,
+    ),
+    "ply": Format(
+        "mesh.ply",
+        lambda: [_ASCII_PLY.encode(), *_files("data/scene/meshes/tall.ply")()], mutations.MESH,
+        _make_scene, _around_scene(_ROOM.format(kind="ply")), 2,
+    ),
+    "obj": Format(
+        "mesh.obj", _texts(_OBJ), mutations.TEXT, _make_scene,
+        _around_scene(_ROOM.format(kind="obj")), 1,
+    ),
+    "texture": Format(
+        "bump.exr", _files("data/images/train_000.exr"), mutations.IMAGE, _make_scene,
+        _around_scene(_LIT_BY_ALL), 0.7,
+    ),
+}  # fmt: skip
