@@ -24,8 +24,9 @@ from .defaults import with_defaults
 from .memory import memory_mb
 from .monitor import Monitor
 from .path_depth import told_depth, with_path_depth
+from .plausibility import data_warnings
 from .preview import Preview
-from .problem import Problem, camera_warnings, make_problem, training_pixels
+from .problem import Problem, make_problem, training_pixels
 from .run_folder import Origin, RunFolder
 from .run_lock import RunLock
 from .saving import Saving
@@ -131,7 +132,7 @@ def _begin(
     if before is not None:
         _require_same_data(folder, before, origin)
     problem = make_problem(dataset.scene, dataset.background, config, origin.mean_radiance)
-    for warning in camera_warnings(dataset, problem.scene_view.scene):
+    for warning in data_warnings(dataset, pixels, problem):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
     if config.follows_paths:

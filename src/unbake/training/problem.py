@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -14,7 +13,7 @@ from ..config import FitConfig
 from ..dataset.data_folder import TRANSFORMS
 from ..dataset.photographs import Photographs
 from ..dataset.pixels import CameraRays, PixelSource
-from ..dataset.views import Dataset, check_cameras
+from ..dataset.views import Dataset
 from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.emission import Emission, emission_textures
@@ -194,10 +193,3 @@ def training_pixels(dataset: Dataset, *, clip_negative: bool, smoothed: bool = T
     if photographs.mean <= 0:
         raise UserError("all training images are black", dataset.folder)
     return PixelSource(CameraRays.of([view.camera for view in views]), photographs)
-
-
-def camera_warnings(dataset: Dataset, scene: mi.Scene) -> list[str]:
-    """One line for each camera that seems to stand inside geometry."""
-    with dr.suspend_grad():
-        inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
-    return [f"{name}: the camera seems to stand inside geometry" for name in inside]

@@ -1,0 +1,153 @@
+"""Whether cameras see the scene where their photographs do, and what may be wrong if not."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError, printable
+from ..scene import free_space
+from .camera import Camera
+from .photographs import Photographs
+from .views import View
+
+#: Pixels that are looked through, of all views.
+_PIXELS = 4096
+#: Shares of the pixels below which poses are doubtful. Where the background is hidden, or black as
+#: in a scene without environment, all others show surfaces; else many may show the sky.
+_DOUBTFUL, _DOUBTFUL_WITH_SKY = 0.8, 0.02
+#: A view counts as blind if as many of its pixels or more see nothing.
+_BLIND = 16
+#: A mistake is named if as large a share of the pixels that see nothing would see surfaces.
+_CONVINCING = 0.5
+
+# From OpenCV's cameras, which look along z with y down, to OpenGL's.
+_OPENCV = np.diag([1.0, -1.0, -1.0])
+# A quarter turn about x, either way: between worlds whose z and whose y points up.
+_TURNS = {
+    "": np.eye(3),
+    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+
+
+@dataclass(frozen=True)
+class _Mistake:
+    """What poses may have been written with, and how they are without it."""
+
+    told: str
+    scale: float
+    turn: np.ndarray  # (3, 3), of the world
+    flip: np.ndarray  # (3, 3), of the camera's axes
+
+    def corrected(self, camera: Camera) -> Camera:
+        pose = np.eye(4)
+        pose[:3, :3] = self.turn @ camera.to_world[:3, :3] @ self.flip
+        pose[:3, 3] = self.scale * (self.turn @ camera.origin)
+        return replace(camera, to_world=pose)
+
+
+def pose_warnings(
+    scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path
+) -> list[str]:
+    """One line for each sign that poses do not belong to the scene.
+
+    Args:
+        scene: that the photographs show.
+        views: to train on.
+        photographs: of these views.
+        where: the data set's folder, for the error.
+
+    Raises:
+        UserError: no pixel sees a surface of the scene. It names the mistake that explains that, if
+            there is one.
+    """
+    cameras = [view.camera for view in views]
+    numbers = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
+    sky = photographs.chosen is None and scene.environment() is not None
+    if photographs.chosen is not None:
+        numbers = photographs.chosen[numbers]
+    elif not sky:
+        numbers = numbers[photographs.table[numbers, :3].any(axis=1)]
+    seen = _seen(scene, cameras, numbers)
+    share = float(seen.mean()) if len(seen) else 1.0
+    if share < (_DOUBTFUL_WITH_SKY if sky else _DOUBTFUL):
+        remedy = _likely(scene, cameras, numbers, share)
+        if share == 0:
+            raise UserError("no training view sees a surface of the scene", where, remedy)
+        what = f"only {100 * share:.2g} % of the pixels to train on see a surface of the scene"
+        return [f"{what}. {remedy}"]
+    view = _views_of(cameras, numbers)
+    count = np.bincount(view, minlength=len(views))
+    hits = np.bincount(view, seen, len(views))
+    blind = [
+        printable(views[i].name) for i in np.flatnonzero((count >= _BLIND) & (hits == 0)).tolist()
+    ]
+    if not blind:
+        return []
+    more = f" and {len(blind) - 3} more" if len(blind) > 3 else ""
+    remedy = _likely(scene, cameras, numbers, share)
+    return [f"{', '.join(blind[:3])}{more}: the view sees no surface of the scene. {remedy}"]
+
+
+def _likely(scene: mi.Scene, cameras: Sequence[Camera], numbers: np.ndarray, share: float) -> str:
+    """What to correct, as a sentence: the simplest of the mistakes that explain what is seen."""
+    found = [
+        (mistake, float(_seen(scene, [mistake.corrected(c) for c in cameras], numbers).mean()))
+        for mistake in _mistakes(_scales(scene, cameras))
+    ]
+    best = max(value for _, value in found)
+    if best < share + _CONVINCING * (1 - share):
+        return "Check the axes and the units of the poses, and that they are of this scene"
+    mistake, value = next((m, v) for m, v in found if v >= 0.97 * best)
+    return f"Are poses {mistake.told}? Without that {100 * value:.0f} % would"
+
+
+def _mistakes(scales: Sequence[float]) -> Iterator[_Mistake]:
+    """All mistakes with these scales: single ones first, and of these the most common."""
+    parts = itertools.product(_TURNS.items(), scales, (False, True))
+    named = []
+    for (up, turn), scale, opencv in parts:
+        told = []
+        if opencv:
+            told.append("in OpenCV's axes (negate columns 2 and 3 of the matrix)")
+        if scale != 1:
+            told.append(f"in other units (multiply positions by {scale:g})")
+        if up:
+            told.append(f"of a world with {up} up (turn them by 90° about x)")
+        named.append((told, scale, turn, _OPENCV if opencv else np.eye(3)))
+    for told, scale, turn, flip in sorted(named, key=lambda entry: len(entry[0])):
+        if told:
+            yield _Mistake(" and ".join(told), scale, turn, flip)
+
+
+def _scales(scene: mi.Scene, cameras: Sequence[Camera]) -> list[float]:
+    """Scales that positions may need, by how they lie: scaled down, any camera is in the middle."""
+    low, high, diagonal = free_space.bounds(scene)
+    origins = np.array([camera.origin for camera in cameras])
+    away = np.median(np.linalg.norm(origins - (low + high) / 2, axis=1))
+    apart = np.linalg.norm(np.ptp(origins, axis=0))
+    larger = [100.0, 1000.0] if apart < 0.1 * diagonal else []
+    return [1.0, *([1e-3, 1e-2] if away > 10 * diagonal else larger)]
+
+
+def _views_of(cameras: Sequence[Camera], numbers: np.ndarray) -> np.ndarray:
+    """The view of each pixel, all views' pixels being numbered one after the other."""
+    return np.searchsorted(np.cumsum([c.width * c.height for c in cameras]), numbers, "right")
+
+
+def _seen(scene: mi.Scene, cameras: Sequence[Camera], numbers: np.ndarray) -> np.ndarray:
+    """Whether pixels see a surface, (n,) bool."""
+    view = _views_of(cameras, numbers)
+    first = np.cumsum([0, *(c.width * c.height for c in cameras)])
+    origins, directions = np.empty((2, len(numbers), 3))
+    for i in np.unique(view):
+        here = view == i
+        row, column = np.divmod(numbers[here].astype(np.int64) - first[i], cameras[i].width)
+        origins[here], directions[here] = cameras[i].rays(column + 0.5, row + 0.5)
+    return np.isfinite(free_space.trace(scene, origins, directions).distance)

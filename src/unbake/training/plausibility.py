@@ -1,0 +1,103 @@
+"""Whether photographs, cameras and lights of a fit can belong together."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.outliers import told_outliers
+from ..dataset.pixels import PixelSource
+from ..dataset.poses import pose_warnings
+from ..dataset.views import Dataset, check_cameras
+from ..fields.arrays import from_numpy
+from ..transport.render import RayGenerator, render_radiance
+from .problem import Problem
+
+#: Photographs that are so many times brighter or darker than the scene's lights make grey surfaces
+#: are in other units. Between black and white surfaces, and in corners that light reaches after
+#: many reflections, there is less.
+FACTOR = 50.0
+_PIXELS, _SAMPLES, _DEPTH = 1024, 8, 8
+_GREY = 0.5
+
+
+def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> list[str]:
+    """One line for each sign that something is wrong with the data of a fit.
+
+    Args:
+        dataset: of the fit.
+        pixels: to train on.
+        problem: with untrained fields.
+
+    Raises:
+        UserError: no training view sees a surface of the scene.
+    """
+    scene = problem.scene_view.scene
+    with dr.suspend_grad():
+        inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
+        found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
+        found += pose_warnings(scene, dataset.train, pixels.photographs, dataset.folder)
+        units = None if found else _other_units(pixels, problem)
+    return [line for line in (*found, units, told_outliers(pixels.photographs.outliers)) if line]
+
+
+def _other_units(pixels: PixelSource, problem: Problem) -> str | None:
+    """A line if the photographs are too bright or too dark for lights that are known."""
+    if problem.environment is not None or problem.emission is not None:
+        return None
+    photographs = pixels.photographs
+    numbers = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
+    if photographs.chosen is not None:
+        numbers = photographs.chosen[numbers]
+    mean = float(photographs.table[numbers, :3].mean(dtype=np.float64))
+    table = from_numpy(mi.UInt32, numbers.astype(np.uint32))
+
+    def through(pixel: mi.UInt32, offset: mi.Point2f) -> mi.Ray3f:
+        return pixels.rays.through(dr.gather(mi.UInt32, table, pixel), offset)
+
+    # Direct light is quickly compiled and most often enough; corners that it does not reach need
+    # the whole paths.
+    for estimate in (_direct_light, _all_light):
+        expected = estimate(problem, through)
+        if mean < FACTOR * expected and expected < FACTOR * mean:
+            return None
+    if expected <= 0:
+        return "no light of the scene reaches what the training views see"
+    told = "brighter" if mean > expected else "darker"
+    ratio = max(mean / expected, expected / mean) if mean > 0 else np.inf
+    return (
+        f"the photographs are {ratio:.2g} times {told} than the scene's lights make grey surfaces. "
+        "Are they in other units than the lights?"
+    )
+
+
+def _direct_light(problem: Problem, through: RayGenerator) -> float:
+    """Mean radiance of the pixels if surfaces were grey and reflected direct light alone."""
+    scene = problem.scene_view.scene
+    count = _PIXELS * _SAMPLES
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    ray = through(dr.arange(mi.UInt32, count) // _SAMPLES, sampler.next_2d())
+    si = scene.ray_intersect(ray)
+    direction, light = scene.sample_emitter_direction(si, sampler.next_2d(), True, si.is_valid())
+    reflected = light * dr.abs(dr.dot(si.n, direction.d)) * (_GREY / dr.pi)
+    seen = si.is_valid() | (not problem.hide_emitters)
+    emitted = si.emitter(scene).eval(si)
+    total = dr.select(si.is_valid(), reflected, 0) + dr.select(seen, emitted, 0)
+    return float(np.nanmean(np.array(total)))
+
+
+def _all_light(problem: Problem, through: RayGenerator) -> float:
+    """Mean radiance of the pixels with untrained materials, which are grey."""
+    image = render_radiance(
+        problem.scene_view,
+        through,
+        _PIXELS,
+        _SAMPLES,
+        seed=0,
+        max_depth=_DEPTH,
+        rr_depth=_DEPTH,
+        hide_emitters=problem.hide_emitters,
+    )
+    return float(image.mean(dtype=np.float64))

@@ -1,0 +1,77 @@
+"""Photographs in other units than the lights are told, and good data are not doubted."""
+
+import shutil
+
+import numpy as np
+import pytest
+from support import TINY_FIT
+
+from unbake.config import update
+from unbake.dataset.views import Dataset
+from unbake.imaging.pictures import read_exr, write_exr
+from unbake.training import plausibility
+from unbake.training.fresh_fit import begin_fit
+from unbake.training.plausibility import data_warnings
+
+
+def told(folder, config=TINY_FIT):
+    dataset = Dataset.load(folder)
+    fit = begin_fit(dataset, config)
+    return data_warnings(dataset, fit.pixels, fit.problem)
+
+
+@pytest.fixture
+def times(cornell, tmp_path):
+    """The data set with photographs times a factor."""
+
+    def make(factor):
+        data = shutil.copytree(cornell, tmp_path / "data", dirs_exist_ok=True)
+        for name in ("train_000", "train_001"):
+            pixels = read_exr(cornell / "images" / f"{name}.exr")
+            pixels[..., :3] *= factor
+            write_exr(data / "images" / f"{name}.exr", pixels)
+        return data
+
+    return make
+
+
+def test_good_data_are_not_doubted(cornell):
+    assert told(cornell) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"), [(1e6, "e+06 times brighter"), (1e-6, "times darker")]
+)
+def test_photographs_in_other_units_are_told(factor, message, times):
+    (line,) = told(times(factor))
+    assert line.startswith("the photographs are ") and message in line
+    assert line.endswith("Are they in other units than the lights?")
+
+
+@pytest.mark.parametrize("factor", [0.1, 10])
+def test_dark_and_bright_surfaces_are_not_doubted(factor, times):
+    assert told(times(factor)) == []
+
+
+def test_where_lights_are_unknown_any_brightness_is_good(times):
+    lighting = update(TINY_FIT, {"unknown": "emission"})
+    assert told(times(1e6), lighting) == []
+
+
+def test_what_direct_light_does_not_reach_is_lit_by_whole_paths(cornell, monkeypatch):
+    monkeypatch.setattr(plausibility, "_direct_light", lambda *words: 0.0)
+    assert told(cornell) == []
+    monkeypatch.setattr(plausibility, "_all_light", lambda *words: 0.0)
+    assert told(cornell) == ["no light of the scene reaches what the training views see"]
+
+
+def test_a_pixel_that_is_far_too_bright_is_told(times):
+    data = times(1)
+    image = data / "images" / "train_001.exr"
+    pixels = read_exr(image)
+    pixels[3, 5, :3] = 1e8
+    write_exr(image, pixels)
+    (line,) = told(data)
+    assert line.startswith("1 pixel is over 10,000 times as bright as the others: ")
+    assert "train_001 at (5, 3): 1e+08, taken as " in line
+    assert np.isfinite(float(line.rsplit(" ", 1)[1]))
