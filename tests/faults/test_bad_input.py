@@ -307,7 +307,21 @@ def test_a_binary_file_is_no_scene(refuses, tmp_path):
 def test_a_damaged_mesh(refused_fit, data):
     (data / "scene" / "meshes" / "tall.ply").write_bytes(b"ply\nformat")
     line = refused_fit(data)
-    assert "Mitsuba cannot make this scene" in line and "tall.ply" in line
+    assert "tall.ply: not a PLY file: its header is not readable" in line
+
+
+def test_a_mesh_of_vertices_that_it_does_not_have(data, refuses, tmp_path, tiny):
+    """Mitsuba read beyond its vertices: capturing ended by a signal, fitting went on."""
+    mesh = data / "scene" / "meshes" / "tall.ply"
+    content = bytearray(mesh.read_bytes())
+    content[-4:] = (4_000_000).to_bytes(4, "little")
+    mesh.write_bytes(content)
+    for words in (
+        ("capture", data / "scene" / "scene.xml", "--out", tmp_path / "again"),
+        ("fit", data, "--out", tmp_path / "run", "--settings", tiny),
+    ):
+        line = refuses(*words)
+        assert "tall.ply: 1 of 10 triangles are of vertices that do not exist" in line
 
 
 def test_an_unknown_scene(refuses, tmp_path):

@@ -13,7 +13,7 @@ def find(name: str, folders: Iterable[Path], root: Path, where: object) -> Path:
 
     Args:
         name: as the scene has it: relative to one of the folders, or absolute.
-        root: folder that the file must not leave, with all links resolved.
+        root: folder that the file must not leave, without links.
         where: what names the file, for error messages.
 
     Raises:
@@ -38,9 +38,9 @@ def find_folder(name: str, folders: Iterable[Path], root: Path, where: object) -
 
 
 def require_inside(file: Path, root: Path, where: object, what: str) -> None:
-    """Raise a `UserError` if a file lies outside a folder, with all links resolved."""
+    """Raise a `UserError` if a file lies, all links resolved, outside a folder without links."""
     try:
-        inside = file.resolve().is_relative_to(root.resolve())
+        inside = file.resolve().is_relative_to(root)
     except (OSError, RuntimeError):  # such as a link to itself
         raise UserError(f"{what} cannot be found", where, "Check its links") from None
     if not inside:

@@ -16,6 +16,8 @@ import numpy as np
 from ..backend import mitsuba_folder
 from ..errors import UserError
 from .files import find
+from .images import IMAGES, check_image
+from .meshes import FORMATS, check_mesh
 from .preflight import check_xml
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]+", re.ASCII)
@@ -116,7 +118,7 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     """
     if not path.is_file():
         raise UserError("no such scene file", where=path)
-    root = path.parent if root is None else root
+    root = (path.parent if root is None else root).resolve()
     folders = check_xml(path, root)
     config = mi.parser.ParserConfig(mi.variant())
     try:
@@ -207,14 +209,22 @@ def _resolve_files(scene: ParsedScene, folders: list[Path]) -> None:
         folders: to search, after that of the file that has the name, and the scene's.
     """
     own = scene.path.parent.resolve()
+    beside = [Path(str(file)).parent.resolve() for file in scene.state.files]
     for node in scene.state.nodes:
         value = node.props.get("filename", None)
         if not isinstance(value, str):
             continue
-        where = mi.parser.file_location(scene.state, node)
-        beside = Path(str(scene.state.files[node.file_index])).parent.resolve()
-        file = find(value, [beside, own, *folders], scene.root, where)
-        node.props["filename"] = str(file.absolute())
+        try:
+            file = find(value, [beside[node.file_index], own, *folders], scene.root, None)
+        except UserError as error:
+            where = mi.parser.file_location(scene.state, node)
+            raise UserError(error.what, where, error.remedy) from None
+        node.props["filename"] = str(file)
+        plugin = node.props.plugin_name()
+        if plugin in FORMATS:
+            check_mesh(plugin, file, node.props.get("shape_index", 0))
+        elif plugin in IMAGES:
+            check_image(file)
 
 
 def _require_finite(scene: ParsedScene) -> None:

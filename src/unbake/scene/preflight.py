@@ -36,7 +36,7 @@ def check_xml(path: Path, root: Path) -> list[Path]:
 
     Args:
         path: the scene.
-        root: folder that what it includes must not leave.
+        root: folder that what it includes must not leave, without links.
 
     Returns:
         Folders in which the scene wants its files to be searched, besides its own.
