@@ -163,7 +163,7 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
     print(message)
     needed = re.fullmatch(
         r"a step of 8192 paths by ad-pt needs about (\S+) MB of memory, 0 MB are free\. "
-        r"Lower --batch or --spp or path\.max_depth, or use --method prb",
+        r"Lower --batch from 2048 to 1, or --spp or path\.max_depth, or use --method prb",
         message,
     )
     assert needed and 0 <= float(needed[1]) < 5000
@@ -180,9 +180,10 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
 def test_the_estimate_of_memory_is_what_a_step_then_takes(built_in):
     config = dataclasses.replace(TINY_FIT, method="ad-pt", pixels=32768, **SHORT)
     step, state = start(built_in, config)
-    estimate = step.bytes_needed(state)
-    if estimate is None:
+    forecast = step.forecast(state)
+    if forecast is None:
         pytest.skip("the memory of a step cannot be measured here")
+    estimate = forecast.bytes(config.pixels)
     state.set_learning_rates(rates(0))
     step.unfrozen(state, 1)
     taken = peak_bytes(lambda: step.unfrozen(state, 1))
@@ -199,9 +200,10 @@ def test_russian_roulette_saves_memory(built_in):
             TINY_FIT, method="ad-pt", pixels=8192, representation="grid", path=path
         )
         step, state = start(built_in, config, scene="furnace")
-        needed[rr_depth] = step.bytes_needed(state)
-        if needed[rr_depth] is None:
+        forecast = step.forecast(state)
+        if forecast is None:
             pytest.skip("the memory of a step cannot be measured here")
+        needed[rr_depth] = forecast.bytes(config.pixels)
     print({depth: f"{need / 1e6:.1f} MB" for depth, need in needed.items()})
     assert 0 < needed[1] < 0.7 * needed[24]
 

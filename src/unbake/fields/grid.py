@@ -11,7 +11,7 @@ import mitsuba as mi
 from .arrays import first_value, sigmoid
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
-from .settings import DenseGridConfig
+from .settings import DenseGridConfig, features_of
 
 
 class DenseGrid(Field):
@@ -27,7 +27,7 @@ class DenseGrid(Field):
         self.outputs = spec.outputs
         self.bounded = spec.bounded
         corners = settings.cells + 1
-        features = max(2, 1 << (spec.outputs - 1).bit_length())
+        features = features_of(spec.outputs)
         # A hash grid of one level whose table has room for every corner hashes nothing.
         self.grid = nn.HashGridEncoding(
             mi.Float,

@@ -10,6 +10,9 @@ from .domain import Domain, SurfacePoint
 from .field import Engine, Field, FieldSpec
 from .settings import FieldSettings
 
+#: Outputs of the function that is learned, and its inputs beside the position.
+OUTPUTS, EXTRA = 6, 12
+
 
 class RadianceField:
     """Reflected radiance as a function of position, direction, normal and albedo.
@@ -21,7 +24,7 @@ class RadianceField:
     Emission is not part of it: the rendering equation's E is known and added analytically.
 
     Args:
-        function: six outputs without bounds, of a position and twelve further inputs.
+        function: `OUTPUTS` without bounds, of a position and `EXTRA` further inputs.
         scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good
             one.
 
@@ -91,7 +94,7 @@ def make_radiance(
 
     Paper: Sec. 5.3, Fig. 5.
     """
-    spec = FieldSpec(outputs=6, extra=12, seed=seed, half=half)
+    spec = FieldSpec(outputs=OUTPUTS, extra=EXTRA, seed=seed, half=half)
     return RadianceField(
         registry.representation(representation).field(settings, spec), domain, scale=scale
     )

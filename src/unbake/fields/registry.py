@@ -43,6 +43,8 @@ class Representation:
             which is imported when the first field is made.
         radiance: settings of the radiance field; None: it cannot be represented so.
         unwrapped: the field is in texture coordinates, apart for each material.
+        size: the key of the settings, dotted, that decides how much memory a field takes; told
+            where it takes too much.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Representation:
     make: Maker | str
     radiance: FieldSettings | None = None
     unwrapped: bool = False
+    size: str | None = None
 
     def field(self, settings: FieldSettings, spec: FieldSpec) -> Field:
         """A fresh field."""
@@ -112,6 +115,7 @@ register_representation(
         NetworkConfig(),
         make="unbake.fields.network:Network",
         radiance=NetworkConfig(GridConfig(6)),
+        size="grid.table_log2",
     )
 )
 register_representation(
@@ -121,6 +125,7 @@ register_representation(
         DenseGridConfig(),
         make="unbake.fields.grid:DenseGrid",
         radiance=DenseGridConfig(),
+        size="cells",
     )
 )
 register_representation(
@@ -130,6 +135,7 @@ register_representation(
         BitmapConfig(),
         make="unbake.fields.bitmap:Bitmaps",
         unwrapped=True,
+        size="resolution",
     )
 )
 register_representation(
@@ -139,5 +145,6 @@ register_representation(
         TriPlaneConfig(),
         make="unbake.fields.triplane:TriPlane",
         radiance=TriPlaneConfig(hidden=2),
+        size="base_resolution",
     )
 )

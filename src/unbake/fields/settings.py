@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from ..errors import POSITIVE, require, require_ranges
 
@@ -30,6 +30,20 @@ class FieldSettings(Protocol):
         ...
 
 
+@runtime_checkable
+class SizedSettings(Protocol):
+    """Settings that tell how large a field they make, so that it can be refused before."""
+
+    def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
+        """How many numbers are learned: those of all parameters, or slightly more.
+
+        Args:
+            outputs, extra: as in `FieldSpec`.
+            materials: number of the scene's materials.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class GridConfig:
     """A multiresolution hash grid over the unit cube (Sec. 5.3; Müller et al. 2022)."""
@@ -48,6 +62,12 @@ class GridConfig:
         finest = math.log2(self.base_resolution) + (self.levels - 1) * math.log2(self.growth)
         require(finest <= 24, "levels", f"such that {_FINEST}", self.levels)
 
+    def numbers(self) -> int:
+        """How many numbers the tables hold, or slightly more."""
+        cells = [self.base_resolution * self.growth**level for level in range(self.levels)]
+        corners = [(math.ceil(n) + 2) ** 3 for n in cells]
+        return self.features * sum(min(1 << self.table_log2, count) for count in corners)
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -59,8 +79,12 @@ class NetworkConfig:
     learning_rate: float = 0.01  #: Adam (Sec. 5.4: 5e-4)
 
     def __post_init__(self) -> None:
-        ranges = {"width": _WIDTH, "hidden": _HIDDEN, "learning_rate": RATES}
-        require_ranges(self, ranges)
+        require_ranges(self, {"width": _WIDTH, "hidden": _HIDDEN, "learning_rate": RATES})
+
+    def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
+        """How many numbers are learned; see `SizedSettings`."""
+        inputs = self.grid.levels * self.grid.features + extra
+        return self.grid.numbers() + _of_layers(inputs, self.width, self.hidden, outputs)
 
 
 @dataclass(frozen=True)
@@ -72,6 +96,10 @@ class DenseGridConfig:
 
     def __post_init__(self) -> None:
         require_ranges(self, {"cells": (1, 512), "learning_rate": RATES})
+
+    def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
+        """How many numbers are learned; see `SizedSettings`."""
+        return features_of(outputs) * (self.cells + 1) ** 3
 
 
 @dataclass(frozen=True)
@@ -101,6 +129,13 @@ class TriPlaneConfig:
         """Corners along an edge of the finest level."""
         return self.base_resolution * 2 ** (self.levels - 1)
 
+    def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
+        """How many numbers are learned; see `SizedSettings`."""
+        corners = [(self.base_resolution * 2**level + 1) ** 2 for level in range(self.levels)]
+        inputs = self.levels * self.features + extra
+        layers = _of_layers(inputs, self.width, self.hidden, outputs)
+        return 3 * self.features * sum(corners) + layers
+
 
 @dataclass(frozen=True)
 class BitmapConfig:
@@ -111,3 +146,17 @@ class BitmapConfig:
 
     def __post_init__(self) -> None:
         require_ranges(self, {"resolution": (1, 8192), "learning_rate": RATES})
+
+    def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
+        """How many numbers are learned; see `SizedSettings`."""
+        return materials * self.resolution**2 * outputs
+
+
+def features_of(outputs: int) -> int:
+    """Features of a dense grid with so many outputs: a hash grid has a power of two, at least 2."""
+    return max(2, 1 << (outputs - 1).bit_length())
+
+
+def _of_layers(inputs: int, width: int, hidden: int, outputs: int) -> int:
+    """Weights and biases of a perceptron."""
+    return (inputs + 1) * width + (hidden - 1) * (width + 1) * width + (width + 1) * outputs

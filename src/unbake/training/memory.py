@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -57,23 +59,42 @@ def _peak_resident() -> int:
 
 #: Paths of the smaller of the two batches that a forecast measures.
 _PROBED_PATHS = 4096
-#: The remedy where paths do not fit the memory.
-SMALLER = "Lower --batch or --spp or path.max_depth, or use --method prb"
+#: More than a camera sample takes in a step, with any field in any method that does not keep paths:
+#: batches that fit the memory at that rate need no forecast.
+MOST_BYTES_A_SAMPLE = 1 << 16
 
 
 def lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error comes from Dr.Jit running out of memory, also while it records."""
-    while error is not None and "out of memory" not in str(error):
+    """Whether an error comes from running out of memory, also in Dr.Jit while it records."""
+    while error is not None:
+        if isinstance(error, MemoryError) or "out of memory" in str(error):
+            return True
         error = error.__cause__ or error.__context__
-    return error is not None
+    return False
 
 
-def forecast_bytes(probe: Callable[[int], None], pixels: int, spp: int) -> float | None:
-    """Memory that a batch will take, from two smaller ones; None where it cannot be measured.
+@dataclass(frozen=True)
+class Forecast:
+    """Memory that batches will take: a line through two that were measured."""
+
+    fixed: float
+    a_pixel: float
+
+    def bytes(self, pixels: int) -> float:
+        """Memory of a batch."""
+        return self.fixed + self.a_pixel * pixels
+
+    def pixels(self, free: float) -> int:
+        """The largest batch that takes no more; 1 if none does."""
+        return max(1, math.floor((free - self.fixed) / max(self.a_pixel, 1e-9)))
+
+
+def forecast(probe: Callable[[int], None], pixels: int, spp: int) -> Forecast | None:
+    """Memory of batches, from two smaller ones; None where it cannot be measured.
 
     Args:
         probe: computes a batch of this number of pixels, and drops the results.
-        pixels: of the batch.
+        pixels: of the batch that is wanted.
         spp: samples a pixel.
     """
     few = max(1, min(pixels // 4, _PROBED_PATHS // spp))
@@ -81,4 +102,5 @@ def forecast_bytes(probe: Callable[[int], None], pixels: int, spp: int) -> float
     fewer, more = (peak_bytes(lambda n=n: probe(n)) for n in (few, 2 * few))
     if fewer is None or more is None:
         return None
-    return more + max(0, more - fewer) * (pixels / few - 2)
+    a_pixel = max(0, more - fewer) / few
+    return Forecast(more - 2 * few * a_pixel, a_pixel)

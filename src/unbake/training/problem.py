@@ -27,6 +27,7 @@ from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
+from .limits import require_room
 
 Parameters = Mapping[str, mi.Float | mi.TensorXf]
 
@@ -95,11 +96,12 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
             the settings say it.
 
     Raises:
-        UserError: the scene cannot be loaded, has no emitter or nothing to fit, or has meshes
-            without the texture coordinates that bitmaps need.
+        UserError: the scene cannot be loaded, has no emitter or nothing to fit, has meshes without
+            the texture coordinates that bitmaps need, or the fields do not fit the memory.
     """
     parsed = parse(scene)
     edit.to_principled(parsed)
+    require_room(config, len(edit.material_names(parsed)))
     seeds = np.random.SeedSequence(config.seed).generate_state(2)
     materials = environment = emission = None
     emitter_names: list[str] = []

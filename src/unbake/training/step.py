@@ -19,12 +19,12 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
 from ..errors import UserError
-from ..memory import require_memory
+from ..memory import free_bytes, require_memory
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
 from .loss_scaling import gradients_are_finite, next_scale
-from .memory import SMALLER, forecast_bytes, lacks_memory
+from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast, lacks_memory
 from .problem import Problem
 from .regularizers import regularization_terms
 from .state import State
@@ -69,7 +69,7 @@ class TrainingStep:
             field.recordable for field in problem.fields()
         )
         self._frozen = dr.freeze(self._step) if recordable else None
-        self._fits_memory = not self._path_sampler.keeps_paths
+        self._fits_memory = False  # as far as is known
         self._planned = not self._path_sampler.keeps_paths
 
     def __call__(
@@ -82,7 +82,7 @@ class TrainingStep:
             rates: Adam's learning rates; see `learning_rates`.
 
         Raises:
-            UserError: `ad-pt` would need more memory than there is.
+            UserError: the step needs more memory than there is.
         """
         self.plan(state)
         self.require_memory(state)
@@ -90,11 +90,13 @@ class TrainingStep:
         try:
             with without_garbage_collection():
                 return step(self.prepare(state, number, rates), state)
-        except RuntimeError as error:
+        except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
                 raise
-            lanes = self._config.samples_per_pass
-            raise UserError(f"no memory for a step of {lanes} paths", None, SMALLER) from None
+            paths = self._config.samples_per_pass
+            raise UserError(
+                f"no memory for a step of {paths} paths", None, self._smaller()
+            ) from None
 
     def plan(self, state: State) -> None:
         """Let the path sampler decide what it fixes for all steps, once.
@@ -116,22 +118,25 @@ class TrainingStep:
     def require_memory(self, state: State) -> None:
         """Raise an error if a step would need more memory than there is free.
 
-        This is checked once, for methods that keep whole paths in memory. Two smaller batches are
-        measured, and their gradients dropped.
+        This is checked once, where the method keeps whole paths in memory or the batch is large.
+        Two smaller batches are measured, and their gradients dropped.
 
         Raises:
-            UserError: the step would need more.
+            UserError: the step would need more; it names the batch that would fit.
         """
         if self._fits_memory:
             return
-        paths, method = self._config.samples_per_pass, self._config.method
-        require_memory(
-            self.bytes_needed(state), f"a step of {paths} paths by {method} needs", SMALLER
-        )
+        paths, free = self._config.samples_per_pass, free_bytes()
+        large = free is not None and paths * MOST_BYTES_A_SAMPLE > free
+        found = self.forecast(state) if large or self._path_sampler.keeps_paths else None
+        if found is not None:
+            what = f"a step of {paths} paths by {self._config.method} needs"
+            need = found.bytes(self._config.pixels)
+            require_memory(need, what, lambda free: self._smaller(found.pixels(free)))
         self._fits_memory = True
 
-    def bytes_needed(self, state: State) -> float | None:
-        """Memory that a step will take; None where it cannot be measured."""
+    def forecast(self, state: State) -> Forecast | None:
+        """Memory that steps will take; None where it cannot be measured."""
         self.plan(state)
 
         def probe(pixels: int) -> None:
@@ -140,7 +145,20 @@ class TrainingStep:
                 dr.eval(terms, [dr.grad(value) for value in optimizer.values()])
                 dr.clear_grad(dict(optimizer.items()))
 
-        return forecast_bytes(probe, self._config.pixels, self._config.spp)
+        return forecast(probe, self._config.pixels, self._config.spp)
+
+    def _smaller(self, pixels: int | None = None) -> str:
+        """The remedy where a step does not fit the memory.
+
+        Args:
+            pixels: of a batch that would fit, if it is known.
+        """
+        told = "Lower --batch or --spp"
+        if pixels is not None:
+            told = f"Lower --batch from {self._config.pixels} to {pixels}, or --spp"
+        if self._path_sampler.keeps_paths:
+            told += " or path.max_depth, or use --method prb"
+        return told
 
     def recordings(self) -> int:
         """How often the step was traced to be replayed; 0 if it is traced each time."""

@@ -1,0 +1,106 @@
+"""What a fit needs, before it is made: memory of its fields."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ..config import FieldSettings, FitConfig, update
+from ..errors import UserError
+from ..fields import radiance
+from ..fields.registry import Representation, representation
+from ..fields.settings import SizedSettings
+from ..memory import largest, require_memory
+from ..quantities import QUANTITIES
+from ..transport.objective import has_radiance
+
+#: Memory of a number that is learned: its value, its gradient and Adam's two moments, these anew in
+#: a step, and all copied and put together for a checkpoint. Measured: 62 to 70.
+BYTES_A_NUMBER = 72
+
+
+@dataclass(frozen=True)
+class _Field:
+    """A field that a fit will make."""
+
+    key: str  #: of its settings, dotted
+    form: Representation
+    settings: FieldSettings
+    outputs: int
+    extra: int = 0
+
+    def bytes(self, materials: int) -> int:
+        """Memory that it takes; 0 if its settings do not tell."""
+        if not isinstance(self.settings, SizedSettings):
+            return 0
+        return BYTES_A_NUMBER * self.settings.numbers(self.outputs, self.extra, materials)
+
+    @property
+    def size(self) -> int:
+        """The setting that decides how large it is."""
+        value: Any = self.settings
+        for key in (self.form.size or "").split("."):
+            value = getattr(value, key)
+        return value
+
+    def resized(self, size: int) -> _Field | None:
+        """The field in another size; None if it cannot have it."""
+        table: Mapping[str, Any] | int = size
+        for key in reversed((self.form.size or "").split(".")):
+            table = {key: table}
+        assert isinstance(table, Mapping)
+        try:
+            return replace(self, settings=update(self.settings, table))
+        except UserError:
+            return None
+
+
+def require_room(config: FitConfig, materials: int) -> None:
+    """Refuse fields that do not fit the memory, before any is made.
+
+    Args:
+        config: settings of the fit.
+        materials: number of the scene's materials.
+
+    Raises:
+        UserError: they do not fit; it names the largest field, and the size that would fit.
+    """
+    fields = _fields(config)
+    needs = {field.key: field.bytes(materials) for field in fields}
+    total = sum(needs.values())
+    if not total:
+        return
+    worst = max(fields, key=lambda field: needs[field.key])
+    others = total - needs[worst.key]
+
+    def remedy(free: int) -> str:
+        if worst.form.size is None:
+            return f"Make the field of {worst.key} smaller"
+
+        def fits(size: int) -> bool:
+            resized = worst.resized(size)
+            return resized is None or others + resized.bytes(materials) <= free
+
+        most = largest(fits, worst.size)
+        name = f"{worst.key}.{worst.form.size}"
+        if most and worst.resized(most):
+            return f"Lower {name} from {worst.size} to {most} or less"
+        return f"Lower {name} and those of the other fields"
+
+    told = "the fields of this fit, with gradients and Adam's moments, need"
+    require_memory(total, told, remedy, worst.key)
+
+
+def _fields(config: FitConfig) -> list[_Field]:
+    found = []
+    if config.learns_materials:
+        form = representation(config.representation)
+        for name, settings in config.material_settings.items():
+            key = f"materials.{name}.{form.name}"
+            found.append(_Field(key, form, settings, QUANTITIES[name].channels))
+    if has_radiance(config.chosen_method):
+        form, settings = representation(config.radiance_representation), config.radiance_settings
+        key = f"radiance.{form.name}"
+        found.append(_Field(key, form, settings, radiance.OUTPUTS, radiance.EXTRA))
+    return found
