@@ -339,3 +339,51 @@ def assert_same_expectation(ours: mi.Color3f, theirs: mi.Color3f, spp: int) -> N
     print(report)
     assert accepted >= 0.9975, report
     assert np.abs(whole).max() < 3.5, report
+
+
+def student_quantile(probability: float, freedom: int) -> float:
+    """Quantile of Student's t distribution, to 1 % from 10 degrees of freedom on.
+
+    Abramowitz and Stegun, 26.7.5.
+    """
+    z = NormalDist().inv_cdf(probability)
+    first = (z**3 + z) / 4
+    second = (5 * z**5 + 16 * z**3 + 3 * z) / 96
+    third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384
+    return z + first / freedom + second / freedom**2 + third / freedom**3
+
+
+def assert_same_mean(
+    batches: np.ndarray,
+    expected: np.ndarray,
+    error: np.ndarray,
+    names: list[str],
+    tests: int,
+) -> np.ndarray:
+    """Z-test of the means of independent batches, each against a reference with a standard error.
+
+    Significance 1 % over all tests of a matrix, with Šidák's correction.
+
+    Args:
+        batches: (batches, numbers).
+        expected, error: (numbers,).
+        names: of the numbers.
+        tests: numbers that are compared in the whole matrix.
+
+    Returns:
+        The relative deviations that would have been rejected, (numbers,).
+    """
+    assert np.isfinite(batches).all() and np.isfinite(expected).all()
+    count = len(batches)
+    spread = np.sqrt(batches.var(0, ddof=1) / count + error**2)
+    z = (batches.mean(0) - expected) / spread
+    alpha = 1 - (1 - 0.01) ** (1 / tests)
+    limit = student_quantile(1 - alpha / 2, count - 1)
+    seen = limit * spread / np.abs(expected)
+    rows = zip(names, batches.mean(0), expected, z, seen, strict=True)
+    report = "\n".join(
+        f"{n}: {a:.5g} and {b:.5g}, z {c:.2f}, sees {d:.2%}" for n, a, b, c, d in rows
+    )
+    print(report)
+    assert np.abs(z).max() < limit, f"a |z| exceeds {limit:.2f}\n{report}"
+    return seen
