@@ -90,6 +90,21 @@ def locked(folder: Path) -> Iterator[bool]:
         os.close(number)
 
 
+def is_locked(folder: Path) -> bool:
+    """Whether a process holds a folder, or may hold it."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(number)
+    return False
+
+
 def write_text(path: Path, content: str, *, durable: bool = False) -> None:
     """Write a UTF-8 text file, complete or not at all; arguments as in `write_atomically`."""
     write_atomically(path, lambda p: p.write_text(content, encoding="utf-8"), durable=durable)

@@ -1,14 +1,18 @@
 """Capture from scene files: truth is what the scene says, and nothing is lost on the way."""
 
+import os
+
 import numpy as np
 import pytest
 
+from unbake.acquisition import capture as module
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.dataset.camera import LookAt, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.io import locked
 from unbake.scene.parse import parse
 
 SMALL = CaptureSettings(views=2, held_out=1, resolution=24, spp=8, max_depth=6)
@@ -140,8 +144,81 @@ def test_a_capture_that_fails_leaves_nothing(failure, tmp_path, monkeypatch):
     monkeypatch.setattr("unbake.acquisition.capture._truth", fail)
     settings = CaptureSettings(views=1, held_out=0, resolution=4, spp=1)
     with pytest.raises((UserError, KeyboardInterrupt)):
-        capture("cube", tmp_path / "data", settings, tell=lambda line: None)
+        capture("cube", tmp_path / "new" / "data", settings, tell=lambda line: None)
     assert not list(tmp_path.iterdir())
+
+
+TINY = CaptureSettings(views=1, held_out=0, resolution=4, spp=1, max_depth=2)
+
+
+@pytest.mark.parametrize("scene", ["cube", "cbue", "none.xml"])
+def test_a_folder_of_the_user_is_left_alone(scene, tmp_path):
+    """`data.partial` was deleted, even if the scene's name was misspelt."""
+    mine = tmp_path / "data.partial"
+    mine.mkdir()
+    (mine / "work").write_text("years")
+    if scene == "cube":
+        capture(scene, tmp_path / "data", TINY, tell=lambda line: None)
+    else:
+        with pytest.raises(UserError, match="no such scene"):
+            capture(scene, tmp_path / "new" / "data", TINY, tell=lambda line: None)
+    assert (mine / "work").read_text() == "years"
+    left = {"data.partial", "data"} if scene == "cube" else {"data.partial"}
+    assert {p.name for p in tmp_path.iterdir()} == left
+
+
+def test_what_a_killed_capture_has_left_is_told_and_what_a_live_one_has_is_not(tmp_path, told):
+    left, live = (tmp_path / f".data.{digit * 16}.partial" for digit in "ab")
+    other = tmp_path / ".data.mine.partial"
+    for folder in (left, live, other):
+        folder.mkdir()
+    with locked(live):
+        capture("cube", tmp_path / "data", TINY, tell=told.append)
+    assert [line for line in told if "did not finish" in line] == [
+        f"an earlier capture did not finish and has left {left}"
+    ]
+    assert all(folder.is_dir() for folder in (left, live, other))
+
+
+@pytest.mark.parametrize("kind", ["folder", "link"])
+def test_a_folder_that_appears_meanwhile_is_not_replaced(kind, tmp_path, monkeypatch):
+    out = tmp_path / "data"
+
+    def appear(*words):
+        if kind == "folder":
+            out.mkdir()
+            (out / "mine").write_text("mine")
+        else:
+            out.symlink_to(tmp_path / "elsewhere")
+        return real(*words)
+
+    real = module._truth
+    monkeypatch.setattr(module, "_truth", appear)
+    with pytest.raises(UserError, match="data: cannot be written"):
+        capture("cube", out, TINY, tell=lambda line: None)
+    assert [p.name for p in tmp_path.iterdir()] == ["data"]
+    assert out.is_symlink() or [p.name for p in out.iterdir()] == ["mine"]
+
+
+def test_a_link_that_leads_nowhere_is_not_written_through(tmp_path):
+    (tmp_path / "data").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="data: exists already"):
+        capture("cube", tmp_path / "data", TINY, tell=lambda line: None)
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("place", ["out", "scene"])
+def test_a_path_that_is_not_utf8_is_refused(place, tmp_path):
+    odd = tmp_path / "d\udcff"
+    words = ("cube", odd) if place == "out" else (odd / "scene.xml", tmp_path / "data")
+    with pytest.raises(UserError, match=r"the path of the (data folder|scene) is not UTF-8"):
+        capture(*words, TINY, tell=lambda line: None)
+
+
+def test_a_pipe_is_no_scene(tmp_path):
+    os.mkfifo(tmp_path / "scene.xml")
+    with pytest.raises(UserError, match="it is a pipe or a device"):
+        capture(tmp_path / "scene.xml", tmp_path / "data", TINY, tell=lambda line: None)
 
 
 HALF_OPAQUE = """<scene version="3.0.0">

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
+import secrets
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +19,10 @@ from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
-from ..errors import UserError
+from ..errors import UserError, printable
 from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
+from ..io import is_locked, locked, require_file, require_utf8
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import parse, write
@@ -30,6 +35,10 @@ from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
 #: Samples a pixel of the truth images, which are noisy at edges only.
 TRUTH_SAMPLES = 16
+
+_KIND = "data folder"
+#: How the names of unfinished captures end.
+_PARTIAL = ".partial"
 
 
 def capture(
@@ -54,20 +63,55 @@ def capture(
     Paper: Sec. 6.
     """
     out, cameras = Path(out), None if cameras is None else Path(cameras)
-    if out.exists():
+    _require_scene(str(scene))
+    require_utf8(out, _KIND)
+    if os.path.lexists(out):
         raise UserError("exists already", where=out, remedy="Give another --out, or remove it")
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    # Nobody else has a folder of this name: what is removed in the end is our own.
+    partial = out.with_name(f"{_partial_name(out)}{secrets.token_hex(8)}{_PARTIAL}")
+    missing = [folder for folder in out.parents if not folder.exists()]
     try:
+        _tell_unfinished(out, tell)
         partial.mkdir(parents=True)
-        dataset = _capture(str(scene), DataFolder(partial), settings, cameras, tell)
-        dataset.save(partial)
-        partial.rename(out)
+        with locked(partial):
+            dataset = _capture(str(scene), DataFolder(partial), settings, cameras, tell)
+            dataset.save(partial)
+            partial.rename(out)
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", where=out) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            for folder in missing:  # if they are empty: where nothing was written
+                folder.rmdir()
     return Dataset.load(out)
+
+
+def _require_scene(name: str) -> None:
+    """Refuse a misspelt scene before anything is written."""
+    if name in SCENES:
+        return
+    path = Path(name)
+    require_utf8(path, "scene")
+    if path.suffix != ".xml" and not path.exists():
+        known = ", ".join(SCENES)
+        raise UserError(f"no such scene: {name!r}", None, f"Give an XML file or one of {known}")
+    if not path.exists():
+        raise UserError("no such scene file", where=path)
+    require_file(path, "scene file")
+
+
+def _partial_name(out: Path) -> str:
+    """How the names of unfinished captures to a folder begin."""
+    return f".{out.name[:100]}."
+
+
+def _tell_unfinished(out: Path, tell: Callable[[str], None]) -> None:
+    """Tell of captures to this folder that were killed; they are left for the user to remove."""
+    pattern = re.compile(re.escape(_partial_name(out)) + r"[0-9a-f]{16}" + re.escape(_PARTIAL))
+    for folder in out.parent.iterdir() if out.parent.is_dir() else ():
+        if pattern.fullmatch(folder.name) and not is_locked(folder):
+            tell(f"an earlier capture did not finish and has left {printable(folder, 1000)}")
 
 
 def _capture(
@@ -138,13 +182,7 @@ def _copy_scene(name: str, folder: Path, tell: Callable[[str], None]) -> tuple[P
     """
     folder.mkdir(parents=True)
     made = folder.with_name("made")
-    if name in SCENES:
-        source = write_scene(name, made)
-    else:
-        source = Path(name)
-        if source.suffix != ".xml" and not source.exists():
-            known = ", ".join(SCENES)
-            raise UserError(f"no such scene: {name!r}", None, f"Give an XML file or one of {known}")
+    source = write_scene(name, made) if name in SCENES else Path(name)
     parsed = parse(source)
     changed = edit.to_principled(parsed)
     if changed:
