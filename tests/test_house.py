@@ -7,11 +7,6 @@ import pytest
 
 FORBIDDEN = {
     "unfinished work": r"\b(TODO|FIXME|XXX)\b|raise NotImplementedError",
-    "code run from data": (
-        r"(?<![\w.])(?<!def )(eval|exec)\(|\bpickle\b|\bdill\b|yaml\.(unsafe_|full_)?load\b"
-        r"|allow_pickle\s*=\s*True"
-    ),
-    "a shell between us and a command": r"shell\s*=\s*True|os\.system\(",
     "a path of one machine": (
         r"[\"'\s(=](/home/|/root/|/Users/|/work/|/tmp/|/mnt/|[A-Z]:\\\\?Users)"
     ),
@@ -80,11 +75,6 @@ def test_source_is_free_of(rule, repository):
 @pytest.mark.parametrize(
     ("rule", "line", "hit"),
     [
-        ("code run from data", "value = eval(text)", True),
-        ("code run from data", "dr.eval(value); mi_bsdf.eval(ctx)", False),
-        ("code run from data", "def eval(self, si, active=True):", False),
-        ("code run from data", "exec(code)", True),
-        ("code run from data", "np.load(path, allow_pickle=True)", True),
         ("unfinished work", "# TODO: later", True),
         ("a path of one machine", 'open("/home/me/scene.xml")', True),
         ("a path of one machine", '"/usr/lib/*/libLLVM*.so*"', False),
