@@ -455,7 +455,7 @@ def plan_steps(bench: Bench, name: str, benchmark: Steps) -> Planned:
 
 
 #: Fits of a search with one seed, about; seconds of each beside the fit itself, and of a step.
-TRIALS, SCORING, STEP = 7, 6.0, 0.008
+TRIALS, SCORING, STEP = 12, 6.0, 0.008
 
 
 def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
@@ -466,7 +466,7 @@ def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
     options, text = bench.settings(None)
     folders = [bench.data(data) for data in benchmark.data]
     described = {"settings": text, "data": [str(folder) for folder in folders]}
-    described |= {"seconds": benchmark.seconds, "steps": benchmark.steps}
+    described |= {"seconds": benchmark.seconds, "steps": benchmark.steps, "schedule": True}
     file = bench.work / "rates" / digest(described) / f"{name}.json"
     jobs = [job for data in benchmark.data for job in bench.capture(data)]
     fits = TRIALS * len(folders) * len(benchmark.seeds)
@@ -474,7 +474,7 @@ def plan_rates(bench: Bench, name: str, benchmark: Rates) -> Planned:
     lengths += [(method, "--steps", n) for method, n in benchmark.steps.items()]
     for method, option, length in lengths:
         words = ["bench", "rates", "--data", *folders, "--methods", method, option, length]
-        words += [*options, "--seeds", *benchmark.seeds, "--out", file]
+        words += [*options, "--seeds", *benchmark.seeds, "--schedule", "--out", file]
         # Defaults of methods are what is searched: no search depends on them.
         settings = described | {"method": method, "seeds": list(benchmark.seeds)}
         command = partial(unbake, *words, until=bench.until)

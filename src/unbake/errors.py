@@ -94,13 +94,13 @@ def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) 
     """Raise a `UserError` that names all numbers of some settings that are out of range.
 
     Args:
-        settings: an object with the numbers as attributes.
+        settings: an object with the numbers as attributes; None is one that is left open.
         ranges: the least and the most of each, by its name.
     """
     wrong = []
     for key, (least, most) in ranges.items():
         value = getattr(settings, key)
-        wanted = _wanted(value, least, most)
+        wanted = None if value is None else _wanted(value, least, most)
         if wanted is not None:
             wrong.append((key, f"must be {wanted}, not {value!r}"))
     if wrong:

@@ -19,10 +19,10 @@ from unbake.transport.methods import METHODS
 def rates(unbake, cornell, tiny, tmp_path):
     """`rates("direct")` into the file `rates.json`."""
 
-    def run(*methods, data=cornell, steps=2, extra=(), seconds=None):
+    def run(*methods, data=cornell, steps=2, extra=(), seconds=None, settings=tiny):
         length = ("--steps", steps) if seconds is None else ("--seconds", seconds)
         return unbake("bench", "rates", "--data", data, "--methods", *methods, *length,
-                      "--settings", tiny, "--out", tmp_path / "rates.json", *extra)  # fmt: skip
+                      "--settings", settings, "--out", tmp_path / "rates.json", *extra)  # fmt: skip
 
     return run
 
@@ -142,6 +142,40 @@ def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, mon
     made.clear()
     assert rates("prb:neural:split-halves").status == 0
     assert {estimator for estimator, _ in made} == {"split-halves"}
+
+
+def test_the_schedule_is_searched_where_that_is_asked_for(rates, tmp_path, monkeypatch):
+    """Its values are recorded, those of all methods first, and become the method's own."""
+    made = []
+
+    def scores(fit, dataset):
+        final, warm_up = fit.config.final_learning_rate, fit.config.warm_up
+        made.append((final, warm_up))
+        return {"score": 20 - abs(math.log(final / 0.3125, 2.5)) + (warm_up == 100)}
+
+    monkeypatch.setattr(module, "_scores", scores)
+    monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
+    own = {"direct": {"room": MethodDefaults(final_learning_rate=0.7, warm_up=9)}}
+    monkeypatch.setattr(method_defaults, "METHOD_DEFAULTS", own)
+    settings = tmp_path / "open.toml"
+    settings.write_text("pixels = 64\nspp = 4\nsteps = 2\n")
+    assert rates("direct", extra=("--schedule",), settings=settings).status == 0
+    (search,) = searches(tmp_path)
+    first = search["trials"][0]
+    assert (first["final_learning_rate"], first["warm_up"]) == (0.05, 0)
+    best = search["best"]
+    assert (best["final_learning_rate"], best["warm_up"]) == (0.3125, 100)
+    assert best["factors"] == {"roughness": 1.0, "albedo": 1.0}
+    assert (0.78125, 0) in made and (0.3125, 250) in made, "both sides are tried"
+    found = found_defaults({"searches": [search]})["direct"]["room"]
+    assert (found.final_learning_rate, found.warm_up) == (0.3125, 100)
+    # Without it, a search has the schedule of all methods, whatever was found; and its own file.
+    outcome = rates("direct", settings=settings)
+    assert outcome.status == 2 and "final_learning_rate, warm_up. Give another" in outcome.err
+    (tmp_path / "rates.json").unlink()
+    made.clear()
+    assert rates("direct", settings=settings).status == 0
+    assert set(made) == {(0.05, 0)} and "warm_up" not in searches(tmp_path)[0]["best"]
 
 
 def trial(albedo, estimator, *scores):
@@ -266,6 +300,7 @@ def test_the_defaults_of_methods_are_those_that_were_found(repository):
         (("rates", "--data", "x", "--out", "o", "--steps", 0), "--steps: must be 1 or more"),
         (("rates", "--data", "x", "--out", "o", "--steps", 1, "--seconds", 1), "--steps: cannot"),
         (("methods", "--seconds", 3), "--seconds: is an option of rates"),
+        (("methods", "--schedule"), "--schedule: is an option of rates"),
         (("step", "--data", "x", "y"), "--data: step takes one data set"),
         (("rates", "--data", "x", "--out", "o.json"), "x: the data folder does not exist"),
     ],

@@ -28,7 +28,7 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
         ("ours", "neural", "neural", "split-halves"),
         ("prb", "grid", None, "split-halves"),
         ("prb", "grid", None, "two-pass"),
-        ("ad-pt", "neural", None, "split-halves"),
+        ("ad-pt", "neural", None, "two-pass"),
         ("direct", "bitmap", None, "split-halves"),
     ]
     first = rows[0]["milliseconds_per_step"]

@@ -46,7 +46,7 @@ def test_the_kind_of_scene_is_told_by_the_background(cornell):
 @pytest.mark.parametrize("method", METHODS)
 def test_only_methods_with_a_radiance_field_warm_up(method, cornell):
     """Without L_θ there is nothing to wait for: the first step has the whole rate."""
-    config = replace(TINY_FIT, method=method, warm_up=100)
+    config = replace(TINY_FIT, method=method, warm_up=None)
     fit = begin_fit(Dataset.load(cornell), config)
     assert (fit.problem.radiance is not None) == has_radiance(config.chosen_method)
     first, later = (learning_rates(fit.config, step, 0.0) for step in (0, 500))
@@ -57,15 +57,15 @@ def test_only_methods_with_a_radiance_field_warm_up(method, cornell):
 
 def test_a_fit_without_a_radiance_field_logs_its_whole_rate(unbake, cornell, tiny, tmp_path):
     settings = tmp_path / "warm.toml"
-    settings.write_text(tiny.read_text().replace("warm_up = 0", "warm_up = 10"))
+    settings.write_text(tiny.read_text().replace("warm_up = 0\n", ""))
     rates = {}
     for method in ("direct", "no-prior"):
         run = tmp_path / method
         words = ("--out", run, "--settings", settings, "--method", method, "--steps", 1)
         assert unbake("fit", cornell, *words).status == 0
         rates[method] = json.loads((run / "log.jsonl").read_text().splitlines()[0])["learning_rate"]
-        assert read_toml(run / "config.toml").warm_up == (10 if method == "no-prior" else 0)
-    assert rates["direct"] == pytest.approx(11 * rates["no-prior"], rel=1e-4)
+        assert read_toml(run / "config.toml").warm_up == (100 if method == "no-prior" else 0)
+    assert rates["direct"] == pytest.approx(101 * rates["no-prior"], rel=1e-3)
 
 
 def test_a_method_has_the_rates_that_were_found_for_it(table):
@@ -97,6 +97,26 @@ def test_what_a_user_says_stays(table):
         published = with_method_defaults(replace(preset(name), method="prb"), "room")
         assert set(published.rate_factors.values()) == {1.0}
         assert published.estimator == "two-pass"
+
+
+def test_a_method_has_the_schedule_that_was_found_or_given(monkeypatch):
+    """A warm-up that a user asks for is one, for methods without L_θ too."""
+    slow = MethodDefaults(final_learning_rate=0.3, warm_up=30)
+    monkeypatch.setattr(module, "METHOD_DEFAULTS", {"prb": {"room": slow}})
+
+    def schedule(method, **settings):
+        found = defaults(method, **settings)
+        return found.final_learning_rate, found.warm_up
+
+    assert schedule("prb") == schedule("ad-pt") == (0.3, 30)
+    assert schedule("direct") == (0.05, 0) and schedule("ours") == (0.05, 100)
+    assert schedule("prb", warm_up=7, final_learning_rate=1.0) == (1.0, 7)
+    assert schedule("direct", warm_up=7) == (0.05, 7)
+    # Another method has its own again.
+    ours = MethodVariant("ours").settings(defaults("prb"))
+    assert (ours.final_learning_rate, ours.warm_up) == (None, None)
+    published = replace(preset("paper"), method="prb")
+    assert with_method_defaults(published, "room").final_learning_rate == 1.0
 
 
 def test_factors_that_were_found_with_networks_are_for_networks(table, monkeypatch):

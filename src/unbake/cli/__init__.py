@@ -271,6 +271,7 @@ def bench(
     steps: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
     seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
     seeds: Annotated[tuple[int, ...], arg(metavar="SEEDS", help_behavior_hint="")] = (),
+    schedule: Flag = False,
     preset: Preset = None,
     settings: File = None,
     out: File = None,
@@ -293,6 +294,7 @@ def bench(
             fit (default: as in the settings).
         seconds: For rates, the length of a fit in seconds of training, instead of steps.
         seeds: For rates, seeds of the fits whose scores are averaged, such as 0 1 2 (default: 0).
+        schedule: For rates, also search how far all rates fall, and the warm-up of the unknowns.
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
@@ -304,9 +306,10 @@ def bench(
     if what == "rates":
         length = {"steps": steps, "seconds": seconds}
         chosen = with_length(chosen, {k: v for k, v in length.items() if v is not None})
-        _bench_rates(data, methods, chosen, out, seeds or (0,))
+        _bench_rates(data, methods, chosen, out, seeds or (0,), schedule)
         return
-    for option, given_value in {"seconds": seconds, "seeds": seeds or None}.items():
+    only = {"seconds": seconds, "seeds": seeds or None, "schedule": schedule or None}
+    for option, given_value in only.items():
         if given_value is not None:
             raise UserError("is an option of rates", f"--{option}", "Or: unbake bench rates")
     if len(data) > 1:
@@ -335,6 +338,7 @@ def _bench_rates(
     chosen: FitConfig,
     out: Path | None,
     seeds: tuple[int, ...],
+    schedule: bool,
 ) -> None:
     for option, value in {"data": data, "out": out}.items():
         if not value:
@@ -350,7 +354,7 @@ def _bench_rates(
     for seed in seeds:
         require("seeds", seed, 0)
     variants = [MethodVariant.of(method) for method in methods]
-    bench_rates(data, variants, chosen, out, Console(highlight=False), seeds)
+    bench_rates(data, variants, chosen, out, Console(highlight=False), seeds, schedule=schedule)
     _say(f"wrote {out}")
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from rich.console import Console
 
 from ..config import FitConfig, to_toml
+from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.scene_kind import SceneKind
@@ -30,7 +31,7 @@ from ..formats import check_format
 from ..io import read_object, write_json
 from ..machine import machine
 from ..quantities import QUANTITIES
-from ..training.defaults import with_defaults
+from ..training.defaults import own_warm_up, with_defaults
 from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
 from ..training.schedule import learning_rates
 from ..training.validation import Score
@@ -62,8 +63,15 @@ DEFINITIONS = {
     "needs as much; and once again if anything moved. Of the trial that is found, the estimator "
     "and then the rates are taken if they are better than the published estimator and the fields' "
     "own rates by more than the standard deviation of the difference over seeds",
+    "final_learning_rate": "factor that all rates reach at the end, where it is searched too",
+    "warm_up": "steps over which the unknowns' rates rise, where they are searched too",
     "seconds": "of the steps, whose kernels were compiled before",
 }
+
+#: Settings that can be searched beside the rates, after them.
+SCHEDULE = ("final_learning_rate", "warm_up")
+#: What tells the trials of a search apart.
+TRIED = ("factors", "estimator", *SCHEDULE)
 
 Row = dict[str, Any]
 
@@ -75,6 +83,8 @@ def bench_rates(
     out: Path | str,
     console: Console,
     seeds: Sequence[int] = (0,),
+    *,
+    schedule: bool = False,
 ) -> Row:
     """Search the learning rates of methods, and the estimator of those that follow paths.
 
@@ -90,6 +100,7 @@ def bench_rates(
         out: JSON file to write; searches of other methods and data sets that it has are kept.
         console: shows progress and a table.
         seeds: of the fits of a trial, whose scores are averaged. More of them may be given later.
+        schedule: also search the decay of all rates and the warm-up of the unknowns.
 
     Returns:
         The content of the file.
@@ -110,9 +121,15 @@ def bench_rates(
     if not shared.seconds:
         _require_one_estimator(variants, shared)
     planned = [(d, variant) for d in datasets for variant in variants]
-    searches = [_search(result, d, variant, shared, seeds, out) for d, variant in planned]
-    for (dataset, variant), search in zip(planned, searches, strict=True):
-        _Search(dataset, variant, shared, search, result, out, console).run()
+    # Whatever is the default of a method by now: a search begins with what all methods have.
+    configs = [_with_own_schedule(variant.settings(shared)) for _, variant in planned]
+    searches = [
+        _search(result, dataset, variant.name, config, seeds, out, schedule)
+        for (dataset, variant), config in zip(planned, configs, strict=True)
+    ]
+    for (dataset, variant), config, search in zip(planned, configs, searches, strict=True):
+        name = f"{dataset.folder.name}, {variant.name}"
+        _Search(dataset, name, config, search, result, out, console, schedule).run()
     print_rates(searches, console)
     return result
 
@@ -135,7 +152,8 @@ def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
         if before.factors.keys() & best["factors"].keys():
             raise ValueError(f"{search['method']} was searched in two scenes: {search['kind']}")
         estimator = before.estimator or (best["estimator"] if search["follows_paths"] else None)
-        kinds[search["kind"]] = MethodDefaults({**before.factors, **best["factors"]}, estimator)
+        factors, own = {**before.factors, **best["factors"]}, [best.get(key) for key in SCHEDULE]
+        kinds[search["kind"]] = MethodDefaults(factors, estimator, *own)
     return {method: kinds for method, kinds in found.items() if kinds}
 
 
@@ -149,8 +167,8 @@ def settled(trials: Sequence[Row], best: Row) -> Row:
         trials: of the search, the one of the fields' own rates first.
         best: the one of them that `best_trial` found.
     """
-    same = (row for row in trials if row["factors"] == best["factors"])
-    published = next((row for row in same if row["estimator"] == PUBLISHED), best)
+    wanted = {key: best[key] for key in TRIED if key in best} | {"estimator": PUBLISHED}
+    published = next((row for row in trials if wanted.items() <= row.items()), best)
     chosen = best if beats(_per_seed(best), _per_seed(published)) else published
     return chosen if beats(_per_seed(chosen), _per_seed(trials[0])) else trials[0]
 
@@ -168,20 +186,22 @@ class _Search:
     def __init__(
         self,
         dataset: Dataset,
-        variant: MethodVariant,
-        shared: FitConfig,
+        name: str,
+        config: FitConfig,
         record: Row,
         result: Row,
         out: Path,
         console: Console,
+        schedule: bool,
     ) -> None:
         self._dataset = dataset
-        self._config = variant.settings(shared)
+        self._name = name
+        self._config = config
         self._record = record
         self._result = result
         self._out = out
         self._console = console
-        self._name = f"{dataset.folder.name}, {variant.name}"
+        self._schedule = SCHEDULE if schedule else ()
 
     def run(self) -> None:
         """Make the trials that are missing, and note the best one."""
@@ -193,23 +213,25 @@ class _Search:
         if config.seconds and record["best"] is None:
             variants = [replace(config, estimator=name) for name in _estimators(config)]
             compile_kernels(self._dataset.folder, variants)
-        best = best_trial([*reversed(materials), *lights], _estimators(config), self._score)
+        searched = [*reversed(materials), *lights, *self._schedule]
+        best = best_trial(searched, _estimators(config), self._score)
         found = self._row(best)
         if "error" in found:
             raise UserError(found["error"], self._name)
         taken = settled(record["trials"], found)
-        record["best"] = {key: taken[key] for key in ("factors", "estimator", "score")}
+        record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
         self._write()
 
     def _score(self, trial: Trial) -> float:
-        factors = ", ".join(f"{name} x {by:g}" for name, by in trial.factors.items())
         found = self._row(trial)
-        self._complete(found, _learned, f"{factors}, {trial.estimator}", trial)
+        told = [f"{name} x {by:g}" for name, by in found["factors"].items()]
+        told += [f"{key} {found[key]:g}" for key in self._schedule]
+        self._complete(found, _learned, ", ".join([*told, trial.estimator]), trial)
         return LEAST if found["score"] is None else found["score"]
 
     def _row(self, trial: Trial) -> Row:
         """The trial's line of the record."""
-        same = {"factors": trial.factors, "estimator": trial.estimator}
+        same = _tried(trial, self._config)
         for row in self._record["trials"]:
             if same.items() <= row.items():
                 return row
@@ -235,7 +257,8 @@ class _Search:
         """A fit with the settings of a trial, scored."""
         config = replace(self._config, seed=seed)
         if trial is not None:
-            config = replace(config, rate_factors=trial.factors, estimator=trial.estimator)
+            tried = _tried(trial, config)
+            config = replace(config, rate_factors=tried.pop("factors"), **tried)
         try:
             fit = begin_fit(self._dataset, config)
             effort = learn(fit)
@@ -256,6 +279,36 @@ class _Search:
         text = row.get("error") or ", ".join(values)
         line = f"{self._name}: {what}: {text}"
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _with_own_schedule(config: FitConfig) -> FitConfig:
+    """Settings whose decay and warm-up, where they are left open, are those of all methods."""
+    final, warm_up = config.final_learning_rate, config.warm_up
+    return replace(
+        config,
+        final_learning_rate=OWN_FINAL_RATE if final is None else final,
+        warm_up=own_warm_up(config) if warm_up is None else warm_up,
+    )
+
+
+def _tried(trial: Trial, config: FitConfig) -> Row:
+    """What a trial sets: keys of `TRIED`, those of the schedule where it is searched.
+
+    Rates that grow during a fit are not tried. A method without a warm-up begins with that of the
+    others.
+    """
+    factors = trial.factors
+    powers = dict(zip(trial.unknowns, trial.powers, strict=True))
+    found: Row = {"factors": {k: v for k, v in factors.items() if k not in SCHEDULE}}
+    found["estimator"] = trial.estimator
+    if "final_learning_rate" in factors:
+        end = (config.final_learning_rate or OWN_FINAL_RATE) * factors["final_learning_rate"]
+        found["final_learning_rate"] = min(1.0, float(f"{end:.6g}"))
+    if "warm_up" in factors:
+        own, power = config.warm_up, powers["warm_up"]
+        first = OWN_WARM_UP * STEP ** (power - 1) if power > 0 else 0
+        found["warm_up"] = round(own * factors["warm_up"] if own else first)
+    return found
 
 
 def _mean(fits: Sequence[Row]) -> Row:
@@ -288,19 +341,20 @@ def _read(out: Path) -> Row:
 def _search(
     result: Row,
     dataset: Dataset,
-    variant: MethodVariant,
-    shared: FitConfig,
+    name: str,
+    config: FitConfig,
     seeds: Sequence[int],
     out: Path,
+    schedule: bool,
 ) -> Row:
     """The search of a method on a data set in the record; a new one if there is none."""
-    config = with_defaults(variant.settings(shared), dataset)
+    config = with_defaults(config, dataset)
     settings = tomllib.loads(to_toml(config))
-    for key in ("rate_factors", "estimator", "seed"):
+    for key in ("rate_factors", "estimator", "seed", *(SCHEDULE if schedule else ())):
         del settings[key]
     camera = dataset.train[0].camera
     described: Row = {
-        "method": variant.name,
+        "method": name,
         "data": dataset.folder.name,
         "kind": dataset.kind,
         "unknown": config.unknown,
@@ -315,12 +369,13 @@ def _search(
         if all(search[key] == described[key] for key in same):
             other = [key for key, value in described.items() if search[key] != value]
             if "settings" in other:
-                other += [k for k, v in settings.items() if search["settings"].get(k) != v]
+                both = settings.keys() | search["settings"].keys()
+                other += sorted(k for k in both if search["settings"].get(k) != settings.get(k))
             if other:
-                what = f"the search of {variant.name} in this file differs in {', '.join(other)}"
+                what = f"the search of {name} in this file differs in {', '.join(other)}"
                 raise UserError(what, out, "Give another --out")
             if set(seeds) < set(search["seeds"]):
-                what = f"the search of {variant.name} in this file has more seeds"
+                what = f"the search of {name} in this file has more seeds"
                 raise UserError(what, out, f"Give --seeds {' '.join(map(str, search['seeds']))}")
             search["seeds"] = list(dict.fromkeys([*search["seeds"], *seeds]))
             return search

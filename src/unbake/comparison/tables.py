@@ -42,6 +42,8 @@ def print_rates(searches: list[Row], console: Console) -> None:
     for search in searches:
         best, trials = search["best"], search["trials"]
         rates = [f"{name} {by:g}" for name, by in best["factors"].items()]
+        schedule = {"final_learning_rate": "final rate", "warm_up": "warm-up"}
+        rates += [f"{title} {best[key]:g}" for key, title in schedule.items() if key in best]
         chosen = "\n".join([*rates, best["estimator"]])
         scores = search["untrained"]["score"], trials[0]["score"], best["score"]
         numbers = (_number(score, 2) for score in scores)

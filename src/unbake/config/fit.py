@@ -134,6 +134,9 @@ class RegularizationConfig:
 #: What a fit can recover, each with a learning rate of its own.
 UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
+#: Schedule of methods for which no other one was found best.
+OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
+
 #: Bounces that can be differentiated before the radiance field takes over.
 MOST_BOUNCES = 16
 
@@ -241,12 +244,15 @@ class FitConfig:
     spp: Annotated[int, Flag("Samples per pixel in a step, an even number")] = 8
     radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
 
-    final_learning_rate: float = 0.05  #: factor reached at the end, exponentially (1: constant)
+    #: Factor reached at the end, exponentially (1: constant). None: what was found best for the
+    #: method, else `OWN_FINAL_RATE`; a run that was started has a number.
+    final_learning_rate: float | None = None
     #: Multiples of the fields' learning rates, by unknown. None: what was found best for the method
     #: and the kind of scene (`method_defaults.py`; ours); a run that was started has numbers.
     rate_factors: Mapping[str, float | None] = field(default_factory=dict)
-    #: Steps over which the unknowns' rates rise, so that L_θ stays ahead; none without L_θ (ours).
-    warm_up: int = 100
+    #: Steps over which the unknowns' rates rise (ours). None: what was found best for the method,
+    #: else `OWN_WARM_UP`, so that L_θ stays ahead, and none without L_θ.
+    warm_up: int | None = None
     #: Unbiased squared error (Sec. 5.2). auto: what was found best for the method; see `halves`.
     estimator: Estimator = "auto"
     loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)

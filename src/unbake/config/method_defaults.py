@@ -21,10 +21,15 @@ class MethodDefaults:
     Args:
         factors: by unknown, multiples of the learning rate of its field; 1 where absent.
         estimator: of gradients; None: split halves, or two passes for methods that follow paths.
+        final_learning_rate: factor that all rates reach at the end; None: that of all methods.
+        warm_up: steps over which the unknowns' rates rise; None: those of all methods with L_θ, and
+            none without it.
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)
     estimator: Literal["split-halves", "two-pass"] | None = None
+    final_learning_rate: float | None = None
+    warm_up: int | None = None
 
 
 #: By method and kind of scene. Ours is not listed: it keeps the fields' own rates, although its

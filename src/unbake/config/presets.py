@@ -78,7 +78,7 @@ def _release_lighting() -> FitConfig:
 def with_method(config: FitConfig, name: str) -> FitConfig:
     """The settings with another method, without what belongs to the method that they name.
 
-    Settings of a run that was started have the rates, the estimator and the warm-up of its method
+    Settings of a run that was started have the rates, the estimator and the schedule of its method
     filled in. Another method has its own, which a fit chooses when it starts. What a user gives in
     settings that leave some of it open stays.
 
@@ -94,8 +94,14 @@ def with_method(config: FitConfig, name: str) -> FitConfig:
     if not method_named(name).takes_options:
         config = dataclasses.replace(config, bounces=1, prior="extra-bounce")
     if None not in config.rate_factors.values():
-        warm_up = preset(config.preset).warm_up
-        config = dataclasses.replace(config, rate_factors={}, estimator="auto", warm_up=warm_up)
+        own = preset(config.preset)
+        config = dataclasses.replace(
+            config,
+            rate_factors={},
+            estimator="auto",
+            final_learning_rate=own.final_learning_rate,
+            warm_up=own.warm_up,
+        )
     return dataclasses.replace(config, method=name)
 
 

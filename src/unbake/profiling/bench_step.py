@@ -92,7 +92,7 @@ def bench_step(
 
 def _replayed(step: TrainingStep, state: State, config: FitConfig, steps: int) -> dict:
     """The step of a fit: wall time, time in kernels and time in Python."""
-    rates = learning_rates(config, config.warm_up, 0.0)
+    rates = learning_rates(config, config.warm_up or 0, 0.0)
     for i in range(WARM_UP):
         step(state, i, rates)
     dr.sync_thread()

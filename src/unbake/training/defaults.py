@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 from ..config import FitConfig
+from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults, method_defaults
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
 from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
 from .path_depth import with_path_depth
+
+Number = TypeVar("Number", int, float)
 
 
 def with_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
@@ -23,12 +27,12 @@ def with_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
 
 
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
-    """The settings with the method's own learning rates, estimator and warm-up.
+    """The settings with the method's own learning rates, estimator and schedule.
 
-    Factors of learning rates and an estimator that are given stay. Factors of materials were found
-    with networks: other representations keep the fields' own rates. A method without L_θ has no
-    warm-up. A run is started with these settings and its `config.toml` has them, so that it goes on
-    with the same ones, whatever a later version finds better.
+    Factors of learning rates, an estimator and a schedule that are given stay. Factors of materials
+    were found with networks: other representations keep the fields' own rates. A method without L_θ
+    has no warm-up unless one is given. A run is started with these settings and its `config.toml`
+    has them, so that it goes on with the same ones, whatever a later version finds better.
 
     Args:
         config: settings as a user gives them; those that are complete already are returned as is.
@@ -53,5 +57,17 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
         config,
         rate_factors=factors,
         estimator=estimator,
-        warm_up=config.warm_up if has_radiance(config.chosen_method) else 0,
+        final_learning_rate=_first_known(
+            config.final_learning_rate, found.final_learning_rate, OWN_FINAL_RATE
+        ),
+        warm_up=_first_known(config.warm_up, found.warm_up, own_warm_up(config)),
     )
+
+
+def own_warm_up(config: FitConfig) -> int:
+    """The warm-up of a method for which no other one was found: none without L_θ."""
+    return OWN_WARM_UP if has_radiance(config.chosen_method) else 0
+
+
+def _first_known(*values: Number | None) -> Number:
+    return next(value for value in values if value is not None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..config import FitConfig
+from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 
 
 def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float]:
@@ -13,13 +14,14 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     albedo would run into its bounds.
 
     Args:
-        config: settings of a fit. Those that a fit was not started with have no factors and the
-            warm-up that they name; see `with_defaults`.
+        config: settings of a fit. Those that a fit was not started with may leave factors, warm-up
+            and decay open, which are then those of methods with L_θ; see `with_defaults`.
         step: steps taken so far.
         done: fraction of the fit that is done, [0,1].
     """
-    decay = config.final_learning_rate ** min(done, 1.0)
-    rise = min(1.0, (step + 1) / (config.warm_up + 1))
+    decay = (config.final_learning_rate or OWN_FINAL_RATE) ** min(done, 1.0)
+    warm_up = OWN_WARM_UP if config.warm_up is None else config.warm_up
+    rise = min(1.0, (step + 1) / (warm_up + 1))
     unknowns = {name: field.learning_rate for name, field in config.material_settings.items()}
     unknowns |= dict.fromkeys(("environment", "emission"), config.lighting.learning_rate)
     rates = {
