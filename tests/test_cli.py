@@ -169,7 +169,7 @@ def test_every_option_is_explained(command, unbake):
     outcome = unbake(command, "--help")
     assert outcome.status == 0
     assert "None" not in outcome.out and "STR" not in outcome.out
-    text = re.sub(r"[│\s]+", " ", outcome.out)
+    text = re.sub(r"[│\s]+", " ", outcome.out).partition(" options ")[2]
     options = re.findall(r"(--[a-z-]+)(?: [A-Z]+| \{[^}]*\})? (\S+ \S+)", text)
     for option, explained in options:
         assert re.match(r"[A-Za-z]", explained), option

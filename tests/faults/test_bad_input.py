@@ -324,6 +324,29 @@ def test_a_mesh_of_vertices_that_it_does_not_have(data, refuses, tmp_path, tiny)
         assert "tall.ply: 1 of 10 triangles are of vertices that do not exist" in line
 
 
+def test_files_of_a_scene_lie_in_the_data_set_unless_allowed(data, refuses, unbake, tiny, tmp_path):
+    """A link into another folder is followed only with --allow-outside, by each command."""
+    mesh, run = data / "scene" / "meshes" / "tall.ply", tmp_path / "run"
+    mesh.rename(data / "tall.ply")
+    mesh.symlink_to(data / "tall.ply")  # inside of the data set, outside of its scene's folder
+    fit = ("fit", data, "--out", run, "--settings", tiny, "--steps", "1")
+    assert unbake(*fit).status == 0
+    shutil.rmtree(run)
+    (data / "tall.ply").rename(tmp_path / "tall.ply")
+    (data / "tall.ply").symlink_to(tmp_path / "tall.ply")
+    told = "'meshes/tall.ply' lies outside the folder"
+    assert told in refuses(*fit, leaves=["data/.cache"])
+    assert unbake(*fit, "--allow-outside").status == 0
+    evaluate = ("evaluate", run, "--spp", "1", "--train-views", "0")
+    assert told in refuses(*evaluate)
+    assert unbake(*evaluate, "--allow-outside").status == 0
+    capture = ("capture", data / "scene" / "scene.xml", "--out", tmp_path / "again")
+    assert told in refuses(*capture)
+    small = ("--views", "1", "--held-out", "0", "--resolution", "8", "--spp", "1")
+    assert unbake(*capture, *small, "--allow-outside").status == 0
+    assert not (tmp_path / "again" / "scene" / "meshes" / "tall.ply").is_symlink()
+
+
 def test_an_unknown_scene(refuses, tmp_path):
     line = refuses("capture", "dmeo", "--out", tmp_path / "data")
     assert "no such scene: 'dmeo'. Give an XML file or one of demo, annex, still, cornell" in line

@@ -47,6 +47,7 @@ def capture(
     settings: CaptureSettings,
     *,
     cameras: Path | str | None = None,
+    allow_outside: bool = False,
     tell: Callable[[str], None] = print,
 ) -> Dataset:
     """Render a scene from many cameras, with its true materials and lighting.
@@ -55,6 +56,7 @@ def capture(
         scene: a Mitsuba XML file, or the name of a built-in scene.
         out: folder to write; it must not exist yet, and appears only when it is complete.
         cameras: a camera file; None: the built-in scene's own cameras, or automatic placement.
+        allow_outside: read files that the scene names and that lie outside of its folder.
         tell: called with lines of progress.
 
     Raises:
@@ -74,7 +76,9 @@ def capture(
         _tell_unfinished(out, tell)
         partial.mkdir(parents=True)
         with locked(partial):
-            dataset = _capture(str(scene), DataFolder(partial), settings, cameras, tell)
+            dataset = _capture(
+                str(scene), DataFolder(partial), settings, cameras, allow_outside, tell
+            )
             dataset.save(partial)
             partial.rename(out)
     except OSError as error:
@@ -119,9 +123,10 @@ def _capture(
     data: DataFolder,
     settings: CaptureSettings,
     camera_file: Path | None,
+    allow_outside: bool,
     tell: Callable[[str], None],
 ) -> Dataset:
-    path, scene = _copy_scene(name, data.scene, tell)
+    path, scene = _copy_scene(name, data.scene, allow_outside, tell)
     posed = _cameras(name, scene, settings, camera_file)
     counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
     seen = coverage(scene, [c for split, c in posed if split == "train"])
@@ -175,7 +180,9 @@ def _capture(
     )
 
 
-def _copy_scene(name: str, folder: Path, tell: Callable[[str], None]) -> tuple[Path, mi.Scene]:
+def _copy_scene(
+    name: str, folder: Path, allow_outside: bool, tell: Callable[[str], None]
+) -> tuple[Path, mi.Scene]:
     """Write the scene and its files into the folder, opaque BSDFs turned into `principled`.
 
     The scene that is returned comes from the original, so that errors name the user's file.
@@ -183,7 +190,8 @@ def _copy_scene(name: str, folder: Path, tell: Callable[[str], None]) -> tuple[P
     folder.mkdir(parents=True)
     made = folder.with_name("made")
     source = write_scene(name, made) if name in SCENES else Path(name)
-    parsed = parse(source)
+    root = Path(source.resolve().anchor) if allow_outside else None
+    parsed = parse(source, root)
     changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")
@@ -191,7 +199,7 @@ def _copy_scene(name: str, folder: Path, tell: Callable[[str], None]) -> tuple[P
         raise UserError(
             "no material to fit: no shape has a principled, diffuse or roughplastic BSDF", source
         )
-    original = parse(source)
+    original = parse(source, root)
     edit.to_principled(original)
     scene = original.instantiate()
     emitters.require_emitters(scene, source)

@@ -90,6 +90,7 @@ def capture(
     /,
     out: Path,
     cameras: File = None,
+    allow_outside: Flag = False,
     *,
     capture: OmitArgPrefixes[CaptureFlags],
 ) -> None:
@@ -100,6 +101,7 @@ def capture(
             of one), still, cornell, cube, furnace.
         out: Folder to write; it must not exist.
         cameras: Camera file (or transforms.json) to use instead of --views and --held-out.
+        allow_outside: Read files that the scene names outside of its folder.
         capture: How the data set is rendered.
     """
     settings = with_options(CaptureSettings(), given(capture))
@@ -107,7 +109,7 @@ def capture(
     from ..acquisition.capture import capture as run
 
     start = time.perf_counter()
-    run(scene, out, settings, cameras=cameras, tell=_say)
+    run(scene, out, settings, cameras=cameras, allow_outside=allow_outside, tell=_say)
     _say(f"wrote {out} in {time.perf_counter() - start:.0f} s; next: unbake fit {out} --out RUN")
 
 
@@ -119,6 +121,7 @@ def fit(
     settings: File = None,
     resume: Flag = False,
     clip_negative: Flag = False,
+    allow_outside: Flag = False,
     *,
     fit: OmitArgPrefixes[FitFlags],
 ) -> int:
@@ -135,6 +138,7 @@ def fit(
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
         clip_negative: Take negative pixels as zero instead of refusing them.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
         fit: Settings that differ from those of the preset or the file.
     """
     changes = given(fit)
@@ -152,7 +156,15 @@ def fit(
     from ..training.loop import fit as run
 
     console = Console(highlight=False)
-    progress = run(data, out, chosen, resume=resume, clip_negative=clip_negative, console=console)
+    progress = run(
+        data,
+        out,
+        chosen,
+        resume=resume,
+        clip_negative=clip_negative,
+        allow_outside=allow_outside,
+        console=console,
+    )
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
         return signals.status()
     if not progress.step:
@@ -165,20 +177,27 @@ def fit(
     return 0
 
 
-def evaluate(run: Positional[Run], /, *, evaluate: OmitArgPrefixes[EvaluationFlags]) -> None:
+def evaluate(
+    run: Positional[Run],
+    /,
+    allow_outside: Flag = False,
+    *,
+    evaluate: OmitArgPrefixes[EvaluationFlags],
+) -> None:
     """Render the recovered scene and measure it against photographs and truth.
 
     Writes pictures and metrics.json to RUN/evaluation.
 
     Args:
         run: Folder that `unbake fit` wrote.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
         evaluate: How views are rendered.
     """
     settings = with_options(EvaluationSettings(), given(evaluate))
     backend.activate()
     from ..evaluation.evaluate import evaluate as go
 
-    metrics = go(run, settings, tell=_say)
+    metrics = go(run, settings, allow_outside=allow_outside, tell=_say)
     if not metrics["steps"]:
         _say("untrained: after 0 steps the fields have their initial values")
     for split in ("heldout", "train"):
@@ -190,19 +209,20 @@ def evaluate(run: Positional[Run], /, *, evaluate: OmitArgPrefixes[EvaluationFla
     _say(f"wrote {RunFolder(run).evaluation}; next: unbake report {run} --out report.html")
 
 
-def report(runs: Positional[Runs], /, out: Path) -> None:
+def report(runs: Positional[Runs], /, out: Path, allow_outside: Flag = False) -> None:
     """Write one HTML page that shows evaluated runs of a data set side by side.
 
     Args:
         runs: Folders of runs, each after `unbake evaluate`.
         out: The page to write, such as report.html. It needs no other file.
+        allow_outside: Read files that the data set names outside of its folder.
     """
     if not runs:
         raise UserError("no run given", remedy="unbake report RUN [RUN ...] --out report.html")
     backend.activate()
     from ..report.page import write_report
 
-    _say(f"wrote {write_report(runs, out)}")
+    _say(f"wrote {write_report(runs, out, allow_outside=allow_outside)}")
 
 
 def compare(
@@ -216,6 +236,7 @@ def compare(
     evaluate_spp: int = 32,
     evaluate_truth: Flag = False,
     clip_negative: Flag = False,
+    allow_outside: Flag = False,
     *,
     compare: OmitArgPrefixes[CompareFlags],
 ) -> int:
@@ -241,6 +262,7 @@ def compare(
         evaluate_spp: Samples per pixel of the final renderings.
         evaluate_truth: Render captured scenes with their true materials too.
         clip_negative: Take negative pixels as zero instead of refusing them.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
         compare: Settings of all methods that differ from those of the preset or the file.
     """
     require("evaluate-spp", evaluate_spp, 1)
@@ -257,7 +279,15 @@ def compare(
     evaluation = EvaluationSettings(
         spp=evaluate_spp, clip_negative=clip_negative, truth=evaluate_truth
     )
-    result = run(data, variants, out, chosen, evaluation=evaluation, clip_negative=clip_negative)
+    result = run(
+        data,
+        variants,
+        out,
+        chosen,
+        evaluation=evaluation,
+        clip_negative=clip_negative,
+        allow_outside=allow_outside,
+    )
     _say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
     return 1 if any("error" in row for row in result["methods"].values()) else 0
 

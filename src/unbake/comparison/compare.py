@@ -72,6 +72,7 @@ def compare(
     *,
     evaluation: EvaluationSettings,
     clip_negative: bool = False,
+    allow_outside: bool = False,
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Fit, evaluate and report several methods, one after the other.
@@ -87,6 +88,7 @@ def compare(
         config: settings of all runs; its `method` is ignored.
         evaluation: how results are rendered.
         clip_negative: set negative pixels to zero.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
         console: shows progress and tables.
 
     Returns:
@@ -108,7 +110,7 @@ def compare(
         raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
     if UNTRAINED in names:
         raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
-    dataset = Dataset.load(data)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
     if evaluation.truth:
         require_true_materials(dataset)
     config = with_path_depth(config, dataset)
@@ -125,8 +127,8 @@ def compare(
         console.rule(name, align="left")
         try:
             run = RunFolder(out / name)
-            progress = _fitted(data, run, settings, clip_negative, console)
-            metrics = _evaluated(run, progress, evaluation, console)
+            progress = _fitted(data, run, settings, clip_negative, allow_outside, console)
+            metrics = _evaluated(run, progress, evaluation, allow_outside, console)
             rows[name] = description(settings) | _numbers(run, metrics)
         except UserError as error:
             errors[name] = error
@@ -154,7 +156,7 @@ def compare(
     write_json(out / "compare.json", result, allow_nan=False)
     good = [out / name for name in fits if name not in errors]
     failed = {name: str(error) for name, error in errors.items()}
-    write_report(good, out / "report.html", failed)
+    write_report(good, out / "report.html", failed, allow_outside=allow_outside)
     print_comparison(result, console)
     return result
 
@@ -174,11 +176,22 @@ def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:
 
 
 def _fitted(
-    data: Path, run: RunFolder, settings: FitConfig, clip_negative: bool, console: Console
+    data: Path,
+    run: RunFolder,
+    settings: FitConfig,
+    clip_negative: bool,
+    allow_outside: bool,
+    console: Console,
 ) -> Progress:
     resume, path = run.exists, run.path
     progress = fit(
-        data, path, settings, resume=resume, clip_negative=clip_negative, console=console
+        data,
+        path,
+        settings,
+        resume=resume,
+        clip_negative=clip_negative,
+        allow_outside=allow_outside,
+        console=console,
     )
     done, total = progress.step, settings.steps
     if settings.seconds:
@@ -190,7 +203,11 @@ def _fitted(
 
 
 def _evaluated(
-    run: RunFolder, progress: Progress, settings: EvaluationSettings, console: Console
+    run: RunFolder,
+    progress: Progress,
+    settings: EvaluationSettings,
+    allow_outside: bool,
+    console: Console,
 ) -> dict[str, Any]:
     """Metrics of the run. Evaluates it unless they are of this state and these settings."""
     if run.metrics_file.is_file():
@@ -199,7 +216,12 @@ def _evaluated(
         same = same and metrics.get("evaluation") == asdict(settings)
         if same and NUMBERS <= metrics.keys():
             return metrics
-    return evaluate(run.path, settings, tell=lambda line: console.print(line, soft_wrap=True))
+    return evaluate(
+        run.path,
+        settings,
+        allow_outside=allow_outside,
+        tell=lambda line: console.print(line, soft_wrap=True),
+    )
 
 
 def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:

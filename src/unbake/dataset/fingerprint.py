@@ -34,7 +34,7 @@ def fingerprint(dataset: Dataset) -> dict[str, str]:
         "photographs": _of_values(_of_files(view.image for view in views)),
         "poses": _of_values(poses),
         "views": _of_values([dataset.background, *([view.name, view.split] for view in views)]),
-        "scene": _of_values(_of_files(_scene_files(dataset.scene))),
+        "scene": _of_values(_of_files(_scene_files(dataset))),
     }
 
 
@@ -43,9 +43,9 @@ def changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     return [part for part, value in before.items() if now.get(part, value) != value]
 
 
-def _scene_files(scene: Path) -> list[Path]:
+def _scene_files(dataset: Dataset) -> list[Path]:
     """The files of a scene: those of its text, then what these name, in their order."""
-    state = parse(scene).state
+    state = parse(dataset.scene, dataset.root).state
     named = (node.props[key] for node in state.nodes for key in node.props)
     texts = (str(value) for value in named if isinstance(value, str) and os.path.isabs(value))
     return [Path(str(name)) for name in (*state.files, *filter(os.path.isfile, texts))]

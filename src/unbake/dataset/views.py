@@ -87,6 +87,12 @@ class Dataset:
         return light_of_depth(self.light_by_depth, depth)
 
     @property
+    def root(self) -> Path:
+        """The folder that the scene's files must not leave."""
+        folder = self.folder.resolve()
+        return Path(folder.anchor) if self.allow_outside else folder
+
+    @property
     def kind(self) -> SceneKind:
         """The kind of scene."""
         return scene_kind(self.background)

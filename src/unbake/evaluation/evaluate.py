@@ -52,6 +52,7 @@ def evaluate(
     run: Path | str,
     settings: EvaluationSettings | None = None,
     *,
+    allow_outside: bool = False,
     tell: Callable[[str], None] = print,
 ) -> dict:
     """Render a run's views from what it recovered, and compare them with photographs and truth.
@@ -61,6 +62,7 @@ def evaluate(
     Args:
         run: folder of a fit.
         settings: how to render.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
         tell: called with lines of progress.
 
     Returns:
@@ -74,7 +76,7 @@ def evaluate(
     """
     settings = settings or EvaluationSettings()
     run = Path(run)
-    recovered, folder = load_run(run), RunFolder(run)
+    recovered, folder = load_run(run, allow_outside=allow_outside), RunFolder(run)
     dataset = recovered.dataset
     true_scene = _true_scene(recovered) if settings.truth else None
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
@@ -147,7 +149,7 @@ def _true_scene(recovered: Recovered) -> SceneView:
     """The scene that the photographs were rendered from, as the data set holds it."""
     dataset = recovered.dataset
     require_true_materials(dataset)
-    parsed = parse(dataset.scene)
+    parsed = parse(dataset.scene, dataset.root)
     edit.to_principled(parsed)
     specular = recovered.config.transport.max_specular
     return SceneView.of(parsed.instantiate(), None, specular)

@@ -74,7 +74,13 @@ class Scales:
     error: dict[str, float]  #: by quantity, the error that has the brightest colour
 
 
-def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | None = None) -> Path:
+def write_report(
+    runs: Sequence[Path],
+    out: Path,
+    failed: Mapping[str, str] | None = None,
+    *,
+    allow_outside: bool = False,
+) -> Path:
     """Write one HTML page that compares evaluated runs with the ground truth and each other.
 
     The page contains its images, styles and script and loads nothing from elsewhere.
@@ -86,6 +92,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
         runs: run folders, all evaluated on the same data.
         out: the page's file; it appears complete or not at all.
         failed: further runs that failed: name to reason.
+        allow_outside: read files of the data set that lie outside of its folder.
 
     Returns:
         `out`.
@@ -97,7 +104,7 @@ def write_report(runs: Sequence[Path], out: Path, failed: Mapping[str, str] | No
         raise UserError("a report needs at least one run")
     loaded = [read_run(path, label) for path, label in labels(runs)]
     data = data_folder(loaded)
-    dataset = Dataset.load(data)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
     views = read_views(dataset, loaded)
     scales = _scales(loaded, views)
     groups = [

@@ -39,7 +39,7 @@ def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     smoothed = config.loss_reference == "smoothed"
     pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed)
     mean = pixels.photographs.mean
-    problem = make_problem(dataset.scene, dataset.background, config, mean)
+    problem = make_problem(dataset.scene, dataset.background, config, mean, dataset.root)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))
 

@@ -51,6 +51,7 @@ def fit(
     *,
     resume: bool = False,
     clip_negative: bool = False,
+    allow_outside: bool = False,
     console: Console | None = None,
 ) -> Progress:
     """Recover materials or lighting of a scene from its photographs.
@@ -62,6 +63,7 @@ def fit(
             and no seconds the run has untrained fields.
         resume: go on with the run's newest checkpoint.
         clip_negative: take negative pixels as zero.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
 
     Returns:
         How far the fit came. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it early, with a checkpoint.
@@ -78,10 +80,19 @@ def fit(
         if resume:
             folder.require_resumable()
             lock = held.enter_context(folder.lock())
-            begun = _begin(Path(data), folder, _resumed_config(folder, config), console, resume)
+            begun = _begin(
+                Path(data),
+                folder,
+                _resumed_config(folder, config),
+                console,
+                resume,
+                allow_outside=allow_outside,
+            )
         else:
             folder.require_new()
-            begun = _begin(Path(data), folder, config, console, resume, clip_negative)
+            begun = _begin(
+                Path(data), folder, config, console, resume, clip_negative, allow_outside
+            )
             # Here all input is known to be good, and the folder is made.
             lock = held.enter_context(folder.lock())
             folder.require_new()
@@ -113,9 +124,10 @@ def _begin(
     console: Console,
     resume: bool,
     clip_negative: bool = False,
+    allow_outside: bool = False,
 ) -> _Begun:
     """Read all input, and check it; nothing is written but the cache of the data set."""
-    dataset = Dataset.load(data)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
     before = folder.origin() if resume else None
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = clip_negative or (before is not None and before.clip_negative)
@@ -131,7 +143,9 @@ def _begin(
     )
     if before is not None:
         _require_same_data(folder, before, origin)
-    problem = make_problem(dataset.scene, dataset.background, config, origin.mean_radiance)
+    problem = make_problem(
+        dataset.scene, dataset.background, config, origin.mean_radiance, dataset.root
+    )
     for warning in data_warnings(dataset, pixels, problem):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 

@@ -86,7 +86,9 @@ class Problem:
         return [(word, light) for word, light in both if light is not None]
 
 
-def make_problem(scene: Path, background: str, config: FitConfig, scale: float) -> Problem:
+def make_problem(
+    scene: Path, background: str, config: FitConfig, scale: float, root: Path | None = None
+) -> Problem:
     """Replace the unknowns of a scene by untrained fields.
 
     Args:
@@ -94,12 +96,13 @@ def make_problem(scene: Path, background: str, config: FitConfig, scale: float) 
         background: `visible` or `hidden`.
         scale: radiance of the untrained radiance field and emitters, and of the environment unless
             the settings say it.
+        root: folder that the scene's files must not leave; None: the scene's own.
 
     Raises:
         UserError: the scene cannot be loaded, has no emitter or nothing to fit, has meshes without
             the texture coordinates that bitmaps need, or the fields do not fit the memory.
     """
-    parsed = parse(scene)
+    parsed = parse(scene, root)
     edit.to_principled(parsed)
     require_room(config, len(edit.material_names(parsed)))
     seeds = np.random.SeedSequence(config.seed).generate_state(2)

@@ -25,12 +25,16 @@ class Recovered:
     clip_negative: bool
 
 
-def load_run(run: Path) -> Recovered:
+def load_run(run: Path, *, allow_outside: bool = False) -> Recovered:
     """Read a run's newest checkpoint.
 
     `problem.scene_view.scene` is a Mitsuba scene with the recovered fields in the place of its
     unknown quantities, its environment or its lights' strengths. Where materials were recovered,
     any integrator of Mitsuba renders it after `problem.materials.stand_alone()`, and else at once.
+
+    Args:
+        run: folder of a fit.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
 
     Raises:
         UserError: the folder holds no run, no checkpoint, or its data set is gone.
@@ -43,8 +47,10 @@ def load_run(run: Path) -> Recovered:
     if not data.is_dir():
         moved = f"Put it back, or tell where it is now: unbake fit DATA --out {run} --resume"
         raise UserError(f"the data set of the run {run} is gone", data, moved)
-    dataset = Dataset.load(data)
-    problem = make_problem(dataset.scene, dataset.background, config, origin.mean_radiance)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
+    problem = make_problem(
+        dataset.scene, dataset.background, config, origin.mean_radiance, dataset.root
+    )
     state = initial_state(problem)
     progress = load_checkpoint(folder, state)
     if progress is None:
