@@ -254,10 +254,10 @@ def test_depths_are_those_of_methods_that_follow_paths():
 
 def test_a_file_that_is_no_text_or_missing_is_named(tmp_path):
     file = tmp_path / "a.toml"
-    with pytest.raises(UserError, match=r"a.toml: cannot be read \(No such file"):
+    with pytest.raises(UserError, match=r"a.toml: the file does not exist"):
         read_toml(file)
     file.write_bytes(b"steps = 1 # \xff")
-    with pytest.raises(UserError, match=r"a.toml: is not UTF-8 text. Save it as UTF-8"):
+    with pytest.raises(UserError, match=r"a.toml: the file is not UTF-8 text. Repair it"):
         read_toml(file)
     with pytest.raises(UserError, match="cannot be read"):
         read_toml(tmp_path)
@@ -407,3 +407,26 @@ def test_settings_are_read_without_mitsuba():
         [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | PATH
     )
     assert done.stdout.strip() == "set()", done.stderr
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "steps = " + "[" * 5000 + "]" * 5000,
+        "steps = " + "[" * 70 + "]" * 70,
+        ".".join(["a"] * 5000) + " = 1",
+        "steps = " + "1" * 5000,
+    ],
+)
+def test_toml_that_is_deep_or_endless_is_told_in_one_line(text, tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text(text)
+    with pytest.raises(UserError, match=r"a\.toml: not valid TOML") as caught:
+        read_toml(file)
+    assert len(str(caught.value)) < 300
+
+
+def test_a_pipe_is_no_settings_file(tmp_path):
+    os.mkfifo(tmp_path / "a.toml")
+    with pytest.raises(UserError, match="it is a pipe or a device"):
+        read_toml(tmp_path / "a.toml")

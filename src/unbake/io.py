@@ -22,8 +22,8 @@ from .errors import UserError
 
 #: Longest text file that is read, in bytes: the poses of some 50,000 views.
 LONGEST_TEXT = 64 << 20
-#: How deep objects and lists of a JSON file may be nested.
-DEEPEST_JSON = 64
+#: How deep objects and lists of a file may be nested.
+DEEPEST = 64
 
 # ------------------------------------------------------------------------------------------ writing
 
@@ -240,13 +240,13 @@ def read_json(path: Path, remedy: str | None = None) -> Any:
         raise UserError(
             f"the file is not readable JSON ({error})", path, remedy or "Repair it"
         ) from None
-    if _depth(parsed) > DEEPEST_JSON:
-        said = f"the file is not readable JSON (nested deeper than {DEEPEST_JSON} levels)"
+    if nesting(parsed) > DEEPEST:
+        said = f"the file is not readable JSON (nested deeper than {DEEPEST} levels)"
         raise UserError(said, path, remedy or "Repair it")
     return parsed
 
 
-def _depth(content: object) -> int:
+def nesting(content: object) -> int:
     """How deep objects and lists are nested: 0 for a number or a text."""
     depth, level = 0, [content]
     while level := [x for x in level if isinstance(x, dict | list)]:

@@ -267,3 +267,13 @@ def test_a_broken_camera_file_is_one_clear_error(tmp_path, content, message):
 def test_a_missing_camera_file_is_named(tmp_path):
     with pytest.raises(UserError, match=r"none\.json: the file does not exist"):
         read_cameras(tmp_path / "none.json", 8, 8)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e16, 1e300, float("inf")])
+@pytest.mark.parametrize("key", [0, 1, 2])
+def test_a_view_beyond_single_precision_is_refused(value, key):
+    points = [[0, 0, 3], [0, 0, 0], [0, 1, 0]]
+    points[key] = [value, 1, 1]
+    with pytest.raises(UserError, match=r"origin, target or up have entries over 1e\+15"):
+        Camera.look_at(*points, 40, 4, 4)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from unbake import memory
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
 from unbake.dataset.outliers import told_outliers, without_outliers
@@ -368,6 +369,16 @@ def test_more_pixels_than_there_are_numbers_are_refused(dataset):
     views = [replace(view, camera=huge) for view in made.views]
     with pytest.raises(UserError, match=r"have 12,675,000,000 pixels, more than 4,294,967,295"):
         Photographs.load(replace(made, views=views), False)
+
+
+def test_photographs_that_do_not_fit_the_memory_are_refused_before_they_are_read(
+    dataset, monkeypatch
+):
+    made = dataset()
+    monkeypatch.setattr(memory, "free_bytes", lambda: 4000)
+    monkeypatch.setattr(module, "read_image", None)
+    with pytest.raises(UserError, match="the photographs need about 0 MB of memory, 0 MB are free"):
+        Photographs.load(made, False)
 
 
 # ------------------------------------------------------------------------------------- Outliers

@@ -11,6 +11,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..fields.registry import representations
+from ..io import DEEPEST, nesting, read_text
 from ..transport.methods import METHODS
 from .fit import FitConfig, PresetName
 from .migration import FORMAT, migrated
@@ -68,8 +69,10 @@ def from_toml(text: str, where: str = "settings") -> FitConfig:
     """
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also of numbers with thousands of digits
         raise UserError(f"not valid TOML ({error})", where=where) from None
+    if nesting(table) > DEEPEST:
+        raise UserError(f"not valid TOML (nested deeper than {DEEPEST} levels)", where=where)
     try:
         table = migrated(table)
         _require_registered(table)
@@ -94,10 +97,4 @@ def _require_registered(table: Mapping[str, Any]) -> None:
 
 def read_toml(path: Path) -> FitConfig:
     """Settings from a TOML file; see `from_toml`."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot be read ({error.strerror})", path, "Check the path") from None
-    except UnicodeDecodeError:
-        raise UserError("is not UTF-8 text", path, "Save it as UTF-8") from None
-    return from_toml(text, str(path))
+    return from_toml(read_text(path), str(path))

@@ -20,6 +20,12 @@ SPLITS = ("train", "heldout")
 
 # OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
 _FLIP = np.diag([-1.0, 1.0, -1.0, 1.0])
+#: Width and height of an image, in pixels.
+LONGEST_SIDE = 1 << 16
+# In pixels; rays are computed in single precision.
+_FOCAL_LENGTHS, _FARTHEST_CENTRE = (1e-3, 1e9), 1e6
+# In world units. Squares of distances must be finite in single precision.
+_FARTHEST = 1e15
 # Text files round rotations to a few digits; a worse matrix is a mistake, not rounding.
 _RIGID_TOLERANCE = 1e-3
 _SQUARE_TOLERANCE = 1e-4
@@ -47,8 +53,8 @@ class Camera:
         height: of the image, in pixels.
 
     Raises:
-        UserError: the pose is not a finite, right-handed rigid motion, a focal length is not
-            positive, or the image is empty.
+        UserError: the pose is not a finite, right-handed rigid motion, or the image is empty, or a
+            number is so large or small that rays cannot be computed in single precision.
     """
 
     to_world: np.ndarray
@@ -68,13 +74,22 @@ class Camera:
                 f"the image size {self.width} x {self.height} is empty",
                 remedy="Width and height are positive pixel counts",
             )
-        if not (0 < self.fl_x < math.inf and 0 < self.fl_y < math.inf):
+        if max(self.width, self.height) > LONGEST_SIDE:
             raise UserError(
-                f"the focal length ({self.fl_x:g}, {self.fl_y:g}) is not positive",
-                remedy="fl_x and fl_y are in pixels; check the field of view",
+                f"the image size {self.width:.6g} x {self.height:.6g} is too large",
+                remedy=f"Width and height are pixel counts up to {LONGEST_SIDE}",
             )
-        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
-            raise UserError(f"the principal point ({self.cx:g}, {self.cy:g}) is not finite")
+        least, most = _FOCAL_LENGTHS
+        if not (least <= self.fl_x <= most and least <= self.fl_y <= most):
+            raise UserError(
+                f"the focal length ({self.fl_x:g}, {self.fl_y:g}) is out of range",
+                remedy=f"It is from {least:g} to {most:g} pixels; check the field of view",
+            )
+        if not (abs(self.cx) <= _FARTHEST_CENTRE and abs(self.cy) <= _FARTHEST_CENTRE):
+            raise UserError(
+                f"the principal point ({self.cx:g}, {self.cy:g}) is far outside of the image",
+                remedy="cx and cy are in pixels from the top left corner",
+            )
 
     @classmethod
     def look_at(
@@ -106,6 +121,12 @@ class Camera:
                 remedy="'fov' is the horizontal field of view in degrees",
             )
         position = np.asarray(origin, dtype=np.float64)
+        given = np.concatenate([position, np.asarray(target), np.asarray(up)])
+        if np.abs(given).max() > _FARTHEST:
+            raise UserError(
+                f"origin, target or up have entries over {_FARTHEST:g}",
+                remedy="They are points in world units, and a direction",
+            )
         back = position - np.asarray(target, dtype=np.float64)
         right = np.cross(np.asarray(up, dtype=np.float64), back)
         scale = np.linalg.norm(back) * np.linalg.norm(up)
@@ -321,7 +342,9 @@ def camera_from_frame(
         raise UserError(
             "the key 'fl_x' is missing", where, "Give 'fl_x' in pixels, or 'camera_angle_x'"
         )
-    fl_y = _focal(both, "fl_y", "camera_angle_y", height, where) or fl_x
+    fl_y = _focal(both, "fl_y", "camera_angle_y", height, where)
+    if fl_y is None:
+        fl_y = fl_x
     cx = number(both, "cx", where) if "cx" in both else width / 2
     cy = number(both, "cy", where) if "cy" in both else height / 2
     try:
@@ -354,6 +377,8 @@ def _rigid(matrix: np.ndarray) -> np.ndarray:
         raise UserError(f"the pose has shape {matrix.shape}", remedy=remedy)
     if not np.isfinite(matrix).all():
         raise UserError("the pose has NaN or infinite entries", remedy=remedy)
+    if np.abs(matrix).max() > _FARTHEST:
+        raise UserError(f"the pose has entries over {_FARTHEST:g}", remedy=remedy)
     rotation = matrix[:3, :3]
     determinant = np.linalg.det(rotation)
     if abs(determinant) < 1e-6:

@@ -16,10 +16,11 @@ import numpy as np
 
 from ..errors import UserError
 from ..io import locked, read_object, remove_unfinished, temporary_beside, write_json
+from ..memory import require_memory
 from .camera import Camera
 from .data_folder import DataFolder
 from .outliers import Outliers, without_outliers
-from .views import Dataset, View, read_image
+from .views import PIXEL_BYTES, Dataset, View, read_image
 
 #: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
 #: set's folder, of which the system keeps in memory what it has room for.
@@ -112,10 +113,15 @@ class Photographs:
         views = dataset.train
         hidden = dataset.background == "hidden"
         count = sum(view.camera.width * view.camera.height for view in views)
+        remedy = "Use fewer views, or smaller images"
         if count > _MOST_PIXELS:
             what = f"the training views have {count:,} pixels, more than {_MOST_PIXELS:,}"
-            raise UserError(what, dataset.folder, "Use fewer views, or smaller images")
+            raise UserError(what, dataset.folder, remedy)
         columns = _WITH_BLURRED if smoothed else _COLUMNS
+        # Views are decoded one after the other
+        largest = PIXEL_BYTES * max(view.camera.width * view.camera.height for view in views)
+        need = largest + min(4 * columns * count, IN_MEMORY) + 8 * count * hidden
+        require_memory(need, "the photographs need", remedy, dataset.folder)
         if 4 * columns * count <= IN_MEMORY:
             table = np.empty((count, columns), np.float32)
             return _decode_into(table, views, clip_negative, hidden)

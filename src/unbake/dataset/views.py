@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,17 +14,22 @@ from unbake.dataset.camera import Camera, camera_from_frame, read_split
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError
-from unbake.io import require_file, text
+from unbake.imaging.headers import SUFFIXES, HeaderError, read_header
+from unbake.io import number, require_file, text
+from unbake.memory import require_memory
 from unbake.quantities import QUANTITIES
 from unbake.scene import free_space
 from unbake.transport.light_by_depth import depth_of_light, light_of_depth
 
 BACKGROUNDS = ("visible", "hidden")
 
-_HDR_SUFFIXES = (".exr", ".hdr", ".pfm", ".rgbe")
 _LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".webp", ".gif", ".tif", ".tiff", ".ppm")
-_HEAD = 1 << 16  # bytes of a file that are read to know its size
-_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_MOST_CHANNELS = 4
+_OTHER_CHANNELS = "the image has other channels than RGB and alpha"
+#: Memory in bytes that takes part in decoding a pixel, blurring it included.
+PIXEL_BYTES = 100
+#: Bytes of the name of a view, which files of results are named after.
+_LONGEST_NAME = 200
 _NEED_HDR = "Give linear HDR images (OpenEXR); tone-mapped 8-bit images hold no radiance"
 _REPLACE = f"Write the image again, or remove its frame from {TRANSFORMS}"
 
@@ -163,13 +166,14 @@ def read_image(path: Path, width: int, height: int, clip_negative: bool = False)
     """
     # The header first: a damaged one may ask for more memory than there is
     _check_header(path, width, height)
+    require_memory(PIXEL_BYTES * width * height, "the image needs", "Use a smaller image", path)
     try:
         bitmap = mi.Bitmap(str(path))
         size = tuple(bitmap.size())
         _check_size((int(size[0]), int(size[1])), width, height, path)
         kind = mi.Bitmap.PixelFormat
         if bitmap.pixel_format() not in (kind.RGB, kind.RGBA, kind.Y, kind.YA):
-            raise UserError("the image has other channels than RGB and alpha", path, _REPLACE)
+            raise UserError(_OTHER_CHANNELS, path, _REPLACE)
         bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, False)
     except (RuntimeError, MemoryError, ValueError) as error:
         reason = " ".join(str(error).split())[:160]
@@ -225,6 +229,9 @@ def _read_views(data: DataFolder, file: Path, top: dict[str, Any]) -> tuple[View
 def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
     image = data.inside(text(frame, "file_path", where), f"{where}: 'file_path'")
     where = f"{where} ({image.name})"
+    if len(image.stem.encode()) > _LONGEST_NAME:
+        what = f"the name of the image has over {_LONGEST_NAME} bytes"
+        raise UserError(what, where, "Rename it: results are named after it")
     split = read_split(frame, where)
     camera = camera_from_frame(frame, top, where)
     known = {name: data.truth(name, image.stem) for name in QUANTITIES}
@@ -260,40 +267,26 @@ def _check_header(path: Path, width: int, height: int) -> None:
     if path.suffix.lower() in _LDR_SUFFIXES:
         raise UserError("the image is low dynamic range", path, _NEED_HDR)
     require_file(path, "image", _REPLACE)
-    if path.suffix.lower() not in _HDR_SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise UserError(f"unknown image format {path.suffix!r}", path, _NEED_HDR)
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
+        header = read_header(path)
+    except HeaderError as error:
+        raise UserError(f"the image cannot be read ({error})", path, _REPLACE) from None
     except OSError as error:
         raise UserError(f"the image cannot be read ({error.strerror})", path, _REPLACE) from None
-    size = _exr_size(head)
-    if path.suffix.lower() == ".exr" and size is None:
-        # A long header, full of a renderer's notes, may tell the size later on
-        if not head.startswith(_EXR_MAGIC):
-            raise UserError("the image cannot be read (it is not OpenEXR)", path, _REPLACE)
-        if len(head) < _HEAD:
-            raise UserError("the image cannot be read (it is cut off)", path, _REPLACE)
-    _check_size(size, width, height, path)
+    _check_size((header.width, header.height), width, height, path)
+    if header.channels > _MOST_CHANNELS:
+        raise UserError(_OTHER_CHANNELS, path, _REPLACE)
 
 
-def _check_size(size: tuple[int, int] | None, width: int, height: int, path: Path) -> None:
-    if size is not None and size != (width, height):
+def _check_size(size: tuple[int, int], width: int, height: int, path: Path) -> None:
+    if size != (width, height):
         raise UserError(
             f"the image has {size[0]} x {size[1]} pixels, its frame says {width} x {height}",
             path,
             "Correct 'w' and 'h', or use the image that belongs to the camera",
         )
-
-
-def _exr_size(head: bytes) -> tuple[int, int] | None:
-    """Width and height in an OpenEXR header, None where it is not there or comes later."""
-    key = b"dataWindow\0box2i\0\x10\0\0\0"
-    at = head.find(key)
-    if not head.startswith(_EXR_MAGIC) or at < 0 or len(head) < at + len(key) + 16:
-        return None
-    left, top, right, bottom = struct.unpack_from("<4i", head, at + len(key))
-    return right - left + 1, bottom - top + 1
 
 
 def _frame(data: DataFolder, view: View) -> dict[str, Any]:
@@ -324,10 +317,13 @@ def _provenance(top: dict[str, Any], file: Path) -> tuple[dict[str, Any], float 
         raise UserError("'render' is not an object", file, "Remove it if it is unknown")
     if coverage is None:
         return render, None
-    number = isinstance(coverage, int | float) and not isinstance(coverage, bool)
-    if not number or not math.isfinite(coverage) or not 0 <= coverage <= 1:
+    try:
+        share = number(top, "coverage", str(file))
+    except UserError:
+        share = -1.0
+    if not 0 <= share <= 1:
         raise UserError("'coverage' is not a number from 0 to 1", file, "Set it to null")
-    return render, float(coverage)
+    return render, share
 
 
 def _light_by_depth(top: dict[str, Any], file: Path) -> tuple[float, ...]:
