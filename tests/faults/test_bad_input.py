@@ -246,6 +246,17 @@ BAD_SCENES = {
         ),
         "(line 1, col 120): the file 'gone.ply' does not exist",
     ),
+    "bitmap without a file": (
+        scene(
+            LIGHT + '<shape type="sphere"><bsdf type="diffuse"><texture type="bitmap" '
+            'name="reflectance"><string name="file" value="a.exr"/></texture></bsdf></shape>'
+        ),
+        "the bitmap has no 'filename'. Add it",
+    ),
+    "blend of nothing": (
+        scene(LIGHT + '<shape type="sphere"><bsdf type="blendbsdf"/></shape>'),
+        "the blendbsdf has no 'weight'. Add it",
+    ),
     "no number": (
         scene(LIGHT + BALL.format(inside='<float name="radius" value="wide"/>')),
         'could not parse floating point value "wide"',

@@ -22,6 +22,8 @@ from .preflight import check_xml
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]+", re.ASCII)
 _LIBRARY = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+#: Properties without which Mitsuba 3.9 crashes (segmentation fault) where other plugins complain.
+_NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}
 #: Where copies of files go, by what names them.
 _FOLDERS = {
     mi.ObjectType.Shape: "meshes",
@@ -130,6 +132,7 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     scene = ParsedScene(path, root, config, state)
     _require_own_plugins(scene)
     _require_finite(scene)
+    _require_needed(scene)
     _resolve_files(scene, folders)
     return scene
 
@@ -236,6 +239,15 @@ def _require_finite(scene: ParsedScene) -> None:
                     mi.parser.file_location(scene.state, node),
                     "Correct it",
                 )
+
+
+def _require_needed(scene: ParsedScene) -> None:
+    for node in scene.state.nodes:
+        plugin = node.props.plugin_name()
+        needed = _NEEDED.get(plugin)
+        if needed is not None and needed not in node.props:
+            where = mi.parser.file_location(scene.state, node)
+            raise UserError(f"the {plugin} has no {needed!r}", where, "Add it")
 
 
 def _is_finite(value: Any) -> bool:
