@@ -358,6 +358,24 @@ def test_files_of_a_scene_lie_in_the_data_set_unless_allowed(data, refuses, unba
     assert not (tmp_path / "again" / "scene" / "meshes" / "tall.ply").is_symlink()
 
 
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        '<shape type="obj" id="flat"><string name="filename" value="mesh.obj"/>{}</shape>',
+        '<shape type="shapegroup" id="all"><shape type="obj" id="flat"><string name="filename" '
+        'value="mesh.obj"/>{}</shape></shape><shape type="instance"><ref id="all"/></shape>',
+    ],
+    ids=["alone", "in a group"],
+)
+def test_a_mesh_whose_faces_are_no_triangles(shapes, refuses, tmp_path):
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1\n")
+    material = '<bsdf type="diffuse" id="grey"/>'
+    file = tmp_path / "bad.xml"
+    file.write_text(scene(LIGHT + BALL.format(inside="") + shapes.format(material)))
+    line = refuses("capture", file, "--out", tmp_path / "data")
+    assert "bad.xml: the mesh" in line and "has no triangles. Remove it" in line
+
+
 def test_an_unknown_scene(refuses, tmp_path):
     line = refuses("capture", "dmeo", "--out", tmp_path / "data")
     assert "no such scene: 'dmeo'. Give an XML file or one of demo, annex, still, cornell" in line

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..backend import mitsuba_folder
 from ..errors import UserError
+from ..fields.shapes import met_shapes
 from .files import find
 from .images import IMAGES, check_image
 from .meshes import FORMATS, check_mesh
@@ -68,6 +69,10 @@ class ParsedScene:
         box = np.ravel([scene.bbox().min, scene.bbox().max])
         if not np.isfinite(box).all():
             raise UserError("the scene has no shapes, or one without end", self.path)
+        for shape in met_shapes(scene):
+            # Dr.Jit 1.5 cannot look up the corners of what was hit where a mesh has none at all.
+            if isinstance(shape, mi.Mesh) and not shape.face_count():
+                raise UserError(f"the mesh {shape.id()!r} has no triangles", self.path, "Remove it")
         return scene
 
     def _forget_queries(self) -> None:
