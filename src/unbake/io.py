@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from .errors import UserError
+from .signals import cleaned_up
 
 #: Longest text file that is read, in bytes: the poses of some 50,000 views.
 LONGEST_TEXT = 64 << 20
@@ -45,19 +46,22 @@ def write_atomically(
     """
     path = Path(path)
     temporary = temporary_beside(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        if durable:
-            with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or error
-        raise UserError(f"the {what} cannot be written ({reason})", path) from error
-    finally:
+
+    def remove() -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+    with cleaned_up(remove):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary)
+            if durable:
+                with open(temporary, "rb+") as file:
+                    os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except (OSError, RuntimeError) as error:
+            reason = (isinstance(error, OSError) and error.strerror) or error
+            raise UserError(f"the {what} cannot be written ({reason})", path) from error
 
 
 def temporary_beside(path: Path) -> Path:

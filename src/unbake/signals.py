@@ -2,8 +2,9 @@
 
 SIGINT (Ctrl-C), SIGTERM and SIGHUP ask the program to end; so does a closed pipe, as in
 `unbake fit … | head`. A training loop looks for that between steps and saves its state
-(`deferred`). Everything else ends at once with `Interrupted`, and leaves no half-written file under
-the name of a whole one. A second signal ends the process without another line of Python.
+(`deferred`). Everything else ends at once, after it has removed what is unfinished (`cleaned_up`).
+No exception is raised for that: one that goes through native code may be lost there, or end the
+process in another way. A second signal ends the process without another word.
 
 The exit status is 128 plus the number of the signal: 130 (SIGINT), 143 (SIGTERM), 129 (SIGHUP),
 141 (closed pipe).
@@ -19,7 +20,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 #: The signals that ask the program to end, of those that this system has.
@@ -27,23 +28,20 @@ STOPPING = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 _CLOSED_PIPE = 13  # the number of SIGPIPE, which Windows lacks
-
-
-class Interrupted(KeyboardInterrupt):
-    """A signal asked the program to end."""
+_SHOW_CURSOR = b"\x1b[?25h"  # a progress bar hides it
 
 
 class _Program:
     """What this process was told."""
 
-    is_ours = False  #: whether the process is the command line, and may be ended at once
-    started = False  #: whether a command runs; before, there is nothing to clean up
+    is_ours = False  #: whether the process is the command line, and may be ended
     received: int | None = None  #: number of the first signal
     stop: list[int] | None = None  #: of the training loop that runs
+    unfinished: list[Callable[[], object]] = []  #: what removes it  # noqa: RUF012
 
 
 def received() -> bool:
-    """Whether the program was told to end."""
+    """Whether the program was told to end, and a training loop has therefore ended early."""
     return _Program.received is not None
 
 
@@ -52,17 +50,32 @@ def status() -> int:
     return 128 + (_Program.received or signal.SIGINT)
 
 
-def begin() -> None:
-    """A command begins: signals from now on raise `Interrupted`, so that it can clean up."""
-    _Program.started, _Program.received = True, None
-
-
 def interrupt(number: int, frame: object = None) -> None:
-    """The handler of a signal that ends what runs with `Interrupted`."""
-    if _Program.is_ours and (_Program.received is not None or not _Program.started):
+    """The handler of a signal that ends what runs.
+
+    It raises `KeyboardInterrupt` in a process that is not the command line's.
+    """
+    if not _Program.is_ours:
+        raise KeyboardInterrupt
+    if received():
         os._exit(128 + number)
-    _Program.received = _Program.received or number
-    raise Interrupted
+    _end(number)
+
+
+@contextmanager
+def cleaned_up(clean_up: Callable[[], object]) -> Iterator[None]:
+    """Call `clean_up` at the end of a block, and where a signal ends the process in it.
+
+    Where the signal comes at the end of the block, it is called twice.
+    """
+    _Program.unfinished.append(clean_up)
+    try:
+        yield
+    finally:
+        try:
+            clean_up()
+        finally:
+            _Program.unfinished.remove(clean_up)
 
 
 @contextmanager
@@ -75,12 +88,9 @@ def deferred() -> Iterator[list[int]]:
     stop: list[int] = []
 
     def handler(number: int, frame: object) -> None:
-        if stop and _Program.is_ours:
-            os._exit(128 + number)
         if stop:
-            raise KeyboardInterrupt
-        _Program.received = number
-        stop.append(number)
+            interrupt(number)
+        _ask_to_stop(stop, number)
 
     outer, _Program.stop = _Program.stop, stop
     main = threading.current_thread() is threading.main_thread()
@@ -101,42 +111,39 @@ def run_program(command: Callable[[], object]) -> None:
         command: exits with `SystemExit`.
     """
     _Program.is_ours = True
-    for number in STOPPING:
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
-            signal.signal(number, interrupt)
-    sys.unraisablehook = _unraisable
+    _handle(interrupt)
     sys.stdout, sys.stderr = _guarded(sys.stdout), _guarded(sys.stderr)
     try:
-        try:
-            command()
-        finally:
-            # The work is done. The interpreter's own end must not be disturbed.
-            for number in STOPPING:
-                signal.signal(number, signal.SIG_IGN)
-    except SystemExit:
-        raise
-    except BaseException:
-        # Whatever an interruption became on its way through native code, it was one.
-        if not received():
-            raise
-        _leave()
+        command()
+    finally:
+        # The work is done. The interpreter's own end must not be disturbed.
+        _handle(signal.SIG_IGN)
 
 
-def _leave() -> NoReturn:
-    """End the process without the interpreter's clean-up, which waits for kernels that run."""
+def _handle(handler: Any) -> None:
+    for number in STOPPING:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, handler)
+
+
+def _ask_to_stop(stop: list[int], number: int) -> None:
+    stop.append(number)
+    if _Program.is_ours:
+        _Program.received = number
+
+
+def _end(number: int) -> NoReturn:
+    """Remove what is unfinished and end the process, whatever it does."""
+    _Program.received = number
+    for clean_up in reversed(_Program.unfinished):
+        with suppress(Exception):
+            clean_up()
     for stream in (sys.stdout, sys.stderr):
-        try:
+        with suppress(Exception):  # the signal may have come while it was written to
             stream.flush()
-        except (OSError, ValueError, AttributeError):
-            continue
-    os._exit(status())
-
-
-def _unraisable(about: Any) -> None:
-    """An interruption that came in a destructor or a callback of native code, and would be lost."""
-    if issubclass(about.exc_type, Interrupted):
-        _leave()
-    sys.__unraisablehook__(about)
+    with suppress(OSError):
+        os.write(2, (_SHOW_CURSOR if os.isatty(2) else b"") + b"interrupted\n")
+    os._exit(128 + number)
 
 
 # ------------------------------------------------------------------------------ Standard streams
@@ -162,7 +169,6 @@ def _guarded(stream: Any) -> Any:
         io.BufferedWriter(raw),
         encoding=stream.encoding,
         errors=stream.errors,
-        newline=None,
         line_buffering=True,
     )
 
@@ -170,8 +176,7 @@ def _guarded(stream: Any) -> Any:
 def _output_closed() -> None:
     if received():
         return
-    _Program.received = _CLOSED_PIPE
     if _Program.stop is not None:
-        _Program.stop.append(_CLOSED_PIPE)
-    elif _Program.started and threading.current_thread() is threading.main_thread():
-        raise Interrupted
+        _ask_to_stop(_Program.stop, _CLOSED_PIPE)
+    elif threading.current_thread() is threading.main_thread():
+        _end(_CLOSED_PIPE)

@@ -26,6 +26,7 @@ from ..io import is_locked, locked, require_file, require_utf8
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import parse, write
+from ..signals import cleaned_up
 from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
 from ..transport.vertex import SceneView
@@ -72,22 +73,25 @@ def capture(
     # Nobody else has a folder of this name: what is removed in the end is our own.
     partial = out.with_name(f"{_partial_name(out)}{secrets.token_hex(8)}{_PARTIAL}")
     missing = [folder for folder in out.parents if not folder.exists()]
-    try:
-        _tell_unfinished(out, tell)
-        partial.mkdir(parents=True)
-        with locked(partial):
-            dataset = _capture(
-                str(scene), DataFolder(partial), settings, cameras, allow_outside, tell
-            )
-            dataset.save(partial)
-            partial.rename(out)
-    except OSError as error:
-        raise UserError(f"cannot be written ({error.strerror})", where=out) from None
-    finally:
+
+    def remove() -> None:
         shutil.rmtree(partial, ignore_errors=True)
         with contextlib.suppress(OSError):
             for folder in missing:  # if they are empty: where nothing was written
                 folder.rmdir()
+
+    with cleaned_up(remove):
+        try:
+            _tell_unfinished(out, tell)
+            partial.mkdir(parents=True)
+            with locked(partial):
+                dataset = _capture(
+                    str(scene), DataFolder(partial), settings, cameras, allow_outside, tell
+                )
+                dataset.save(partial)
+                partial.rename(out)
+        except OSError as error:
+            raise UserError(f"cannot be written ({error.strerror})", where=out) from None
     return Dataset.load(out)
 
 

@@ -63,7 +63,6 @@ def main() -> None:
         "doctor": doctor,
     }
     try:
-        signals.begin()
         status = tyro.extras.subcommand_cli_from_dict(
             commands,
             prog="unbake",
@@ -81,7 +80,8 @@ def main() -> None:
         # A full disk, a file taken away: nothing that a traceback would explain.
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}")
     except KeyboardInterrupt:
-        _interrupted()
+        print("interrupted", file=sys.stderr)
+        sys.exit(signals.status())
     sys.exit(status or 0)
 
 
@@ -431,15 +431,8 @@ def _say(line: str) -> None:
     print(line, flush=True)
 
 
-def _interrupted() -> NoReturn:
-    print("interrupted", file=sys.stderr)
-    sys.exit(signals.status())
-
-
 def _fail(message: str) -> NoReturn:
     """Tell what is wrong, on one line whatever the width of the terminal, and exit."""
-    if signals.received():  # native code may turn an interruption into an error of its own
-        _interrupted()
     line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
     Console(stderr=True).print(line, soft_wrap=True)
     sys.exit(2)

@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 from rich.console import Console
 
+from .. import signals
 from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
@@ -196,7 +197,7 @@ def _fitted(
     done, total = progress.step, settings.steps
     if settings.seconds:
         done, total = progress.seconds, settings.seconds
-    if done < total:
+    if done < total or signals.received():
         console.print("the same command goes on from here")
         raise KeyboardInterrupt
     return progress

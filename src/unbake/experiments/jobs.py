@@ -21,7 +21,7 @@ from rich.console import Console
 
 from ..errors import UserError
 from ..io import write_json
-from ..signals import interrupt
+from ..signals import cleaned_up, interrupt
 
 #: What a job finds. It must be serializable as JSON.
 Findings = dict[str, Any]
@@ -175,15 +175,18 @@ class JobRunner:
         """Run a job and write its record, which of a stopped one has the time spent so far."""
         before, start = self.record(job).get("seconds", 0.0), time.perf_counter()
         record: Record = {"settings": dict(job.settings), "machine": dict(self.machine())}
-        try:
-            record["findings"] = job.work()
-        except UserError as error:
-            record["error"] = str(error)
-            raise
-        finally:
+
+        def keep() -> None:
             record["seconds"] = round(before + time.perf_counter() - start, 2)
             write_json(self._file(job), record)
             self.release()
+
+        with cleaned_up(keep):
+            try:
+                record["findings"] = job.work()
+            except UserError as error:
+                record["error"] = str(error)
+                raise
 
     def _file(self, job: Job) -> Path:
         return self.folder / f"{job.name}.json"

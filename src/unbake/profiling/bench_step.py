@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import shutil
 import statistics
 import sys
 import tempfile
@@ -23,6 +24,7 @@ from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from ..io import write_json
 from ..machine import machine
+from ..signals import cleaned_up
 from ..training.fresh_fit import begin_fit
 from ..training.memory import memory_mb
 from ..training.schedule import learning_rates
@@ -49,7 +51,8 @@ def small_data(data: Path | None, scene: str) -> Iterator[Path]:
     if data is not None:
         yield data
         return
-    with tempfile.TemporaryDirectory() as folder:
+    folder = tempfile.mkdtemp()
+    with cleaned_up(lambda: shutil.rmtree(folder, ignore_errors=True)):
         small = CaptureSettings(views=4, held_out=0, resolution=64, spp=8)
         made = Path(folder) / Path(scene).stem
         capture(scene, made, small, tell=lambda line: None)
