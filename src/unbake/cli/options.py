@@ -42,6 +42,8 @@ def with_length(settings: config.FitConfig, values: dict[str, Any]) -> config.Fi
     if "steps" in values:
         exclude("seconds", {"steps": values["steps"]} if "seconds" in values else {})
         settings = dataclasses.replace(settings, seconds=0.0)
+    if values.get("seconds") == 0:
+        raise UserError("must be more than 0", "--seconds", "--steps 0 trains nothing")
     return with_options(settings, values)
 
 
