@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..config import FitConfig
+from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
@@ -39,6 +40,7 @@ DEFINITIONS = {
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
     "samples": "camera samples traced in training; of an estimator with two passes, both count",
+    "data_changed": "parts of the data set that differ from those that the run was fit to",
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",
 }
@@ -77,7 +79,21 @@ def evaluate(
     settings = settings or EvaluationSettings()
     run = Path(run)
     recovered, folder = load_run(run, allow_outside=allow_outside), RunFolder(run)
+    with folder.lock_evaluation():
+        folder.forget_evaluation()
+        return _evaluate(recovered, folder, settings, tell)
+
+
+def _evaluate(
+    recovered: Recovered,
+    folder: RunFolder,
+    settings: EvaluationSettings,
+    tell: Callable[[str], None],
+) -> dict:
     dataset = recovered.dataset
+    data_changed = changed(folder.origin().fingerprint, fingerprint(dataset))
+    if data_changed:
+        tell(f"warning: other {', '.join(data_changed)} than the run was fit to")
     true_scene = _true_scene(recovered) if settings.truth else None
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
     views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
@@ -105,6 +121,7 @@ def evaluate(
         "per_view": rows,
         "definitions": DEFINITIONS | (lighting.DEFINITIONS if recovered_lighting else {}),
         "data": str(dataset.folder),
+        "data_changed": data_changed,
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
         "evaluation": asdict(settings),
     }

@@ -261,6 +261,8 @@ def _details(run: Run) -> list[tuple[str, str, str]]:
         return []
     estimator = str(metrics["estimator"])
     details = [(form, "φ", "")] if (form := _form(metrics.get("representation"))) else []
+    if differing := metrics.get("data_changed"):
+        details.append((f"evaluated on other {_listed(differing)}", "", ""))
     if run.untrained:
         return [*details, ("initial values, the same for all methods", "", "")]
     details.append((_form(metrics.get("radiance")) or "no", "L", "θ"))

@@ -17,7 +17,7 @@ import os
 import shutil
 import stat
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,11 +98,32 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
         UserError: the checkpoint belongs to other settings or was written by a newer version, or
             none can be used.
     """
-    written = run.written_checkpoints()
-    identity = run.origin().run if run.origin_file.exists() else None
     expected = _arrays(state)
     most = 2 * sum(array.nbytes for array in expected.values()) + _MOST_TEXT
-    others = 0
+    for path, arrays, progress in _whole(run, most):
+        _require_fit(arrays, expected, path)
+        _restore(state, arrays)
+        return progress
+    return None
+
+
+def newest_progress(run: RunFolder) -> Progress | None:
+    """How far the newest good checkpoint of a run has come; errors as in `load_checkpoint`."""
+    return next((progress for *_, progress in _whole(run, 1 << 40)), None)
+
+
+def _whole(run: RunFolder, most: int) -> Iterator[tuple[Path, dict[str, np.ndarray], Progress]]:
+    """The checkpoints of a run that are whole, the newest first.
+
+    Args:
+        most: bytes that a state can have; larger files are not read.
+
+    Raises:
+        UserError: there are checkpoints, but none that is whole and of this run, or one was written
+            by a newer version.
+    """
+    written, others, found = run.written_checkpoints(), 0, 0
+    identity = run.origin().run if run.origin_file.exists() else None
     for path in written:
         try:
             arrays, manifest = _read(path, most)
@@ -116,15 +137,13 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
         if manifest.get("run") != identity:
             others += 1
             continue
-        _require_fit(arrays, expected, path)
-        _restore(state, arrays)
-        return progress
-    if others:
+        found += 1
+        yield path, arrays, progress
+    if others and not found:
         what = "the checkpoints in this folder are of another run"
         raise UserError(what, run.checkpoints, "Put the right ones back, or fit again")
-    if written:
+    if written and not found:
         raise UserError("no checkpoint in this folder can be read", run.checkpoints, "Fit again")
-    return None
 
 
 # ------------------------------------------------------------------------------------------ writing
@@ -228,7 +247,7 @@ def _content(path: Path, most: int) -> bytes:
         about = os.fstat(number)
         if not stat.S_ISREG(about.st_mode) or about.st_size > most:
             raise _Damaged("is not a plain file of this size")
-        return file.read(most + 1)
+        return file.read(about.st_size)
 
 
 def _read_version_0_1(path: Path, most: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

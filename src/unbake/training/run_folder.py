@@ -304,15 +304,13 @@ class RunFolder:
         """
         written = self.written_checkpoints()
         at = written.index(newest)
-        for path in written[:at] + written[at + KEEP :]:
-            _remove(path)
+        _remove(*written[:at], *written[at + KEEP :])
 
     def sweep(self) -> None:
         """Delete what a killed process left unfinished; only with the lock."""
         for folder in (self.path, self.checkpoints, self.previews):
             # Version 0.1 wrote checkpoints under the name of `*.partial`.
-            for path in [*folder.glob(".*.tmp"), *folder.glob("step-*.partial")]:
-                _remove(path)
+            _remove(*folder.glob(".*.tmp"), *folder.glob("step-*.partial"))
 
     def preview(self, step: int) -> Path:
         """The preview after a number of steps."""
@@ -332,6 +330,14 @@ class RunFolder:
     def environment(self, suffix: str = ".exr") -> Path:
         """The picture of the recovered environment map; `suffix` as in `picture`."""
         return self.evaluation / f"environment{suffix}"
+
+    def forget_evaluation(self) -> None:
+        """Delete the numbers of an earlier evaluation, whose pictures are now replaced.
+
+        Also what a killed one left unfinished. Only with the lock.
+        """
+        self.metrics_file.unlink(missing_ok=True)
+        _remove(*self.evaluation.glob("**/.*.tmp"))
 
     def metrics(self) -> dict[str, Any]:
         """The numbers of the evaluation.
@@ -373,8 +379,9 @@ def _filled(folder: Path) -> bool:
     return any(folder.iterdir())
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+def _remove(*paths: Path) -> None:
+    for path in paths:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

@@ -95,7 +95,7 @@ _METRICS: Mapping[str, Check] = {
     **dict.fromkeys(("steps", "samples", "seconds", "bounces"), _count),
     **dict.fromkeys(("method", "data", "unknown", "estimator", "prior"), _text),
     **dict.fromkeys(("representation", "radiance"), _or_none(_text)),
-    "quantities": _list_of(_text),
+    **dict.fromkeys(("quantities", "data_changed"), _list_of(_text)),
     **dict.fromkeys(("heldout", "train"), _or_none(_SCORES)),
     "per_view": _list_of(_object_of(_score, name=_text, split=_text)),
     "environment": _or_none(_SCORES),
