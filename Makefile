@@ -1,7 +1,7 @@
 # One command a job; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev lint test test-fast test-slow fuzz soak docs demo bench clean distclean
+.PHONY: help setup setup-dev lint test test-fast test-slow fuzz soak docs demo bench kill clean distclean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-complete
@@ -10,6 +10,8 @@ PYTEST := $(BIN)/python -m pytest
 FORMATTED := src tests benchmarks scripts examples
 # Dr.Jit compiles on one thread: two processes of tests take little more than half the time of one.
 WORKERS ?= 2
+KILLS ?= 200
+EACH ?= 40
 PARALLEL := -n $(WORKERS) --dist worksteal
 # Tests of single functions, for the inner loop; what renders or fits is left to `make test`.
 FAST := tests/test_backend.py tests/test_config.py tests/test_equations.py tests/test_house.py \
@@ -68,6 +70,10 @@ demo: setup ## capture, fit, evaluate and report a small room into demo/ (FRESH=
 
 bench: setup ## where the time of a step goes here, into benchmarks/results (STAIRCASE=data adds it)
 	@$(BIN)/python benchmarks/run.py machine --again
+
+kill: setup ## kill a fit at 200 random instants and go on; signals to every command (KILLS, EACH)
+	@$(BIN)/python benchmarks/kill.py --kills $(KILLS) --out benchmarks/results/kill.json
+	@$(BIN)/python benchmarks/signals.py --each $(EACH) --out benchmarks/results/signals.json
 
 clean: ## remove the demo, builds and caches
 	rm -rf demo build dist site src/*.egg-info .hypothesis .pytest_cache .ruff_cache .import_linter_cache

@@ -1,0 +1,45 @@
+"""A fit that starts fast and has small steps, for the measurements that end it early."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from unbake.quantities import QUANTITIES
+
+#: A checkpoint after every step, so that ends at random instants meet many that are being written.
+_SETTINGS = "steps = 100000000\npixels = 64\nspp = 4\nwarm_up = 0\ncheckpoint_seconds = 0\n"
+_FIELD = (
+    "[{}.neural]\nwidth = 8\nhidden = 1\n"
+    "[{}.neural.grid]\nlevels = 2\ntable_log2 = 8\nbase_resolution = 2\n"
+)
+
+
+def prepare(folder: Path) -> tuple[Path, list[str]]:
+    """Make a data set of two views, and a fit of it that never comes to its end.
+
+    Returns:
+        The data set, and the words after `unbake` that begin the fit, but for `--out`.
+    """
+    data, settings = folder / "data", folder / "settings.toml"
+    names = [*(f"materials.{name}" for name in QUANTITIES), "radiance"]
+    settings.write_text(_SETTINGS + "".join(_FIELD.format(name, name) for name in names))
+    if not data.is_dir():
+        size = {"views": 2, "held-out": 1, "resolution": 16, "spp": 8, "max-depth": 6}
+        words = [word for name, value in size.items() for word in (f"--{name}", str(value))]
+        start(["capture", "cornell", "--out", str(data), *words]).communicate()
+    return data, ["fit", str(data), "--settings", str(settings), "--method", "direct"]
+
+
+def start(words: list[str]) -> subprocess.Popen[str]:
+    """A command of `unbake`, in a process group of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "unbake", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
