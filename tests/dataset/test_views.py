@@ -221,6 +221,10 @@ NAN_POSE = [[float("nan")] * 4] * 4
         (set_frame("transform_matrix", FAR_POSE), r"the pose has entries over 1e\+15"),
         (set_frame("transform_matrix", [[10**400] * 4] * 4), "not an array of 4 x 4 numbers"),
         (set_frame("file_path", f"images/{'x' * 201}.exr"), "the name of the image has over 200"),
+        (
+            set_frame("file_path", "images/a\x1b[31m.exr"),
+            "name of the image has control characters",
+        ),
         (set_top("coverage", 10**400), "'coverage' is not a number from 0 to 1"),
         (set_top("coverage", float("nan")), "'coverage' is not a number from 0 to 1"),
         (set_top("coverage", True), "'coverage' is not a number from 0 to 1"),

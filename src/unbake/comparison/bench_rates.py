@@ -433,7 +433,7 @@ def _scores(fit: FreshFit, dataset: Dataset) -> Row:
         score = Score(problem, dataset.heldout).measure(SPP)
         values |= {key: value for key, value in score.items() if key != "views"}
     if problem.environment is not None:
-        truth = true_environment(dataset.folder)
+        truth = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
         found = problem.environment.to_latlong(ROWS)
         values["relight_psnr"] = None if truth is None else relight_psnr(found, truth)
     if problem.emission is not None:

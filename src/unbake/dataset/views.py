@@ -232,6 +232,9 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
     if len(image.stem.encode()) > _LONGEST_NAME:
         what = f"the name of the image has over {_LONGEST_NAME} bytes"
         raise UserError(what, where, "Rename it: results are named after it")
+    if not image.stem.isprintable():
+        what = "the name of the image has control characters"
+        raise UserError(what, where, "Rename it: results are named after it")
     split = read_split(frame, where)
     camera = camera_from_frame(frame, top, where)
     known = {name: data.truth(name, image.stem) for name in QUANTITIES}

@@ -233,11 +233,11 @@ def _evaluate_lighting(
     recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]
 ) -> dict:
     """Scores and images of the lighting; empty if the run did not optimize it."""
-    problem, data = recovered.problem, recovered.dataset.folder
+    problem, data = recovered.problem, recovered.dataset
     found: dict[str, Any] = {}
     if problem.environment is not None:
         map_ = problem.environment.to_latlong(ROWS)
-        truth = true_environment(data)
+        truth = true_environment(data.folder, allow_outside=data.allow_outside)
         write_exr(folder.environment(), map_)
         tiles = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
         write_png(folder.environment(".png"), montage(tiles))
@@ -246,7 +246,12 @@ def _evaluate_lighting(
             found["environment"] = numbers = lighting.compare_environments(map_, truth)
             tell(", ".join(f"environment {k} {v:.3g}" for k, v in numbers.items()))
     if problem.emission is not None:
-        found["emission"] = [asdict(x) for x in lighting.recovered_emitters(problem, data)]
+        found["emission"] = [
+            asdict(x)
+            for x in lighting.recovered_emitters(
+                problem, data.folder, allow_outside=data.allow_outside
+            )
+        ]
         for row in found["emission"]:
             error = row["emission_error"]
             off = "" if error is None else f", {100 * error:.2f} % off"

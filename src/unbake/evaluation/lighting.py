@@ -43,15 +43,23 @@ class RecoveredEmitter:
     emission_error: float | None
 
 
-def recovered_emitters(problem: Problem, data: Path) -> list[RecoveredEmitter]:
+def recovered_emitters(
+    problem: Problem, data: Path, *, allow_outside: bool = False
+) -> list[RecoveredEmitter]:
     """The emitters' strengths beside the true ones of the data set, where those are known.
+
+    Args:
+        problem: the fit.
+        data: the data set's folder.
+        allow_outside: follow a link out of the folder.
 
     Raises:
         UserError: the data set's truth cannot be read.
     """
     if problem.emission is None:
         return []
-    known, found = true_emission(data), np.array(problem.emission.values).T
+    known = true_emission(data, allow_outside=allow_outside)
+    found = np.array(problem.emission.values).T
     recovered = []
     for name, strength in zip(problem.emitter_names, found, strict=True):
         truth, error = known.get(name), None

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from unbake.dataset.lighting import true_environment
+from unbake.dataset.views import Dataset
 from unbake.report import display
 from unbake.report.runs import Run
 
@@ -21,7 +21,7 @@ NUMBERS = {
 }
 
 
-def lighting_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
+def lighting_section(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
     """The contents of the section: `maps` and `emitters`, each None if no run optimized it.
 
     Raises:
@@ -29,14 +29,14 @@ def lighting_section(runs: list[Run], data: Path) -> dict[str, Any] | None:
     """
     if not any(run.optimizes("environment") or run.optimizes("emission") for run in runs):
         return None
-    return {"maps": _maps(runs, data), "emitters": _emitters(runs)}
+    return {"maps": _maps(runs, dataset), "emitters": _emitters(runs)}
 
 
-def _maps(runs: list[Run], data: Path) -> dict[str, Any] | None:
+def _maps(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
     """Maps and their errors, at the exposure of the truth if it is known."""
     if not any(run.optimizes("environment") for run in runs):
         return None
-    truth = true_environment(data)
+    truth = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
     found: list[np.ndarray | None] = []
     errors: list[np.ndarray | None] = []
     for run in runs:

@@ -115,7 +115,7 @@ def write_report(
         }
         for split in SPLITS
     ]
-    lighting, materials = lighting_section(loaded, data), _materials(loaded)
+    lighting, materials = lighting_section(loaded, dataset), _materials(loaded)
     page = (
         _environment()
         .from_string(TEMPLATE.read_text(encoding="utf-8"))

@@ -30,7 +30,9 @@ class Preview:
         self._view: View = (dataset.heldout or dataset.train)[0]
         materials = problem.materials
         self._truth = None if materials is None else GroundTruth.of(self._view, materials)
-        known = None if problem.environment is None else true_environment(dataset.folder)
+        known = None
+        if problem.environment is not None:
+            known = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
         self._environment = [] if known is None else [[tonemap(known)]]
 
     def show(self, progress: Progress) -> list[dict]:

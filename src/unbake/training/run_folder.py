@@ -29,7 +29,7 @@ from ..config import FitConfig, read_toml, to_toml
 from ..config.migration import migrated
 from ..errors import UserError
 from ..formats import check_format
-from ..io import read_object, read_text, write_json, write_text
+from ..io import read_object, read_text, require_utf8, write_json, write_text
 from . import run_numbers
 from .run_lock import RunLock
 
@@ -124,6 +124,7 @@ class RunFolder:
         Raises:
             UserError: there is one.
         """
+        require_utf8(self.path, "run folder")
         if self.config_file.exists():
             raise UserError(
                 "there is a run in this folder already",
@@ -173,6 +174,7 @@ class RunFolder:
         Raises:
             UserError: settings or origin are missing.
         """
+        require_utf8(self.path, "run folder")
         if not self.exists or not self.origin_file.is_file():
             raise UserError("no run in this folder", self.path, "Make one with `unbake fit`")
 
