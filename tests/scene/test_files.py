@@ -152,9 +152,9 @@ def test_a_million_triangles_are_checked_in_no_time(tmp_path):
     head = binary_ply(vertex=3 * triangles, face=triangles).split(b"end_header\n")[0]
     points = np.random.default_rng(0).random((3 * triangles, 3)).astype("<f4")
     (tmp_path / "mesh.ply").write_bytes(head + b"end_header\n" + points.tobytes() + faces.tobytes())
-    started = time.perf_counter()
+    started = time.process_time()
     check_mesh("ply", tmp_path / "mesh.ply")
-    assert time.perf_counter() - started < 2
+    assert time.process_time() - started < 2
 
 
 # ------------------------------------------------------------------------------------------ images

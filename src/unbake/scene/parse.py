@@ -60,11 +60,9 @@ class ParsedScene:
             # Mitsuba 3.9: emitters that were made although their shapes were not crash the process
             # in the next virtual call. They live as long as the nodes, which this error keeps.
             self.state = mi.parser.ParserState()
-            reason = _reason(error)
-            if "not been instantiated" in reason:
-                # Mitsuba 3.9 loads in parallel and may report an error that another one caused.
-                reason = _serial_reason(self.path, self.root) or reason
-            raise UserError(f"Mitsuba cannot make this scene: {reason}", self.path) from None
+            raise UserError(
+                f"Mitsuba cannot make this scene: {_reason(error)}", self.path
+            ) from None
         scene = scene[0] if isinstance(scene, list) else scene
         box = np.ravel([scene.bbox().min, scene.bbox().max])
         if not np.isfinite(box).all():
@@ -128,6 +126,9 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     root = (path.parent if root is None else root).resolve()
     folders = check_xml(path, root)
     config = mi.parser.ParserConfig(mi.variant())
+    # Mitsuba 3.9 ends the process if a node fails on another thread, such as a bitmap that is cut
+    # off ("terminate called"), or tells an error that another one caused. It is no faster there.
+    config.parallel = False
     try:
         state = mi.parser.parse_file(config, str(path))
         mi.parser.transform_upgrade(config, state)
@@ -181,18 +182,6 @@ def referenced(scene: ParsedScene, value: Any) -> Any | None:
 def is_reference(value: object) -> bool:
     """Whether the value of a property is a reference to another node."""
     return isinstance(value, mi.Properties.ResolvedReference)
-
-
-def _serial_reason(path: Path, root: Path) -> str | None:
-    """The error of instantiating a scene on one thread; None if there is none."""
-    scene = parse(path, root)
-    scene.config.parallel = False
-    try:
-        mi.parser.instantiate(scene.config, scene.state)
-    except (RuntimeError, ValueError, MemoryError) as error:
-        scene.state = mi.parser.ParserState()
-        return _reason(error)
-    return None
 
 
 def _require_own_plugins(scene: ParsedScene) -> None:
