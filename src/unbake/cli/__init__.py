@@ -70,9 +70,9 @@ def main() -> None:
             "from posed HDR photographs, with the global illumination taken out.\n\n"
             "From nothing to a result: unbake capture demo --out DATA; unbake fit DATA --out RUN; "
             "unbake evaluate RUN; unbake report RUN --out report.html\n\n"
-            "Exit status: 0; 1 where a part failed; 2 on bad input or a full disk; ended early, "
-            "with what was done saved: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 (closed "
-            "pipe). A second Ctrl-C ends at once.",
+            "Exit status: 0; 1 where a part failed or a fit learned nothing; 2 on bad input or a "
+            "full disk; ended early, with what was done saved: 130 (Ctrl-C), 143 (SIGTERM), 129 "
+            "(SIGHUP), 141 (closed pipe). A second Ctrl-C ends at once.",
         )
     except UserError as error:
         _fail(str(error))
@@ -170,11 +170,10 @@ def fit(
     if not progress.step:
         _say(f"nothing was learned: the fields are untrained; next: unbake evaluate {out}")
         return 0
-    _say(
-        f"{progress.step} steps, {progress.samples / 1e6:.1f} M samples in "
-        f"{progress.seconds:.0f} s; next: unbake evaluate {out}"
-    )
-    return 0
+    skipped = f" ({progress.skipped} skipped)" if progress.skipped else ""
+    done = f"{progress.step} steps{skipped}, {progress.samples / 1e6:.1f} M samples in "
+    _say(f"{done}{progress.seconds:.0f} s; next: unbake evaluate {out}")
+    return 1 if progress.warning else 0
 
 
 def evaluate(

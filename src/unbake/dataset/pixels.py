@@ -102,6 +102,11 @@ class PixelBatch:
         rgb = [dr.reinterpret_array(mi.Float, self._row(1 + i, pixel)) for i in columns]
         return RayBatch(mi.Color3f(rgb[:3]), mi.Color3f(rgb[3:]) if self.smoothed else None, ray)
 
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Back to NumPy: the numbers, shape (n,), and the rows of `Photographs.table`."""
+        packed = np.array(self._packed).reshape(-1, self.count)
+        return packed[0], packed[1:].view(np.float32).T
+
     def _row(self, row: int, pixel: mi.UInt32) -> mi.UInt32:
         return dr.gather(mi.UInt32, self._packed, pixel + row * self.count)
 
@@ -182,6 +187,13 @@ class PixelSource:
         row, column = np.divmod(np.arange(edge * edge), edge)
         numbers = first + (place // across + row) * width + place % across + column
         return PixelBatch.of(numbers, self.photographs.table[numbers])
+
+    def place(self, number: int) -> tuple[int, int, int]:
+        """The view of a pixel, from 0, and its column and row in it."""
+        view = max(i for i, (first, *_) in enumerate(self._layout) if first <= number)
+        first, width, _ = self._layout[view]
+        row, column = divmod(number - first, width)
+        return view, column, row
 
     def require_crops(self, count: int) -> None:
         """Raise a `UserError` if there are no square crops of that many pixels in all views."""

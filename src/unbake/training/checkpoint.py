@@ -48,6 +48,15 @@ class Progress:
     step: int = 0
     seconds: float = 0.0  #: of training, without previews and checkpoints
     samples: int = 0  #: from the camera, traced in all passes
+    skipped: int = 0  #: steps whose loss was not finite
+    rate: float = 1.0  #: factor on all learning rates, less than 1 after the loss has exploded
+    #: Losses of the first steps, for a comparison in the end; none in runs of version 0.1.
+    untrained: tuple[float, ...] = ()
+    warning: str | None = None  #: what is wrong with a fit that has ended; not part of checkpoints
+
+    def counted(self) -> dict[str, Any]:
+        """Steps, seconds and samples, as lines of the log have them."""
+        return {"step": self.step, "seconds": self.seconds, "samples": self.samples}
 
 
 class _Damaged(Exception):
@@ -72,9 +81,10 @@ def save_checkpoint(
     content = save(_arrays(state))
     manifest = {
         "format": FORMAT,
-        "step": progress.step,
-        "seconds": progress.seconds,
-        "samples": progress.samples,
+        **progress.counted(),
+        "skipped": progress.skipped,
+        "rate": progress.rate,
+        "untrained": list(progress.untrained),
         **(about or {}),
         "files": {STATE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
     }
@@ -128,7 +138,12 @@ def _whole(run: RunFolder, most: int) -> Iterator[tuple[Path, dict[str, np.ndarr
         try:
             arrays, manifest = _read(path, most)
             progress = Progress(
-                int(manifest["step"]), float(manifest["seconds"]), int(manifest["samples"])
+                int(manifest["step"]),
+                float(manifest["seconds"]),
+                int(manifest["samples"]),
+                int(manifest.get("skipped", 0)),
+                float(manifest.get("rate", 1.0)),
+                tuple(map(float, manifest.get("untrained", ()))),
             )
             if not all(np.isfinite(array).all() for array in arrays.values()):
                 raise _Damaged("a number is not finite")

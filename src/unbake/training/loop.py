@@ -34,14 +34,13 @@ from .schedule import learning_rates
 from .state import State, initial_state
 from .step import TrainingStep
 from .validation import Score
+from .watchdog import Watchdog
 
 #: Steps between readings of the loss; reading waits for the machine.
 READ_EVERY = 20
 #: Steps between looks at the clock, where time is the limit or decides when to score. Looking waits
 #: for the machine, too.
 TIME_EVERY = 4
-#: Consecutive steps without a finite loss after which a fit gives up.
-GIVE_UP_AFTER = 100
 
 
 def fit(
@@ -66,11 +65,12 @@ def fit(
         allow_outside: read files of the data set and its scene that lie outside of its folder.
 
     Returns:
-        How far the fit came. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it early, with a checkpoint.
+        How far the fit came, and what is wrong with it. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it
+        early, with a checkpoint.
 
     Raises:
         UserError: the data set or the run's folder cannot be used, what was learned cannot be
-            saved, or the loss does not stay finite.
+            saved, the loss does not stay finite, or the fit diverges twice.
 
     Paper: Sec. 4, 5.4.
     """
@@ -115,6 +115,7 @@ class _Begun:
     restored: Progress | None  #: of the checkpoint that it goes on with
     preview: Preview
     score: Score | None
+    views: list[str]  #: names of those that it learns from
 
 
 def _begin(
@@ -160,7 +161,8 @@ def _begin(
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
     step.require_memory(state)
-    return _Begun(config, origin, problem, step, state, restored, preview, score)
+    names = [view.name for view in dataset.train]
+    return _Begun(config, origin, problem, step, state, restored, preview, score, names)
 
 
 def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
@@ -187,7 +189,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     saving = Saving(folder, lock, about, config.checkpoint_seconds, progress.seconds)
     shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
-    skipped = 0
+    watchdog = Watchdog(state, begun.step, progress, begun.views)
     failures: list[UserError] = []  # to write what was due last
     with Monitor(folder.log_file, console, total) as monitor:
         if score is not None and not progress.step:
@@ -200,7 +202,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
         while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
             done = _done(config, progress) / total
-            rates = learning_rates(config, progress.step, done)
+            rates = watchdog.rates(learning_rates(config, progress.step, done))
             recent.append(begun.step(state, progress.step, rates))
             progress.step += 1
             progress.samples = progress.step * config.samples_per_step
@@ -218,9 +220,9 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             if not (full or last or due or save):
                 continue
 
-            entry = _log_entry(recent, progress, rates[unknown])
-            skipped = skipped + entry["skipped"] if entry["skipped"] == len(recent) else 0
+            readings = [{term: float(x[0]) for term, x in losses.items()} for losses in recent]
             recent.clear()
+            entry = _log_entry(readings, progress, rates[unknown])
             # Scores, checkpoints and previews are not training: the clock stands still.
             if score is not None and (due or last):
                 state.publish(problem)
@@ -228,22 +230,45 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 scored_at = progress.seconds
             lock.require_held()
             monitor.record(_done(config, progress), entry)
-            if skipped >= GIVE_UP_AFTER:
-                raise UserError(
-                    f"the loss was not finite in the last {skipped} steps",
-                    where=folder.path,
-                    remedy="Lower the learning rates, or look for extreme pixels in the images",
-                )
-            failures = saving.save(state, progress) if save or last else []
+            _watch(watchdog, readings, monitor, saving, begun, progress, last)
+            failures = saving.save(state, progress) if last or (save and watchdog.trusts) else []
             if last or progress.seconds - shown_at >= config.preview_seconds:
                 failures += _show(begun, monitor, progress)
                 shown_at = progress.seconds
             for failure in () if last else failures:
                 monitor.say(f"warning: {failure}; the fit goes on, and tries again later")
             clock = time.perf_counter() - progress.seconds
+        if not stop and not failures:
+            _judge(watchdog, monitor, progress, config)
     for failure in [*failures, *monitor.failures]:
         raise failure
     return progress
+
+
+def _watch(
+    watchdog: Watchdog,
+    readings: list[dict[str, float]],
+    monitor: Monitor,
+    saving: Saving,
+    begun: _Begun,
+    progress: Progress,
+    last: bool,
+) -> None:
+    """Let the watchdog look at the last steps. Where it gives up, the last good state is saved."""
+    try:
+        for line in watchdog.read(readings, last=last):
+            monitor.note(progress.step, progress.seconds, line)
+    except UserError as error:
+        monitor.note(progress.step, progress.seconds, str(error), say=False)
+        saving.save(begun.state, progress)
+        raise
+
+
+def _judge(watchdog: Watchdog, monitor: Monitor, progress: Progress, config: FitConfig) -> None:
+    """Note what is wrong with a fit that has ended."""
+    progress.warning = watchdog.verdict(learning_rates(config, config.warm_up, 0.0))
+    if progress.warning is not None:
+        monitor.note(progress.step, progress.seconds, progress.warning)
 
 
 def _show(begun: _Begun, monitor: Monitor, progress: Progress) -> list[UserError]:
@@ -262,15 +287,11 @@ def _done(config: FitConfig, progress: Progress) -> float:
     return progress.seconds if config.seconds else progress.step
 
 
-def _log_entry(recent: list[dict[str, mi.Float]], progress: Progress, rate: float) -> dict:
+def _log_entry(readings: list[dict[str, float]], progress: Progress, rate: float) -> dict:
     """A line of the log: means over the steps since the last one."""
-    entry: dict = {
-        "step": progress.step,
-        "seconds": progress.seconds,
-        "samples": progress.samples,
-    }
-    for term in recent[0] if recent else ():
-        values = [float(losses[term][0]) for losses in recent]
+    entry: dict = progress.counted()
+    for term in readings[0] if readings else ():
+        values = [reading[term] for reading in readings]
         if term == "skipped":
             entry[term] = int(sum(values))
             continue

@@ -62,6 +62,12 @@ class Monitor:
         """Print a line above the bar."""
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
+    def note(self, step: int, seconds: float, line: str, *, say: bool = True) -> None:
+        """Log, and print, what has to be known of the fit after a step."""
+        self._write({"step": step, "seconds": seconds, "note": line})
+        if say:
+            self.say(f"warning: {line}")
+
     def record(self, done: float, entry: dict) -> None:
         """Show and log the state after a step.
 

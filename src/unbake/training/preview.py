@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,7 @@ class Preview:
             )
         if sheets:
             write_png(self._run.preview(progress.step), montage(sheets, gap=0))
-        return [{**asdict(progress), "validation": values} for values in found]
+        return [{**progress.counted(), "validation": values} for values in found]
 
     def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:
         """Pictures of them and of the truth; PSNRs where there is truth."""

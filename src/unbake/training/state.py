@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .loss_scaling import first_scale
 from .problem import Problem
+
+#: What `State.restore` brings back, by optimiser and parameter; and the scale of the loss.
+Snapshot = tuple[dict[str, dict[str, Any]], "mi.Float | None"]
 
 
 @dataclass
@@ -45,6 +49,48 @@ class State:
         if problem.radiance is not None and self.theta is not None:
             problem.radiance.assign(dict(self.theta.items()))
 
+    def snapshot(self) -> Snapshot:
+        """The present state. Nothing is copied: steps make new arrays, and do not change old ones.
+
+        It takes memory from the next step on, as much as the state.
+        """
+        kept = {
+            name: {
+                key: (_same(value), tuple(map(_same, extra[:3])))
+                for key, (value, _, _, extra) in optimizer.state.items()
+            }
+            for name, optimizer in self.optimizers()
+        }
+        return kept, None if self.scale is None else _same(self.scale)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot, which can be used again."""
+        kept, scale = snapshot
+        self.scale = None if scale is None else _same(scale)
+        for name, optimizer in self.optimizers():
+            for key, (_, promoted, rate, _) in list(optimizer.state.items()):
+                value, extra = kept[name][key]
+                value = _same(value)
+                dr.enable_grad(value)
+                optimizer.state[key] = (value, promoted, rate, (*map(_same, extra), None))
+
+    def moved(self) -> bool:
+        """Whether any gradient has reached the unknowns, as Adam's moments tell."""
+        moments = [extra[2] for _, _, _, extra in self.phi.state.values()]
+        return any(dr.any(moment.array != 0)[0] for moment in moments)
+
+    def broken(self) -> list[str]:
+        """Names of the parameters that are not finite, or whose moments in Adam are not."""
+        good = {}
+        for name, optimizer in self.optimizers():
+            for key, (value, _, _, (_, *moments, _)) in optimizer.state.items():
+                finite = mi.Bool(True)
+                for numbers in (dr.detach(value), *moments):
+                    finite &= dr.all(dr.isfinite(numbers.array))
+                good[key if name == "phi" else f"radiance.{key}"] = finite
+        dr.eval(good)
+        return [name for name, finite in good.items() if not finite[0]]
+
 
 def initial_state(problem: Problem) -> State:
     """Optimisers that own the problem's parameters.
@@ -59,3 +105,8 @@ def initial_state(problem: Problem) -> State:
         theta = mi.ad.Adam(1e-3, problem.radiance.parameters(), mask_updates=True)
     scale = first_scale() if problem.half_precision else None
     return State(phi, theta, scale)
+
+
+def _same(array: Any) -> Any:
+    """The same array as another Python object, which does not follow when that one is assigned."""
+    return type(array)(dr.detach(array))

@@ -31,6 +31,8 @@ from .state import State
 
 #: Camera samples, at most, of the batch that a path sampler plans with.
 _PLANNED_PATHS = 1 << 15
+#: The largest gradient whose square is finite in single precision, with some room.
+_LARGEST_GRADIENT = 1e18
 
 
 @dataclass
@@ -43,6 +45,18 @@ class Inputs:
     sampler: mi.Sampler  # of all camera samples
     second: mi.Sampler  # of those that L_θ learns from, if these are fewer
     seed: mi.UInt32
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A step taken apart."""
+
+    terms: dict[str, float]
+    broken: list[str]  #: parameters whose gradient is not finite
+    numbers: np.ndarray  #: of the pixels, shape (n,)
+    image: np.ndarray  #: as the step sees it, linear RGB, shape (n, 3)
+    photograph: np.ndarray  #: the same
+    errors: np.ndarray  #: squared, the same
 
 
 class TrainingStep:
@@ -159,6 +173,54 @@ class TrainingStep:
         if self._path_sampler.keeps_paths:
             told += " or path.max_depth, or use --method prb"
         return told
+
+    @property
+    def rate_names(self) -> tuple[str, ...]:
+        """The names of learning rates that a step takes."""
+        return (*self._config.unknowns, "radiance")
+
+    def loss_of_black(self) -> float:
+        """About the photometric loss of black pictures."""
+        _, colours = self._pixels.draw(self._config.seed, _PLANNED_PATHS).read()
+        target = colours[:, :3].astype(np.float64)
+        smoothed = self._config.loss_reference == "smoothed"
+        reference = colours[:, 3:] if smoothed else target
+        return float((target**2 / (reference**2 + self._config.loss_epsilon)).mean())
+
+    def replay(self, state: State, number: int) -> Replay:
+        """A step taken apart, for a diagnosis; the state stays as it is."""
+        self.plan(state)
+        inputs, config = self._inputs(number), self._config
+        terms = self._gradients(inputs, state)
+        gradients = {
+            key: dr.grad(value)
+            for _, optimizer in state.optimizers()
+            for key, value in optimizer.items()
+        }
+        broken = [k for k, g in gradients.items() if not np.isfinite(np.array(g.array)).all()]
+        for _, optimizer in state.optimizers():
+            dr.clear_grad(dict(optimizer.items()))
+        with dr.suspend_grad(), self._path_sampler.prepared():
+            inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
+            batch = inputs.pixels.batch(inputs.rays, inputs.sampler, config.spp)
+            image = self._path_sampler.image(inputs.scene, batch.ray, inputs.sampler)
+            image = np.array(pixel_means(image, config.spp)).T
+        numbers, colours = inputs.pixels.read()
+        photograph = colours[:, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors = (image - photograph) ** 2
+        return Replay(
+            {name: float(value[0]) for name, value in terms.items()},
+            broken,
+            numbers,
+            image,
+            photograph,
+            errors,
+        )
+
+    def place(self, pixel: int) -> tuple[int, int, int]:
+        """The training view of a pixel, from 0, and its column and row in it."""
+        return self._pixels.place(pixel)
 
     def recordings(self) -> int:
         """How often the step was traced to be replayed; 0 if it is traced each time."""
@@ -292,10 +354,10 @@ def without_garbage_collection() -> Iterator[None]:
 
 
 def _drop_broken_gradients(optimizer: mi.ad.Adam) -> None:
-    """Replace gradients that are not finite by zero, so that Adam does not update those entries.
+    """Replace gradients that Adam cannot square by zero, so that it does not update those entries.
 
-    A single NaN would stay in Adam's moments for the rest of the fit.
+    A single NaN, or an infinite square, would stay in Adam's moments for the rest of the fit.
     """
     for value in optimizer.values():
         gradient = dr.grad(value)
-        dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))
+        dr.set_grad(value, dr.select(dr.abs(gradient) < _LARGEST_GRADIENT, gradient, 0))

@@ -1,0 +1,220 @@
+"""Watches a fit: skipped steps, a loss that explodes, and a fit that learns nothing."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from statistics import median
+from typing import final
+
+from ..errors import UserError
+from ..transport.methods import PHOTOMETRIC
+from .checkpoint import Progress
+from .diagnosis import diagnose
+from .state import Snapshot, State
+from .step import TrainingStep
+
+#: Consecutive steps without a finite loss after which a fit gives up. It also does where more than
+#: half of so many steps, or of the whole fit, were skipped.
+GIVE_UP_AFTER = 100
+#: A loss has exploded where it is so many times as high as it was lately, in two readings of
+#: `READ_EVERY` steps, one after the other. Compared are medians over the steps of a reading, in
+#: which single fireflies do not count.
+EXPLOSION = 30.0
+#: Readings that say how high the loss was lately, and how many there must be.
+_LATELY, _FEWEST = 25, 3
+#: Readings between snapshots. The older of two is the one to go back to: at least so many readings
+#: before the first one with an exploded loss.
+_BETWEEN_SNAPSHOTS = 5
+#: Factor on all learning rates after an explosion.
+SLOWER = 0.5
+#: Batches of the first steps that are looked at again in the end.
+COMPARED = 8
+#: Losses of those batches that are so many times that of the first one are left out.
+_FAR = 10.0
+#: Steps of a fit from which on it should have learned something.
+LONG_ENOUGH = 200
+#: Where the loss falls by less than this share, most batches must agree that it falls.
+_CLEARLY, _MOST = 0.01, 0.8
+#: Parameters are of the order of one: those that moved by less have not learned anything.
+_STANDING = 1e-3
+#: A fit is worse than none where its loss is so many times that of black pictures. (That of noisy
+#: renderings is higher than that of their expectation, with an estimator of two passes.)
+_WORSE_THAN_BLACK = 100.0
+_LOOK = "Look at the learning rates, the lights and the cameras"
+
+Reading = Mapping[str, float]
+
+
+@final
+class Watchdog:
+    """Watches the loss and the state of a fit at each reading of the log.
+
+    Steps without a finite loss are counted, and the first one is explained. Where the loss explodes
+    or a parameter is not finite, the fit goes back to its last good state, once, and on from there
+    with lower rates. In the end the batches of the first steps show whether anything was learned.
+
+    Args:
+        state: of the fit.
+        step: its training step.
+        progress: of the fit; what a resumed fit has to know is noted there.
+        views: names of the training views.
+    """
+
+    def __init__(
+        self, state: State, step: TrainingStep, progress: Progress, views: Sequence[str]
+    ) -> None:
+        self._state, self._step, self._progress, self._views = state, step, progress, views
+        self._lately: deque[float] = deque(maxlen=_LATELY)
+        self._good: deque[tuple[int, Snapshot]] = deque(maxlen=2)
+        self._good.append((progress.step, state.snapshot()))
+        self._readings = self._suspicious = self._in_a_row = 0
+        self._first = math.nan  # the loss of the first step
+        self._cause = ""
+
+    @property
+    def trusts(self) -> bool:
+        """Whether the state looks good enough to be saved."""
+        return not self._suspicious
+
+    def rates(self, rates: Mapping[str, float]) -> dict[str, float]:
+        """Learning rates, lower after an explosion."""
+        return {name: rate * self._progress.rate for name, rate in rates.items()}
+
+    def read(self, readings: Sequence[Reading], *, last: bool) -> list[str]:
+        """Look at the loss terms of the last steps, and act.
+
+        Args:
+            readings: of each step, as numbers.
+            last: whether the fit ends with these steps.
+
+        Returns:
+            What is to be told.
+
+        Raises:
+            UserError: the fit makes no sense any more; its state is the last good one.
+        """
+        self._note_untrained(readings)
+        told = self._count_skipped(readings, last)
+        level = median([abs(_total(r)) for r in readings if not r["skipped"]] or [math.nan])
+        broken = self._state.broken()
+        if math.isnan(self._first):
+            self._first = abs(_total(readings[0]))
+        usual = median(self._lately) if len(self._lately) >= _FEWEST else EXPLOSION * self._first
+        if broken or level > EXPLOSION * usual:
+            self._suspicious += 1
+            if broken or last or self._suspicious > 1:
+                what = f"{', '.join(broken)} has numbers that are not finite"
+                if not broken:
+                    what = f"the loss rose from about {usual:.3g} to {level:.3g}"
+                told.append(self._go_back(what, last))
+            return told
+        self._suspicious = 0
+        self._readings += 1
+        if math.isfinite(level):
+            self._lately.append(level)
+        if self._readings % _BETWEEN_SNAPSHOTS == 0:
+            self._good.append((self._progress.step, self._state.snapshot()))
+        return told
+
+    def verdict(self, rates: Mapping[str, float]) -> str | None:
+        """What is wrong with a fit that has ended; None if it has learned something.
+
+        The batches of the first steps are looked at again, with the same random numbers: what is
+        noise is in both, and what differs was learned.
+
+        Args:
+            rates: Adam's learning rates at the start, of unknowns and L_θ.
+        """
+        before, progress = self._progress.untrained, self._progress
+        if progress.step < LONG_ENOUGH:
+            return None
+        if not self._state.moved():
+            return f"nothing was learned: no gradient ever reached the unknowns. {_LOOK}"
+        # Adam moves a parameter by about its rate in a step
+        path = progress.step * max(rates[key.partition(".")[0]] for key in self._state.phi)
+        if path < _STANDING:
+            what = f"{progress.step} steps move the unknowns by {path:.1g} at most"
+            return f"nothing was learned: {what}. Raise the learning rates"
+        again = self._looked_at_again(len(before) or 1)
+        end, black = median(r[PHOTOMETRIC] for r in again), self._step.loss_of_black()
+        if end > _WORSE_THAN_BLACK * black:
+            return (
+                f"nothing useful was learned: the loss is {end:.3g}, and of black pictures "
+                f"{black:.3g}. Look at the strength of the lights, and the unit of the photographs"
+            )
+        # With rates that are far too high, the fields are not untrained any more after one step.
+        pairs = [(a, _total(b)) for a, b in zip(before, again, strict=False)]
+        pairs = [(a, b) for a, b in pairs if abs(a) < _FAR * abs(before[0])]
+        if not pairs:
+            return None
+        start, end = (sum(losses) / len(pairs) for losses in zip(*pairs, strict=True))
+        better = sum(b < a for a, b in pairs)
+        if start - end > _CLEARLY * abs(start) or better > _MOST * len(pairs):
+            return None
+        return (
+            "nothing was learned: the photographs are explained no better than by the untrained "
+            f"fields (loss {end:.4g}, and {start:.4g} at the start). {_LOOK}"
+        )
+
+    def _note_untrained(self, readings: Sequence[Reading]) -> None:
+        """Note the losses of the first steps, in which next to nothing has been learned."""
+        noted, first = self._progress.untrained, self._progress.step - len(readings)
+        if first == len(noted) < COMPARED and PHOTOMETRIC in readings[0]:
+            losses = [_total(reading) for reading in readings[: COMPARED - len(noted)]]
+            if all(map(math.isfinite, losses)):
+                self._progress.untrained = (*noted, *losses)
+
+    def _count_skipped(self, readings: Sequence[Reading], last: bool) -> list[str]:
+        progress, told = self._progress, []
+        skipped = [i for i, reading in enumerate(readings) if reading["skipped"]]
+        if skipped and not self._cause:
+            number = progress.step - len(readings) + skipped[0]
+            self._cause = diagnose(self._step, self._state, number, self._views)
+            told.append(f"step {number + 1} was skipped: {self._cause}; further ones are counted")
+        progress.skipped += len(skipped)
+        self._in_a_row = self._in_a_row + len(skipped) if len(skipped) == len(readings) else 0
+        long_enough = last or progress.step >= GIVE_UP_AFTER
+        if self._in_a_row >= GIVE_UP_AFTER or (
+            2 * progress.skipped > progress.step and long_enough
+        ):
+            raise UserError(
+                f"the loss was not finite in {progress.skipped} of {progress.step} steps: "
+                f"{self._cause}",
+                remedy="Lower the learning rates, or look for extreme values in images and scene",
+            )
+        return told
+
+    def _go_back(self, what: str, last: bool) -> str:
+        """Go back to the last good state, or give up where that was done before."""
+        number, snapshot = self._good[0]
+        self._state.restore(snapshot)
+        self._good.clear()
+        self._good.append((number, snapshot))
+        self._suspicious = 0
+        again = " again" if self._progress.rate < 1 else ""
+        if again or last:
+            raise UserError(
+                f"the fit diverged{again}: {what} by step {self._progress.step}",
+                remedy=f"{_LOOK}; the state of step {number} is kept",
+            )
+        self._progress.rate *= SLOWER
+        return (
+            f"step {self._progress.step}: {what}; back to the state of step {number}, with "
+            f"{SLOWER:g} times the learning rates"
+        )
+
+    def _looked_at_again(self, count: int) -> list[Reading]:
+        """The loss terms of the first batches, now."""
+        now, rates = self._state.snapshot(), dict.fromkeys(self._step.rate_names, 0.0)
+        readings = []
+        for number in range(count):
+            terms = self._step(self._state, number, rates)
+            readings.append({term: float(value[0]) for term, value in terms.items()})
+            self._state.restore(now)
+        return readings
+
+
+def _total(reading: Reading) -> float:
+    return sum(value for term, value in reading.items() if term != "skipped")
