@@ -117,3 +117,14 @@ def test_a_scene_lit_by_its_environment_alone_has_no_light_to_fit(kind, parse_li
     with pytest.raises(UserError, match=r"scene.xml: the scene has no light to fit: no area") as e:
         edit.set_emission(parsed, lambda count: [])
     assert "--unknown lighting" in str(e.value) and "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    "strength",
+    ['<string name="radiance" value="bright"/>', '<texture name="radiance" type="checkers"/>'],
+)
+def test_a_strength_that_is_none_is_told(strength, parse):
+    """Lights are named before Mitsuba makes the scene, which would complain of them itself."""
+    parsed = parse(BALL.format(f'<emitter type="area">{strength}</emitter>'))
+    with pytest.raises(UserError, match=r"scene.xml: 'radiance' of area is no strength: "):
+        emitters.named_emitters(parsed)

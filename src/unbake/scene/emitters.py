@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..fields.envmap import latlong
-from .parse import ParsedScene, is_reference, referenced
+from .parse import ParsedScene, is_reference, reason, referenced
 
 #: Plugins that surround the scene.
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
@@ -96,11 +96,16 @@ def _strength(scene: ParsedScene, props: mi.Properties) -> tuple[float, float, f
     """The strength of an emitter, linear RGB; None if it is not one colour."""
     key = STRENGTHS[props.plugin_name()]
     node = referenced(scene, props[key]) if key in props else None
-    if node is not None:
-        texture = mi.PluginManager.instance().create_object(node.props)
-        texture = (texture.expand() or [texture])[0]
-    else:
-        texture = props.get_emissive_texture(key, 1.0)
+    try:
+        if node is not None:
+            texture = mi.PluginManager.instance().create_object(node.props)
+            texture = (texture.expand() or [texture])[0]
+        else:
+            texture = props.get_emissive_texture(key, 1.0)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(
+            f"{key!r} of {props.plugin_name()} is no strength: {reason(error)}", scene.path
+        ) from None
     if texture.is_spatially_varying():
         return None
     try:

@@ -60,9 +60,7 @@ class ParsedScene:
             # Mitsuba 3.9: emitters that were made although their shapes were not crash the process
             # in the next virtual call. They live as long as the nodes, which this error keeps.
             self.state = mi.parser.ParserState()
-            raise UserError(
-                f"Mitsuba cannot make this scene: {_reason(error)}", self.path
-            ) from None
+            raise UserError(f"Mitsuba cannot make this scene: {reason(error)}", self.path) from None
         scene = scene[0] if isinstance(scene, list) else scene
         box = np.ravel([scene.bbox().min, scene.bbox().max])
         if not np.isfinite(box).all():
@@ -134,7 +132,7 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
         mi.parser.transform_upgrade(config, state)
         mi.parser.transform_resolve(config, state)
     except (RuntimeError, ValueError) as error:
-        raise UserError(f"not a scene that Mitsuba can read: {_reason(error)}", path) from None
+        raise UserError(f"not a scene that Mitsuba can read: {reason(error)}", path) from None
     scene = ParsedScene(path, root, config, state)
     _require_own_plugins(scene)
     _require_finite(scene)
@@ -159,7 +157,7 @@ def write(scene: ParsedScene, folder: Path) -> Path:
                 node.props["filename"] = copies[source]
         mi.parser.write_file(scene.state, str(folder / "scene.xml"))
     except (RuntimeError, ValueError) as error:
-        raise UserError(f"cannot be copied: {_reason(error)}", scene.path) from None
+        raise UserError(f"cannot be copied: {reason(error)}", scene.path) from None
     return folder / "scene.xml"
 
 
@@ -256,7 +254,7 @@ def _is_finite(value: Any) -> bool:
     return bool(np.isfinite(value).all())
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """Mitsuba's message on one line, without positions in its C++ source."""
     text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
     return text[:300] or type(error).__name__
