@@ -119,6 +119,7 @@ class Kind:
         sky: whether there is an environment.
         specular: whether there are surfaces that pass or reflect rays. Mitsuba counts these as
             bounces and we do not, so that paths must be long enough for the rest not to matter.
+            (Small lamps are left out there: seen through others, they have heavy tails.)
         integrator: Mitsuba's.
     """
 
@@ -137,8 +138,13 @@ class Kind:
 
     @property
     def depth(self) -> int:
-        """Mitsuba's `max_depth` of whole paths."""
+        """`max_depth` of whole paths, of ours."""
         return 6 if self.specular else 4
+
+    @property
+    def stock_depth(self) -> int:
+        """`max_depth` of the same paths in Mitsuba, which counts every surface."""
+        return 12 if self.specular else 4
 
     @property
     def unknowns(self) -> list[str]:
@@ -183,11 +189,11 @@ KINDS = {
     "several lights": Kind(a_ball, lights=("lamp", "point"), sky=True),
     "glossy": Kind(a_ball, roughness=0.3, metallic=0.0),
     "metal": Kind(a_ball, roughness=0.35, metallic=0.9),
-    "mask": Kind(a_mask, specular=True, integrator="volpath"),
+    "mask": Kind(a_mask, lights=(), sky=True, specular=True, integrator="volpath"),
     "bump": Kind(a_bump),
     "two-sided": Kind(a_back),
     "glass": Kind(a_glass, lights=(), sky=True, specular=True),
-    "mirror": Kind(a_mirror, specular=True),
+    "mirror": Kind(a_mirror, lights=("point",), sky=True, specular=True),
     "instances": Kind(instances),
 }
 
@@ -373,7 +379,7 @@ def sampler_of(name: str, way: str, spp: int):
         live.view,
         pixel_rays([CAMERA], spp, 1),
         spp,
-        max_depth=depth,
+        max_depth=live.kind.stock_depth if way == "prb" else depth,
         bounces=row.bounces or depth - 1,
         radiance=exact if row.exact else ConstantRadiance(0),
         read_by_scene=live.read_by_scene,
@@ -454,7 +460,7 @@ def image_of(name: str, scene: mi.Scene, ray: mi.Ray3f, seed: int, depth: int) -
 
 def after_first_bounce(name: str, scene: mi.Scene, ray: mi.Ray3f, seed: int) -> np.ndarray:
     """Light of two bounces and more, where only the first has the materials of this scene."""
-    fixed, lanes, depth = stock_scene(name), dr.width(ray), KINDS[name].depth
+    fixed, lanes, depth = stock_scene(name), dr.width(ray), KINDS[name].stock_depth
     with dr.suspend_grad():
         si, sampler, ctx = fixed.ray_intersect(ray), seeded(seed, lanes), mi.BSDFContext()
         bs, _ = si.bsdf().sample(ctx, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
@@ -487,7 +493,7 @@ def reference(name: str, kind_of: str) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the weighted sum of Mitsuba's image, and their standard errors."""
     kind, (first, second, third) = KINDS[name], seeds(name, kind_of, 3).tolist()
     ray = pixel_rays([CAMERA], REFERENCE_SPP, first)
-    depth = kind.depth if kind_of == "paths" else 2
+    depth = kind.stock_depth if kind_of == "paths" else 2
     weight = weights(name, REFERENCE_SPP)
     if kind_of == "first bounce":
         weight = weight * is_solid(stock_scene(name), ray)
@@ -541,7 +547,7 @@ CELLS = cells({("area light", "direct"), ("environment", "direct"), ("two-sided"
 #: Numbers that all cells compare, for Šidák's correction.
 TESTS = sum(len(KINDS[cell.values[0]].unknowns) for cell in CELLS)
 #: Relative errors that the test of gradients must be able to see.
-SEEN = {"roughness": 0.5, "metallic": 0.05}
+SEEN = {"roughness": 0.5, "metallic": 0.07}
 SEEN_OF_OTHERS = 0.04
 
 
@@ -563,18 +569,19 @@ def image_and_truth(name: str, way: str) -> tuple[mi.Color3f, mi.Color3f]:
     live.reset()
     first, second, third = seeds(name, way, 2 * BATCHES + 3)[-3:].tolist()
     ray = pixel_rays([CAMERA], IMAGE_SPP, first)
-    depth = 2 if way != "series" and WAYS[way].reference == "one bounce" else kind.depth
+    one_bounce = way != "series" and WAYS[way].reference == "one bounce"
     with dr.suspend_grad():
         if way == "series":
             image = path_traced(
-                live.view, ray, second, max_depth=depth, rr_depth=5, hide_emitters=False
+                live.view, ray, second, max_depth=kind.depth, rr_depth=5, hide_emitters=False
             )
         else:
             sampler = sampler_of(name, way, IMAGE_SPP)
             with sampler.prepared():
                 image = sampler.image(live.scene, ray, seeded(second, dr.width(ray)))
-    stock = stock_scene(name)
-    return image, stock_path(stock, ray, third, max_depth=depth, integrator=kind.integrator)
+    depth = 2 if one_bounce else kind.stock_depth
+    truth = stock_path(stock_scene(name), ray, third, max_depth=depth, integrator=kind.integrator)
+    return image, truth
 
 
 @pytest.mark.parametrize(("name", "way"), CELLS)
