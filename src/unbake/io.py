@@ -14,11 +14,12 @@ import secrets
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from .errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
 from .signals import cleaned_up
 
 #: Longest text file that is read, in bytes: the poses of some 50,000 views.
@@ -295,6 +296,8 @@ def integer(keys: dict[str, Any], key: str, where: str) -> int:
 
 def array(keys: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
     """The nested list of numbers at a key as a float64 array of that shape."""
+    import numpy as np  # here, for settings are read without it
+
     value = _value(keys, key, where)
     try:
         # Texts such as "1" would convert, but are a mistake
