@@ -3,9 +3,9 @@
     python benchmarks/kill.py --kills 200
 
 Each kill is followed by `unbake fit --resume`, which is killed in its turn: a quarter while it
-starts, the others while it trains and saves. A kill counts as survived if the next fit that comes so
-far goes on at the newest checkpoint that the killed one had written, at most one interval (here one
-step) before the last line of its log. The exit status is 1 if one is not.
+starts, the others while it trains and saves. A kill counts as survived if the next fit that comes
+so far goes on at the newest checkpoint that the killed one had written, at most one interval (here
+one step) before the last line of its log. The exit status is 1 if one is not.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ No other module names these files.
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import sys
@@ -225,13 +226,13 @@ class RunFolder:
         match facts:
             case {
                 "data": str(data),
-                "mean_radiance": int(radiance) | float(radiance),
+                "mean_radiance": float(radiance),
                 "clip_negative": bool(clip),
-            } if data and "\0" not in data and 0 < radiance < sys.float_info.max:
+            } if data and "\0" not in data and 0 < radiance < math.inf:
                 run, fingerprint = facts.get("run"), facts.get("fingerprint", {})
                 texts = fingerprint.values() if isinstance(fingerprint, dict) else (None,)
                 if isinstance(run, str | None) and all(isinstance(x, str) for x in texts):
-                    return Origin(data, float(radiance), clip, run, fingerprint)
+                    return Origin(data, radiance, clip, run, fingerprint)
         raise UserError("cannot be read", self.origin_file, again)
 
     def write_origin(self, origin: Origin) -> None:
