@@ -23,11 +23,7 @@ def test_whole_files_are_read(worker, name):
         assert worker.read(name, content) == {"verdict": "worked"}
 
 
-#: Read without checks of their own so far.
-UNCHECKED = {"settings", "config.toml", "scene.xml", "ply", "obj"}
-
-
-@pytest.mark.parametrize("name", [name for name in FORMATS if name not in UNCHECKED])
+@pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_are_read_or_refused_in_one_line(worker, name):
     campaign = Campaign(worker)
     campaign.mutate(name, COUNTS[name], start=0)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 from . import mutations
 from .mutations import Mutation
@@ -60,11 +61,15 @@ def _data_set(folder: Path) -> None:
     shutil.copytree(FIRST / "data", folder, dirs_exist_ok=True)
 
 
-def _data_set_of_pfm(folder: Path) -> None:
-    """A data set one of whose photographs is a PFM."""
-    _data_set(folder)
-    file = folder / "transforms.json"
-    file.write_text(file.read_text().replace("train_001.exr", "train_001.pfm"))
+def _data_set_with(suffix: str) -> Callable[[Path], None]:
+    """A data set one of whose photographs is a file of another kind."""
+
+    def prepare(folder: Path) -> None:
+        _data_set(folder)
+        file = folder / "transforms.json"
+        file.write_text(file.read_text().replace("train_001.exr", f"train_001.{suffix}"))
+
+    return prepare
 
 
 def _load_data(folder: Path) -> None:
@@ -116,6 +121,10 @@ def _floats(count: int) -> bytes:
     import numpy as np
 
     return np.linspace(0.1, 2, count, dtype="<f4").tobytes()
+
+
+def _rgbe() -> Sequence[bytes]:
+    return [b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 16\n" + bytes([90, 80, 70, 129]) * 256]
 
 
 def _pfm() -> Sequence[bytes]:
@@ -287,6 +296,46 @@ def _load_run(folder: Path) -> None:
     load_run(folder / "run")
 
 
+_STATE = "run/checkpoints/step-000000060/state.safetensors"
+_OLD_STATE = "run/checkpoints/step-0000060.safetensors"
+_MANIFEST = json.dumps(
+    {
+        "format": 2,
+        "step": 60,
+        "seconds": 1.5,
+        "samples": 7680,
+        "run": None,
+        "seed": 0,
+        "files": {"state.safetensors": {"bytes": 13016, "sha256": "right"}},
+        "sha256": "right",
+    }
+)
+
+
+def _state() -> Sequence[bytes]:
+    """The numbers of a checkpoint of version 0.1, as they are written today."""
+    from safetensors.numpy import load, save
+
+    return [save(load((FIRST / _OLD_STATE).read_bytes()))]
+
+
+def _run_of_today(folder: Path) -> None:
+    """A run with a checkpoint of today's format alone."""
+    _run(folder)
+    (folder / _OLD_STATE).unlink()
+    state = folder / _STATE
+    state.parent.mkdir()
+    state.write_bytes(*_state())
+    state.with_name("manifest.json").write_text(_MANIFEST)
+
+
+def _load_signed_run(folder: Path) -> None:
+    """Read a run whose hashes are right whatever was changed, as somebody can make them."""
+    with patch("unbake.training.checkpoint.hashlib") as hashes:
+        hashes.sha256.return_value.hexdigest.return_value = "right"
+        _load_run(folder)
+
+
 _LOG = "".join(
     json.dumps(row) + "\n"
     for row in (
@@ -342,16 +391,29 @@ FORMATS: dict[str, Format] = {
     ),
     "rates.json": Format("rates.json", _texts(_SEARCHES), mutations.JSON, _read_searches),
     "checkpoint": Format(
-        "run/checkpoints/step-0000060.safetensors",
-        _files("run/checkpoints/step-0000060.safetensors"), mutations.SAFETENSORS, _load_run, _run,
-        0.7,
+        _STATE, _state, mutations.SAFETENSORS, _load_signed_run, _run_of_today, 0.5
+    ),
+    "manifest.json": Format(
+        _STATE.replace("state.safetensors", "manifest.json"), _texts(_MANIFEST), mutations.JSON,
+        _load_signed_run, _run_of_today, 0.5,
+    ),
+    "checkpoint 0.1": Format(
+        _OLD_STATE, _files(_OLD_STATE), mutations.SAFETENSORS, _load_run, _run, 0.5
+    ),
+    "evaluated picture": Format(
+        "run/evaluation/heldout/heldout_000_albedo.exr",
+        _files("run/evaluation/heldout/heldout_000_albedo.exr"), mutations.IMAGE, _report, _run,
+        0.3, ("page.html",),
     ),
     "photograph": Format(
         "images/train_001.exr", _files("data/images/train_001.exr"), mutations.IMAGE,
         _load_photographs, _data_set, 3,
     ),
     "photograph pfm": Format(
-        "images/train_001.pfm", _pfm, mutations.IMAGE, _load_photographs, _data_set_of_pfm
+        "images/train_001.pfm", _pfm, mutations.IMAGE, _load_photographs, _data_set_with("pfm")
+    ),
+    "photograph rgbe": Format(
+        "images/train_001.hdr", _rgbe, mutations.IMAGE, _load_photographs, _data_set_with("hdr")
     ),
     "picture": Format(
         "picture.exr", _files("data/images/train_001.exr"), mutations.IMAGE, _read_picture, weight=2
