@@ -24,6 +24,7 @@ from unbake.config import (
     to_toml,
 )
 from unbake.errors import UserError
+from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
 
 PRESETS = typing.get_args(PresetName)
@@ -424,6 +425,19 @@ def test_toml_that_is_deep_or_endless_is_told_in_one_line(text, tmp_path):
     with pytest.raises(UserError, match=r"a\.toml: not valid TOML") as caught:
         read_toml(file)
     assert len(str(caught.value)) < 300
+
+
+def test_settings_are_not_read_if_they_are_far_longer_than_settings_are(tmp_path):
+    run = RunFolder(tmp_path)
+    run.config_file.write_text(".".join(["a"] * 50_000) + " = 1")
+    for read in (run.settings, run.settings_table):
+        with pytest.raises(
+            UserError, match=r"config\.toml: has 100003 characters, settings at most"
+        ):
+            read()
+    run.config_file.write_text("steps = " + "[" * 5000 + "]" * 5000)
+    with pytest.raises(UserError, match=r"config\.toml: not valid TOML"):
+        run.settings_table()
 
 
 def test_a_pipe_is_no_settings_file(tmp_path):

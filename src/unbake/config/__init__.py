@@ -27,7 +27,7 @@ from .fit import (
 from .flag import Flag
 from .presets import preset, with_method
 from .tables import update
-from .toml import from_toml, read_toml, to_toml
+from .toml import from_toml, read_toml, to_tables, to_toml
 
 __all__ = [
     "MOST_BOUNCES",
@@ -52,6 +52,7 @@ __all__ = [
     "from_toml",
     "preset",
     "read_toml",
+    "to_tables",
     "to_toml",
     "update",
     "with_method",

@@ -26,18 +26,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
-from ..config import FitConfig, read_toml, to_toml
-from ..config.migration import migrated
+from ..config import FitConfig, read_toml, to_tables, to_toml
 from ..errors import UserError
 from ..formats import check_format
 from ..io import read_object, read_text, require_utf8, write_json, write_text
 from . import run_numbers
 from .run_lock import RunLock
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 #: The newest formats of `origin.json` and `metrics.json` that can be read, and those written.
 ORIGIN_FORMAT = 1
@@ -198,14 +192,7 @@ class RunFolder:
             UserError: the file is missing, is not TOML, or is of a newer version.
         """
         text = read_text(self.config_file, _GIVE_RUN)
-        try:
-            return migrated(tomllib.loads(text))
-        except UserError as error:
-            where = f"{self.config_file}: {error.where}"
-            raise UserError(error.what, where, error.remedy) from None
-        except tomllib.TOMLDecodeError as error:
-            what = f"the settings are not valid TOML ({error})"
-            raise UserError(what, self.config_file, _GIVE_RUN) from None
+        return to_tables(text, str(self.config_file))
 
     def write_settings(self, config: FitConfig) -> None:
         """Write the settings; this makes the folder that of a run."""
