@@ -90,7 +90,7 @@ worker.main()
 @pytest.fixture(scope="module")
 def broken(repository):
     script = BROKEN.format(paths=[str(repository / "tests")])
-    with Worker(patience=2, command=[sys.executable, "-c", script]) as worker:
+    with Worker(patience=3, command=[sys.executable, "-c", script]) as worker:
         yield worker
 
 

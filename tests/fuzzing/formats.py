@@ -276,13 +276,6 @@ def _read_settings(folder: Path) -> None:
     to_toml(read_toml(folder / "settings.toml"))
 
 
-def _read_run_settings(folder: Path) -> None:
-    from unbake.training.run_folder import RunFolder
-
-    RunFolder(folder / "run").settings()
-    RunFolder(folder / "run").settings_table()
-
-
 def _read_origin(folder: Path) -> None:
     from unbake.training.run_folder import RunFolder
 
@@ -377,7 +370,8 @@ FORMATS: dict[str, Format] = {
         "settings.toml", _files("run/config.toml"), mutations.TOML, _read_settings, weight=3
     ),
     "config.toml": Format(
-        "run/config.toml", _files("run/config.toml"), mutations.TOML, _read_run_settings, _run
+        "run/config.toml", _files("run/config.toml"), mutations.TOML, _report, _run, 0.6,
+        ("page.html",),
     ),
     "origin.json": Format(
         "run/origin.json", _files("run/origin.json"), mutations.JSON, _read_origin, _run
