@@ -264,6 +264,17 @@ def test_a_disk_error_is_one_line(unbake, tmp_path, monkeypatch):
     assert outcome.err == "error: data/images/train_000.exr: No space left on device\n"
 
 
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("jit_malloc(): out of memory!")])
+def test_too_little_memory_is_one_line(error, unbake, tmp_path, monkeypatch):
+    def full(*words, **named):
+        raise error
+
+    monkeypatch.setattr("unbake.acquisition.capture.capture", full)
+    outcome = unbake("capture", "demo", "--out", tmp_path / "data")
+    assert outcome.status == 2 and outcome.err.startswith("error: out of memory. Lower the res")
+    assert outcome.err.count("\n") == 1
+
+
 def test_ctrl_c_while_nothing_is_written_yet(unbake, tmp_path, monkeypatch):
     def interrupted(*words, **named):
         raise KeyboardInterrupt

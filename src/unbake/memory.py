@@ -80,6 +80,15 @@ def require_memory(
     raise UserError(told, where, remedy if isinstance(remedy, str) else remedy(free))
 
 
+def lacks_memory(error: BaseException | None) -> bool:
+    """Whether an error comes from running out of memory, also in Dr.Jit while it records."""
+    while error is not None:
+        if isinstance(error, MemoryError) or "out of memory" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def size(count: float) -> str:
     """A number of bytes, for people: `20 MB`, `2.5 GB`, `104 GB`."""
     if count < 1e8:

@@ -163,6 +163,15 @@ def test_logged_terms_without_a_title_have_charts_too(made, tmp_path: Path):
     assert "Learning rate over" not in text and "Skipped over" not in text
 
 
+def test_skipped_steps_and_what_was_noted_of_a_fit_are_told(made, tmp_path: Path):
+    line = {"step": 190, "seconds": 1.0}
+    noted = [{"skipped": 3}, {"skipped": 4}, {"note": f"nothing was learned{EVIL}"}]
+    (made[1][0] / "log.jsonl").write_text("".join(json.dumps(line | x) + "\n" for x in noted))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert text.count("7 of 200 steps skipped") == 1 == text.count("nothing was learned")
+    assert EVIL not in text
+
+
 def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
     text = write_report(made[1], tmp_path / "report.html").read_text()
     differing, shared = text.split("What differs between the runs.")[1].split("<details>")

@@ -18,6 +18,7 @@ from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig
 from ..errors import UserError
 from ..evaluation.settings import EvaluationSettings
+from ..memory import lacks_memory
 from ..training.run_folder import RunFolder
 from .flags import flags, given, with_options
 from .options import (
@@ -76,6 +77,10 @@ def main() -> None:
         )
     except UserError as error:
         _fail(str(error))
+    except (MemoryError, RuntimeError) as error:  # Dr.Jit raises the latter
+        if not lacks_memory(error):
+            raise
+        _fail("out of memory. Lower the resolution, --batch or --spp, or the size of the fields")
     except OSError as error:
         # A full disk, a file taken away: nothing that a traceback would explain.
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}")

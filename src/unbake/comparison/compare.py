@@ -43,6 +43,8 @@ DEFINITIONS = {
     "(kernels of earlier runs are cached)",
     "samples_per_second": "camera samples of a step over that median",
     "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
+    "skipped": "steps whose loss was not finite",
+    "notes": "what was noted of the fit: a state to which it went back, or that it learned nothing",
     "untrained": "the fields that all methods start from, with the shared representation and seed",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
     "time_to_quality": "psnr: where the scores of a run end, and 1 and 2 dB below that, for each "
@@ -239,6 +241,8 @@ def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:
         "memory_mb": max((r["memory_mb"] for r in log if "memory_mb" in r), default=None),
         "heldout": metrics["heldout"],
         "train": metrics["train"],
+        "skipped": sum(r.get("skipped", 0) for r in log),
+        "notes": [r["note"] for r in log if "note" in r],
         "score": score_curve(log),
         **{key: metrics[key] for key in LIGHTING if key in metrics},
     }

@@ -20,11 +20,12 @@ from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig, PathConfig, PriorName, update
 from ..dataset.views import Dataset
 from ..errors import UserError
+from ..memory import lacks_memory
 from ..profiling.phases import kernel_history, milliseconds
 from ..scene.edit import to_principled
 from ..scene.parse import parse, write
 from ..training.fresh_fit import FreshFit, begin_fit
-from ..training.memory import lacks_memory, peak_bytes
+from ..training.memory import peak_bytes
 from ..transport.methods import METHODS
 from .experiment import Experiment, ExperimentContext, ExperimentResult, save_figure
 from .jobs import Findings, Job, digest

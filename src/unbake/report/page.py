@@ -255,6 +255,18 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
 
 
 def _details(run: Run) -> list[tuple[str, str, str]]:
+    """What is to be known of a run, in a few words each: text, symbol and subscript."""
+    return [*_described(run), *((text, "", "") for text in _warnings(run))]
+
+
+def _warnings(run: Run) -> list[str]:
+    """Steps that were skipped, and what a fit's watchdog noted."""
+    skipped = sum(line.get("skipped", 0) for line in run.log)
+    told = [f"{_count(skipped)} of {_count(run.metrics.get('steps'))} steps skipped"]
+    return [*(told if skipped else []), *(line["note"] for line in run.log if "note" in line)]
+
+
+def _described(run: Run) -> list[tuple[str, str, str]]:
     """Representations, unknown and estimator of a run as text, symbol and subscript."""
     metrics = run.metrics
     if "estimator" not in metrics:

@@ -266,7 +266,7 @@ def _watch(
 
 def _judge(watchdog: Watchdog, monitor: Monitor, progress: Progress, config: FitConfig) -> None:
     """Note what is wrong with a fit that has ended."""
-    progress.warning = watchdog.verdict(learning_rates(config, config.warm_up, 0.0))
+    progress.warning = watchdog.verdict(learning_rates(config, progress.step, 0.0))
     if progress.warning is not None:
         monitor.note(progress.step, progress.seconds, progress.warning)
 

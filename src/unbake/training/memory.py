@@ -64,15 +64,6 @@ _PROBED_PATHS = 4096
 MOST_BYTES_A_SAMPLE = 1 << 16
 
 
-def lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error comes from running out of memory, also in Dr.Jit while it records."""
-    while error is not None:
-        if isinstance(error, MemoryError) or "out of memory" in str(error):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
-
-
 @dataclass(frozen=True)
 class Forecast:
     """Memory that batches will take: a line through two that were measured."""

@@ -85,8 +85,8 @@ _NUMBERS = _list_of(_score)
 _SCORES = _object_of(_score)
 
 _LOG: Mapping[str, Check] = {
-    **dict.fromkeys(("step", "seconds", "samples"), _count),
-    **dict.fromkeys(("samples_per_second", "memory_mb", "learning_rate", "skipped"), _number),
+    **dict.fromkeys(("step", "seconds", "samples", "skipped"), _count),
+    **dict.fromkeys(("samples_per_second", "memory_mb", "learning_rate"), _number),
     "note": _text,
     "score": _SCORES,
     "validation": _object_of(_score, split=_text, emission=_object_of(_NUMBERS)),

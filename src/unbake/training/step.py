@@ -19,12 +19,12 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
 from ..errors import UserError
-from ..memory import free_bytes, require_memory
+from ..memory import free_bytes, lacks_memory, require_memory
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
 from .loss_scaling import gradients_are_finite, next_scale
-from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast, lacks_memory
+from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
 from .problem import Problem
 from .regularizers import regularization_terms
 from .state import State
