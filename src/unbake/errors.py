@@ -110,7 +110,8 @@ def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) 
 
 def _wanted(value: float, least: float, most: float) -> str | None:
     """What a number should be; None where it is in range."""
-    if not math.isfinite(value):
+    # An integer is finite, but with hundreds of digits it is no float.
+    if isinstance(value, float) and not math.isfinite(value):
         return "a finite number"
     if value < least:
         return "positive" if least == POSITIVE else f"{least} or more"

@@ -77,6 +77,18 @@ def test_the_mean_over_views_leaves_out_views_without_truth():
 # -------------------------------------------------------------------------------------------- files
 
 
+def test_an_exr_that_claims_more_pixels_than_fit_the_memory(tmp_path: Path, monkeypatch):
+    def full(*words):
+        raise MemoryError("std::bad_alloc")
+
+    full.FileFormat = mi.Bitmap.FileFormat
+    path = tmp_path / "picture.exr"
+    pictures.write_exr(path, np.ones((4, 4, 3)))
+    monkeypatch.setattr(pictures.mi, "Bitmap", full)
+    with pytest.raises(UserError, match=r"picture\.exr: the picture cannot be read as OpenEXR"):
+        pictures.read_exr(path)
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_exr_gives_back_what_was_written(tmp_path: Path, channels: int):
     picture = _picture(channels=channels) * 100 - 3

@@ -9,11 +9,16 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping
+from difflib import get_close_matches
+from textwrap import shorten
 from typing import Any, Literal, TypeVar, cast
 
 from ..errors import UserError
 
 Settings = TypeVar("Settings")
+
+#: Characters of known keys in a message.
+_SHOWN = 250
 
 
 def update(
@@ -41,8 +46,7 @@ def update(
         here = (*path, key)
         dotted = ".".join(here)
         if key not in current:
-            known = ", ".join(current)
-            raise UserError("unknown key", where=dotted, remedy=f"Known keys: {known}")
+            raise UserError("unknown key", where=dotted, remedy=_known(key, list(current)))
         if dataclasses.is_dataclass(current[key]) or isinstance(current[key], Mapping):
             if not isinstance(value, Mapping):
                 raise UserError("must be a table", where=dotted)
@@ -57,6 +61,15 @@ def update(
     except UserError as error:
         where = ".".join((*path, *([error.where] if error.where else [])))
         raise UserError(error.what, where, error.remedy) from None
+
+
+def _known(key: str, names: list[str]) -> str:
+    """The keys there are; where they are many, those that resemble `key` most."""
+    known = ", ".join(names)
+    if len(known) > _SHOWN:
+        nearest = get_close_matches(key[:_SHOWN], names, len(names), cutoff=0)
+        known = shorten(", ".join(nearest), _SHOWN, placeholder=" …")
+    return f"Known keys: {known}"
 
 
 def typed(value: object, hint: Any, where: str) -> Any:
