@@ -431,4 +431,4 @@ def safetensors_header(draw: Draw, data: bytes) -> bytes:
     return len(changed).to_bytes(8, "little") + changed + data[8 + size :]
 
 
-SAFETENSORS: tuple[Mutation, ...] = (*(safetensors_header,) * 6, *IMAGE)
+SAFETENSORS: tuple[Mutation, ...] = (*(safetensors_header,) * 6, *IMAGE, *BYTES, *BYTES)

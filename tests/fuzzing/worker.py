@@ -38,6 +38,7 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     sys.path.insert(0, str(Path(__file__).parents[1]))
     from fuzzing.formats import FORMATS
+
     # What every reading needs is loaded before the first one is timed.
     from unbake import backend, cli  # noqa: F401
 
