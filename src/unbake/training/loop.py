@@ -230,7 +230,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 scored_at = progress.seconds
             lock.require_held()
             monitor.record(_done(config, progress), entry)
-            _watch(watchdog, readings, monitor, saving, begun, progress, last)
+            ended = last and not stop  # one that was stopped is not judged by its few steps
+            _watch(watchdog, readings, monitor, saving, begun, progress, ended)
             failures = saving.save(state, progress) if last or (save and watchdog.trusts) else []
             if last or progress.seconds - shown_at >= config.preview_seconds:
                 failures += _show(begun, monitor, progress)
