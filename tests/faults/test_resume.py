@@ -10,21 +10,28 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from support import tiny_fields
 
 from unbake import cli
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.config import read_toml
 from unbake.errors import UserError
+from unbake.fields.registry import representations
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.quantities import QUANTITIES
 from unbake.training import loop
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
+from unbake.transport.methods import METHODS
 
 
 @pytest.fixture
@@ -75,13 +82,13 @@ def state_of(checkpoint):
     return load_file(checkpoint / "state.safetensors")
 
 
-def interrupt_at(monkeypatch, step):
-    """Press Ctrl-C during a step, once."""
-    plain, pressed = TrainingStep.__call__, []
+def interrupt_at(monkeypatch, *steps):
+    """Press Ctrl-C during each of some steps, once."""
+    plain, left = TrainingStep.__call__, set(steps)
 
     def call(self, state, number, *rates):
-        if number == step and not pressed:
-            pressed.append(True)
+        if number in left:
+            left.remove(number)
             signal.raise_signal(signal.SIGINT)
         return plain(self, state, number, *rates)
 
@@ -170,6 +177,71 @@ def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(
         assert np.array_equal(whole[key], parts[key]), key
     settings = [read_toml(tmp_path / name / "config.toml") for name in ("whole", "parts")]
     assert settings[0] == settings[1] and settings[0].steps == 12
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A captured data set whose environment can be unknown."""
+    folder = tmp_path_factory.mktemp("captured") / "still"
+    small = CaptureSettings(views=2, held_out=1, resolution=16, spp=8, max_depth=6)
+    capture("still", folder, small, tell=lambda line: None)
+    return folder
+
+
+def in_parts_and_whole(data, config, folder, monkeypatch, threads=nullcontext):
+    """The states of a fit of 12 steps at its end, uninterrupted and interrupted three times."""
+    config = dataclasses.replace(config, steps=12)
+    with threads():
+        loop.fit(data, folder / "whole", config)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 0, 5, 10)
+        for after in (1, 6, 11, 12):
+            with threads():
+                progress = loop.fit(data, folder / "parts", config, resume=after > 1)
+            assert progress.step == after
+    return [state_of(checkpoints(folder / name)[-1]) for name in ("whole", "parts")]
+
+
+FORMS = [(form, "neural") for form in representations()]
+FORMS += [("neural", form) for form in representations(radiance=True) if form != "neural"]
+UNKNOWNS = ("lighting", "materials+lighting", "emission")
+MATRIX = [
+    *({"method": method} for method in METHODS),
+    *({"unknown": unknown} for unknown in UNKNOWNS),
+    *({"unknown": unknown, "method": "prb"} for unknown in UNKNOWNS),
+    *({"representation": a, "radiance_representation": b} for a, b in FORMS),
+    {"quantities": tuple(QUANTITIES)},
+    {"precision": "half"},
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", MATRIX, ids=lambda row: "-".join(map(str, row.values())))
+def test_every_fit_that_is_interrupted_three_times_ends_bit_for_bit_as_uninterrupted(
+    changes, cornell, still, tmp_path, monkeypatch
+):
+    forms = ("representation", "radiance_representation")
+    config = tiny_fields(*(changes.get(form, "neural") for form in forms))
+    config = dataclasses.replace(config, **{"method": "ours"} | changes)
+    data = still if "lighting" in config.unknown else cornell
+    threads = partial(one_thread, monkeypatch)
+    whole, parts = in_parts_and_whole(data, config, tmp_path, monkeypatch, threads)
+    assert whole.keys() == parts.keys() and len(whole) >= 4
+    for key in whole:
+        assert np.array_equal(whole[key], parts[key]), key
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_with_several_threads_a_resumed_fit_ends_as_near_as_another_one(
+    method, cornell, tmp_path, monkeypatch
+):
+    """Sums have no fixed order then."""
+    config = dataclasses.replace(tiny_fields(), method=method)
+    whole, parts = in_parts_and_whole(cornell, config, tmp_path, monkeypatch)
+    for key in whole:
+        scale = np.abs(whole[key]).max()
+        assert np.abs(whole[key].astype(float) - parts[key]).max() <= 1e-5 * scale, key
 
 
 def test_a_resumed_fit_keeps_its_length_unless_told_otherwise(fit, tmp_path, monkeypatch):
