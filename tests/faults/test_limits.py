@@ -108,7 +108,7 @@ def test_a_fit_without_room_for_its_grid_makes_no_run(limited, cornell, tiny, tm
     done = limited(4 * GB, *words, "--settings", file)
     assert done.returncode == 2, done
     assert re.fullmatch(
-        r"error: materials.albedo.grid: the fields of this fit, .* need about 3\d.\d GB of memory, "
+        r"error: materials.albedo.grid: the fields of this fit, .* need about 5\d.\d GB of memory, "
         r"3.\d GB are free. Lower materials.albedo.grid.cells from 512 to 2\d\d or less\n",
         done.stderr,
     ), done.stderr

@@ -16,8 +16,9 @@ from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
 
 #: Memory of a number that is learned: its value, its gradient and Adam's two moments, these anew in
-#: a step, and all copied and put together for a checkpoint. Measured: 62 to 70.
-BYTES_A_NUMBER = 72
+#: a step, and all copied and put together for a checkpoint (measured: 62 to 70); and two snapshots
+#: of value and moments, to which a fit that diverges goes back.
+BYTES_A_NUMBER = 96
 
 
 @dataclass(frozen=True)
