@@ -152,6 +152,7 @@ def test_settings_cannot_be_changed_in_place():
             'preset = "fast"',
             "preset: must be one of cpu, paper, release, release-lighting, not 'fast'",
         ),
+        (f'preset = "{"fast " * 99}"', "preset: must be one of .{100,150}$"),
         ("preset = 1", "preset: must be one of cpu, paper, release, release-lighting, not 1"),
         ("preset = [1]", "preset: must be one of"),
         ('method = "best"', "method: must be one of ours, no-prior, direct, ad-pt, .*not 'best'"),

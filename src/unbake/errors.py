@@ -87,7 +87,7 @@ def require_name(name: str, known: Collection[str], what: str, where: object | N
 def require(good: bool, key: str, wanted: str, value: object) -> None:
     """Raise a `UserError` that says what a setting must be, unless it is good."""
     if not good:
-        raise UserError(f"must be {wanted}, not {value!r}", where=key)
+        raise UserError(f"must be {wanted}, not {printable(repr(value))}", where=key)
 
 
 def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) -> None:

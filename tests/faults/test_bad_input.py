@@ -238,6 +238,10 @@ BAD_SCENES = {
         scene(LIGHT + '<shape type="spere"><bsdf type="diffuse"/></shape>'),
         'Plugin "spere" not found',
     ),
+    "endless plugin": (
+        scene(LIGHT + f'<shape type="{"x" * 5000}"><bsdf type="diffuse"/></shape>'),
+        "x' is no plugin of Mitsuba",
+    ),
     "unknown reference": (scene(LIGHT + BALL.format(inside='<ref id="x"/>')), 'reference to "x"'),
     "missing mesh": (
         scene(

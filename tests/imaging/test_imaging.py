@@ -77,14 +77,19 @@ def test_the_mean_over_views_leaves_out_views_without_truth():
 # -------------------------------------------------------------------------------------------- files
 
 
-def test_an_exr_that_claims_more_pixels_than_fit_the_memory(tmp_path: Path, monkeypatch):
-    def full(*words):
-        raise MemoryError("std::bad_alloc")
+@pytest.mark.parametrize(
+    "error", [MemoryError("std::bad_alloc"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid")]
+)
+def test_an_exr_that_mitsuba_cannot_take(error, tmp_path: Path, monkeypatch):
+    """It claims more pixels than fit the memory, or Mitsuba's message is not UTF-8."""
 
-    full.FileFormat = mi.Bitmap.FileFormat
+    def fail(*words):
+        raise error
+
+    fail.FileFormat = mi.Bitmap.FileFormat
     path = tmp_path / "picture.exr"
     pictures.write_exr(path, np.ones((4, 4, 3)))
-    monkeypatch.setattr(pictures.mi, "Bitmap", full)
+    monkeypatch.setattr(pictures.mi, "Bitmap", fail)
     with pytest.raises(UserError, match=r"picture\.exr: the picture cannot be read as OpenEXR"):
         pictures.read_exr(path)
 

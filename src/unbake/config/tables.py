@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from textwrap import shorten
 from typing import Any, Literal, TypeVar, cast
 
-from ..errors import UserError
+from ..errors import UserError, printable
 
 Settings = TypeVar("Settings")
 
@@ -78,7 +78,7 @@ def typed(value: object, hint: Any, where: str) -> Any:
     if origin is Literal:
         if value not in inner:
             told = ", ".join(map(str, inner))
-            raise UserError(f"must be one of {told}, not {value!r}", where=where)
+            raise UserError(f"must be one of {told}, not {printable(repr(value))}", where=where)
         return value
     if origin in (types.UnionType, typing.Union):  # such as `int | None`: TOML has no None
         (kind,) = (kind for kind in inner if kind is not types.NoneType)

@@ -42,7 +42,7 @@ def read_exr(path: Path) -> np.ndarray:
     require_file(path, "picture")
     try:
         bitmap = mi.Bitmap(str(path), mi.Bitmap.FileFormat.OpenEXR)
-    except (RuntimeError, MemoryError) as error:
+    except (RuntimeError, MemoryError, ValueError) as error:  # ValueError: a message of bad UTF-8
         raise UserError(
             "the picture cannot be read as OpenEXR", path, "Write it again, or copy it again"
         ) from error

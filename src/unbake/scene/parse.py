@@ -21,7 +21,7 @@ from .images import IMAGES, check_image
 from .meshes import FORMATS, check_mesh
 from .preflight import check_xml
 
-_PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]+", re.ASCII)
+_PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
 _LIBRARY = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 #: Properties without which Mitsuba 3.9 crashes (segmentation fault) where other plugins complain.
 _NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}
