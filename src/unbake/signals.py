@@ -37,6 +37,7 @@ class _Program:
     is_ours = False  #: whether the process is the command line, and may be ended
     received: int | None = None  #: number of the first signal
     stop: list[int] | None = None  #: of the training loop that runs
+    told = False  #: whether it was told that output is lost
     unfinished: list[Callable[[], object]] = []  #: what removes it  # noqa: RUF012
 
 
@@ -150,14 +151,19 @@ def _end(number: int) -> NoReturn:
 
 
 class _Guarded(io.FileIO):
-    """A standard stream whose reader may go away: the program is then told to end, once."""
+    """A standard stream whose reader may go away: the program is then told to end, once.
+
+    What cannot be written for another reason is lost, which is told once: the work goes on.
+    """
 
     def write(self, data: Any, /) -> int:
         try:
             return super().write(data)
-        except OSError:
+        except BrokenPipeError:
             _output_closed()
-            return len(data)
+        except OSError as error:  # such as a full disk
+            _output_lost(error)
+        return len(data)
 
 
 def _guarded(stream: Any) -> Any:
@@ -171,6 +177,15 @@ def _guarded(stream: Any) -> Any:
         errors=stream.errors,
         line_buffering=True,
     )
+
+
+def _output_lost(error: OSError) -> None:
+    if _Program.told:
+        return
+    _Program.told = True
+    line = f"warning: what this program prints cannot be written ({error.strerror}); it goes on\n"
+    with suppress(OSError):
+        os.write(2, line.encode())
 
 
 def _output_closed() -> None:

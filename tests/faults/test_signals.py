@@ -104,6 +104,21 @@ def test_a_closed_pipe_ends_a_command_that_prints():
     process.stderr.close()
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux alone has this device")
+def test_output_to_a_full_disk_is_told_once_and_the_work_goes_on(tmp_path):
+    with open("/dev/full", "w") as full:
+        line = f"{PROGRAM.format('    for n in range(9): print(n)')}\nprint('more')\nsys.exit(3)"
+        process = subprocess.run(
+            [sys.executable, "-c", line], env=os.environ | {"PYTHONPATH": SOURCE},
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=100,
+        )  # fmt: skip
+    assert process.returncode == 3
+    assert process.stderr == (
+        "warning: what this program prints cannot be written (No space left on device); "
+        "it goes on\n"
+    )
+
+
 def test_a_command_without_output_streams_runs(tmp_path):
     words = [sys.executable, "-m", "unbake", "fit", tmp_path / "none", "--out", tmp_path / "run"]
     script = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", *words]
