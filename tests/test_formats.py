@@ -74,6 +74,16 @@ def test_an_evaluation_of_the_first_version_is_reported(run, tmp_path):
         assert f">{heldout[key]:.2f}</td>" in page
 
 
+def test_a_run_of_the_first_version_is_evaluated_and_reported_from_its_folder(
+    first, unbake, monkeypatch
+):
+    """The path of its data set starts at the run, not at the working folder."""
+    monkeypatch.chdir(first)
+    assert unbake("evaluate", "run", "--spp", 1, "--train-views", 0).status == 0
+    outcome = unbake("report", "run", "--out", "page.html")
+    assert outcome.status == 0, outcome.err
+
+
 def test_a_run_of_the_first_version_goes_on(first, run, unbake):
     settings = run.settings()
     outcome = unbake("fit", first / "data", "--out", run.path, "--resume", "--steps", 64)

@@ -91,12 +91,15 @@ def _evaluate(
     tell: Callable[[str], None],
 ) -> dict:
     dataset = recovered.dataset
-    data_changed = changed(folder.origin().fingerprint, fingerprint(dataset))
+    origin = folder.origin()
+    data_changed = changed(origin.fingerprint, fingerprint(dataset))
     if data_changed:
         tell(f"warning: other {', '.join(data_changed)} than the run was fit to")
     true_scene = _true_scene(recovered) if settings.truth else None
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
     views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
+    # First, as the true lighting may be damaged, and views take long
+    recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     rows, materials = [], []
     for view in views:
         row, seen, truth = _evaluate_view(recovered, view, folder, settings, true_scene)
@@ -105,7 +108,6 @@ def _evaluate(
         told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
         values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told)
         tell(f"{view.name}: {', '.join(values)}")
-    recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     both = recovered.config.unknown == "materials+lighting"
     if both and "albedo" in recovered.config.quantities:
         recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
@@ -120,7 +122,7 @@ def _evaluate(
         **recovered_lighting,
         "per_view": rows,
         "definitions": DEFINITIONS | (lighting.DEFINITIONS if recovered_lighting else {}),
-        "data": str(dataset.folder),
+        "data": origin.data,
         "data_changed": data_changed,
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
         "evaluation": asdict(settings),
