@@ -264,15 +264,36 @@ def test_a_disk_error_is_one_line(unbake, tmp_path, monkeypatch):
     assert outcome.err == "error: data/images/train_000.exr: No space left on device\n"
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("jit_malloc(): out of memory!")])
-def test_too_little_memory_is_one_line(error, unbake, tmp_path, monkeypatch):
-    def full(*words, **named):
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("jit_malloc(): out of memory! Could not allocate 2 GiB of host memory."),
+        RuntimeError("Resource temporarily unavailable"),
+        ImportError("libopenblas.so: failed to map segment from shared object"),
+    ],
+)
+def test_memory_that_runs_out_is_one_line(error, unbake, tmp_path, monkeypatch):
+    def starved(*words, **named):
         raise error
 
-    monkeypatch.setattr("unbake.acquisition.capture.capture", full)
+    monkeypatch.setattr("unbake.acquisition.capture.capture", starved)
     outcome = unbake("capture", "demo", "--out", tmp_path / "data")
-    assert outcome.status == 2 and outcome.err.startswith("error: out of memory. Lower the res")
-    assert outcome.err.count("\n") == 1
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("error: out of memory. Lower the res")
+
+
+def test_the_next_command_is_as_a_shell_takes_it(unbake, tmp_path, monkeypatch):
+    monkeypatch.setattr("unbake.acquisition.capture.capture", lambda *words, **named: None)
+    for out, word in {
+        "my data": "'my data'",
+        "-x": "./-x",
+        "plain": "plain",
+        "a\nb\x1b[31m": "'a\\nb\\x1b[31m'",
+    }.items():
+        outcome = unbake("capture", "demo", f"--out={out}")
+        assert outcome.out.count("\n") == 1
+        assert outcome.out.endswith(f"next: unbake fit {word} --out RUN\n")
 
 
 def test_ctrl_c_while_nothing_is_written_yet(unbake, tmp_path, monkeypatch):

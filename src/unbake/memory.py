@@ -23,6 +23,13 @@ _LIMITS = (
 #: Limits of a process (`ulimit -v` and `-d`), and what the kernel counts against each.
 _RESOURCES = ((resource.RLIMIT_AS, "VmSize"), (resource.RLIMIT_DATA, "VmData"))
 _STATUS = Path("/proc/self/status")
+#: What errors say where there is no memory: of Dr.Jit, the system (for a library, for a thread).
+_LACKING = (
+    "out of memory",
+    "Cannot allocate memory",
+    "failed to map segment",
+    "Resource temporarily unavailable",
+)
 
 
 def free_bytes() -> int | None:
@@ -81,9 +88,9 @@ def require_memory(
 
 
 def lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error comes from running out of memory, also in Dr.Jit while it records."""
+    """Whether an error comes from running out of memory, also in native code."""
     while error is not None:
-        if isinstance(error, MemoryError) or "out of memory" in str(error):
+        if isinstance(error, MemoryError) or any(said in str(error) for said in _LACKING):
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from .. import backend, experiments, signals
 from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig
-from ..errors import UserError
+from ..errors import UserError, printable
 from ..evaluation.settings import EvaluationSettings
 from ..memory import lacks_memory
 from ..training.run_folder import RunFolder
@@ -38,6 +39,9 @@ from .options import (
     require,
     with_length,
 )
+
+#: Characters of a line that is printed: more than a path can have.
+_LONGEST = 1 << 14
 
 if TYPE_CHECKING:
     CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = Any
@@ -77,7 +81,7 @@ def main() -> None:
         )
     except UserError as error:
         _fail(str(error))
-    except (MemoryError, RuntimeError) as error:  # Dr.Jit raises the latter
+    except (MemoryError, RuntimeError, ImportError) as error:  # Dr.Jit raises the second
         if not lacks_memory(error):
             raise
         _fail("out of memory. Lower the resolution, --batch or --spp, or the size of the fields")
@@ -115,7 +119,8 @@ def capture(
 
     start = time.perf_counter()
     run(scene, out, settings, cameras=cameras, allow_outside=allow_outside, tell=_say)
-    _say(f"wrote {out} in {time.perf_counter() - start:.0f} s; next: unbake fit {out} --out RUN")
+    took = f"{time.perf_counter() - start:.0f} s"
+    _say(f"wrote {out} in {took}; next: unbake fit {_word(out)} --out RUN")
 
 
 def fit(
@@ -173,11 +178,11 @@ def fit(
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
         return signals.status()
     if not progress.step:
-        _say(f"nothing was learned: the fields are untrained; next: unbake evaluate {out}")
+        _say(f"nothing was learned: the fields are untrained; next: unbake evaluate {_word(out)}")
         return 0
     skipped = f" ({progress.skipped} skipped)" if progress.skipped else ""
     done = f"{progress.step} steps{skipped}, {progress.samples / 1e6:.1f} M samples in "
-    _say(f"{done}{progress.seconds:.0f} s; next: unbake evaluate {out}")
+    _say(f"{done}{progress.seconds:.0f} s; next: unbake evaluate {_word(out)}")
     return 1 if progress.warning else 0
 
 
@@ -210,7 +215,8 @@ def evaluate(
             values = {k: v for k, v in values.items() if v is not None}
         shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in values.items())
         _say(f"{split} ({metrics[split]['views']} views): {shown}")
-    _say(f"wrote {RunFolder(run).evaluation}; next: unbake report {run} --out report.html")
+    wrote = f"wrote {RunFolder(run).evaluation}"
+    _say(f"{wrote}; next: unbake report {_word(run)} --out report.html")
 
 
 def report(runs: Positional[Runs], /, out: Path, allow_outside: Flag = False) -> None:
@@ -431,8 +437,15 @@ def doctor() -> int:
     return module.main()
 
 
+def _word(path: Path) -> str:
+    """A path as a word of a command that a shell reads."""
+    text = str(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
+
+
 def _say(line: str) -> None:
-    print(line, flush=True)
+    """Print a line; names in it may have control characters, which a terminal would obey."""
+    print(printable(line, _LONGEST), flush=True)
 
 
 def _fail(message: str) -> NoReturn:

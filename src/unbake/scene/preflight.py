@@ -6,6 +6,7 @@ grows with nesting, and takes twice as long for each level of nested two-sided B
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from graphlib import CycleError, TopologicalSorter
@@ -111,7 +112,8 @@ class _Reader:
     def _bytes(self, path: Path) -> bytes:
         try:
             with path.open("rb") as file:
-                content = file.read(BYTES + 1 - self.bytes)
+                size = os.fstat(file.fileno()).st_size
+                content = file.read(min(size, BYTES + 1 - self.bytes))
         except OSError as error:
             raise UserError(f"the file cannot be read ({error.strerror})", path) from None
         self.bytes += len(content)
