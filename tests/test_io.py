@@ -7,6 +7,7 @@ import os
 import pytest
 
 from unbake import io
+from unbake.config import from_toml
 from unbake.errors import UserError
 from unbake.formats import check_format
 from unbake.io import (
@@ -153,3 +154,34 @@ def test_a_format_is_the_first_unless_it_says_another():
     assert str(caught.value) == (
         "here: was written by a newer unbake (format 4; this one reads up to 3). Update unbake"
     )
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_no_device_is_replaced_by_a_file(link, tmp_path):
+    """`unbake report RUN --out /dev/null` made it a file where root ran it."""
+    device, name = tmp_path / "device", tmp_path / "name"
+    os.mkfifo(device)
+    if link:
+        name.symlink_to(device)
+    else:
+        name = device
+    with pytest.raises(UserError, match="there is a pipe or a device") as caught:
+        write_text(name, "text")
+    assert str(name) in str(caught.value)
+    assert device.is_fifo() and name.is_symlink() == link
+    assert {p.name for p in tmp_path.iterdir()} == {"device", name.name}
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [("[" * 100_000, "nested too deep"), ("1" * 5000, "a number has too many digits")],
+)
+def test_limits_of_the_parser_are_told_in_plain_words(content, why, tmp_path):
+    file = tmp_path / "a.json"
+    file.write_text(content)
+    with pytest.raises(UserError) as caught:
+        read_json(file)
+    assert str(caught.value) == f"{file}: the file is not readable JSON ({why}). Repair it"
+    with pytest.raises(UserError, match="not valid TOML") as caught:
+        from_toml("a = " + content[:10_000])
+    assert f"({why})" in str(caught.value)

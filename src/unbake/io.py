@@ -43,9 +43,13 @@ def write_atomically(
         what: what the file is, for the error message.
 
     Raises:
-        UserError: the folder cannot be made or written.
+        UserError: the folder cannot be made or written, or the name is that of a pipe or a device,
+            which a file would replace, such as `/dev/null`.
     """
     path = Path(path)
+    if _is_device(path):
+        said = f"the {what} cannot be written (there is a pipe or a device)"
+        raise UserError(said, path, "Give another name")
     temporary = temporary_beside(path)
 
     def remove() -> None:
@@ -63,6 +67,15 @@ def write_atomically(
         except (OSError, RuntimeError) as error:
             reason = (isinstance(error, OSError) and error.strerror) or error
             raise UserError(f"the {what} cannot be written ({reason})", path) from error
+
+
+def _is_device(path: Path) -> bool:
+    """Whether there is something else than a file or a folder; links are followed."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def temporary_beside(path: Path) -> Path:
@@ -242,13 +255,20 @@ def read_json(path: Path, remedy: str | None = None) -> Any:
     try:
         parsed = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"the file is not readable JSON ({error})", path, remedy or "Repair it"
-        ) from None
+        said = f"the file is not readable JSON ({why_unreadable(error)})"
+        raise UserError(said, path, remedy or "Repair it") from None
     if nesting(parsed) > DEEPEST:
         said = f"the file is not readable JSON (nested deeper than {DEEPEST} levels)"
         raise UserError(said, path, remedy or "Repair it")
     return parsed
+
+
+def why_unreadable(error: ValueError | RecursionError) -> str:
+    """What a parser of JSON or TOML found, for people."""
+    if isinstance(error, RecursionError):
+        return "nested too deep"
+    # Python: "Exceeds the limit (4300 digits) for integer string conversion: …"
+    return "a number has too many digits" if "digits" in str(error) else str(error)
 
 
 def nesting(content: object) -> int:

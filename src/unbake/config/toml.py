@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..fields.registry import representations
-from ..io import DEEPEST, nesting, read_text
+from ..io import DEEPEST, nesting, read_text, why_unreadable
 from ..transport.methods import METHODS
 from .fit import FitConfig, PresetName
 from .migration import FORMAT, migrated
@@ -91,7 +91,7 @@ def to_tables(text: str, where: str = "settings") -> dict[str, Any]:
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also of numbers with thousands of digits
-        raise UserError(f"not valid TOML ({error})", where) from None
+        raise UserError(f"not valid TOML ({why_unreadable(error)})", where) from None
     if nesting(table) > DEEPEST:
         raise UserError(f"not valid TOML (nested deeper than {DEEPEST} levels)", where)
     try:
