@@ -428,3 +428,10 @@ def test_a_lamp_in_a_dark_room_is_no_outlier():
     assert without_outliers(pixels, counted, "a", 64)[1] is None
     pixels[4:, :3] = 0
     assert without_outliers(pixels, np.ones(4096, bool), "a", 64)[1] is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_limit_beyond_32_bits_is_none():
+    """NumPy would warn of an overflow, with a line of our source."""
+    pixels = np.full((4096, 4), 3e37, np.float32)
+    assert without_outliers(pixels, np.ones(4096, bool), "a", 64)[1] is None

@@ -157,6 +157,18 @@ def test_a_million_triangles_are_checked_in_no_time(tmp_path):
     assert time.process_time() - started < 2
 
 
+def test_a_mesh_that_cannot_be_opened_is_not_called_damaged(tmp_path, monkeypatch):
+    def refuse(*words, **named):
+        raise OSError(24, "Too many open files")
+
+    file = tmp_path / "mesh.ply"
+    file.write_text(ply())
+    monkeypatch.setattr("pathlib.Path.open", refuse)
+    with pytest.raises(UserError) as caught:
+        check_mesh("ply", file)
+    assert str(caught.value) == f"{file}: the mesh cannot be read (Too many open files)"
+
+
 # ------------------------------------------------------------------------------------------ images
 
 

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+import tracemalloc
 
 import mitsuba as mi
 import pytest
@@ -287,6 +288,22 @@ def test_elements_of_includes_count(refused, tmp_path):
 def test_large_scenes_are_capped(refused, monkeypatch):
     monkeypatch.setattr(preflight, "BYTES", 1 << 20)
     assert "has more than 1 MiB of XML" in refused(ROOM.format(" " * (1 << 20)))
+
+
+def test_a_scene_of_one_point_is_refused(refused):
+    flat = '<transform name="to_world"><scale value="0"/></transform>'
+    told = refused(ROOM.format(f'<shape type="cube">{flat}<bsdf type="diffuse"/></shape>'))
+    assert "all shapes of the scene lie in one point" in told
+
+
+def test_a_small_scene_is_read_in_little_memory(tmp_path):
+    file = tmp_path / "scene.xml"
+    file.write_text(ROOM.format(""))
+    tracemalloc.start()
+    preflight.check_xml(file, tmp_path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 def test_ten_levels_are_fine(tmp_path):

@@ -61,7 +61,7 @@ def without_outliers(
     if len(known) <= 2 * few:
         return pixels, None
     limit = float(np.partition(known, len(known) - 1 - few)[len(known) - 1 - few])
-    over = counted & (brightness > EXTREME * limit)
+    over = counted & (brightness > np.float64(EXTREME * limit))  # too large for 32 bits, maybe
     if limit <= 0 or not over.any():
         return pixels, None
     row, column = divmod(int(np.argmax(np.where(over, brightness, 0))), width)

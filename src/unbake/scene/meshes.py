@@ -79,7 +79,9 @@ def _check(kind: str, path: Path, number: int, *_: int) -> None:
             _check_ply(path)
         else:
             _check_obj(path)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise UserError(f"the mesh cannot be read ({error.strerror})", path) from None
+    except ValueError as error:
         _refuse(f"the mesh cannot be read ({error})", path)
     except MemoryError:
         raise UserError("the mesh does not fit into memory", path, "Use a smaller one") from None

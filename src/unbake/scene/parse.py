@@ -65,6 +65,9 @@ class ParsedScene:
         box = np.ravel([scene.bbox().min, scene.bbox().max])
         if not np.isfinite(box).all():
             raise UserError("the scene has no shapes, or one without end", self.path)
+        if np.ptp(box.reshape(2, 3), axis=0).max() == 0:
+            what = "all shapes of the scene lie in one point"
+            raise UserError(what, self.path, "Correct their transforms")
         for shape in met_shapes(scene):
             # Dr.Jit 1.5 cannot look up the corners of what was hit where a mesh has none at all.
             if isinstance(shape, mi.Mesh) and not shape.face_count():

@@ -51,7 +51,8 @@ def light_by_depth(
             pi, ray = behind_area_emitters(scene, pi, ray, mi.Bool(True))
         sums = _follow(scene, pi, ray, sampler, group, groups, max_depth, rr_depth)
     light = np.array(sums, np.float64).reshape(max_depth, groups)
-    lit = light[:, light.sum(0) > 0]
+    total = light.sum(0)
+    lit = light[:, (total > 0) & np.isfinite(total)]
     if not lit.size:
         return np.zeros(max_depth)
     return np.median(lit.cumsum(0) / lit.sum(0), axis=1)
