@@ -104,3 +104,12 @@ def test_lights_are_told_in_a_line_and_have_no_picture(cornell, tmp_path):
     assert said.getvalue() == f"step 40, 18 s: {name} 0.2 0.2 0.2\n"
     logged = json.loads((tmp_path / "log.jsonl").read_text())
     assert logged["validation"]["emission"].keys() == {name} and logged["step"] == 40
+
+
+def test_a_fit_beyond_its_time_is_done_and_no_more(tmp_path):
+    """The last step may end after a limit of time."""
+    said = io.StringIO()
+    entry = {"step": 1, "seconds": 4.0, "samples_per_second": 1e3, "memory_mb": 100.0}
+    with Monitor(tmp_path / "log.jsonl", Console(file=said, width=200), 2.0) as monitor:
+        monitor.record(4.0, entry)
+    assert said.getvalue().startswith("100 %") and said.getvalue().endswith(" 0 s left\n")

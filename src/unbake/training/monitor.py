@@ -82,8 +82,9 @@ class Monitor:
         self._bar.update(self._task, completed=done, description=line)
         if not self._console.is_terminal and entry["seconds"] - self._last_line >= QUIET_SECONDS:
             self._last_line = entry["seconds"]
-            left = "" if not done else f"  {entry['seconds'] * (self._total / done - 1):.0f} s left"
-            share = done / self._total if self._total else 1.0
+            ahead = entry["seconds"] * max(0.0, self._total / done - 1) if done else None
+            left = "" if ahead is None else f"  {ahead:.0f} s left"
+            share = min(1.0, done / self._total) if self._total else 1.0
             self.say(f"{100 * share:3.0f} %  {line}{left}")
 
     def validation(self, entry: dict) -> None:
