@@ -207,7 +207,7 @@ def test_the_help_of_fit_tells_what_the_presets_say(unbake):
         (("--method", "ad-pt", "--max-depth", "10000"), "--max-depth: must be 256 or less for the"),
         (("--steps", "3", "--seconds", "4"), "--steps: cannot be given together with --seconds"),
         (("--preset", "cpu", "--settings", "a.toml"), "--preset: cannot be given together"),
-        (("--settings", "none.toml"), "none.toml: cannot be read"),
+        (("--settings", "none.toml"), "none.toml: the file does not exist"),
     ],
 )
 def test_a_wrong_option_of_fit_is_named(words, message, unbake, tmp_path, monkeypatch):
