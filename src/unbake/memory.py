@@ -54,6 +54,12 @@ def free_bytes() -> int | None:
     return max(0, free)
 
 
+def reserved_counts() -> bool:
+    """Whether a limit of this process counts memory that is reserved, and not only what is used."""
+    limits = (resource.getrlimit(number)[0] for number, _ in _RESOURCES)
+    return any(limit != resource.RLIM_INFINITY for limit in limits)
+
+
 def _used(key: str) -> int:
     """A number of bytes that the kernel tells of this process; 0 where it does not."""
     try:

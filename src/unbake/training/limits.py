@@ -11,7 +11,7 @@ from ..errors import UserError
 from ..fields import radiance
 from ..fields.registry import Representation, representation
 from ..fields.settings import SizedSettings
-from ..memory import largest, require_memory
+from ..memory import largest, require_memory, reserved_counts
 from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
 
@@ -19,6 +19,10 @@ from ..transport.objective import has_radiance
 #: a step, and all copied and put together for a checkpoint (measured: 62 to 70); and two snapshots
 #: of value and moments, to which a fit that diverges goes back.
 BYTES_A_NUMBER = 96
+#: Where what is reserved counts as well: Dr.Jit 1.5 rounds arrays up to powers of two (measured: up
+#: to 122 bytes a number), and crashes where it gets no memory; kernels and threads have a fixed
+#: share (measured: 70 MB).
+_RESERVED, _RESERVED_ALWAYS = 1.5, 150e6
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ def require_room(config: FitConfig, materials: int) -> None:
         return
     worst = max(fields, key=lambda field: needs[field.key])
     others = total - needs[worst.key]
+    factor, always = (_RESERVED, _RESERVED_ALWAYS) if reserved_counts() else (1.0, 0.0)
 
     def remedy(free: int) -> str:
         if worst.form.size is None:
@@ -81,7 +86,9 @@ def require_room(config: FitConfig, materials: int) -> None:
 
         def fits(size: int) -> bool:
             resized = worst.resized(size)
-            return resized is None or others + resized.bytes(materials) <= free
+            return resized is None or (
+                factor * (others + resized.bytes(materials)) + always <= free
+            )
 
         most = largest(fits, worst.size)
         name = f"{worst.key}.{worst.form.size}"
@@ -90,7 +97,7 @@ def require_room(config: FitConfig, materials: int) -> None:
         return f"Lower {name} and those of the other fields"
 
     told = "the fields of this fit, with gradients and Adam's moments, need"
-    require_memory(total, told, remedy, worst.key)
+    require_memory(factor * total + always, told, remedy, worst.key)
 
 
 def _fields(config: FitConfig) -> list[_Field]:

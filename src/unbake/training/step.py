@@ -19,7 +19,7 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
 from ..errors import UserError
-from ..memory import free_bytes, lacks_memory, require_memory
+from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
@@ -145,8 +145,10 @@ class TrainingStep:
         found = self.forecast(state) if large or self._path_sampler.keeps_paths else None
         if found is not None:
             what = f"a step of {paths} paths by {self._config.method} needs"
-            need = found.bytes(self._config.pixels)
-            require_memory(need, what, lambda free: self._smaller(found.pixels(free)))
+            # Dr.Jit 1.5 rounds arrays up to powers of two, of which only a part is used
+            factor = 2 if reserved_counts() else 1
+            need = factor * found.bytes(self._config.pixels)
+            require_memory(need, what, lambda free: self._smaller(found.pixels(free / factor)))
         self._fits_memory = True
 
     def forecast(self, state: State) -> Forecast | None:
