@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 from unbake.quantities import QUANTITIES
+from unbake.signals import STOPPING
 
 #: A checkpoint after every step, so that ends at random instants meet many that are being written.
 _SETTINGS = "steps = 100000000\npixels = 64\nspp = 4\nwarm_up = 0\ncheckpoint_seconds = 0\n"
@@ -41,5 +43,12 @@ def start(words: list[str]) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=_default_signals,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
+
+
+def _default_signals() -> None:
+    """What a shell starts in the background ignores SIGINT, and unbake then does, too."""
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_DFL)
