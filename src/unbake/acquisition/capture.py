@@ -115,11 +115,19 @@ def _partial_name(out: Path) -> str:
 
 
 def _tell_unfinished(out: Path, tell: Callable[[str], None]) -> None:
-    """Tell of captures to this folder that were killed; they are left for the user to remove."""
+    """Tell of captures to this folder that were killed; they are left for the user to remove.
+
+    Raises:
+        UserError: one is at work: all that the second one of the two renders would be lost.
+    """
     pattern = re.compile(re.escape(_partial_name(out)) + r"[0-9a-f]{16}" + re.escape(_PARTIAL))
     for folder in out.parent.iterdir() if out.parent.is_dir() else ():
-        if pattern.fullmatch(folder.name) and not is_locked(folder):
-            tell(f"an earlier capture did not finish and has left {printable(folder, 1000)}")
+        if not pattern.fullmatch(folder.name):
+            continue
+        if is_locked(folder):
+            remedy = f"Wait for its end, give another --out, or remove {folder} if none is"
+            raise UserError("another capture to this folder is at work", out, remedy)
+        tell(f"an earlier capture did not finish and has left {printable(folder, 1000)}")
 
 
 def _capture(
