@@ -340,6 +340,16 @@ def test_misspelt_properties_are_refused(case, refused):
     assert name in message and "scene.xml (line " in message
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("roughness", -5), ("roughness", 1.5), ("metallic", 7)]
+)
+def test_numbers_of_no_surface_are_refused(name, value, refused):
+    """A capture wrote a truth of -5, and a fit of the albedo alone rendered with it."""
+    bsdf = f'<bsdf type="principled"><float name="{name}" value="{value}"/></bsdf>'
+    message = refused(ROOM.format(BALL.format(bsdf)))
+    assert f"'{name}' of principled is {value}, not from 0 to 1. Correct it" in message
+
+
 def test_all_misspelt_properties_of_an_element_are_told(refused):
     unknown = '<float name="one" value="2"/><float name="two" value="2"/>'
     message = refused(ROOM.format(BALL.format(unknown)))

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ..errors import UserError
 from ..fields.texture import painted_meshes_without_uv
+from ..quantities import QUANTITIES
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
 from .parse import ParsedScene, is_reference, referenced
 
@@ -39,7 +40,8 @@ def to_principled(scene: ParsedScene) -> int:
         The number of BSDFs changed.
 
     Raises:
-        UserError: one has a property that its plugin does not know, or no width that is a number.
+        UserError: one has a property that its plugin does not know, no width that is a number, or a
+            number out of range.
     """
     changed = 0
     for node in scene.state.nodes:
@@ -52,6 +54,9 @@ def to_principled(scene: ParsedScene) -> int:
                 f"It has {', '.join(sorted(_PROPERTIES[props.plugin_name()]))}",
             )
         match props.plugin_name():
+            case "principled":
+                _require_ranges(scene, node)
+                continue
             case "diffuse":
                 colour, roughness = props.get("reflectance", 0.5), 0.9
             case "roughplastic":
@@ -66,6 +71,18 @@ def to_principled(scene: ParsedScene) -> int:
         props["roughness"] = roughness
         changed += 1
     return changed
+
+
+def _require_ranges(scene: ParsedScene, node: mi.parser.SceneNode) -> None:
+    """Refuse numbers that no surface has; Mitsuba 3.9 checks colours alone."""
+    for quantity in QUANTITIES.values():
+        value = node.props.get(quantity.slot)
+        if isinstance(value, int | float) and not 0 <= value <= quantity.upper:
+            raise UserError(
+                f"{quantity.slot!r} of principled is {value:g}, not from 0 to {quantity.upper:g}",
+                mi.parser.file_location(scene.state, node),
+                "Correct it",
+            )
 
 
 def _alpha(scene: ParsedScene, node: mi.parser.SceneNode) -> float:
