@@ -135,6 +135,23 @@ def test_numbers_of_an_interrupted_evaluation_are_not_those_before(fit, run, unb
     one_line(unbake("report", run.path, "--out", run.path / "page.html"), "Run `unbake evaluate")
 
 
+def test_a_run_that_is_deleted_while_it_is_evaluated(fit, run, unbake, monkeypatch):
+    """The evaluation ended well, in a new folder without a run."""
+    from unbake.evaluation import evaluate
+
+    assert fit("--steps", 1).status == 0
+    real = evaluate._evaluate_view
+
+    def deleted(*words):
+        found = real(*words)
+        shutil.rmtree(run.path)
+        return found
+
+    monkeypatch.setattr(evaluate, "_evaluate_view", deleted)
+    one_line(unbake("evaluate", run.path, "--spp", 1), "the folder was deleted, moved or replaced")
+    assert not run.path.exists()
+
+
 # ---------------------------------------------------------------------------------- links and pipes
 
 

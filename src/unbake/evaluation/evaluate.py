@@ -22,6 +22,7 @@ from ..scene import edit
 from ..scene.parse import parse
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
+from ..training.run_lock import RunLock
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
 from ..transport.objective import has_radiance
 from ..transport.render import render_radiance
@@ -79,9 +80,9 @@ def evaluate(
     settings = settings or EvaluationSettings()
     run = Path(run)
     recovered, folder = load_run(run, allow_outside=allow_outside), RunFolder(run)
-    with folder.lock_evaluation():
+    with folder.lock_evaluation() as lock:
         folder.forget_evaluation()
-        return _evaluate(recovered, folder, settings, tell)
+        return _evaluate(recovered, folder, settings, tell, lock)
 
 
 def _evaluate(
@@ -89,6 +90,7 @@ def _evaluate(
     folder: RunFolder,
     settings: EvaluationSettings,
     tell: Callable[[str], None],
+    lock: RunLock,
 ) -> dict:
     dataset = recovered.dataset
     origin = folder.origin()
@@ -102,6 +104,7 @@ def _evaluate(
     recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     rows, materials = [], []
     for view in views:
+        lock.require_held()
         row, seen, truth = _evaluate_view(recovered, view, folder, settings, true_scene)
         rows.append(row)
         materials.append((seen, truth))
@@ -127,6 +130,7 @@ def _evaluate(
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
         "evaluation": asdict(settings),
     }
+    lock.require_held()
     folder.write_metrics(metrics)
     return metrics
 
