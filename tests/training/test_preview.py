@@ -16,6 +16,7 @@ from unbake.acquisition.settings import CaptureSettings
 from unbake.config import LightingConfig
 from unbake.dataset.lighting import ROWS, true_environment
 from unbake.dataset.views import Dataset
+from unbake.errors import UserError
 from unbake.imaging.pictures import tonemap
 from unbake.training.checkpoint import Progress
 from unbake.training.monitor import Monitor
@@ -104,6 +105,15 @@ def test_lights_are_told_in_a_line_and_have_no_picture(cornell, tmp_path):
     assert said.getvalue() == f"step 40, 18 s: {name} 0.2 0.2 0.2\n"
     logged = json.loads((tmp_path / "log.jsonl").read_text())
     assert logged["validation"]["emission"].keys() == {name} and logged["step"] == 40
+
+
+def test_no_preview_is_written_through_a_link(cornell, tmp_path):
+    """Also where a folder has become one while the fit runs."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "previews").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="previews: is a symbolic link"):
+        preview(cornell, "materials", tmp_path)
+    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def test_a_fit_beyond_its_time_is_done_and_no_more(tmp_path):

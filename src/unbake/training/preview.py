@@ -12,7 +12,7 @@ from ..imaging.pictures import montage, shown, tonemap, write_png
 from ..quantities import QUANTITIES
 from .checkpoint import Progress
 from .problem import Problem
-from .run_folder import RunFolder
+from .run_folder import RunFolder, require_no_link
 from .validation import SAMPLES, GroundTruth, MaterialBuffers
 
 
@@ -57,6 +57,7 @@ class Preview:
                 {"emission": dict(zip(self._problem.emitter_names, strengths, strict=True))}
             )
         if sheets:
+            require_no_link(self._run.previews)
             write_png(self._run.preview(progress.step), montage(sheets, gap=0))
         return [{**progress.counted(), "validation": values} for values in found]
 
