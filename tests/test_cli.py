@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import fields
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -173,6 +174,17 @@ def test_every_option_is_explained(command, unbake):
     options = re.findall(r"(--[a-z-]+)(?: [A-Z]+| \{[^}]*\})? (\S+ \S+)", text)
     for option, explained in options:
         assert re.match(r"[A-Za-z]", explained), option
+
+
+def test_the_help_breaks_lines_where_they_are_full(unbake, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in COMMANDS:
+        lines = unbake(command, "--help").out.splitlines()
+        texts = [line.strip("│ ") for line in lines if line.startswith("│  ")]
+        for line, following in pairwise(texts):
+            if line and line[-1] in ",a" and following[:1].islower():
+                word = following.split()[0]
+                assert len(line) + 1 + len(word) > 56, (command, line, following)
 
 
 def test_the_help_of_fit_tells_what_the_presets_say(unbake):

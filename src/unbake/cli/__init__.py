@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 import shlex
 import sys
 import time
@@ -67,6 +69,9 @@ def main() -> None:
         "reproduce": reproduce,
         "doctor": doctor,
     }
+    for command in commands.values():
+        # Tyro 1.0 keeps the line breaks of some arguments' texts.
+        command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
     try:
         status = tyro.extras.subcommand_cli_from_dict(
             commands,
@@ -137,8 +142,8 @@ def fit(
 ) -> int:
     """Recover materials or lighting from the photographs of a data set.
 
-    Ctrl-C, SIGTERM, SIGHUP and a closed pipe stop it after the present step, with a checkpoint;
-    --resume continues from it. A second Ctrl-C ends it at once.
+    Ctrl-C, SIGTERM, SIGHUP and a closed pipe stop it after the present step, with a checkpoint from
+    which --resume continues. A second Ctrl-C ends it at once.
 
     Args:
         data: Folder of the data set, with its transforms.json.
