@@ -144,6 +144,7 @@ def activate(variant: str | None = None) -> str:
         # Told before Dr.Jit is imported: it would print complaints of its own first.
         _raise_if(llvm_problem())
     prepare_llvm()
+    _require_working_folder()
 
     import mitsuba as mi
 
@@ -158,6 +159,15 @@ def activate(variant: str | None = None) -> str:
         mi.set_variant(wanted)
     _keep_two_threads()
     return wanted
+
+
+def _require_working_folder() -> None:
+    """Refuse a working folder that was deleted: it ends the import of Mitsuba 3.9 by SIGABRT."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        what = f"the working folder cannot be used ({error.strerror})"
+        raise UserError(what, remedy="Change to another folder") from None
 
 
 def _forget_working_folder() -> None:
