@@ -187,6 +187,26 @@ def test_the_help_breaks_lines_where_they_are_full(unbake, monkeypatch):
                 assert len(line) + 1 + len(word) > 56, (command, line, following)
 
 
+def test_the_help_of_a_terminal_without_width_ends():
+    done = subprocess.run(
+        [sys.executable, "-m", "unbake", "doctor", "--help"], capture_output=True, timeout=60,
+        env=os.environ | {"PYTHONPATH": SOURCE, "COLUMNS": "1"}, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and "usage" in done.stdout
+
+
+def test_a_working_folder_that_was_deleted_is_one_line(tmp_path):
+    """Mitsuba ended the process by SIGABRT."""
+    (tmp_path / "gone").mkdir()
+    words = ["sh", "-c", 'rmdir ../gone; exec "$@"', "sh", sys.executable, "-m", "unbake"]
+    done = subprocess.run(
+        [*words, "fit", tmp_path, "--out", tmp_path / "run"], cwd=tmp_path / "gone", timeout=60,
+        env=os.environ | {"PYTHONPATH": SOURCE}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stderr.startswith("error: the working folder cannot")
+    assert done.stderr.count("\n") == 1
+
+
 def test_the_help_of_fit_tells_what_the_presets_say(unbake):
     text = re.sub(r"[│\s]+", " ", unbake("fit", "--help").out)
     cpu, paper, release = preset("cpu"), preset("paper"), preset("release")

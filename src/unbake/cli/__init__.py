@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 import re
 import shlex
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -42,6 +44,8 @@ from .options import (
     with_length,
 )
 
+#: Columns of a terminal that texts are wrapped for, at least.
+_NARROWEST = 40
 #: Characters of a line that is printed: more than a path can have.
 _LONGEST = 1 << 14
 
@@ -69,6 +73,8 @@ def main() -> None:
         "reproduce": reproduce,
         "doctor": doctor,
     }
+    if shutil.get_terminal_size().columns < _NARROWEST:
+        os.environ["COLUMNS"] = str(_NARROWEST)  # Tyro 1.0 wraps texts forever below 10
     for command in commands.values():
         # Tyro 1.0 keeps the line breaks of some arguments' texts.
         command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
