@@ -69,13 +69,14 @@ def interrupt(folder: Path, each: int, seed: int, only: list[str]) -> dict[str, 
     shutil.copytree(done, evaluated)
     start(["evaluate", str(evaluated), "--spp", "4"]).communicate()
     small = ["--views", "2", "--held-out", "1", "--resolution", "32", "--spp", "64"]
+    short = [*fit[2:4], "--steps", "50", "--evaluate-spp", "4"]
     commands = {
         "fit": [*fit, "--out", str(out)],
         "resume": ["fit", str(data), "--resume", "--out", str(out), "--steps", "100000"],
         "capture": ["capture", "cornell", "--out", str(out), *small],
         "evaluate": ["evaluate", str(done), "--spp", "256"],
         "report": ["report", str(evaluated), "--out", str(out)],
-        "compare": ["compare", str(data), "direct", "--out", str(out), *fit[2:4], "--steps", "50"],
+        "compare": ["compare", str(data), "--methods", "direct", "--out", str(out), *short],
         "bench": ["bench", "step", "--data", str(data), *fit[2:4], "--steps", "50"],
         "reproduce": ["reproduce", "table2", "--scale", "smoke", "--out", str(out)],
         "doctor": ["doctor"],
@@ -152,7 +153,9 @@ def _seconds(words: list[str], out: Path, done: Path) -> float:
             pass
         time.sleep(1)
         process.kill()
-    process.communicate()
+    complained = process.communicate()[1]
+    if process.returncode not in (0, -signal.SIGKILL):
+        raise RuntimeError(f"{words} fails by itself: {complained}")
     return time.monotonic() - begun
 
 
