@@ -6,7 +6,6 @@ What is wrong with a file becomes a `UserError`.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -17,6 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 if TYPE_CHECKING:
     import numpy as np
@@ -98,12 +102,7 @@ def locked(folder: Path) -> Iterator[bool]:
     """
     number = os.open(folder, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX)
-            held = True
-        except OSError:
-            held = False
-        yield held
+        yield take_lock(number, wait=True) is True
     finally:
         os.close(number)
 
@@ -115,12 +114,30 @@ def is_locked(folder: Path) -> bool:
     except OSError:
         return True
     try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
+        return take_lock(number, wait=False) is not True
     finally:
         os.close(number)
-    return False
+
+
+def take_lock(number: int, *, wait: bool) -> bool | None:
+    """Lock an open file or folder for this process, until it is closed or the process ends.
+
+    Args:
+        number: its file descriptor.
+        wait: until a process that holds it lets go.
+
+    Returns:
+        Whether it is held; None where there are no locks, as on some network file systems.
+    """
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
 
 
 def write_text(path: Path, content: str, *, durable: bool = False) -> None:

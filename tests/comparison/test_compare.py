@@ -291,6 +291,16 @@ def test_runs_of_other_settings_or_data_are_not_mixed_in(compare, cornell, tmp_p
     assert "has other data. Give another --out" in outcome.err
 
 
+def test_no_run_is_written_through_a_link(compare, tmp_path):
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "direct").symlink_to(victim)
+    outcome = compare("direct", steps=2)
+    assert outcome.status == 2 and "direct: is a symbolic link" in outcome.err
+    assert not list(victim.iterdir())
+
+
 def test_a_contender_is_a_method_and_maybe_a_representation():
     shared = FitConfig(bounces=3, prior="one-bounce")
     plain, bitmap = MethodVariant.of("ours"), MethodVariant.of("prb:bitmap")

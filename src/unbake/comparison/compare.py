@@ -30,7 +30,7 @@ from ..training.checkpoint import Progress
 from ..training.defaults import with_defaults
 from ..training.loop import fit
 from ..training.path_depth import with_path_depth
-from ..training.run_folder import RunFolder
+from ..training.run_folder import RunFolder, require_no_link
 from .method_variant import MethodVariant
 from .tables import print_comparison
 
@@ -165,17 +165,18 @@ def compare(
 
 
 def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:
-    """Refuse a run in the folder that has other settings or data."""
+    """Refuse a link in the run's place, and a run that has other settings or data."""
+    require_no_link(run.path)
     if not run.exists:
         return
+    if run.data(run.origin().data).resolve() != data.resolve():
+        raise UserError("the run in this folder has other data", run.path, "Give another --out")
     stored = vars(run.settings())
     other = ", ".join(key for key, value in vars(settings).items() if stored[key] != value)
     if other:
         raise UserError(
             f"the run in this folder differs in {other}", run.path, "Give another --out"
         )
-    if run.data(run.origin().data).resolve() != data.resolve():
-        raise UserError("the run in this folder has other data", run.path, "Give another --out")
 
 
 def _fitted(

@@ -10,11 +10,7 @@ from types import TracebackType
 from typing import final
 
 from ..errors import UserError
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from ..io import take_lock
 
 NAME = ".lock"
 
@@ -59,18 +55,13 @@ class RunLock:
         return self
 
     def _take(self, path: Path) -> None:
-        if fcntl is not None:
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                holder = os.read(self._file, 20).decode("ascii", "replace").strip()
-                raise UserError(
-                    f"another process (number {holder or 'unknown'}) {self._doing} in this folder",
-                    self._folder,
-                    "Wait for its end or stop it, or give another folder",
-                ) from None
-            except OSError:
-                pass  # a network file system without locks
+        if take_lock(self._file, wait=False) is False:
+            holder = os.read(self._file, 20).decode("ascii", "replace").strip()
+            raise UserError(
+                f"another process (number {holder or 'unknown'}) {self._doing} in this folder",
+                self._folder,
+                "Wait for its end or stop it, or give another folder",
+            )
         with suppress(OSError):  # a full disk; the number is only told
             os.ftruncate(self._file, 0)
             os.lseek(self._file, 0, os.SEEK_SET)
