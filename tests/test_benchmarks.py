@@ -417,7 +417,7 @@ def test_neighbouring_samples_that_resemble_each_other_count_as_fewer(soak):
     steps, alone = rng.normal(0, 1, 400), rng.normal(0, 1, 400)
     alike = np.convolve(steps, np.ones(10) / 10**0.5, "same")
     widths = []
-    for noise in (alone, alike):
+    for noise in (alone / alone.std(), alike / alike.std()):
         low, high = watched(soak, 400, lambda i, n=noise: 400 + n[i])[0]["slope_range"]
         widths.append(high - low)
     assert widths[1] > 2 * widths[0]
