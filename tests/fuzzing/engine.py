@@ -33,6 +33,8 @@ CORPUS = ROOT / "tests" / "data" / "corpus"
 PATIENCE = 60.0
 #: Inputs that Hypothesis draws in one go; it remembers all of them.
 _ROUND = 250
+#: The fewest of a round: nothing new in all of them, and there is nothing new to draw.
+_FEWEST = 50
 
 
 class Worker:
@@ -161,6 +163,7 @@ class Campaign:
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     slowest: float = 0.0  #: seconds
     failures: dict[tuple[str, str], Failure] = field(default_factory=dict)
+    _seen: set[tuple[str, bytes]] = field(default_factory=set)
 
     @property
     def total(self) -> int:
@@ -189,19 +192,19 @@ class Campaign:
             known.content, known.told = content, found["told"]
 
     def mutate(self, name: str, count: int, start: int) -> None:
-        """Read damaged files of a format.
+        """Read damaged files of a format, no two of them the same.
 
         Args:
-            count: how many.
+            count: how many; fewer where nothing new is drawn any more.
             start: seed; the same one draws the same inputs.
         """
-        wanted = count + sum(self.counts.get(name, {}).values())
-        numbers = random.Random(f"{name} {start}")
-        while (left := wanted - sum(self.counts.get(name, {}).values())) > 0:
+        numbers, fresh, left = random.Random(f"{name} {start}"), True, count
+        while fresh and left > 0:
+            fresh = False
 
             @seed(numbers.getrandbits(64))
             @settings(
-                max_examples=min(left, _ROUND),
+                max_examples=min(max(left, _FEWEST), _ROUND),
                 database=None,
                 deadline=None,
                 phases=[Phase.generate],
@@ -209,6 +212,11 @@ class Campaign:
             )
             @given(damaged(FORMATS[name]))
             def draw(content: bytes) -> None:
+                nonlocal fresh, left
+                if (name, content) in self._seen or left == 0:
+                    return
+                self._seen.add((name, content))
+                fresh, left = True, left - 1
                 self.read(name, content)
 
             draw()

@@ -161,7 +161,7 @@ def test_known_materials_are_not_evaluated(scored, tmp_path, monkeypatch):
     run = shutil.copytree(scored, tmp_path / "run", ignore=shutil.ignore_patterns("evaluation"))
     recovered = load_run(run)
     recovered.config = dataclasses.replace(recovered.config, unknown="lighting")
-    monkeypatch.setattr("unbake.evaluation.evaluate.load_run", lambda folder: recovered)
+    monkeypatch.setattr("unbake.evaluation.evaluate.load_run", lambda *_, **__: recovered)
     lines: list[str] = []
     metrics = evaluate(run, FEW, tell=lines.append)
     assert lines[0].startswith("heldout_000: render ") and "albedo" not in "".join(lines)
