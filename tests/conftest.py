@@ -133,3 +133,14 @@ def built_in(tmp_path_factory):
         return built_in.write_scene(name, folder / f"{name}-{albedo}", albedo=albedo)
 
     return write
+
+
+@pytest.fixture
+def one_thread():
+    """Sums come in one order, so that equal steps give equal numbers."""
+    import drjit as dr
+
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(threads)

@@ -58,15 +58,6 @@ def rates(i):
     return {"albedo": φ, "roughness": φ, "environment": φ, "emission": φ, "radiance": θ}
 
 
-@pytest.fixture
-def one_thread():
-    """Sums come in one order, so that equal steps give equal numbers."""
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(threads)
-
-
 # --------------------------------------------------------------------------------------- frozen
 
 

@@ -38,15 +38,6 @@ def begun(built_in):
     return start
 
 
-@pytest.fixture
-def one_thread():
-    """Sums come in one order, so that equal steps give equal numbers."""
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(threads)
-
-
 def numbers(state):
     return [
         np.array(array).ravel().copy()
