@@ -314,7 +314,8 @@ def compare(
 
 
 def bench(
-    what: Positional[Literal["step", "methods", "rates"]] = "step",
+    what: Positional[Literal["step", "methods", "rates", "gradients"]] = "step",
+    run: Positional[Annotated[Path | None, arg(metavar="[RUN]", help_behavior_hint="")]] = None,
     /,
     data: Folders = (),
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None,
@@ -323,20 +324,30 @@ def bench(
     seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
     seeds: Annotated[tuple[int, ...], arg(metavar="SEEDS", help_behavior_hint="")] = (),
     schedule: Flag = False,
+    batches: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
+    batch: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
+    spp: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
+    allow_outside: Flag = False,
     preset: Preset = None,
     settings: File = None,
     out: File = None,
 ) -> None:
-    """Measure the training step: samples a second, and where the time goes. Or search for rates.
+    """Measure the training step or its gradients, or search for learning rates.
 
-    step takes one method apart; methods measures several side by side, their steps in turn.
+    step takes one method apart: samples a second, and where the time goes. methods measures several
+    side by side, their steps in turn.
 
     rates searches the learning rates of each method on each data set, and the estimator of those
     that follow paths, by fits that are scored on held-out views. The same command goes on after the
     fits that --out has.
 
+    gradients takes a run on a data set with true materials. It measures the slope of the loss as a
+    quantity goes from the fitted to the true values, and the signal to noise of one batch: of that
+    slope, and of the gradients by the fields' parameters.
+
     Args:
         what: What to measure.
+        run: For gradients: folder that `unbake fit` wrote.
         data: Folder of a data set; rates takes several.
         scene: Without --data: a scene to render a small data set of (default: demo).
         methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
@@ -346,11 +357,27 @@ def bench(
         seconds: For rates, the length of a fit in seconds of training, instead of steps.
         seeds: For rates, seeds of the fits whose scores are averaged, such as 0 1 2 (default: 0).
         schedule: For rates, also search how far all rates fall, and the warm-up of the unknowns.
+        batches: For gradients, how many to measure (default: 64).
+        batch: For gradients, pixels in a batch (default: as in the run).
+        spp: For gradients, samples per pixel (default: as in the run).
+        allow_outside: For gradients, read files that the data set or its scene names outside of its
+            folder.
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
+    of_gradients = {"batches": batches, "batch": batch, "spp": spp}
+    of_gradients |= {"allow-outside": allow_outside or None}
+    if what == "gradients":
+        others = {"data": data, "scene": scene, "methods": methods != ("ours",), "steps": steps}
+        others |= {"seconds": seconds, "seeds": seeds, "schedule": schedule}
+        _refuse("gradients has no such option", others | {"preset": preset, "settings": settings})
+        _bench_gradients(run, of_gradients, out)
+        return
+    _refuse("is an option of gradients", of_gradients, "Or: unbake bench gradients RUN")
+    if run is not None:
+        raise UserError(f"{what} takes no run", run, "Or: unbake bench gradients RUN")
     if data:
         exclude("data", {"scene": scene})
     chosen = chosen_settings(preset, settings)
@@ -359,10 +386,8 @@ def bench(
         chosen = with_length(chosen, {k: v for k, v in length.items() if v is not None})
         _bench_rates(data, methods, chosen, out, seeds or (0,), schedule)
         return
-    only = {"seconds": seconds, "seeds": seeds or None, "schedule": schedule or None}
-    for option, given_value in only.items():
-        if given_value is not None:
-            raise UserError("is an option of rates", f"--{option}", "Or: unbake bench rates")
+    only = {"seconds": seconds, "seeds": seeds, "schedule": schedule}
+    _refuse("is an option of rates", only, "Or: unbake bench rates")
     if len(data) > 1:
         raise UserError(f"{what} takes one data set", "--data", "Or: unbake bench rates")
     steps = 100 if steps is None else steps
@@ -381,6 +406,29 @@ def bench(
             bench_step(folder, variants[0].settings(chosen), steps, out, console)
         else:
             bench_methods(folder, variants, chosen, steps, out, console)
+
+
+def _refuse(what: str, options: dict[str, Any], remedy: str | None = None) -> None:
+    """Raise UserError for the first of these options that was given."""
+    for name, value in options.items():
+        if value is not None and value is not False and value != ():
+            raise UserError(what, f"--{name}", remedy)
+
+
+def _bench_gradients(run: Path | None, options: dict[str, Any], out: Path | None) -> None:
+    if run is None:
+        raise UserError("gradients needs a run", remedy="unbake bench gradients RUN")
+    batches = 64 if options["batches"] is None else options["batches"]
+    folder = RunFolder(run)
+    folder.require_fitted()
+    changes = {name: options[name] for name in ("batch", "spp") if options[name] is not None}
+    config = with_options(folder.settings(), changes)
+    backend.activate()
+    from ..profiling.bench_gradients import FEWEST, bench_gradients
+
+    require("batches", batches, FEWEST)
+    console, outside = Console(highlight=False), bool(options["allow-outside"])
+    bench_gradients(run, config, batches, out, console, allow_outside=outside)
 
 
 def _bench_rates(

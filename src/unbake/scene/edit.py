@@ -136,6 +136,30 @@ def set_own_textures(scene: ParsedScene, textures: Sequence[Mapping[str, object]
             node.props[slot] = texture
 
 
+def wrap_textures(
+    scene: ParsedScene, plugin: str, textures: Sequence[Mapping[str, mi.Texture]]
+) -> None:
+    """Put a texture around parameters of each `principled` BSDF: its own and another one.
+
+    Args:
+        plugin: name of the texture; it finds the BSDF's own as `own`, the other as `fitted`.
+        textures: the other ones, by parameter, for each BSDF.
+    """
+    defaults = {quantity.slot: quantity.default for quantity in QUANTITIES.values()}
+    nodes = scene.state.nodes
+    # By number: a node that is appended moves all others.
+    numbers = [i for i, n in enumerate(nodes) if n.props.plugin_name() == "principled"]
+    for number, others in zip(numbers, textures, strict=True):
+        for slot, other in others.items():
+            around = mi.parser.SceneNode()
+            around.type = mi.ObjectType.Texture
+            around.props.set_plugin_name(plugin)
+            around.props["own"] = nodes[number].props.get(slot, defaults[slot])
+            around.props["fitted"] = other
+            nodes[number].props[slot] = mi.Properties.ResolvedReference(len(nodes))
+            nodes.append(around)
+
+
 def show_as_albedo(scene: ParsedScene, slot: str, default: float) -> None:
     """Replace each base colour by another parameter, so that an albedo integrator renders it.
 

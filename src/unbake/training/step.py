@@ -224,6 +224,11 @@ class TrainingStep:
         """The training view of a pixel, from 0, and its column and row in it."""
         return self._pixels.place(pixel)
 
+    @property
+    def recordable(self) -> bool:
+        """Whether `dr.freeze` can record the step."""
+        return self._frozen is not None
+
     def recordings(self) -> int:
         """How often the step was traced to be replayed; 0 if it is traced each time."""
         return 0 if self._frozen is None else self._frozen.n_recordings
