@@ -11,13 +11,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
-from support import tiny_fields
+from support import built_in_cameras, grey_photographs, tiny_fields
 
 from unbake.config import PathConfig
 from unbake.profiling.bench_gradients import Spread, bench_gradients
 from unbake.profiling.towards_truth import WAY, towards_truth
 from unbake.training.loop import fit
-from unbake.training.problem import training_pixels
+from unbake.training.problem import make_problem, training_pixels
 from unbake.training.recovered import load_run
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
@@ -103,6 +103,19 @@ def test_what_is_true_already_has_no_slope(cornell, tmp_path):
     assert abs(found["roughness"]["slope"]) > 1e-4
     (part,) = found["albedo"]["parts"]
     assert part["part"] == "corners" and part["signal_to_noise"] > 0
+
+
+def test_unknown_lighting_stays_as_it_was_learned(built_in):
+    config = replace(tiny_fields("grid"), method="direct", unknown="materials+lighting")
+    problem = make_problem(built_in("still"), "visible", config, 0.3)
+    dataset = SimpleNamespace(scene=built_in("still"), root=None)
+    problem = towards_truth(SimpleNamespace(problem=problem, dataset=dataset, config=config))
+    step = TrainingStep(problem, grey_photographs(built_in_cameras("still", 8)), config)
+    measured = SimpleNamespace(step=step, state=initial_state(problem), config=config)
+    assert {name.partition(".")[0] for name in measured.state.phi} >= {"albedo", "environment"}
+    found = slope(measured, "albedo", 0)
+    assert found != 0
+    assert found == pytest.approx(difference(measured, "albedo", 0, 0.02), rel=1e-3)
 
 
 def test_the_table_is_that_of_the_batches(unbake, run, tmp_path):

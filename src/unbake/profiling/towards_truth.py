@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from ..dataset.views import Dataset
 from ..fields.domain import SurfacePoint
-from ..fields.emission import emission_textures
 from ..fields.envmap import environment_emitter
 from ..fields.field import Cost, Engine, Field
 from ..fields.materials import Materials
@@ -120,9 +119,6 @@ def _scene(
     edit.wrap_textures(parsed, _PLUGIN, wrapped)
     if problem.environment is not None:
         edit.set_environment(parsed, environment_emitter(problem.environment))
-    if problem.emission is not None:
-        emission = problem.emission
-        edit.set_emission(parsed, lambda count: emission_textures(emission))
     return parsed.instantiate()
 
 
