@@ -186,7 +186,7 @@ def test_numbers_out_of_range_are_told_in_one_line(unbake, run, words, message):
 
 def test_options_of_gradients_are_refused_elsewhere(unbake, run):
     done = unbake("bench", "step", run)
-    assert done.status == 2 and "step takes no run" in done.err
+    assert done.status == 2 and "step takes no folder" in done.err
     done = unbake("bench", "step", "--batches", 3)
     assert done.status == 2 and "--batches: is an option of gradients" in done.err
 

@@ -216,16 +216,26 @@ def evaluate(
     settings = with_options(EvaluationSettings(), given(evaluate))
     backend.activate()
     from ..evaluation.evaluate import evaluate as go
+    from ..evaluation.yardsticks import told_yardsticks
 
     metrics = go(run, settings, allow_outside=allow_outside, tell=_say)
     if not metrics["steps"]:
         _say("untrained: after 0 steps the fields have their initial values")
+    found = metrics.get("yardsticks")
+    told = told_yardsticks(metrics["heldout"], found) if found else []
     for split in ("heldout", "train"):
         values = {k: v for k, v in metrics[split].items() if k != "views"}
         if not metrics["quantities"]:  # of known materials there are no scores
             values = {k: v for k, v in values.items() if v is not None}
         shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in values.items())
         _say(f"{split} ({metrics[split]['views']} views): {shown}")
+        if split == "heldout":
+            for line in told:
+                _say(f"  {line}")
+    if told and found and found["ceiling"] is None:
+        folder = RunFolder(run)
+        data, settings = _word(folder.data(metrics["data"])), _word(folder.config_file)
+        _say(f"for a ceiling: unbake bench ceiling {data} --settings {settings}")
     wrote = f"wrote {RunFolder(run).evaluation}"
     _say(f"{wrote}; next: unbake report {_word(run)} --out report.html")
 
@@ -267,9 +277,10 @@ def compare(
     each method's own, unless the settings give them.
 
     Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. OUT/untrained has
-    the fields before the first step: a method is worth what it adds to these. The same command
-    again keeps finished runs and goes on with interrupted ones. A method that fails is recorded
-    with its error; the exit status is then 1.
+    the fields before the first step: a method is worth what it adds to these. Where the data set
+    has true maps, the same fields are first trained on these: the ceiling of every method. The same
+    command again keeps finished runs and goes on with interrupted ones. A method that fails is
+    recorded with its error; the exit status is then 1.
 
     Args:
         data: Folder of the data set, with its transforms.json.
@@ -314,8 +325,10 @@ def compare(
 
 
 def bench(
-    what: Positional[Literal["step", "methods", "rates", "gradients"]] = "step",
-    run: Positional[Annotated[Path | None, arg(metavar="[RUN]", help_behavior_hint="")]] = None,
+    what: Positional[Literal["step", "methods", "rates", "gradients", "ceiling"]] = "step",
+    folder: Positional[
+        Annotated[Path | None, arg(metavar="[FOLDER]", help_behavior_hint="")]
+    ] = None,
     /,
     data: Folders = (),
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None,
@@ -332,7 +345,7 @@ def bench(
     settings: File = None,
     out: File = None,
 ) -> None:
-    """Measure the training step or its gradients, or search for learning rates.
+    """Measure the training step, its gradients, learning rates, or the ceiling of the fields.
 
     step takes one method apart: samples a second, and where the time goes. methods measures several
     side by side, their steps in turn.
@@ -345,39 +358,50 @@ def bench(
     quantity goes from the fitted to the true values, and the signal to noise of one batch: of that
     slope, and of the gradients by the fields' parameters.
 
+    ceiling takes a data set with true maps. It trains the fields of the settings on those of the
+    training views, without rendering, and scores them on held-out views: no fit with these fields
+    can be expected to be better. `unbake evaluate` then shows it beside a result.
+
     Args:
         what: What to measure.
-        run: For gradients: folder that `unbake fit` wrote.
+        folder: For gradients: of a run. For ceiling: of a data set.
         data: Folder of a data set; rates takes several.
         scene: Without --data: a scene to render a small data set of (default: demo).
         methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
             prb:bitmap prb:bitmap:split-halves.
         steps: Steps to take the median of, after warm-up (default: 100). For rates, the length of a
-            fit (default: as in the settings).
+            fit (default: as in the settings). For ceiling, steps on the true maps (default: as
+            many as they need).
         seconds: For rates, the length of a fit in seconds of training, instead of steps.
         seeds: For rates, seeds of the fits whose scores are averaged, such as 0 1 2 (default: 0).
         schedule: For rates, also search how far all rates fall, and the warm-up of the unknowns.
         batches: For gradients, how many to measure (default: 64).
         batch: For gradients, pixels in a batch (default: as in the run).
         spp: For gradients, samples per pixel (default: as in the run).
-        allow_outside: For gradients, read files that the data set or its scene names outside of its
-            folder.
+        allow_outside: For gradients and ceiling, read files that the data set or its scene names
+            outside of its folder.
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
     of_gradients = {"batches": batches, "batch": batch, "spp": spp}
-    of_gradients |= {"allow-outside": allow_outside or None}
+    others = {"data": data, "scene": scene, "methods": methods != ("ours",)}
+    others |= {"seconds": seconds, "seeds": seeds, "schedule": schedule}
     if what == "gradients":
-        others = {"data": data, "scene": scene, "methods": methods != ("ours",), "steps": steps}
-        others |= {"seconds": seconds, "seeds": seeds, "schedule": schedule}
-        _refuse("gradients has no such option", others | {"preset": preset, "settings": settings})
-        _bench_gradients(run, of_gradients, out)
+        others |= {"steps": steps, "preset": preset, "settings": settings}
+        _refuse("gradients has no such option", others)
+        _bench_gradients(folder, of_gradients, out, allow_outside)
         return
     _refuse("is an option of gradients", of_gradients, "Or: unbake bench gradients RUN")
-    if run is not None:
-        raise UserError(f"{what} takes no run", run, "Or: unbake bench gradients RUN")
+    if what == "ceiling":
+        _refuse("ceiling has no such option", others)
+        _bench_ceiling(folder, chosen_settings(preset, settings), steps, out, allow_outside)
+        return
+    outside = {"allow-outside": allow_outside}
+    _refuse("is an option of gradients and ceiling", outside, "Or: unbake bench gradients RUN")
+    if folder is not None:
+        raise UserError(f"{what} takes no folder", folder, "Or: unbake bench gradients RUN")
     if data:
         exclude("data", {"scene": scene})
     chosen = chosen_settings(preset, settings)
@@ -401,11 +425,11 @@ def bench(
     if what == "step" and len(variants) != 1:
         raise UserError("step takes one method", "--methods", "Or: unbake bench methods")
     console = Console(highlight=False)
-    with small_data(next(iter(data), None), scene or "demo") as folder:
+    with small_data(next(iter(data), None), scene or "demo") as small:
         if what == "step":
-            bench_step(folder, variants[0].settings(chosen), steps, out, console)
+            bench_step(small, variants[0].settings(chosen), steps, out, console)
         else:
-            bench_methods(folder, variants, chosen, steps, out, console)
+            bench_methods(small, variants, chosen, steps, out, console)
 
 
 def _refuse(what: str, options: dict[str, Any], remedy: str | None = None) -> None:
@@ -415,7 +439,9 @@ def _refuse(what: str, options: dict[str, Any], remedy: str | None = None) -> No
             raise UserError(what, f"--{name}", remedy)
 
 
-def _bench_gradients(run: Path | None, options: dict[str, Any], out: Path | None) -> None:
+def _bench_gradients(
+    run: Path | None, options: dict[str, Any], out: Path | None, allow_outside: bool
+) -> None:
     if run is None:
         raise UserError("gradients needs a run", remedy="unbake bench gradients RUN")
     batches = 64 if options["batches"] is None else options["batches"]
@@ -427,8 +453,21 @@ def _bench_gradients(run: Path | None, options: dict[str, Any], out: Path | None
     from ..profiling.bench_gradients import FEWEST, bench_gradients
 
     require("batches", batches, FEWEST)
-    console, outside = Console(highlight=False), bool(options["allow-outside"])
-    bench_gradients(run, config, batches, out, console, allow_outside=outside)
+    console = Console(highlight=False)
+    bench_gradients(run, config, batches, out, console, allow_outside=allow_outside)
+
+
+def _bench_ceiling(
+    data: Path | None, chosen: FitConfig, steps: int | None, out: Path | None, allow_outside: bool
+) -> None:
+    if data is None:
+        raise UserError("ceiling needs a data set", remedy="unbake bench ceiling DATA")
+    if steps is not None:
+        require("steps", steps, 10)
+    backend.activate()
+    from ..profiling.bench_ceiling import bench_ceiling
+
+    bench_ceiling(data, chosen, steps, out, Console(highlight=False), allow_outside=allow_outside)
 
 
 def _bench_rates(

@@ -7,7 +7,7 @@
       truth/QUANTITY/VIEW.exr          true materials; a quantity that is not known has no folder
       truth/environment.exr            the true environment map
       truth/emission.json              the true strengths of lights
-      .cache/                          decoded photographs; can be deleted
+      .cache/                          decoded photographs, measured ceilings; can be deleted
 
 `transforms.json` says where photographs and scene lie, so that those of another program may lie
 elsewhere in the folder. No other module names these files.
@@ -76,7 +76,7 @@ class DataFolder:
 
     @property
     def cache(self) -> Path:
-        """The folder of decoded photographs."""
+        """The folder of decoded photographs and of measured ceilings."""
         return self.path / ".cache"
 
     @property
@@ -93,6 +93,14 @@ class DataFolder:
     def cached_foreground(self) -> Path:
         """The numbers of the pixels that see the scene."""
         return self.cache / "foreground.npy"
+
+    def ceiling(self, key: str) -> Path:
+        """What fields trained on the true maps score.
+
+        Args:
+            key: stands for the maps and the fields.
+        """
+        return self.cache / f"ceiling-{key}.json"
 
     def inside(self, name: str, where: str) -> Path:
         """The file that `transforms.json` names; it must lie in the folder.

@@ -27,20 +27,39 @@ def fingerprint(dataset: Dataset) -> dict[str, str]:
     Raises:
         UserError: a file cannot be read, or the scene is none.
     """
-    views = dataset.views
-    cameras = [view.camera for view in views]
-    poses = [[c.to_world.tolist(), c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height] for c in cameras]
-    return {
-        "photographs": _of_values(_of_files(view.image for view in views)),
-        "poses": _of_values(poses),
-        "views": _of_values([dataset.background, *([view.name, view.split] for view in views)]),
-        "scene": _of_values(_of_files(_scene_files(dataset))),
-    }
+    photographs = _of_values(_of_files(view.image for view in dataset.views))
+    return {"photographs": photographs} | _of_geometry(dataset)
+
+
+def truth_fingerprint(dataset: Dataset, quantities: Iterable[str]) -> dict[str, str]:
+    """SHA-256 of the parts that decide which true materials are seen where.
+
+    `poses`, `views` and `scene` as in `fingerprint`, and `truth`: the true maps of the quantities.
+
+    Raises:
+        UserError: a file cannot be read, or the scene is none.
+    """
+    chosen = [(name, view.truth.get(name)) for name in quantities for view in dataset.views]
+    named = [[name, file is not None] for name, file in chosen]
+    files = _of_files(file for _, file in chosen if file is not None)
+    return _of_geometry(dataset) | {"truth": _of_values([named, files])}
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """The parts that differ, of those that both fingerprints have."""
     return [part for part, value in before.items() if now.get(part, value) != value]
+
+
+def _of_geometry(dataset: Dataset) -> dict[str, str]:
+    """The parts that are not pictures: `poses`, `views` and `scene`."""
+    views = dataset.views
+    cameras = [view.camera for view in views]
+    poses = [[c.to_world.tolist(), c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height] for c in cameras]
+    return {
+        "poses": _of_values(poses),
+        "views": _of_values([dataset.background, *([view.name, view.split] for view in views)]),
+        "scene": _of_values(_of_files(_scene_files(dataset))),
+    }
 
 
 def _scene_files(dataset: Dataset) -> list[Path]:

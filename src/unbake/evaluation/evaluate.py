@@ -27,8 +27,9 @@ from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_key
 from ..transport.objective import has_radiance
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
-from . import lighting
+from . import lighting, yardsticks
 from .settings import EvaluationSettings
+from .yardsticks import find_yardsticks, seen_materials
 
 DEFINITIONS = {
     "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
@@ -114,6 +115,10 @@ def _evaluate(
     both = recovered.config.unknown == "materials+lighting"
     if both and "albedo" in recovered.config.quantities:
         recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
+    measures: dict[str, Any] = {}
+    if recovered.config.learns_materials:
+        heldout = materials[: len(dataset.heldout)]
+        measures["yardsticks"] = asdict(find_yardsticks(dataset, recovered.config, heldout))
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
         "steps": recovered.progress.step,
@@ -122,9 +127,12 @@ def _evaluate(
         "seconds": round(recovered.progress.seconds, 2),
         "heldout": _summary(rows, "heldout"),
         "train": _summary(rows, "train"),
+        **measures,
         **recovered_lighting,
         "per_view": rows,
-        "definitions": DEFINITIONS | (lighting.DEFINITIONS if recovered_lighting else {}),
+        "definitions": DEFINITIONS
+        | (yardsticks.DEFINITIONS if measures else {})
+        | (lighting.DEFINITIONS if recovered_lighting else {}),
         "data": origin.data,
         "data_changed": data_changed,
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
@@ -208,7 +216,7 @@ def _evaluate_view(
     truth, seen = GroundTruth.of(view, recovered.config.quantities), None
     alpha, mask = photograph[..., 3], photograph[..., 3] >= 1
     if recovered.config.learns_materials:
-        (seen,) = MaterialBuffers.of(problem, [view], settings.material_spp, seed=1)
+        seen = seen_materials(problem, view, settings)
         alpha = seen.coverage
     if truth is not None:
         mask = truth.known if seen is None else seen.mask(truth)

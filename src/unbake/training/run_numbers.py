@@ -83,6 +83,14 @@ def _object(value: Any) -> bool:
 
 _NUMBERS = _list_of(_score)
 _SCORES = _object_of(_score)
+_YARDSTICKS = {"ceiling": _or_none(_SCORES), "constant": _SCORES, "untrained": _SCORES}
+
+
+def _yardsticks(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        key in value and check(value[key]) for key, check in _YARDSTICKS.items()
+    )
+
 
 _LOG: Mapping[str, Check] = {
     **dict.fromkeys(("step", "seconds", "samples", "skipped"), _count),
@@ -98,6 +106,7 @@ _METRICS: Mapping[str, Check] = {
     **dict.fromkeys(("representation", "radiance"), _or_none(_text)),
     **dict.fromkeys(("quantities", "data_changed"), _list_of(_text)),
     **dict.fromkeys(("heldout", "train"), _or_none(_SCORES)),
+    "yardsticks": _yardsticks,
     "per_view": _list_of(_object_of(_score, name=_text, split=_text)),
     "environment": _or_none(_SCORES),
     "emission": _or_none(
