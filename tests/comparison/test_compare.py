@@ -16,10 +16,17 @@ from unbake.comparison import compare as module
 from unbake.comparison.method_variant import MethodVariant
 from unbake.config import FitConfig, read_toml
 from unbake.errors import UserError
+from unbake.evaluation import yardsticks
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training import loop
+
+
+@pytest.fixture(autouse=True)
+def short_ceilings(monkeypatch):
+    """Ceilings take a second, once for all tests of the same data set."""
+    monkeypatch.setattr(yardsticks, "STEPS", 20)
 
 
 @pytest.fixture
@@ -126,6 +133,42 @@ def test_the_untrained_fields_stand_beside_the_methods(compare, tmp_path):
     for file, content in before.items():
         same = content[0] == kept[file][0] if file.name in rewritten else content == kept[file]
         assert same, file
+
+
+def test_the_ceiling_of_the_fields_stands_below_the_methods(compare, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data", ignore=lambda *_: [".cache"])
+    outcome = compare("direct", "no-prior", "direct:grid", steps=2, data=data)
+    assert outcome.status == 0 and outcome.err == ""
+    # Measured once for all methods with the same fields.
+    assert outcome.out.count("on the true maps of 2 training views") == 2
+    found = result(tmp_path)["methods"]
+    ceilings = {name: row["yardsticks"]["ceiling"] for name, row in found.items()}
+    assert ceilings["direct"] == ceilings["no-prior"] != ceilings["direct-grid"]
+    metrics = json.loads((tmp_path / "out/direct/evaluation/metrics.json").read_text())
+    assert metrics["yardsticks"] == found["direct"]["yardsticks"]
+    table = outcome.out[outcome.out.index("Held-out views, PSNR in dB") :]
+    for scores in ceilings.values():
+        assert f"{scores['albedo_psnr']:.2f}" in table
+    assert table.index("no-prior") < table.index("constant") < table.index("ceiling")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count('<tr><th scope="row">Ceiling</th>') == 2
+    assert page.count('<tr><th scope="row">Constant</th>') == 1
+    assert "<small>of direct and no-prior</small>" in page
+    gap = found["direct"]["heldout"]["albedo_psnr"] - ceilings["direct"]["albedo_psnr"]
+    assert f"<small>{'−' if gap < 0 else '+'}{abs(gap):.2f}</small>" in page
+
+    again = compare("direct", "no-prior", "direct:grid", steps=2, data=data)
+    assert again.status == 0 and "on the true maps" not in again.out
+
+
+def test_without_true_maps_there_is_no_ceiling(compare, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data", ignore=lambda *_: [".cache"])
+    shutil.rmtree(data / "truth")
+    outcome = compare("direct", steps=2, data=data)
+    assert outcome.status == 0 and "ceiling" not in outcome.out
+    assert result(tmp_path)["methods"]["direct"]["yardsticks"]["ceiling"] is None
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Ceiling</th>" not in page and "Constant</th>" not in page
 
 
 def test_finished_runs_are_kept(compare, tmp_path):

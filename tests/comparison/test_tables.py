@@ -41,6 +41,21 @@ def test_a_comparison_has_a_column_for_each_quantity(monkeypatch):
     assert "gloss" in text and "17.00" in text
 
 
+def test_yardsticks_are_the_last_rows():
+    low, high = {"albedo_psnr": 12.0}, {"albedo_psnr": 33.25}
+    own = {"representation": "neural", "yardsticks": {"ceiling": high, "constant": low}}
+    row = LENGTH | {"heldout": {"render_psnr": 20.0, "albedo_psnr": 28.0}}
+    methods = {"ours": row | own, "prb": row | own, "direct": row | {"representation": "grid"}}
+    lines = printed(print_comparison, compared(methods), width=80).splitlines()
+    rows = [[c.strip() for c in line.split("│")[1:4]] for line in lines if line.startswith("│")]
+    assert rows[-2:] == [["constant", "", "12.00"], ["ceiling", "", "33.25"]]
+    methods["direct"]["yardsticks"] = {"ceiling": {"albedo_psnr": 31.5}, "constant": low}
+    text = printed(print_comparison, compared(methods))
+    assert "ceiling neural" in text and "ceiling grid" in text and "constant grid" not in text
+    methods["prb"] = row | {"representation": "neural", "yardsticks": {"ceiling": None}}
+    assert "33.25" in printed(print_comparison, compared(methods))
+
+
 def test_what_is_known_of_lighting_is_printed():
     light = {"sh_error": 0.125, "sh_error_aligned": 0.5}
     light |= {"relight_psnr": 31.0, "relight_psnr_aligned": 32.0}

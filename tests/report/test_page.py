@@ -450,6 +450,28 @@ def test_an_aligned_albedo_has_its_column(made, tmp_path: Path):
     ]
 
 
+def test_a_ceiling_has_its_row_and_the_distance_to_it(made, tmp_path: Path):
+    low, high = ({"albedo_psnr": 10.5, "roughness_psnr": x} for x in (12.0, 41.25))
+    found = {"ceiling": high, "constant": low, "untrained": low}
+    for run in made[1]:
+        _edit(run, lambda m: m.update(yardsticks=found))
+        _edit(run, lambda m: m["definitions"].update(yardsticks="what to measure by"))
+    text = _section(write_report(made[1], tmp_path / "both.html").read_text(), "numbers")
+    rows = text.split('<tbody class="soft">')[1]
+    titles = re.findall(r'<th scope="row">(\w+)</th>', rows)
+    assert titles == ["Ceiling", "Constant", "Untrained"] and "<small>of" not in rows
+    assert "41.25" in rows and "what to measure by" in text and "distance to the ceiling" in text
+    assert "<small>−1.25</small>" in text and "<small>+29.50</small>" in text
+
+    _edit(made[1][1], lambda m: m.update(yardsticks=found | {"ceiling": None}, steps=0))
+    text = _section(write_report(made[1], tmp_path / "one.html").read_text(), "numbers")
+    titles = re.findall(r'<th scope="row">(\w+)</th>', text.split('<tbody class="soft">')[1])
+    assert titles == ["Ceiling", "Constant"]  # the untrained run has a row of its own
+    _edit(made[1][0], lambda m: m.update(yardsticks={"ceiling": {"albedo_psnr": "x"}}))
+    with pytest.raises(UserError, match="`yardsticks` is of the wrong type"):
+        write_report(made[1], tmp_path / "wrong.html")
+
+
 def test_what_failed_is_told_and_cannot_inject_markup(made, tmp_path: Path):
     page = tmp_path / "report.html"
     text = write_report(made[1], page, {"ad-pt": f"out of memory {EVIL}"}).read_text()

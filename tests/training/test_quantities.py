@@ -14,6 +14,7 @@ from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config import update
 from unbake.dataset.views import Dataset
+from unbake.evaluation import yardsticks
 from unbake.fields.materials import carry, read_carried
 from unbake.imaging.pictures import read_exr
 from unbake.quantities import QUANTITIES
@@ -128,7 +129,7 @@ def test_all_quantities_travel_to_the_bsdfs():
     np.testing.assert_array_equal(np.array(si.dn_dv.x), np.array(material["metallic"]))
 
 
-def test_three_quantities_from_a_fit_to_a_page(unbake, cornell, tiny, tmp_path):
+def test_three_quantities_from_a_fit_to_a_page(unbake, cornell, tiny, tmp_path, monkeypatch):
     run, page = tmp_path / "run", tmp_path / "report.html"
     words = ("--settings", tiny, "--steps", 6, "--quantities", *THREE)
     done = unbake("fit", cornell, "--out", run, *words)
@@ -151,6 +152,7 @@ def test_three_quantities_from_a_fit_to_a_page(unbake, cornell, tiny, tmp_path):
     assert text.count(">Metallic</th>") == text.count(">Roughness</th>") > 0
     assert "albedo, roughness and metallic recovered" in " ".join(text.split())
 
+    monkeypatch.setattr(yardsticks, "STEPS", 20)
     words = ("--steps", 4, "--settings", tiny, "--evaluate-spp", 2, "--quantities", *THREE)
     done = unbake("compare", cornell, "--methods", "direct", "--out", tmp_path / "two", *words)
     assert done.status == 0, done.err

@@ -23,6 +23,7 @@ from ..evaluation.convergence import (
 )
 from ..evaluation.evaluate import description, evaluate, require_true_materials
 from ..evaluation.settings import EvaluationSettings
+from ..evaluation.yardsticks import can_have_ceiling, find_ceiling, measure_ceiling
 from ..io import write_json
 from ..machine import machine
 from ..report.page import write_report
@@ -46,6 +47,9 @@ DEFINITIONS = {
     "skipped": "steps whose loss was not finite",
     "notes": "what was noted of the fit: a state to which it went back, or that it learned nothing",
     "untrained": "the fields that all methods start from, with the shared representation and seed",
+    "yardsticks": "of held-out views, in dB. ceiling: the same fields trained on the true maps of "
+    "the training views, without rendering; constant: the mean of these maps, everywhere; null: "
+    "no true maps",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
     "time_to_quality": "psnr: where the scores of a run end, and 1 and 2 dB below that, for each "
     "unknown of the materials; seconds: training time after which a run first has it, interpolated "
@@ -63,6 +67,8 @@ _CHEAPEST = MethodVariant("direct")
 LIGHTING = ("environment", "emission", "albedo_scale")
 #: Keys of an evaluation that the comparison needs.
 NUMBERS = {"steps", "samples", "seconds", "heldout", "train"}
+#: The key of an evaluation that says what to measure its materials by.
+YARDSTICKS = "yardsticks"
 #: Keys of the row of untrained fields: no method and no time belong to them.
 OF_UNTRAINED = ("unknown", "quantities", "representation", "error", "heldout", "train", *LIGHTING)
 
@@ -76,13 +82,15 @@ def compare(
     evaluation: EvaluationSettings,
     clip_negative: bool = False,
     allow_outside: bool = False,
+    ceiling: bool = True,
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Fit, evaluate and report several methods, one after the other.
 
     The runs are in `out`/NAME. Finished runs are kept, interrupted ones continue. A method that
     fails is recorded with its error. One more run, `out`/untrained, has the fields that all methods
-    start from: where the truth is grey, a method that learns nothing would seem to win.
+    start from: where the truth is grey, a method that learns nothing would seem to win. Where the
+    data set has true maps, the ceiling of each method's fields is measured first.
 
     Args:
         data: folder of the data set.
@@ -92,6 +100,7 @@ def compare(
         evaluation: how results are rendered.
         clip_negative: set negative pixels to zero.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
+        ceiling: measure ceilings that the data set does not have yet.
         console: shows progress and tables.
 
     Returns:
@@ -124,6 +133,8 @@ def compare(
     for name, settings in {**chosen, **fits}.items():
         _check_kept(RunFolder(out / name), settings, data)
 
+    if ceiling:
+        _measure_ceilings(dataset, list(chosen.values()), console)
     rows: dict[str, dict[str, Any]] = {}
     errors: dict[str, UserError] = {}
     for name, settings in fits.items():
@@ -179,6 +190,26 @@ def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:
         )
 
 
+def _measure_ceilings(dataset: Dataset, fits: Sequence[FitConfig], console: Console) -> None:
+    """Measure the ceilings that the data set does not have yet, for the evaluations to find."""
+
+    def tell(line: str) -> None:
+        console.print(line, markup=False, soft_wrap=True)
+
+    # The same fields once, also where the cache of the data set cannot be written.
+    distinct = {(c.representation, repr(c.material_settings)): c for c in fits}
+    for config in distinct.values():
+        if not can_have_ceiling(dataset, config) or find_ceiling(dataset, config) is not None:
+            continue
+        console.rule(f"ceiling of {config.representation} fields", align="left")
+        try:
+            measure_ceiling(dataset, config, tell=tell)
+        except UserError as error:
+            console.print(f"no ceiling: {error}", style="yellow", markup=False, soft_wrap=True)
+        gc.collect()
+        dr.flush_malloc_cache()
+
+
 def _fitted(
     data: Path,
     run: RunFolder,
@@ -218,6 +249,8 @@ def _evaluated(
         metrics = run.metrics()
         same = metrics.get("steps") == progress.step
         same = same and metrics.get("evaluation") == asdict(settings)
+        # Version 0.1 had no yardsticks; runs of known materials have none.
+        same = same and (YARDSTICKS in metrics or not metrics.get("quantities"))
         if same and NUMBERS <= metrics.keys():
             return metrics
     return evaluate(
@@ -245,5 +278,5 @@ def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:
         "skipped": sum(r.get("skipped", 0) for r in log),
         "notes": [r["note"] for r in log if "note" in r],
         "score": score_curve(log),
-        **{key: metrics[key] for key in LIGHTING if key in metrics},
+        **{key: metrics[key] for key in (YARDSTICKS, *LIGHTING) if key in metrics},
     }

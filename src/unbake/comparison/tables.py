@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
@@ -61,12 +62,35 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
         if "error" in row:
             table.add_row(name, "failed")
             continue
+        table.add_row(name, *_scores(row["heldout"], quantities), *_effort(row))
+    measured = [_yardsticks(rows, kind) for kind in ("constant", "ceiling")]
+    if any(measured):
+        table.add_section()
+    for label, scores in (pair for pairs in measured for pair in pairs):
         table.add_row(
-            name,
-            *(_number(row["heldout"].get(f"{quantity}_psnr"), 2) for quantity in quantities),
-            *_effort(row),
+            label,
+            *(
+                "" if q == "render" else x
+                for q, x in zip(quantities, _scores(scores, quantities), strict=True)
+            ),
         )
     console.print(table)
+
+
+def _scores(means: Row, quantities: Sequence[str]) -> list[str]:
+    return [_number(means.get(f"{quantity}_psnr"), 2) for quantity in quantities]
+
+
+def _yardsticks(rows: dict[str, Row], kind: str) -> list[tuple[str, Row]]:
+    """The scores of a yardstick with its label; one for each representation, if they differ."""
+    found: dict[str, Row] = {}
+    for row in rows.values():
+        scores = (row.get("yardsticks") or {}).get(kind)
+        if scores and scores not in found.values():
+            found.setdefault(row["representation"], scores)
+    if len(found) == 1:
+        return [(kind, scores) for scores in found.values()]
+    return [(f"{kind} {name}", scores) for name, scores in found.items()]
 
 
 def _effort(row: Row) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from ..comparison.compare import UNTRAINED, compare
+from ..comparison.compare import UNTRAINED, YARDSTICKS, compare
 from ..comparison.method_variant import MethodVariant
 from ..config import FitConfig, method_defaults
 from ..dataset.views import Dataset, View
@@ -188,9 +188,15 @@ class SceneFits:
             compile_kernels(data, new)
         evaluation = EvaluationSettings(spp=self.spp, train_views=0)
         result = compare(
-            data, variants, out, config, evaluation=evaluation, console=context.console
+            data,
+            variants,
+            out,
+            config,
+            evaluation=evaluation,
+            ceiling=context.scale != "smoke",
+            console=context.console,
         )
-        kept = (*LENGTH, "estimator", "heldout", "score", "environment")
+        kept = (*LENGTH, "estimator", "heldout", "score", "environment", YARDSTICKS)
         findings = {}
         for name, row in {UNTRAINED: result[UNTRAINED], **result["methods"]}.items():
             if "error" in row:

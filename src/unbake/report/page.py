@@ -34,6 +34,12 @@ for _name, _row in QUANTITIES.items():
     PSNRS.append((f"{_name}_psnr", _name, _row.title))
     if _name == "albedo":
         PSNRS.append(("albedo_psnr_aligned", _name, "Aligned albedo"))
+#: What results are measured by, in the order of their rows, and what it is called.
+YARDSTICKS = {
+    "ceiling": "Ceiling",
+    "constant": "Constant",
+    "untrained": "Untrained",
+}
 #: Captions of the scales beside pictures.
 UNITS = {"render": "linear radiance", "environment": "linear radiance"} | {
     name: f"{row.title.lower()}, {row.lower:.0f} to {row.upper:.0f}"
@@ -43,6 +49,7 @@ UNITS = {"render": "linear radiance", "environment": "linear radiance"} | {
 DEFINED = {
     "psnr": "PSNR",
     "albedo_psnr_aligned": "Aligned albedo",
+    "yardsticks": "Ceiling, constant, untrained",
     "colour_space": "Colour space",
     "mask": "Mask",
 }
@@ -125,6 +132,7 @@ def write_report(
             runs=loaded,
             psnrs=_psnrs(loaded).values(),
             rows=_table(loaded),
+            yardsticks=_yardsticks(loaded),
             light=lighting,
             optimized=_optimized(loaded),
             materials=bool(materials),
@@ -134,6 +142,7 @@ def write_report(
             listed=_listed,
             names=NAMES | {"environment": "Environment map"},
             units=UNITS,
+            measures=YARDSTICKS,
             failed=failed or {},
             groups=groups,
             scales=scales,
@@ -239,7 +248,11 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
     columns = []
     for split, key in ((split, key) for split in SPLITS for key in _psnrs(runs)):
         values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
-        columns.append(display.marked(values, display.decibels))
+        tops = [_ceiling(run, key) if split == "heldout" else None for run in runs]
+        marked = display.marked(values, display.decibels)
+        columns.append(
+            [c | {"gap": _gap(*pair)} for c, *pair in zip(marked, values, tops, strict=True)]
+        )
     return [
         {
             "run": run,
@@ -252,6 +265,42 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
         }
         for run, row in zip(runs, zip(*columns, strict=True), strict=True)
     ]
+
+
+def _ceiling(run: Run, key: str) -> float | None:
+    found = run.metrics.get("yardsticks") or {}
+    return display.number((found.get("ceiling") or {}).get(key))
+
+
+def _gap(value: float | None, ceiling: float | None) -> str | None:
+    """How far a PSNR is from its ceiling, with its sign; None where that is not known."""
+    if value is None or ceiling is None:
+        return None
+    return f"{'−' if value < ceiling else '+'}{abs(value - ceiling):.2f}"
+
+
+def _yardsticks(runs: list[Run]) -> list[dict[str, Any]]:
+    """A row for each yardstick: its PSNRs of held-out views, and the runs it is of if not all.
+
+    Fields before their first step have no row where there is a run of them.
+    """
+    rows: list[dict[str, Any]] = []
+    for kind in YARDSTICKS:
+        if kind == "untrained" and any(run.untrained for run in runs):
+            continue
+        for run in runs:
+            scores = (run.metrics.get("yardsticks") or {}).get(kind) or {}
+            values = [display.number(scores.get(key)) for key in _psnrs(runs)]
+            if all(value is None for value in values):
+                continue
+            same = next((r for r in rows if (r["kind"], r["values"]) == (kind, values)), None)
+            if same is None:
+                cells = ["" if v is None else display.decibels(v) for v in values]
+                same = {"kind": kind, "values": values, "cells": cells, "labels": []}
+                rows.append(same)
+            same["labels"] += [] if run.untrained else [run.label]
+    trained = [run.label for run in runs if not run.untrained]
+    return [row | {"labels": [] if row["labels"] == trained else row["labels"]} for row in rows]
 
 
 def _details(run: Run) -> list[tuple[str, str, str]]:
