@@ -200,7 +200,6 @@ ROOM_RIVALS = (
     "direct", "no-prior",
 )  # fmt: skip
 RIVALS = (*ROOM_RIVALS, "prb:bitmap")
-ROOM = "staircase.toml"
 
 #: By the name of the file of results; that of `machine` is named after the machine.
 BENCHMARKS: dict[str, Benchmark] = {
@@ -212,11 +211,11 @@ BENCHMARKS: dict[str, Benchmark] = {
             ("no-prior", "demo", None, 100),
             ("direct", "demo", None, 100),
             ("prb", "demo", None, 100),
-            ("ours", STAIRCASE, ROOM, 40),
+            ("ours", STAIRCASE, None, 40),
         ),
     ),
     "methods-demo": Steps("steps", "demo", STEP_METHODS),
-    "methods-staircase": Steps("steps", STAIRCASE, STEP_METHODS, ROOM),
+    "methods-staircase": Steps("steps", STAIRCASE, STEP_METHODS),
     # What `make demo` fits; and the true materials rendered alike, whose error is noise alone.
     "demo": Compare(
         "demo", "demo", ("ours", "direct"), steps=2400, seeds=(0,),
@@ -226,14 +225,13 @@ BENCHMARKS: dict[str, Benchmark] = {
     "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=60, seeds=SEEDS_AT_TIME),
     "rivals-staircase": Compare(
         "rivals", STAIRCASE, ROOM_RIVALS, seconds=120, seeds=SEEDS_AT_TIME,
-        options=COARSE_RENDERING, settings=ROOM,
+        options=COARSE_RENDERING,
     ),
     "equal-demo": EqualSamples("equal", ("ours", "no-prior", "direct"), "rivals-demo", "prb"),
     # What PRB has after 20 minutes; `rivals` shows when ours has it.
     "long-demo": Compare("long", "demo", ("prb",), seconds=1200, seeds=(0,)),
     "long-staircase": Compare(
         "long", STAIRCASE, ("prb",), seconds=1200, seeds=(0,), options=COARSE_RENDERING,
-        settings=ROOM,
     ),
     "ablation-materials": Compare("ablation", "demo", ABLATION, steps=2400, options=NO_SCORES),
     "ablation-lighting": Compare(

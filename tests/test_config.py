@@ -160,7 +160,7 @@ def test_settings_cannot_be_changed_in_place():
         ('pixel_sampling = "crop"', "pixel_sampling: must be one of all-views, one-view-crop"),
         ("[radiance.neural]\nwidth = 0", r"radiance.neural.width: must be 1 or more"),
         ("[radiance.neural]\nhidden = 0", r"radiance.neural.hidden: must be 1 or more"),
-        ("[radiance.neural.grid]\nlevels = 0", r"radiance.neural.grid.levels: must be 1 or more"),
+        ("[radiance.neural.grid]\nlevels = -1", r"radiance.neural.grid.levels: must be 0 or more"),
         ("[radiance.neural.grid]\nlevels = 30", r"radiance.neural.grid.levels: must be such that"),
         (
             "[radiance.neural.grid]\nfeatures = 3",

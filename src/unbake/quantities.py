@@ -64,7 +64,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 display="colour",
                 gltf="baseColorTexture.rgb",
                 settings={
-                    "neural": {"grid": {"levels": 7}, "hidden": 1, "learning_rate": 0.015},
+                    "neural": {"hidden": 1, "learning_rate": 0.015},
                     "grid": {"cells": 64, "learning_rate": 0.1},
                     "triplane": {"learning_rate": 0.06},
                     "bitmap": {"resolution": 128, "learning_rate": 0.15},
@@ -84,7 +84,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 gltf="metallicRoughnessTexture.g",
                 settings={
                     "neural": {
-                        "grid": {"levels": 4},
+                        "grid": {"footprints": 8.0},
                         "width": 16,
                         "hidden": 1,
                         "learning_rate": 0.004,
@@ -108,7 +108,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 gltf="metallicRoughnessTexture.b",
                 settings={
                     "neural": {
-                        "grid": {"levels": 4},
+                        "grid": {"footprints": 8.0},
                         "width": 16,
                         "hidden": 1,
                         "learning_rate": 0.004,

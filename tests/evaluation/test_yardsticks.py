@@ -212,3 +212,19 @@ def test_a_ceiling_that_cannot_be_kept_is_told(data, tiny, tmp_path, short):
 def test_what_a_ceiling_cannot_be_measured_of_is_refused(words, said, unbake):
     done = unbake("bench", "ceiling", *words)
     assert done.status == 2 and done.out == "" and said in done.err
+
+
+def test_the_ceiling_has_the_sizes_that_a_fit_of_the_data_set_has(
+    data, tiny, unbake, short, tmp_path
+):
+    forget(data)
+    settings, file, run = tmp_path / "open.toml", tmp_path / "ceiling.json", tmp_path / "run"
+    settings.write_text(tiny.read_text().replace("levels = 2\n", ""))
+    done = unbake("bench", "ceiling", data, "--settings", settings, "--out", file)
+    assert done.status == 0, done
+    fields = json.loads(file.read_text())["fields"]
+    assert unbake("fit", data, "--out", run, "--settings", settings, "--steps", 0).status == 0
+    config = read_toml(run / "config.toml")
+    for name, found in config.material_settings.items():
+        assert fields[name]["grid"]["levels"] == found.grid.levels > 0
+    assert find_ceiling(Dataset.load(data), config) is not None

@@ -18,6 +18,8 @@ from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.fields import radiance
 from unbake.fields.field import FieldSpec
+from unbake.fields.grid_sizes import USUAL
+from unbake.fields.grid_sizes import sized as usual
 from unbake.fields.registry import representation, representations
 from unbake.quantities import QUANTITIES
 from unbake.training.fresh_fit import begin_fit
@@ -55,7 +57,7 @@ def test_the_size_of_a_field_is_known_before_it_is_made(form):
     ]
     if chosen.radiance:
         spec = FieldSpec(radiance.OUTPUTS, radiance.EXTRA)
-        wanted += [(config.radiance[form], spec), (chosen.radiance, spec)]
+        wanted += [(config.radiance[form], spec), (usual(chosen.radiance, USUAL), spec)]
     for settings, spec in wanted:
         parameters = chosen.field(settings, spec).parameters()
         made = sum(prod(value.shape) for value in parameters.values())

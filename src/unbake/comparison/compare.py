@@ -28,9 +28,8 @@ from ..io import write_json
 from ..machine import machine
 from ..report.page import write_report
 from ..training.checkpoint import Progress
-from ..training.defaults import with_defaults
+from ..training.defaults import with_data_defaults, with_defaults
 from ..training.loop import fit
-from ..training.path_depth import with_path_depth
 from ..training.run_folder import RunFolder, require_no_link
 from .method_variant import MethodVariant
 from .tables import print_comparison
@@ -125,7 +124,7 @@ def compare(
     dataset = Dataset.load(data, allow_outside=allow_outside)
     if evaluation.truth:
         require_true_materials(dataset)
-    config = with_path_depth(config, dataset)
+    config = with_data_defaults(config, dataset)
     chosen = {v.name: with_defaults(v.settings(config), dataset) for v in variants}
     untrained = with_defaults(_CHEAPEST.settings(config), dataset)
     untrained = replace(untrained, steps=0, seconds=0.0, score_seconds=0.0)

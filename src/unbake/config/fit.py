@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from ..errors import POSITIVE, UserError, require, require_name, require_ranges
+from ..fields.grid_sizes import USUAL, sized
 from ..fields.registry import representation, representations
 from ..fields.settings import RATES, FieldSettings
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
@@ -410,13 +411,20 @@ class FitConfig:
 
     @property
     def material_settings(self) -> dict[str, FieldSettings]:
-        """Settings of the chosen representation, by unknown quantity."""
-        return {name: self.materials[name][self.representation] for name in self.quantities}
+        """Settings of the chosen representation, by unknown quantity.
+
+        Sizes of hash grids that are left open are the usual ones; a fit that starts chooses those
+        of its data set (`training.grid_sizes.with_grid_sizes`).
+        """
+        return {
+            name: sized(self.materials[name][self.representation], USUAL)
+            for name in self.quantities
+        }
 
     @property
     def radiance_settings(self) -> FieldSettings:
-        """Settings of the chosen representation of L_θ."""
-        return self.radiance[self.radiance_representation]
+        """Settings of the chosen representation of L_θ; sizes as in `material_settings`."""
+        return sized(self.radiance[self.radiance_representation], USUAL)
 
     @property
     def radiance_samples(self) -> int:

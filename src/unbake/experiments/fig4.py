@@ -12,7 +12,7 @@ from typing import Any, final
 import mitsuba as mi
 import numpy as np
 
-from ..config import FitConfig
+from ..config import FitConfig, update
 from ..dataset.camera import Camera, read_cameras
 from ..dataset.pixels import CameraRays
 from ..errors import UserError
@@ -44,6 +44,8 @@ COARSE = 80
 DEGREE = 3
 #: ε of the relative L2 loss.
 EPSILON = 0.01
+#: The network of L_θ at cpu scale.
+RADIANCE = {"learning_rate": 0.008, "grid": {"levels": 7, "table_log2": 16}}
 #: Columns of the figure.
 METHODS = (
     "reference",
@@ -136,7 +138,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
     picture = {"shrunk": context.pick(80, 6, 2), "spp": context.pick(4, 64, 1024)}
     picture["zoom"] = context.pick(1, 3, 1)
     first, each = _trainings(context)
-    network = {"radiance": asdict(STAIRCASE.settings(context).radiance_settings), "first": FIRST}
+    network = {"radiance": asdict(_settings(context).radiance_settings), "first": FIRST}
     network |= {"training": asdict(first)}
     trained = network | {"further": asdict(each)} | known
     jobs = [
@@ -173,6 +175,12 @@ def _trainings(context: ExperimentContext) -> tuple[CacheTraining, CacheTraining
     return first, replace(first, steps=context.pick(1, 600, 4000), rate=0.002)
 
 
+def _settings(context: ExperimentContext) -> FitConfig:
+    """The settings of L_θ. There are no photographs here that its size could follow."""
+    settings = STAIRCASE.settings(context)
+    return update(settings, {"radiance": {"neural": context.pick({}, RADIANCE, {})}})
+
+
 def _shrunk(context: ExperimentContext) -> int:
     """Resolution of the scene's film over that of the renderings for the table."""
     return context.pick(80, 16, 8)
@@ -204,7 +212,7 @@ def _train_first(context: ExperimentContext) -> Findings:
     """Train L_θ at a roughness in the middle."""
     wood = Wood.of(STAIRCASE.unpacked(context), _shrunk(context))
     wood.assign(mi.Float(FIRST))
-    config, views = STAIRCASE.settings(context), _views(wood)
+    config, views = _settings(context), _views(wood)
     radiance = fresh_radiance(wood.scene_view, views, config, 0)
     loss = train(wood.scene_view, radiance, views, _trainings(context)[0], seed=0)
     save_radiance(_network(context), radiance)
@@ -224,7 +232,7 @@ def _trained(
 def _at(context: ExperimentContext, value: float, shrunk: int, spp: int) -> Findings:
     """Images and derivatives of all methods at one roughness, kept in a file of arrays."""
     wood = Wood.of(STAIRCASE.unpacked(context), shrunk)
-    radiance, loss = _trained(context, wood, value, STAIRCASE.settings(context))
+    radiance, loss = _trained(context, wood, value, _settings(context))
     arrays = arrays_at(wood, value, spp, radiance=radiance)
     save(_arrays(context, value), arrays)
     return {"height": wood.camera.height, "width": wood.camera.width, "residual": loss}
@@ -293,7 +301,7 @@ def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _pictures(context: ExperimentContext, shrunk: int, spp: int, zoom: int) -> Findings:
     """The first row of the figure: derivatives at a roughness of 0.5."""
     wood = Wood.of(STAIRCASE.unpacked(context), shrunk)
-    radiance, _ = _trained(context, wood, 0.5, STAIRCASE.settings(context))
+    radiance, _ = _trained(context, wood, 0.5, _settings(context))
     e = wood.estimate(0.5, spp, 1, radiance=radiance)
     shape = (wood.camera.height, wood.camera.width, 3)
     pictures = {m: np.abs(d).mean(-1).reshape(shape[:2]) for m, (_, d) in _methods(e).items()}

@@ -11,6 +11,7 @@ import numpy as np
 from .arrays import from_numpy
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
+from .grid_sizes import USUAL, sized_grid
 from .perceptron import Perceptron, can_record_layout
 from .settings import NetworkConfig
 
@@ -23,7 +24,7 @@ class Network(Field):
 
     def __init__(self, settings: NetworkConfig, spec: FieldSpec) -> None:
         rng = np.random.default_rng(spec.seed)
-        g = settings.grid
+        g = sized_grid(settings.grid, USUAL)
         self.grid = nn.HashGridEncoding(
             mi.Float,
             3,

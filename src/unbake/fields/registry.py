@@ -114,7 +114,7 @@ register_representation(
         "network",
         NetworkConfig(),
         make="unbake.fields.network:Network",
-        radiance=NetworkConfig(GridConfig(6)),
+        radiance=NetworkConfig(GridConfig(footprints=2.0)),
         size="grid.table_log2",
     )
 )

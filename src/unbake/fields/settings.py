@@ -11,12 +11,14 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from ..errors import POSITIVE, require, require_ranges
 
-_FINEST = "base_resolution * growth^(levels - 1) is 2^24 or less"
+#: log2 of the most cells along an axis.
+FINEST = 24
+_FINEST = f"base_resolution * growth^(levels - 1) is 2^{FINEST} or less"
 #: Adam moves a parameter by about its rate in a step, and parameters are of the order of one.
 RATES = (POSITIVE, 10.0)
 #: Sizes up to which the kernels of a step are compiled in a minute or two: 32 levels of three
 #: fields took 96 s on two cores, 64 layers 9 s and 512 neurons 12 s, 64 levels more than 200 s.
-_LEVELS, _WIDTH, _HIDDEN = (1, 32), (1, 1024), (1, 32)
+_LEVELS, _WIDTH, _HIDDEN = (0, 32), (1, 1024), (1, 32)
 
 
 class FieldSettings(Protocol):
@@ -46,21 +48,27 @@ class SizedSettings(Protocol):
 
 @dataclass(frozen=True)
 class GridConfig:
-    """A multiresolution hash grid over the unit cube (Sec. 5.3; Müller et al. 2022)."""
+    """A multiresolution hash grid over the unit cube (Sec. 5.3; Müller et al. 2022).
 
-    levels: int = 8  #: number of resolutions
+    Where levels and tables are left open, 0, a fit chooses them from scene and photographs
+    (`grid_sizes.py`; ours); a run that was started has numbers.
+    """
+
+    levels: int = 0  #: number of resolutions
     features: int = 2  #: features of each level
-    table_log2: int = 15  #: log2 of the largest number of entries of a level
+    table_log2: int = 0  #: log2 of the largest number of entries of a level
     base_resolution: int = 4  #: cells along an axis of the coarsest level
     growth: float = 2.0  #: ratio of resolutions of neighbouring levels
+    footprints: float = 1.0  #: finest cells of levels left open, in footprints of a pixel
 
     def __post_init__(self) -> None:
-        sizes = {"levels": _LEVELS, "table_log2": (4, 28), "base_resolution": (1, 1 << 24)}
-        require_ranges(self, sizes | {"growth": (1, 1 << 24)})
+        sizes = {"levels": _LEVELS, "base_resolution": (1, 1 << 24)}
+        sizes |= {"table_log2": (4, 28)} if self.table_log2 else {}
+        require_ranges(self, sizes | {"growth": (1, 1 << 24), "footprints": (1e-3, 1e3)})
         require(self.features in (2, 4, 8), "features", "2, 4 or 8", self.features)
         # Cells of a finer level than that are smaller than single precision tells positions apart.
         finest = math.log2(self.base_resolution) + (self.levels - 1) * math.log2(self.growth)
-        require(finest <= 24, "levels", f"such that {_FINEST}", self.levels)
+        require(finest <= FINEST, "levels", f"such that {_FINEST}", self.levels)
 
     def numbers(self) -> int:
         """How many numbers the tables hold, or slightly more."""

@@ -14,6 +14,7 @@ from ..dataset.views import Dataset
 from ..evaluation.yardsticks import DEFINITIONS, STEPS, measure_ceiling
 from ..io import write_json
 from ..machine import machine
+from ..training.grid_sizes import with_grid_sizes
 from ..training.validation import psnr_keys
 from ..version import VERSION
 
@@ -33,7 +34,7 @@ def bench_ceiling(
 
     Args:
         data: folder of a data set with true maps.
-        config: says the fields.
+        config: says the fields; sizes that it leaves open are those of a fit.
         steps: length of the training; None: that of the ceilings that evaluations show.
         out: JSON file to write.
         console: shows the results.
@@ -48,6 +49,7 @@ def bench_ceiling(
     Paper: Sec. 5.3.
     """
     dataset = Dataset.load(data, allow_outside=allow_outside)
+    config = with_grid_sizes(config, dataset)
 
     def tell(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)

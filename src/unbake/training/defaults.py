@@ -12,6 +12,7 @@ from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
 from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
+from .grid_sizes import with_grid_sizes
 from .path_depth import with_path_depth
 
 Number = TypeVar("Number", int, float)
@@ -21,9 +22,18 @@ def with_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     """The settings of a new fit, with what they leave to the method and to the data set.
 
     Raises:
-        UserError: the method has a term that does not exist.
+        UserError: the method has a term that does not exist, or the scene cannot be loaded.
     """
-    return with_method_defaults(with_path_depth(config, dataset), dataset.kind)
+    return with_method_defaults(with_data_defaults(config, dataset), dataset.kind)
+
+
+def with_data_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
+    """The settings with what they leave to the data set, whatever the method.
+
+    Raises:
+        UserError: the scene cannot be loaded.
+    """
+    return with_grid_sizes(with_path_depth(config, dataset), dataset)
 
 
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:

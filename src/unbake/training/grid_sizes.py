@@ -1,0 +1,103 @@
+"""How large hash grids are: as fine as the photographs of a data set tell surfaces apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import mitsuba as mi
+import numpy as np
+
+from ..config import FitConfig
+from ..dataset.camera import Camera
+from ..dataset.views import Dataset
+from ..fields.domain import Domain
+from ..fields.grid_sizes import SurfaceSeen, is_open, sized
+from ..scene import free_space
+from ..scene.parse import parse
+
+#: Rays that are traced, in all training views together; a ray a view at least.
+RAYS = 4096
+#: Hits to a box that tell how many boxes of that size the seen surface meets.
+_HITS = 4
+
+#: Of the boxes, in their edges: walls often lie in planes through the middle of the domain, where
+#: they would count in the boxes of either side.
+_SHIFT = (0.31, 0.53, 0.79)
+
+_SEEN: WeakKeyDictionary[Dataset, SurfaceSeen | None] = WeakKeyDictionary()
+
+
+def with_grid_sizes(config: FitConfig, dataset: Dataset) -> FitConfig:
+    """The settings with levels and tables of hash grids where they leave them open (0).
+
+    The finest cells of albedo are about as wide as a pixel of the training views on the surfaces,
+    those of other quantities and of L_θ a multiple of that (`GridConfig.footprints`). A table has
+    room for those cells that the seen surface meets. Other presets than `cpu` leave nothing open.
+
+    Raises:
+        UserError: the scene cannot be loaded.
+    """
+    materials = [config.materials[name][config.representation] for name in config.quantities]
+    if not any(map(is_open, [*materials, config.radiance[config.radiance_representation]])):
+        return config
+    if dataset not in _SEEN:
+        scene = parse(dataset.scene, dataset.root).instantiate()
+        _SEEN[dataset] = surface_seen(scene, [view.camera for view in dataset.train])
+    seen = _SEEN[dataset]
+    if seen is None:  # the fit warns of poses that see nothing, and has the usual sizes
+        return config
+    form, of_radiance = config.representation, config.radiance_representation
+    return replace(
+        config,
+        materials={
+            name: {**forms, form: sized(forms[form], seen)} if name in config.quantities else forms
+            for name, forms in config.materials.items()
+        },
+        radiance={**config.radiance, of_radiance: sized(config.radiance[of_radiance], seen)},
+    )
+
+
+def surface_seen(scene: mi.Scene, cameras: Sequence[Camera]) -> SurfaceSeen | None:
+    """What cameras see of a scene's surfaces, of a sparse grid of rays in each.
+
+    Args:
+        scene: the scene.
+        cameras: those that are learned from, one at least.
+
+    Returns:
+        Extent of the fields' domain, median footprint and area, in world units; None where no ray
+        hits anything. The area is that of faces of boxes that have hits in them: exact to a
+        factor of two.
+    """
+    along = math.ceil(math.sqrt(RAYS / len(cameras)))
+    film = (np.arange(along) + 0.5) / along
+    x, y = (axis.ravel() for axis in np.meshgrid(film, film))
+    rays = [camera.rays(x * camera.width, y * camera.height) for camera in cameras]
+    origins, directions = (np.concatenate(each) for each in zip(*rays, strict=True))
+    focal = np.repeat([math.sqrt(camera.fl_x * camera.fl_y) for camera in cameras], len(x))
+    distance = free_space.trace(scene, origins, directions).distance
+    hit = np.isfinite(distance) & (distance > 0)
+    if not hit.any():
+        return None
+    points = origins[hit] + distance[hit, None] * directions[hit]
+    domain = Domain.of(scene.bbox())
+    unit = (points - np.array(domain.centre)) / domain.extent + 0.5
+    footprint = float(np.median(distance[hit] / focal[hit]))
+    return SurfaceSeen(domain.extent, footprint, domain.extent**2 * _area(unit))
+
+
+def _area(points: np.ndarray) -> float:
+    """The area of the surface that points (n, 3) in [0,1]³ lie on, counted in boxes.
+
+    A surface meets a number of boxes that grows by four as their edge is halved. They are counted
+    at the smallest edge at which a box has several points on average, so that hardly any is missed.
+    """
+    area, along = 1.0, 1
+    while True:
+        boxes = len(np.unique((points * along + _SHIFT).astype(int), axis=0))
+        if boxes * _HITS > len(points):
+            return area
+        area, along = boxes / along**2, 2 * along

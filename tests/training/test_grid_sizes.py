@@ -1,0 +1,112 @@
+"""New fits have hash grids as fine as the photographs of their data set tell surfaces apart."""
+
+import dataclasses
+import math
+
+import mitsuba as mi
+import pytest
+from support import TINY_FIT
+
+from unbake.comparison.method_variant import MethodVariant
+from unbake.config import FitConfig, from_toml, preset, read_toml, to_toml, update
+from unbake.dataset.camera import Camera
+from unbake.dataset.views import Dataset
+from unbake.fields.grid_sizes import sized
+from unbake.training import grid_sizes
+from unbake.training.grid_sizes import surface_seen, with_grid_sizes
+
+#: Tiny fields whose sizes are left open, but for one.
+OPEN = {
+    "materials": {
+        "albedo": {"neural": {"grid": {"levels": 0, "table_log2": 0}}},
+        "roughness": {"neural": {"grid": {"levels": 0}}},
+    }
+}
+
+
+def sizes(config):
+    fields = (*config.material_settings.values(), config.radiance_settings)
+    return [(field.grid.levels, field.grid.table_log2) for field in fields]
+
+
+def wall(side: float) -> mi.Scene:
+    """A square of that side in the plane z = 0, and no light."""
+    turned = mi.ScalarTransform4f().scale(side / 2)
+    return mi.load_dict({"type": "scene", "wall": {"type": "rectangle", "to_world": turned}})
+
+
+def camera(distance: float, fov: float, pixels: int = 32) -> Camera:
+    return Camera.look_at((0, 0, distance), (0, 0, 0), (0, 1, 0), fov, pixels, pixels)
+
+
+def test_extent_footprint_and_area_of_a_wall():
+    # The wall fills the image.
+    straight = camera(4.0, straight_fov())
+    seen = surface_seen(wall(2.0), [straight])
+    assert seen.extent == pytest.approx(2.02)
+    # 2 / 32 where the pixel looks straight, a little more elsewhere.
+    assert 2 / 32 < seen.footprint < 1.05 * 2 / 32
+    assert seen.area == pytest.approx(4.0, rel=0.2)
+    # Twice as many pixels on the same surface; a second view of it shows no more of it.
+    finer = surface_seen(wall(2.0), [camera(4.0, straight_fov(), 64)] * 2)
+    assert finer.footprint == pytest.approx(seen.footprint / 2, rel=1e-3)
+    assert finer.area == pytest.approx(seen.area, rel=0.2)
+    # A part is less than all of it.
+    part = surface_seen(wall(4.0), [straight])
+    assert part.extent == pytest.approx(4.04) and part.area == pytest.approx(4.0, rel=0.4)
+
+
+def straight_fov() -> float:
+    return 2 * math.degrees(math.atan(1 / 4))
+
+
+def test_cameras_that_see_nothing_tell_nothing():
+    away = Camera.look_at((0, 0, 4), (0, 0, 9), (0, 1, 0), 40.0, 8, 8)
+    assert surface_seen(wall(2.0), [away]) is None
+    assert surface_seen(wall(2.0), [camera(4.0, 30.0), away]) is not None
+
+
+def test_sizes_follow_the_data_set_and_settings_come_first(cornell):
+    dataset = Dataset.load(cornell)
+    config = with_grid_sizes(FitConfig(), dataset)
+    seen = grid_sizes._SEEN[dataset]
+    # 16 x 16 pixels for a box of extent 2: cells of some 0.1.
+    assert seen.extent / 40 < seen.footprint < seen.extent / 8
+    albedo, roughness, radiance = sizes(config)
+    assert albedo == (sized(FitConfig().materials["albedo"]["neural"], seen).grid.levels, 15)
+    assert 3 <= albedo[0] <= 5 and radiance[0] == albedo[0] - 1 and roughness == (2, 15)
+    assert with_grid_sizes(config, dataset) is config
+    assert from_toml(to_toml(config)) == config
+    # What is no unknown stays open.
+    assert config.materials["metallic"] == FitConfig().materials["metallic"]
+
+    mine = from_toml("[materials.albedo.neural.grid]\nlevels = 9\n")
+    assert sizes(with_grid_sizes(mine, dataset)) == [(9, 15), roughness, radiance]
+    for name in ("paper", "release", "release-lighting"):
+        published = preset(name)
+        assert with_grid_sizes(published, dataset) is published
+    # The same for all methods.
+    for method in ("prb", "direct", "no-prior"):
+        assert sizes(with_grid_sizes(FitConfig(method=method), dataset)) == sizes(config)
+    assert sizes(MethodVariant("prb").settings(config)) == sizes(config)
+
+
+def test_settings_that_leave_nothing_open_need_no_scene(cornell):
+    dataset = dataclasses.replace(Dataset.load(cornell), scene=cornell / "none.xml")
+    assert with_grid_sizes(TINY_FIT, dataset) is TINY_FIT
+
+
+def test_a_run_goes_on_with_the_sizes_that_it_was_started_with(
+    unbake, cornell, tiny, tmp_path, monkeypatch
+):
+    settings, run = tmp_path / "open.toml", tmp_path / "run"
+    settings.write_text(to_toml(update(read_toml(tiny), OPEN)))
+    words = ("fit", cornell, "--out", run)
+    assert unbake(*words, "--settings", settings, "--steps", 1).status == 0
+    first = read_toml(run / "config.toml")
+    # Bases of 2 with cells of an eighth of the box; what the file gives stays.
+    (levels, table), roughness, radiance = sizes(first)
+    assert 4 <= levels <= 6 and table == 15 and roughness == (2, 8) and radiance == (2, 8)
+    monkeypatch.setattr(grid_sizes, "surface_seen", None)
+    assert unbake(*words, "--resume", "--steps", 2).status == 0
+    assert sizes(read_toml(run / "config.toml")) == sizes(first)
