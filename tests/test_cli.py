@@ -16,7 +16,14 @@ import pytest
 
 from unbake import cli
 from unbake.cli.flags import flags, options, with_options
-from unbake.config import FitConfig, NetworkConfig, preset, read_toml
+from unbake.config import (
+    QUALITIES,
+    FitConfig,
+    NetworkConfig,
+    preset,
+    read_toml,
+    with_quality,
+)
 from unbake.errors import UserError
 from unbake.fields import registry
 from unbake.imaging.pictures import read_exr
@@ -357,6 +364,32 @@ def test_every_wrong_option_is_told_at_once(unbake, tmp_path, monkeypatch):
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     for told in ("--steps: must be 0", "--spp: must be an even", "--batch: must be 1"):
         assert told in outcome.err
+
+
+def test_quality_is_a_length_and_a_length_that_is_given_comes_first(
+    unbake, cornell, tiny, tmp_path
+):
+    def length(name, *words):
+        run = tmp_path / name
+        assert unbake("fit", cornell, "--out", run, "--settings", tiny, *words).status == 0
+        settings = read_toml(run / "config.toml")
+        return settings.steps, settings.seconds
+
+    assert length("draft", "--quality", "draft") == (8, 0)  # a quarter of 30
+    assert length("steps", "--quality", "high", "--steps", 2) == (2, 0)
+    assert length("seconds", "--quality", "high", "--seconds", 0.1)[1] == 0.1
+    again = ("--out", tmp_path / "draft", "--resume", "--quality", "high")
+    outcome = unbake("fit", cornell, *again)
+    told = "error: --quality: cannot be given together with --resume\n"
+    assert outcome.status == 2 and outcome.err == told
+
+
+def test_the_length_of_each_quality():
+    assert [with_quality(FitConfig(), name).steps for name in QUALITIES] == [600, 2400, 9600]
+    timed = with_quality(FitConfig(seconds=60.0), "draft")
+    assert timed.seconds == 15.0 and with_quality(FitConfig(), "normal") == FitConfig()
+    with pytest.raises(UserError, match="quality"):
+        with_quality(FitConfig(), "best")
 
 
 def test_options_are_made_of_the_settings(unbake):

@@ -20,7 +20,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from .. import backend, experiments, signals
 from ..acquisition.settings import CaptureSettings
-from ..config import FitConfig
+from ..config import FitConfig, with_quality
 from ..errors import UserError, printable
 from ..evaluation.settings import EvaluationSettings
 from ..memory import lacks_memory
@@ -34,6 +34,7 @@ from .options import (
     Folders,
     Methods,
     Preset,
+    Quality,
     Run,
     Runs,
     Scale,
@@ -140,6 +141,7 @@ def fit(
     out: Path,
     preset: Preset = None,
     settings: File = None,
+    quality: Quality = None,
     resume: Flag = False,
     clip_negative: Flag = False,
     allow_outside: Flag = False,
@@ -157,6 +159,8 @@ def fit(
         preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
+        quality: How long the fit is: draft, a quarter of the length of the preset or the file;
+            normal, the same; high, four times as long. --steps and --seconds take its place.
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
@@ -166,12 +170,12 @@ def fit(
     if resume:
         length = {"steps", "seconds"}
         others = {name: value for name, value in changes.items() if name not in length}
-        exclude("resume", {"preset": preset, "settings": settings} | others)
+        exclude("resume", {"preset": preset, "settings": settings, "quality": quality} | others)
         folder = RunFolder(out)
         folder.require_resumable()
         chosen = folder.settings()
     else:
-        chosen = chosen_settings(preset, settings)
+        chosen = with_quality(chosen_settings(preset, settings), quality or "normal")
     chosen = with_length(chosen, changes)
     backend.activate()
     from ..training.loop import fit as run

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
@@ -25,6 +25,10 @@ Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint=
 Preset = Annotated[
     config.PresetName | None,
     arg(metavar="{cpu,paper,release,release-lighting}", help_behavior_hint=""),
+]
+Quality = Annotated[
+    Literal["draft", "normal", "high"] | None,
+    arg(metavar="{draft,normal,high}", help_behavior_hint=""),
 ]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
 

@@ -25,13 +25,14 @@ from .fit import (
     Unknown,
 )
 from .flag import Flag
-from .presets import preset, with_method
+from .presets import QUALITIES, preset, with_method, with_quality
 from .tables import update
 from .toml import from_toml, read_toml, to_tables, to_toml
 
 __all__ = [
     "MOST_BOUNCES",
     "PAPER_DEPTH",
+    "QUALITIES",
     "BitmapConfig",
     "DenseGridConfig",
     "Estimator",
@@ -56,4 +57,5 @@ __all__ = [
     "to_toml",
     "update",
     "with_method",
+    "with_quality",
 ]
