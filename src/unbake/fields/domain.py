@@ -16,6 +16,7 @@ class SurfacePoint:
     position: mi.Point3f  # [0,1]³
     uv: mi.Point2f | None = None  # texture coordinates: without bounds, maybe not finite
     material: mi.UInt32 | None = None  # its number, where each material has a field of its own
+    albedo: mi.Color3f | None = None  # as it is fitted now, linear RGB; None where it is known
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -84,16 +85,22 @@ class Materials(Mapping[str, Field]):
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine | None = None
     ) -> Material:
         """The materials at surface interactions; see `Field.evaluate` for the engines."""
-        point = self._locate(si, valid)
-        return {
-            name: _bounded(QUANTITIES[name], field.evaluate(point, (), engine))
-            for name, field in self.items()
-        }
+        return self._evaluate_at(self._locate(si, valid), engine)
+
+    def _evaluate_at(self, point: SurfacePoint, engine: Engine | None) -> Material:
+        found: Material = {}
+        for name, field in self.items():
+            found[name] = _bounded(QUANTITIES[name], field.evaluate(point, (), engine))
+            if name == "albedo":  # the first in the table: the others may depend on it
+                point = replace(point, albedo=dr.detach(found[name]))
+        return found
 
     def evaluate_one(
         self, name: str, si: mi.SurfaceInteraction3f, valid: mi.Bool
     ) -> mi.Color3f | mi.Float:
         """One quantity alone, for points where no BSDF is evaluated."""
+        if name != "albedo":
+            return self.evaluate(si, valid)[name]
         return _bounded(QUANTITIES[name], self[name].evaluate(self._locate(si, valid)))
 
     def evaluate_near(

@@ -78,6 +78,38 @@ class GridConfig:
 
 
 @dataclass(frozen=True)
+class GuideConfig:
+    """A coarse grid over position and brightness of the albedo, beside a network (ours).
+
+    See `guide.py`. Resolutions double from level to level.
+    """
+
+    #: Number of resolutions; 0: there is no guide. None: a fit decides (`training/guides.py`), and
+    #: a run that was started has a number.
+    levels: int | None = None
+    base_resolution: int = 1  #: cells along an axis of the coarsest level
+    brightnesses: int = 8  #: of the albedo, from black to white
+    gain: float = 15.0  #: how much faster the coarsest level learns than the network would alone
+    falloff: float = 0.4  #: ratio of the gains of neighbouring levels
+    network: float = 0.2  #: how much slower the network learns beside a guide
+
+    def __post_init__(self) -> None:
+        sizes = {"base_resolution": (1, 64), "falloff": (POSITIVE, 1.0), "network": (POSITIVE, 1.0)}
+        sizes |= {"gain": (POSITIVE, 1e4)} | ({"levels": (0, 8)} if self.levels else {})
+        require_ranges(self, sizes)
+        few = self.brightnesses
+        require(few in (2, 4, 8), "brightnesses", "2, 4 or 8", few)
+        finest = self.base_resolution << max(0, (self.levels or 0) - 1)
+        bound = "such that base_resolution * 2^(levels - 1) is 256 or less"
+        require(finest <= 256, "levels", bound, self.levels)
+
+    def numbers(self, outputs: int) -> int:
+        """How many numbers are learned, or slightly more."""
+        cells = [self.base_resolution << level for level in range(self.levels or 0)]
+        return outputs * self.brightnesses * sum((count + 2) ** 3 for count in cells)
+
+
+@dataclass(frozen=True)
 class NetworkConfig:
     """A multilayer perceptron on top of a hash grid (Sec. 5.3)."""
 
@@ -85,6 +117,7 @@ class NetworkConfig:
     width: int = 32  #: neurons of a hidden layer
     hidden: int = 2  #: number of hidden layers
     learning_rate: float = 0.01  #: Adam (Sec. 5.4: 5e-4)
+    guide: GuideConfig = field(default_factory=GuideConfig)
 
     def __post_init__(self) -> None:
         require_ranges(self, {"width": _WIDTH, "hidden": _HIDDEN, "learning_rate": RATES})
@@ -92,7 +125,8 @@ class NetworkConfig:
     def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
         """How many numbers are learned; see `SizedSettings`."""
         inputs = self.grid.levels * self.grid.features + extra
-        return self.grid.numbers() + _of_layers(inputs, self.width, self.hidden, outputs)
+        layers = _of_layers(inputs, self.width, self.hidden, outputs)
+        return self.grid.numbers() + layers + self.guide.numbers(outputs)
 
 
 @dataclass(frozen=True)
