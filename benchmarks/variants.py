@@ -26,6 +26,7 @@ sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
 from unbake.machine import machine  # noqa: E402
+from unbake.training.run_folder import RunFolder  # noqa: E402
 
 #: What is kept of a fit's scores.
 SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
@@ -67,7 +68,7 @@ def fit(data: Path, settings: Path, method: str, seed: int, steps: int) -> dict[
         options = ["--settings", settings, "--method", method, "--seed", seed, "--steps", steps]
         unbake("fit", data, "--out", run, *options)
         unbake("evaluate", run)
-        metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+        metrics = json.loads(RunFolder(run).metrics_file.read_text(encoding="utf-8"))
     scores = {key: metrics["heldout"][key] for key in SCORES}
     return scores | {"seconds": metrics["seconds"]}
 

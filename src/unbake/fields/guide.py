@@ -30,7 +30,7 @@ class Guide:
     def __init__(self, settings: GuideConfig, outputs: int) -> None:
         self._settings = settings
         self._outputs = outputs
-        self._levels = settings.levels or 0
+        self._levels = settings.levels
         bins = settings.brightnesses
         self._grids = [
             nn.HashGridEncoding(
