@@ -34,6 +34,7 @@ def numbers(file):
     return result
 
 
+@pytest.mark.slow
 def test_the_script_for_gpu_machines_runs_through(repository, tmp_path):
     done = cuda(repository, tmp_path, "doctor", "step", "staircase", "table2", "fig3")
     assert done.returncode == 0, done.stderr[-3000:]
