@@ -87,6 +87,18 @@ def pixel_rays(cameras: list[Camera], spp: int, seed: int) -> mi.Ray3f:
     return ray
 
 
+def randomised(field, seed: int = 0) -> dict[str, mi.Float | mi.TensorXf]:
+    """Give a field large random parameters with gradients: untrained ones are nearly zero."""
+    rng = np.random.default_rng(seed)
+    values = {
+        k: type(v)(rng.normal(0, 0.7, v.shape).astype(np.float32))
+        for k, v in field.parameters().items()
+    }
+    dr.enable_grad(values)
+    field.assign(values)
+    return values
+
+
 def seeded(seed: int, lanes: int) -> mi.Sampler:
     """A sampler that is ready to draw from."""
     sampler = mi.load_dict({"type": "independent"})

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY, seeded
+from support import TINY, randomised, seeded
 
 from unbake.fields.domain import Domain, SurfacePoint
 from unbake.fields.field import FieldSpec
@@ -30,18 +30,6 @@ def points(lanes=LANES, seed=1):
     p = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
     dr.eval(p)
     return p
-
-
-def randomised(network, seed=0):
-    """Large weights and features: the untrained ones are nearly zero."""
-    rng = np.random.default_rng(seed)
-    values = {
-        k: type(v)(rng.normal(0, 0.7, v.shape).astype(np.float32))
-        for k, v in network.parameters().items()
-    }
-    dr.enable_grad(values)
-    network.assign(values)
-    return values
 
 
 # ---------------------------------------------------------------------------------- the engines

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import seeded
+from support import randomised, seeded
 
 from unbake.errors import UserError
 from unbake.fields.domain import SurfacePoint
@@ -30,23 +30,12 @@ def points(albedo=None, seed=1):
     return SurfacePoint(p, albedo=grey)
 
 
-def filled(field, seed=0):
-    rng = np.random.default_rng(seed)
-    values = {
-        k: type(v)(rng.normal(0, 0.5, v.shape).astype(np.float32))
-        for k, v in field.parameters().items()
-    }
-    dr.enable_grad(values)
-    field.assign(values)
-    return values
-
-
 @pytest.mark.parametrize("outputs", [1, 3])
 def test_engines_agree_with_a_guide(outputs):
     results = []
     for engine in ENGINES:
         network = Network(NETWORK, FieldSpec(outputs, bounded=True, initial=0.3, seed=2))
-        parameters = filled(network)
+        parameters = randomised(network)
         values = network.evaluate(points(), (), engine)
         dr.backward(dr.sum(sum(values)))
         gradients = {k: np.array(dr.grad(v).array) for k, v in parameters.items()}
@@ -66,7 +55,7 @@ def test_an_untrained_guide_changes_nothing():
 
 def test_brightness_decides_which_numbers_are_read():
     guide = Guide(SMALL, 1)
-    values = filled(guide)
+    values = randomised(guide)
     (dark,) = guide.evaluate(points(0.0))
     dr.backward(dr.sum(dark))
     rows = np.array(dr.grad(values["guide.0"])).reshape(-1, SMALL.brightnesses)
@@ -78,7 +67,7 @@ def test_brightness_decides_which_numbers_are_read():
 
 def test_values_between_brightnesses_are_between_theirs():
     guide = Guide(SMALL, 1)
-    filled(guide)
+    randomised(guide)
     low, middle, high = (
         np.array(guide.evaluate(points(level**2))[0]) for level in (1 / 3, 0.5, 2 / 3)
     )
@@ -88,7 +77,7 @@ def test_values_between_brightnesses_are_between_theirs():
 @pytest.mark.parametrize("albedo", [-1.0, 2.0, float("nan")])
 def test_an_albedo_out_of_bounds_reads_no_other_memory(albedo):
     guide = Guide(SMALL, 1)
-    filled(guide)
+    randomised(guide)
     bound = points(1.0 if albedo == 2.0 else 0.0)
     found, wanted = (np.array(guide.evaluate(p)[0]) for p in (points(albedo), bound))
     np.testing.assert_allclose(found, wanted, atol=1e-5)
@@ -97,7 +86,7 @@ def test_an_albedo_out_of_bounds_reads_no_other_memory(albedo):
 def test_roughness_does_not_pull_albedo():
     settings = {name: NETWORK for name in ("albedo", "roughness")}
     materials = make_materials("neural", settings, [], seed=1)
-    values = filled(materials)
+    values = randomised(materials)
     material = materials.evaluate(surface(), mi.Bool(True))
     dr.backward(dr.sum(material["roughness"]))
     reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
@@ -106,7 +95,7 @@ def test_roughness_does_not_pull_albedo():
 
 def test_roughness_alone_has_a_guide_over_positions():
     materials = make_materials("neural", {"roughness": NETWORK}, [], seed=1)
-    filled(materials)
+    randomised(materials)
     values = np.array(materials.evaluate(surface(), mi.Bool(True))["roughness"])
     bounds = QUANTITIES["roughness"]
     assert np.ptp(values) > 0.05

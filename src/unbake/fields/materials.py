@@ -85,9 +85,7 @@ class Materials(Mapping[str, Field]):
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine | None = None
     ) -> Material:
         """The materials at surface interactions; see `Field.evaluate` for the engines."""
-        return self._evaluate_at(self._locate(si, valid), engine)
-
-    def _evaluate_at(self, point: SurfacePoint, engine: Engine | None) -> Material:
+        point = self._locate(si, valid)
         found: Material = {}
         for name, field in self.items():
             found[name] = _bounded(QUANTITIES[name], field.evaluate(point, (), engine))
