@@ -24,6 +24,7 @@ SRC = str(ROOT / "src")
 sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
+from unbake import backend  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402
 from unbake.experiments.commands import unbake  # noqa: E402
 from unbake.experiments.seeds import across_seeds  # noqa: E402
@@ -48,6 +49,7 @@ def main() -> None:
     length.add_argument("--seconds", type=float, help="of training, instead of steps")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
+    backend.activate()
     stop = ["--steps", args.steps]
     if args.seconds is not None:
         stop = ["--seconds", args.seconds]

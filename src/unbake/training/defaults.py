@@ -13,6 +13,7 @@ from ..dataset.views import Dataset
 from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
 from .grid_sizes import with_grid_sizes
+from .guides import with_guides
 from .path_depth import with_path_depth
 
 Number = TypeVar("Number", int, float)
@@ -33,7 +34,8 @@ def with_data_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     Raises:
         UserError: the scene cannot be loaded.
     """
-    return with_grid_sizes(with_path_depth(config, dataset), dataset)
+    config = with_guides(with_path_depth(config, dataset), dataset.kind)
+    return with_grid_sizes(config, dataset)
 
 
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
