@@ -29,7 +29,9 @@ from unbake.fields import registry
 from unbake.imaging.pictures import read_exr
 
 SOURCE = str(Path(cli.__file__).parents[2])
-COMMANDS = ("capture", "fit", "evaluate", "report", "compare", "bench", "reproduce", "doctor")
+COMMANDS = (
+    "capture", "fit", "evaluate", "report", "export", "compare", "bench", "reproduce", "doctor"
+)  # fmt: skip
 PSNRS = ("render_psnr", "albedo_psnr", "roughness_psnr")
 
 

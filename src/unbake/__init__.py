@@ -8,6 +8,7 @@
     unbake.fit(Path("data"), Path("run"), unbake.preset("cpu"))
     unbake.evaluate(Path("run"))
     unbake.write_report([Path("run")], Path("report.html"))
+    unbake.export(Path("run"), Path("exported"))
 
 `import unbake` loads neither Mitsuba nor Dr.Jit. A public name is loaded when it is first used; if
 it needs Mitsuba and no variant has been chosen, `activate()` chooses one for this machine.
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from .dataset.views import View as View
     from .evaluation.evaluate import evaluate as evaluate
     from .evaluation.settings import EvaluationSettings as EvaluationSettings
+    from .exports.export import export as export
     from .fields.domain import SurfacePoint as SurfacePoint
     from .fields.field import Cost as Cost
     from .fields.field import Field as Field
@@ -122,6 +124,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "evaluation.settings": ("EvaluationSettings",),
     "evaluation.evaluate": ("evaluate",),
     "report.page": ("write_report",),
+    "exports.export": ("export",),
     "comparison.compare": ("compare",),
     "comparison.method_variant": ("MethodVariant",),
     # Data sets.

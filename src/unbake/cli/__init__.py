@@ -32,6 +32,7 @@ from .options import (
     File,
     Flag,
     Folders,
+    Formats,
     Methods,
     Preset,
     Quality,
@@ -69,6 +70,7 @@ def main() -> None:
         "fit": fit,
         "evaluate": evaluate,
         "report": report,
+        "export": export,
         "compare": compare,
         "bench": bench,
         "reproduce": reproduce,
@@ -258,6 +260,39 @@ def report(runs: Positional[Runs], /, out: Path, allow_outside: Flag = False) ->
     from ..report.page import write_report
 
     _say(f"wrote {write_report(runs, out, allow_outside=allow_outside)}")
+
+
+def export(
+    run: Positional[Run],
+    /,
+    out: Path,
+    format: Formats = ("gltf", "textures"),
+    texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
+    allow_outside: Flag = False,
+) -> None:
+    """Write what a run recovered for other programs: textures, glTF, or a scene for Mitsuba.
+
+    The scene keeps its parts and their names. Each material gets textures of albedo, roughness and
+    metallic, in the texture coordinates of its parts if these are unique, else unwrapped. What no
+    training view saw is filled in from what was seen, and marked in a mask. DIR/export.json has all
+    of it.
+
+    Args:
+        run: Folder that `unbake fit` wrote.
+        out: Folder to write to, new or empty.
+        format: gltf, one file, scene.glb, with parts, textures and lights; textures, OpenEXR and
+            PNG; mitsuba, a scene that Mitsuba renders without unbake.
+        texels: Texels along a scene unit (default: one for each pixel of the training views on the
+            surfaces). A texture has from 64 to 8192 along an edge.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
+    """
+    backend.activate()
+    from ..exports.export import export as run_export
+
+    console = Console(highlight=False)
+    options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
+    run_export(run, out, format, texels=texels, **options)
+    _say(f"wrote {out}")
 
 
 def compare(

@@ -19,6 +19,10 @@ Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hi
 Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint="(required)")]
 Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
+Formats = Annotated[
+    tuple[Literal["gltf", "textures", "mitsuba"], ...],
+    arg(metavar="{gltf,textures,mitsuba} ...", help_behavior_hint="(default: gltf textures)"),
+]
 #: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]

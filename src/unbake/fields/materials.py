@@ -85,7 +85,10 @@ class Materials(Mapping[str, Field]):
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine | None = None
     ) -> Material:
         """The materials at surface interactions; see `Field.evaluate` for the engines."""
-        point = self._locate(si, valid)
+        return self.evaluate_at(self._locate(si, valid), engine)
+
+    def evaluate_at(self, point: SurfacePoint, engine: Engine | None = None) -> Material:
+        """The materials at points given in all coordinates that fields use."""
         found: Material = {}
         for name, field in self.items():
             found[name] = _bounded(QUANTITIES[name], field.evaluate(point, (), engine))

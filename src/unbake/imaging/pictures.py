@@ -72,13 +72,13 @@ def write_png(path: Path, array: np.ndarray) -> None:
         UserError: the folder cannot be written.
         ValueError: the array is not such a picture.
     """
-    data = _png(array)
+    data = png_bytes(array)
     write_atomically(path, lambda p: p.write_bytes(data))
 
 
 def png_data_uri(array: np.ndarray) -> str:
     """A `data:image/png;base64,…` address of an (H, W) or (H, W, C) uint8 sRGB picture."""
-    return "data:image/png;base64," + base64.b64encode(_png(array)).decode("ascii")
+    return "data:image/png;base64," + base64.b64encode(png_bytes(array)).decode("ascii")
 
 
 def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
@@ -203,7 +203,8 @@ def montage(rows: Sequence[Sequence[np.ndarray]], gap: int = 2, paper: int = 255
     return sheet
 
 
-def _png(array: np.ndarray) -> bytes:
+def png_bytes(array: np.ndarray) -> bytes:
+    """A PNG file of (H, W) or (H, W, C) uint8 values; C is 1, 3 or 4."""
     _check_bytes(array, channels=(1, 3, 4))
     stream = mi.MemoryStream()
     mi.Bitmap(np.ascontiguousarray(array)).write(stream, mi.Bitmap.FileFormat.PNG)

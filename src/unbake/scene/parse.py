@@ -42,19 +42,22 @@ class ParsedScene:
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
 
-    def instantiate(self) -> mi.Scene:
+    def instantiate(self, *, merge: bool = True) -> mi.Scene:
         """Make the scene, once: the nodes cannot be used again.
 
-        Equal materials become one, and meshes that share a material one mesh: tracing a step takes
-        longer with every object that a ray can hit.
+        Args:
+            merge: equal materials become one, and meshes that share a material one mesh: tracing a
+                step takes longer with every object that a ray can hit. Without it, shapes keep
+                their ids.
 
         Raises:
             UserError: Mitsuba cannot instantiate the scene.
         """
         try:
             self._forget_queries()
-            mi.parser.transform_merge_equivalent(self.config, self.state)
-            self._merge_meshes()
+            if merge:
+                mi.parser.transform_merge_equivalent(self.config, self.state)
+                self._merge_meshes()
             scene = mi.parser.instantiate(self.config, self.state)
         except (RuntimeError, ValueError, MemoryError) as error:
             # Mitsuba 3.9: emitters that were made although their shapes were not crash the process
@@ -147,6 +150,8 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
 def write(scene: ParsedScene, folder: Path) -> Path:
     """Write the scene and copies of all its files into a folder, as `scene.xml`.
 
+    Files that lie in the folder already are left where they are.
+
     Raises:
         UserError: a file cannot be copied.
     """
@@ -166,6 +171,8 @@ def write(scene: ParsedScene, folder: Path) -> Path:
 
 def _copy(source: Path, folder: Path, kind: str) -> str:
     """Copy a file into a folder's folder; its path in there, with a number where it is taken."""
+    if source.is_relative_to(folder):
+        return source.relative_to(folder).as_posix()
     (folder / kind).mkdir(exist_ok=True)
     target, number = folder / kind / source.name, 0
     while target.exists():

@@ -1,0 +1,1 @@
+"""Results for other programs: textures, glTF, and scenes for Mitsuba without unbake."""

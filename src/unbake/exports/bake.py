@@ -1,0 +1,253 @@
+"""Fields to textures: what was recovered, texel by texel of an atlas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from ..fields.domain import SurfacePoint
+from ..fields.materials import Materials
+from ..memory import require_memory
+from ..quantities import QUANTITIES
+from ..scene.parse import ParsedScene, is_reference, reason
+from .observed import Views, filled
+from .parts import principled_numbers
+from .unwrap import Atlas, joined, parameterized
+
+#: Texels that are looked up at once; bounds the memory.
+CHUNK = 1 << 17
+#: Places in a texel that are looked up, in texels.
+_OFFSETS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+#: Bytes a texel of the arrays here, with those of the pyramid.
+_TEXEL_BYTES = 120
+
+#: Textures of a material that a scene gives: by its number, then by quantity.
+OwnTextures = dict[int, dict[str, "mi.Texture"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """The textures of an atlas. Row 0 is v = 0; texels are centred at (i + 1/2) / n."""
+
+    atlas: Atlas
+    values: dict[str, np.ndarray]  #: by quantity: (n, n, channels) float32, linear
+    covered: np.ndarray  #: (n, n) bool: there is surface
+    observed: np.ndarray  #: (n, n) bool: and a training view saw it
+    learned: tuple[str, ...]  #: quantities that were recovered; the others are the scene's own
+
+    @property
+    def unobserved_share(self) -> float:
+        """Of the texels with surface, those that no training view saw."""
+        return 1 - int(self.observed.sum()) / max(int(self.covered.sum()), 1)
+
+
+class Baker:
+    """Looks up materials on the surfaces of atlases.
+
+    Args:
+        materials: what was recovered; None: the scene's own materials are all there is.
+        own: textures of the scene, for what was not recovered.
+        views: those that the fit learned from.
+    """
+
+    def __init__(self, materials: Materials | None, own: OwnTextures, views: Views) -> None:
+        self._materials, self._own, self._views = materials, own, views
+        self._learned = () if materials is None else tuple(materials)
+
+    def bake(self, atlas: Atlas, advance: Callable[[int], object] = lambda texels: None) -> Baked:
+        """The textures of an atlas, averaged over four places a texel in linear space.
+
+        Texels that no view saw, and those beside charts, are filled from those that were seen.
+
+        Args:
+            atlas: where parts lie.
+            advance: called with numbers of texels that are done.
+
+        Raises:
+            UserError: the textures do not fit into the memory.
+        """
+        n = atlas.resolution
+        require_memory(_TEXEL_BYTES * n * n, "the textures need", "Lower --texels", atlas.name)
+        mesh = _lookup(atlas)
+        values = {k: np.zeros((n * n, q.channels), np.float32) for k, q in QUANTITIES.items()}
+        covered, observed = np.zeros(n * n, bool), np.zeros(n * n, bool)
+        for start in range(0, n * n, CHUNK):
+            part = slice(start, min(start + CHUNK, n * n))
+            count = part.stop - part.start
+            means, hit, seen = self._chunk(mesh, atlas, start, min(CHUNK, n * n))
+            for name, mean in means.items():
+                values[name][part] = mean[:count]
+            covered[part], observed[part] = hit[:count], seen[:count]
+            advance(count)
+        baked = {}
+        for name, quantity in QUANTITIES.items():
+            known = observed if name in self._learned else covered
+            default = [quantity.default] * quantity.channels
+            square = values[name].reshape(n, n, quantity.channels)
+            baked[name] = filled(square, known.reshape(n, n), default)
+        return Baked(atlas, baked, covered.reshape(n, n), observed.reshape(n, n), self._learned)
+
+    def _chunk(
+        self, mesh: mi.Mesh, atlas: Atlas, start: int, width: int
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Means of quantities, whether there is surface, and whether it was seen."""
+        n = atlas.resolution
+        lane = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+        edge = dr.opaque(mi.UInt32, n)
+        column, row = mi.Float(lane % edge), mi.Float(lane // edge)
+        sums = {name: [dr.zeros(mi.Float, width)] * q.channels for name, q in QUANTITIES.items()}
+        count = dr.zeros(mi.Float, width)
+        p, normal, two_sided = mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Bool(False)
+        for x, y in _OFFSETS:
+            dx, dy = dr.opaque(mi.Float, x), dr.opaque(mi.Float, y)
+            uv = mi.Point2f(column + dx, row + dy) / mi.Float(edge)
+            si = mesh.eval_parameterization(uv, active=lane < edge * edge)
+            valid = si.is_valid()
+            # The number of the material and whether it has two sides.
+            info = mesh.eval_attribute_3("face_info", si, valid)
+            for name, value in self._values(mesh, atlas, si, info, valid).items():
+                sums[name] = [
+                    s + dr.select(valid, v, 0) for s, v in zip(sums[name], value, strict=True)
+                ]
+            count += dr.select(valid, 1.0, 0.0)
+            p, normal = dr.select(valid, si.p, p), dr.select(valid, si.n, normal)
+            two_sided = dr.select(valid, info.y > 0.5, two_sided)
+            dr.eval(sums, count, p, normal, two_sided)
+        hit = count > 0
+        seen = self._views.see(p, normal, two_sided, hit)
+        scale = dr.rcp(dr.maximum(count, 1))
+        means = {
+            name: np.stack([np.array(c * scale) for c in channels], -1)
+            for name, channels in sums.items()
+        }
+        return means, np.array(hit), np.array(seen)
+
+    def _values(
+        self,
+        mesh: mi.Mesh,
+        atlas: Atlas,
+        si: mi.SurfaceInteraction3f,
+        info: mi.Color3f,
+        valid: mi.Bool,
+    ) -> dict[str, list[mi.Float]]:
+        """All quantities at points, in linear space."""
+        own = mesh.eval_attribute_3("vertex_own", si, valid)
+        si = mi.SurfaceInteraction3f(si)
+        si.uv = mi.Point2f(own.x, own.y)
+        number = mi.UInt32(dr.round(info.x))
+        found: dict[str, list[mi.Float]] = {}
+        if self._materials is not None:
+            position = self._materials.domain.to_unit(si.p, valid)
+            point = SurfacePoint(position, si.uv, dr.select(valid, number, 0))
+            for name, value in self._materials.evaluate_at(point).items():
+                found[name] = list(value) if QUANTITIES[name].channels == 3 else [value]
+        for name, quantity in QUANTITIES.items():
+            if name in found:
+                continue
+            value = mi.Color3f(quantity.default)
+            for material in atlas.materials:
+                texture = self._own[material][name]
+                here = valid & (number == material)
+                three = quantity.channels == 3
+                looked_up = texture.eval(si, here) if three else texture.eval_1(si, here)
+                value = dr.select(here, mi.Color3f(looked_up), value)
+            found[name] = list(value)[: quantity.channels]
+        return found
+
+
+def bake_texture(baked: Baked, texture: mi.Texture) -> np.ndarray:
+    """A texture of the scene in the coordinates of an atlas, (n, n, 3) float32, as stored."""
+    atlas, n = baked.atlas, baked.atlas.resolution
+    mesh = _lookup(atlas)
+    found, covered = np.zeros((n * n, 3), np.float32), np.zeros(n * n, bool)
+    width = min(CHUNK, n * n)
+    for start in range(0, n * n, width):
+        lane = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+        uv = mi.Point2f(mi.Float(lane % n) + 0.5, mi.Float(lane // n) + 0.5) / n
+        si = mesh.eval_parameterization(uv)
+        own = mesh.eval_attribute_3("vertex_own", si, si.is_valid())
+        si.uv = mi.Point2f(own.x, own.y)
+        found[start : start + width] = np.array(texture.eval(si, si.is_valid())).T
+        covered[start : start + width] = np.array(si.is_valid())
+    return filled(found.reshape(n, n, 3), covered.reshape(n, n), (0.5, 0.5, 0.5))
+
+
+def own_textures(scene: ParsedScene, without: Sequence[str]) -> OwnTextures:
+    """The textures of the quantities of a scene's materials; constants are textures as well.
+
+    The nodes cannot be used to make the scene again.
+
+    Args:
+        scene: the scene.
+        without: quantities that are not needed.
+
+    Raises:
+        UserError: a texture is stored in meshes.
+    """
+    nodes = scene.state.nodes
+    found: OwnTextures = {}
+    for node, number in principled_numbers(scene).items():
+        props, found[number] = nodes[node].props, {}
+        for name, quantity in QUANTITIES.items():
+            if name in without:
+                continue
+            value = props.get(quantity.slot, quantity.default)
+            if is_reference(value):
+                found[number][name] = make_texture(scene, value.index())
+            else:
+                rgb = [float(x) for x in np.ravel(np.array(value, np.float64))]
+                rgb = rgb * 3 if len(rgb) == 1 else rgb
+                colour = {"type": "rgb", "value": rgb} if name == "albedo" else None
+                uniform = {"type": "uniform", "value": rgb[0]}
+                found[number][name] = mi.load_dict(colour or uniform)
+    return found
+
+
+def make_texture(scene: ParsedScene, node: int) -> mi.Texture:
+    """The texture of a node, with those that it refers to.
+
+    Raises:
+        UserError: it is stored in a mesh, or Mitsuba cannot make it.
+    """
+    props = scene.state.nodes[node].props
+    if props.plugin_name() == "mesh_attribute":
+        what = "values stored in meshes cannot be exported as textures"
+        raise UserError(what, scene.path, "Use a bitmap for them")
+    for key in list(props):
+        if is_reference(props[key]):
+            props[key] = make_texture(scene, props[key].index())
+    try:
+        made = mi.PluginManager.instance().create_object(props)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(f"a texture cannot be made: {reason(error)}", scene.path) from None
+    return (made.expand() or [made])[0]
+
+
+def _lookup(atlas: Atlas) -> mi.Mesh:
+    """The parts of an atlas as one mesh, with what is asked of points on it."""
+    mesh = parameterized(*joined(atlas.placed))
+    info = [
+        np.broadcast_to(
+            np.array([_first(each.part.materials), each.part.two_sided, 0], np.float32),
+            (len(each.triangles.faces), 3),
+        )
+        for each in atlas.placed
+    ]
+    own = [
+        np.zeros((len(each.triangles.positions), 3), np.float32)
+        if each.own_uv is None
+        else np.pad(each.own_uv, ((0, 0), (0, 1)))
+        for each in atlas.placed
+    ]
+    mesh.add_attribute("face_info", 3, mi.Float(np.concatenate(info).ravel()))
+    mesh.add_attribute("vertex_own", 3, mi.Float(np.concatenate(own).ravel().astype(np.float32)))
+    return mesh
+
+
+def _first(materials: Sequence[int]) -> int:
+    return materials[0]

@@ -1,0 +1,368 @@
+"""`unbake export`: what a run recovered, as textures, glTF or a scene for Mitsuba.
+
+DIR/
+  export.json             what is there, how it was made, and its conventions
+  textures/               of each material: OpenEXR, PNG, and a mask of what no view saw
+  scene.glb               the scene as binary glTF
+  mitsuba/scene.xml       the scene for Mitsuba, with its own meshes and textures
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..errors import UserError
+from ..imaging.pictures import write_exr
+from ..io import require_utf8, write_json
+from ..scene import free_space
+from ..signals import cleaned_up
+from ..training.grid_sizes import surface_seen
+from ..training.recovered import Recovered, load_run
+from ..training.run_folder import RunFolder
+from ..version import VERSION
+from .bake import Baked, Baker, own_textures
+from .gltf import write_glb
+from .lights import Light, environment_picture, read_lights
+from .mitsuba import write_scene
+from .observed import Views
+from .parts import Part, Parts, parsed_principled, read_parts
+from .textures import COLOUR_SPACES, file_names, write_textures
+from .unwrap import LARGEST, UNIQUE, Atlas, make_atlases
+
+Format = Literal["gltf", "textures", "mitsuba"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+DEFAULT_FORMATS: tuple[Format, ...] = ("gltf", "textures")
+#: Of `export.json`.
+EXPORT_FORMAT = 1
+#: The recovered environment, beside `export.json`.
+_ENVIRONMENT = Path("environment").with_suffix(".exr").name
+#: Texels along the diagonal of a scene that no camera sees.
+_BLIND = 1024
+#: Materials that are told one by one.
+_TOLD = 12
+
+_CONVENTIONS = {
+    "axes": "those of the scene, unchanged; glTF takes +y as up, and lengths as metres",
+    "texture coordinates": "(0, 0) is the corner of the first texel of the first row of an image, "
+    "in Mitsuba and in glTF",
+    "roughness": "perceptual: GGX alpha = roughness squared",
+    "metallic and roughness of glTF": "blue and green of one texture",
+    "light": "radiance and intensity in the scene's own units; glTF takes them as candela",
+    "environment": "latitude and longitude as Mitsuba's envmap reads them without to_world: +y is "
+    "the first row, -y the last one, +z the middle column, -z the left and right border, +x at a "
+    "quarter of the width; linear RGB",
+    "unobserved": "white where no training view saw the surface: filled from those around it "
+    "that were seen, or the quantity's default where a material has none; what is seen in mirrors "
+    "or through glass alone counts as not seen",
+}
+
+
+def export(
+    run: Path | str,
+    out: Path | str,
+    formats: Collection[str] = DEFAULT_FORMATS,
+    *,
+    texels: float | None = None,
+    allow_outside: bool = False,
+    console: Console | None = None,
+    tell: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Write what a run recovered for other programs.
+
+    Args:
+        run: folder of a fit.
+        out: folder to write; it must be new or empty, and is filled only when all is complete.
+        formats: of `FORMATS`.
+        texels: along a scene unit; None: one for each pixel of the training views on the surfaces.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
+        console: where a progress bar is shown, if it is a terminal; None: nowhere.
+        tell: called with lines of progress.
+
+    Returns:
+        The contents of `export.json`.
+
+    Raises:
+        UserError: the run or its data set cannot be read, the folder is not empty, a format is
+            unknown, or the textures do not fit into memory or onto the disk.
+    """
+    run, out = Path(run), Path(out)
+    chosen = _require_sound(run, out, formats, texels)
+    recovered = load_run(run, allow_outside=allow_outside)
+    partial = out.with_name(f".{out.name[:100]}.{secrets.token_hex(8)}.partial")
+    with cleaned_up(lambda: shutil.rmtree(partial, ignore_errors=True)):
+        try:
+            partial.mkdir(parents=True)
+            manifest = _export(recovered, RunFolder(run), partial, chosen, texels, console, tell)
+            write_json(partial / "export.json", manifest, allow_nan=False)
+            if out.is_dir():
+                out.rmdir()
+            partial.rename(out)
+        except OSError as error:
+            raise UserError(f"cannot be written ({error.strerror})", where=out) from None
+    return manifest
+
+
+def _require_sound(
+    run: Path, out: Path, formats: Collection[str], texels: float | None
+) -> tuple[Format, ...]:
+    """Check all that can be checked before anything is read; tells all mistakes at once."""
+    wrong: list[str] = []
+    with _collected(wrong):
+        RunFolder(run).require_fitted()
+    with _collected(wrong):
+        require_utf8(out, "folder")
+        if out.is_symlink() or (out.exists() and not out.is_dir()):
+            raise UserError("is no folder", out, "Give another --out")
+        if out.is_dir() and any(out.iterdir()):
+            raise UserError("the folder is not empty", out, "Give another --out, or empty it")
+    unknown = [str(name) for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        what = f"no format named {', '.join(map(repr, unknown))}" if unknown else "no format given"
+        wrong.append(str(UserError(what, "--format", f"There are {', '.join(FORMATS)}")))
+    if texels is not None and not 0 < texels < 1e9:
+        wrong.append(str(UserError(f"must be a positive number, not {texels:g}", "--texels")))
+    if wrong:
+        raise UserError("; ".join(wrong))
+    return tuple(name for name in FORMATS if name in formats)
+
+
+@contextlib.contextmanager
+def _collected(wrong: list[str]):
+    try:
+        yield
+    except UserError as error:
+        wrong.append(str(error))
+    except OSError as error:
+        wrong.append(f"{error.filename}: {error.strerror}")
+
+
+def _export(
+    recovered: Recovered,
+    folder: RunFolder,
+    out: Path,
+    formats: Sequence[Format],
+    texels: float | None,
+    console: Console | None,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    problem, dataset = recovered.problem, recovered.dataset
+    cameras = [view.camera for view in dataset.train]
+    scene = problem.scene_view.scene
+    if texels is None:
+        seen = surface_seen(scene, cameras)
+        texels = _BLIND / free_space.bounds(scene)[2] if seen is None else 1 / seen.footprint
+    found = read_parts(dataset.scene, dataset.root)
+    lights = read_lights(parsed_principled(dataset.scene, dataset.root), problem)
+    learned = () if problem.materials is None else tuple(problem.materials)
+    own = own_textures(parsed_principled(dataset.scene, dataset.root), learned)
+    wanted = [p for p in found.parts if "mitsuba" in formats or p.is_optimized]
+    with _Bar(console) as bar:
+        atlases = make_atlases(found.scene, wanted, texels, bar.unwraps)
+        bar.total(sum(atlas.resolution**2 for atlas in atlases))
+        baker = Baker(problem.materials, own, Views(scene, cameras))
+        baked = []
+        for atlas in atlases:
+            bar.bakes(atlas.name)
+            baked.append(baker.bake(atlas, bar.advance))
+        bar.says("writing …")
+        environment = environment_picture(problem)
+        files, notes = _write(recovered, out, formats, found, baked, lights, environment, learned)
+    manifest = {
+        "format": EXPORT_FORMAT,
+        "unbake": VERSION,
+        "run": {
+            "folder": os.fspath(folder.path.resolve()),
+            "data": folder.origin().data,
+            "steps": recovered.progress.step,
+        },
+        "formats": list(formats),
+        "learned": list(learned),
+        "texels_per_unit": texels,
+        "unobserved_share": _unobserved(baked),
+        "files": sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()),
+        "materials": [
+            _material(one, files.get(one.atlas.name, [])) for one in baked if one.atlas.is_optimized
+        ],
+        "parts": [_part(part, atlases) for part in found.parts],
+        "left_out": found.left_out,
+        "lights": [
+            {
+                "name": light.name,
+                "type": light.plugin,
+                "strength": light.strength,
+                "recovered": light.recovered,
+            }
+            for light in lights
+        ],
+        "environment": None if environment is None else _ENVIRONMENT,
+        "colour_spaces": COLOUR_SPACES,
+        "conventions": _CONVENTIONS,
+        "notes": [*_notes(found, baked, lights), *notes],
+    }
+    _report(manifest, tell)
+    return manifest
+
+
+def _write(
+    recovered: Recovered,
+    out: Path,
+    formats: Sequence[Format],
+    found: Parts,
+    baked: Sequence[Baked],
+    lights: Sequence[Light],
+    environment: Any,
+    learned: Sequence[str],
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Write all formats: the textures' files by material, and what is not as it was."""
+    dataset = recovered.dataset
+    shown = [one for one in baked if one.atlas.is_optimized]
+    files: dict[str, list[str]] = {}
+    notes: list[str] = []
+    if "textures" in formats:
+        stems = file_names([one.atlas.name for one in shown])
+        for stem, one in zip(stems, shown, strict=True):
+            files[one.atlas.name] = write_textures(out / "textures", stem, one)
+    if environment is not None:
+        write_exr(out / _ENVIRONMENT, environment)
+    if "gltf" in formats:
+        write_glb(out / "scene.glb", found.scene, found.parts, shown, lights)
+    if "mitsuba" in formats:
+        (out / "mitsuba").mkdir()
+        written = write_scene(
+            out / "mitsuba",
+            parsed_principled(dataset.scene, dataset.root),
+            parsed_principled(dataset.scene, dataset.root),
+            found.parts,
+            baked,
+            lights,
+            environment,
+            dataset.train[0].camera,
+        )
+        notes += written.notes
+    return files, notes
+
+
+# ------------------------------------------------------------------------------------- the manifest
+
+
+def _material(baked: Baked, files: list[str]) -> dict[str, Any]:
+    atlas = baked.atlas
+    return {
+        "name": atlas.name,
+        "textures": files,
+        "resolution": atlas.resolution,
+        "wanted_resolution": atlas.wanted,
+        "coordinates": atlas.method,
+        "unique_share": atlas.unique,
+        "area": atlas.area(),
+        "unobserved_share": baked.unobserved_share,
+        "parts": [placed.part.name for placed in atlas.placed],
+    }
+
+
+def _part(part: Part, atlases: Sequence[Atlas]) -> dict[str, Any]:
+    names = [a.name for a in atlases for placed in a.placed if placed.part is part]
+    return {
+        "name": part.name,
+        "material": names[0] if names and part.is_optimized else None,
+        "triangles": len(part.triangles.faces),
+        "tessellated": not part.exact,
+        "without_area": part.dropped,
+    }
+
+
+def _unobserved(baked: Sequence[Baked]) -> float:
+    """The share of the optimized surface that no training view saw."""
+    shown = [(one.atlas.area(), one.unobserved_share) for one in baked if one.atlas.is_optimized]
+    return sum(a * s for a, s in shown) / max(sum(a for a, _ in shown), 1e-30)
+
+
+def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light]) -> list[str]:
+    """What is not as it should be."""
+    notes = []
+    if found.left_out:
+        notes.append(f"no triangles, left out: {', '.join(found.left_out)}")
+    for one in filter(lambda each: each.atlas.is_optimized, baked):
+        atlas = one.atlas
+        if atlas.resolution < atlas.wanted:
+            notes.append(f"{atlas.name}: limited to {LARGEST} texels, {atlas.wanted} were wanted")
+        if atlas.unique < UNIQUE:
+            overlap = 100 * (1 - atlas.unique)
+            notes.append(f"{atlas.name}: {overlap:.1f} % of its surface shares texels")
+        if one.learned and not one.observed.any():
+            notes.append(f"{atlas.name}: no training view saw it, its textures are the defaults")
+    varying = [light.name for light in lights if light.strength is None]
+    if varying:
+        notes.append(f"lights of varying strength are dark in glTF: {', '.join(varying)}")
+    if not any(one.learned for one in baked):
+        notes.append("the run learned no materials: all textures are the scene's own")
+    return notes
+
+
+def _report(manifest: dict[str, Any], tell: Callable[[str], None]) -> None:
+    """Tell what was written, in a few lines."""
+    materials = manifest["materials"]
+    for row in materials[:_TOLD]:
+        size = row["resolution"]
+        own = "its own coordinates" if row["coordinates"] == "own" else "unwrapped"
+        unseen = f"{100 * row['unobserved_share']:.1f} % unobserved"
+        tell(f"{row['name']}: {size} x {size} texels, {own}, {unseen}")
+    if len(materials) > _TOLD:
+        tell(f"… and {len(materials) - _TOLD} materials more, all in export.json")
+    share = 100 * manifest["unobserved_share"]
+    tell(f"{share:.1f} % of the surface was seen by no training view, and is filled in")
+    for note in manifest["notes"]:
+        tell(f"note: {note}")
+
+
+class _Bar:
+    """Shows progress on a terminal; a context manager."""
+
+    def __init__(self, console: Console | None) -> None:
+        shown = console is not None and console.is_terminal
+        self._bar = Progress(
+            TextColumn("{task.percentage:3.0f} %"),
+            BarColumn(bar_width=24),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.description}"),
+            console=console if shown else Console(quiet=True),
+            disable=not shown,
+            transient=True,
+        )
+        self._task = self._bar.add_task("reading the scene …", total=None)
+
+    def __enter__(self) -> _Bar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def says(self, what: str) -> None:
+        """Show what is at work."""
+        self._bar.update(self._task, description=what)
+
+    def unwraps(self, name: str) -> None:
+        """Show which material is unwrapped."""
+        self.says(f"unwrapping {name[:40]}")
+
+    def bakes(self, name: str) -> None:
+        """Show which material is baked."""
+        self.says(f"baking {name[:40]}")
+
+    def total(self, texels: int) -> None:
+        """Set the number of texels there are."""
+        self._bar.update(self._task, total=texels)
+
+    def advance(self, texels: int) -> None:
+        """Add texels that are done."""
+        self._bar.advance(self._task, texels)

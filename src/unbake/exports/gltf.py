@@ -1,0 +1,285 @@
+"""The scene as one binary glTF 2.0 file: a node for each part, textures and lights inside of it.
+
+Texture coordinates are the same in Mitsuba and in glTF: (0, 0) is the corner of the first texel of
+the first row. Axes and units stay those of the scene; glTF takes +y as up and metres.
+
+Source: Khronos, glTF 2.0 specification; KHR_lights_punctual, KHR_materials_emissive_strength,
+KHR_materials_transmission, KHR_materials_ior.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..imaging.pictures import png_bytes
+from ..io import write_atomically
+from ..scene.parse import ParsedScene
+from ..version import VERSION
+from .bake import Baked
+from .lights import Light
+from .parts import Part, bsdf_nodes
+from .tessellate import Triangles, unit
+from .textures import picture
+
+_FLOAT, _UINT, _ARRAY, _INDEX = 5126, 5125, 34962, 34963
+_LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
+#: A mesh that lights pass through, and its index of refraction where a scene says none.
+_GLASS = ("dielectric", "thindielectric", "roughdielectric")
+_CONDUCTORS = ("conductor", "roughconductor")
+_SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
+
+
+class _Document:
+    """A glTF document and its one buffer."""
+
+    def __init__(self) -> None:
+        self.json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": f"unbake {VERSION}"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+        }
+        self._parts: list[bytes] = []
+        self._length = 0
+        self._extensions: set[str] = set()
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Append to a list of the document; the number of the new entry."""
+        entries = self.json.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
+
+    def use(self, extension: str) -> str:
+        """Declare an extension."""
+        self._extensions.add(extension)
+        return extension
+
+    def view(self, data: bytes, target: int | None = None) -> int:
+        """Append bytes to the buffer; the number of their view."""
+        entry = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
+        if target is not None:
+            entry["target"] = target
+        padded = data + b"\0" * (-len(data) % 4)
+        self._parts.append(padded)
+        self._length += len(padded)
+        return self.add("bufferViews", entry)
+
+    def array(self, values: np.ndarray, kind: str, *, bounds: bool = False) -> int:
+        """Append an array of the attributes of vertices, or of indices; the number of its accessor.
+
+        Args:
+            values: float32 (n, components), or uint32 (n,).
+            kind: of glTF, such as `VEC3`.
+            bounds: tell the least and the most of each component.
+        """
+        index = values.dtype == np.uint32
+        entry: dict[str, Any] = {
+            "bufferView": self.view(
+                np.ascontiguousarray(values).tobytes(), _INDEX if index else _ARRAY
+            ),
+            "componentType": _UINT if index else _FLOAT,
+            "count": len(values),
+            "type": kind,
+        }
+        if bounds:
+            entry |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        return self.add("accessors", entry)
+
+    def image(self, name: str, pixels: np.ndarray) -> int:
+        """Append a picture of 8 bits; the number of its texture."""
+        data = self.view(png_bytes(pixels))
+        image = self.add("images", {"name": name, "bufferView": data, "mimeType": "image/png"})
+        if "samplers" not in self.json:
+            clamped = {"wrapS": _CLAMP, "wrapT": _CLAMP}
+            self.add("samplers", {"magFilter": _LINEAR, "minFilter": _MIPMAPS, **clamped})
+        return self.add("textures", {"sampler": 0, "source": image})
+
+    def write(self, path: Path) -> None:
+        """Write the file, complete or not at all."""
+        self.json["buffers"] = [{"byteLength": self._length}]
+        if self._extensions:
+            self.json["extensionsUsed"] = sorted(self._extensions)
+        text = json.dumps(self.json, allow_nan=False, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + 8 + self._length
+
+        def save(target: Path) -> None:
+            with target.open("wb") as file:
+                file.write(struct.pack("<4sII", b"glTF", 2, total))
+                file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+                file.write(struct.pack("<I4s", self._length, b"BIN\0"))
+                file.writelines(self._parts)
+
+        write_atomically(path, save)
+
+
+def write_glb(
+    path: Path,
+    scene: ParsedScene,
+    parts: Sequence[Part],
+    baked: Sequence[Baked],
+    lights: Sequence[Light],
+) -> None:
+    """Write parts, their materials and the lights.
+
+    Args:
+        path: the file.
+        scene: the nodes that the parts are of.
+        parts: all of them; those that no fit optimizes get materials without textures.
+        baked: textures of the others.
+        lights: point, spot and directional lights are written as such, area lights as emission of
+            their parts; environments are left out, as glTF knows none.
+    """
+    document = _Document()
+    placed = {id(p.part): (p.triangles, b) for b in baked for p in b.atlas.placed}
+    glow = {light.node: light.strength for light in lights}
+    textures: dict[int, dict[str, Any]] = {}
+    materials: dict[str, int] = {}
+    for part in parts:
+        if part.is_optimized:
+            triangles, one = placed[id(part)]
+            if id(one) not in textures:
+                textures[id(one)] = _textured(document, one)
+            material = {"name": one.atlas.name, **textures[id(one)]}
+        else:
+            triangles = part.triangles
+            strength = None if part.emitter is None else glow.get(part.emitter)
+            material = _plain(document, scene, part, strength)
+        material["doubleSided"] = part.two_sided
+        key = json.dumps(material, sort_keys=True)
+        if key not in materials:
+            materials[key] = document.add("materials", material)
+        triangles = triangles if part.is_optimized else replace(triangles, uv=None)
+        _add_part(document, part.name, triangles, materials[key])
+    for light in lights:
+        if light.plugin in _SPOTS and light.strength is not None:
+            _add_light(document, light)
+    document.write(path)
+
+
+def _add_part(document: _Document, name: str, triangles: Triangles, material: int) -> None:
+    attributes = {"POSITION": document.array(triangles.positions, "VEC3", bounds=True)}
+    if triangles.normals is not None:
+        attributes["NORMAL"] = document.array(unit(triangles.normals), "VEC3")
+    if triangles.uv is not None:
+        attributes["TEXCOORD_0"] = document.array(triangles.uv.astype(np.float32), "VEC2")
+    indices = document.array(triangles.faces.astype(np.uint32).ravel(), "SCALAR")
+    primitive = {"attributes": attributes, "indices": indices, "material": material}
+    mesh = document.add("meshes", {"name": name, "primitives": [primitive]})
+    node = document.add("nodes", {"name": name, "mesh": mesh})
+    document.json["scenes"][0]["nodes"].append(node)
+
+
+def _textured(document: _Document, baked: Baked) -> dict[str, Any]:
+    """A material of textures: roughness is the green channel and metallic the blue one."""
+    name, values = baked.atlas.name, baked.values
+    roughness, metallic = (picture(k, values[k]) for k in ("roughness", "metallic"))
+    both = np.stack([np.full_like(roughness, 255), roughness, metallic], -1)
+    colour = document.image(f"{name} base colour", picture("albedo", values["albedo"]))
+    return {
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": colour},
+            "metallicRoughnessTexture": {"index": document.image(f"{name} roughness", both)},
+        }
+    }
+
+
+def _plain(
+    document: _Document,
+    scene: ParsedScene,
+    part: Part,
+    strength: tuple[float, float, float] | None,
+) -> dict[str, Any]:
+    """A material of numbers for what no fit optimizes: lights, glass, mirrors and the like."""
+    nodes = scene.state.nodes
+    found = [] if part.bsdf is None else bsdf_nodes(scene, part.bsdf)
+    props = {nodes[i].props.plugin_name(): nodes[i].props for i in reversed(found)}
+    material: dict[str, Any] = {"name": part.name}
+    factors: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    if part.emitter is not None:
+        factors["baseColorFactor"] = [0.0, 0.0, 0.0, 1.0]
+        if strength is not None:
+            material |= _emissive(document, strength)
+    elif glass := next((props[k] for k in _GLASS if k in props), None):
+        factors["roughnessFactor"] = _roughness(glass, "roughdielectric")
+        ior = glass.get("int_ior", 1.5046)
+        material["extensions"] = {
+            document.use("KHR_materials_transmission"): {"transmissionFactor": 1.0}
+        }
+        if isinstance(ior, float) and ior >= 1:
+            material["extensions"][document.use("KHR_materials_ior")] = {"ior": ior}
+    elif metal := next((props[k] for k in _CONDUCTORS if k in props), None):
+        factors["metallicFactor"] = 1.0
+        factors["roughnessFactor"] = _roughness(metal, "roughconductor")
+        factors["baseColorFactor"] = [*_colour(metal.get("specular_reflectance", None)), 1.0]
+    else:
+        factors["baseColorFactor"] = [0.5, 0.5, 0.5, 1.0]
+    material["pbrMetallicRoughness"] = factors
+    return material
+
+
+def _roughness(props: Any, rough: str) -> float:
+    """Perceptual roughness of a microfacet width, 0 of what is smooth."""
+    alpha = props.get("alpha", 0.1)
+    if props.plugin_name() != rough or not isinstance(alpha, float):
+        return 0.0
+    return math.sqrt(min(max(alpha, 0.0), 1.0))
+
+
+def _colour(value: Any) -> list[float]:
+    """A colour of the scene, linear RGB in [0, 1]; that of a mirror where it is no number."""
+    try:
+        rgb = np.ravel(np.array(value, np.float64))
+    except (TypeError, ValueError, RuntimeError):
+        rgb = np.array([])
+    if rgb.size not in (1, 3) or not np.isfinite(rgb).all():
+        return [0.9, 0.9, 0.9]
+    return np.broadcast_to(rgb.clip(0, 1), 3).tolist()
+
+
+def _emissive(document: _Document, strength: Sequence[float]) -> Mapping[str, Any]:
+    """Emission: a colour in [0, 1] and what multiplies it."""
+    largest = max(*strength, 1e-12)
+    return {
+        "emissiveFactor": [max(x, 0.0) / largest for x in strength],
+        "extensions": {
+            document.use("KHR_materials_emissive_strength"): {"emissiveStrength": largest}
+        },
+    }
+
+
+def _add_light(document: _Document, light: Light) -> None:
+    """A light without extent; glTF's look along -z, Mitsuba's along +z."""
+    assert light.strength is not None
+    largest = max(*light.strength, 1e-12)
+    entry: dict[str, Any] = {
+        "name": light.name,
+        "type": _SPOTS[light.plugin],
+        "color": [max(x, 0.0) / largest for x in light.strength],
+        "intensity": largest,
+    }
+    if light.plugin == "spot":
+        inner, outer = light.angles
+        outer = min(float(outer), math.pi / 2)
+        entry["spot"] = {
+            "innerConeAngle": min(float(inner), 0.999 * outer),
+            "outerConeAngle": outer,
+        }
+    extension = document.use("KHR_lights_punctual")
+    known = document.json.setdefault("extensions", {}).setdefault(extension, {"lights": []})
+    known["lights"].append(entry)
+    matrix = light.to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
+    node = {
+        "name": light.name,
+        "matrix": matrix.T.ravel().tolist(),
+        "extensions": {extension: {"light": len(known["lights"]) - 1}},
+    }
+    document.json["scenes"][0]["nodes"].append(document.add("nodes", node))

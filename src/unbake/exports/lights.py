@@ -1,0 +1,88 @@
+"""The lights of a scene with the strengths that a fit recovered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ..scene.emitters import ENVIRONMENTS, emitter_nodes, named_emitters
+from ..scene.parse import ParsedScene
+from ..training.problem import Problem
+
+#: Rows of the picture of a recovered environment, at least.
+ROWS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """An emitter of `scene.emitters.STRENGTHS`."""
+
+    name: str
+    node: int
+    plugin: str
+    strength: tuple[float, float, float] | None  #: linear RGB; None: it varies
+    recovered: bool
+    to_world: np.ndarray  #: (4, 4); lights look along +z
+    angles: tuple[float, float]  #: of the cone of a spot, to its full and to no light, radians
+
+
+def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
+    """The lights of a scene, without an environment where one was recovered.
+
+    Args:
+        scene: as it was parsed; its strengths must not have been replaced.
+        problem: of the fit.
+    """
+    found = []
+    recovered = None if problem.emission is None else np.array(problem.emission.values).T
+    pairs = zip(named_emitters(scene), emitter_nodes(scene), strict=True)
+    for i, (named, node) in enumerate(pairs):
+        props = scene.state.nodes[node].props
+        if problem.environment is not None and props.plugin_name() in ENVIRONMENTS:
+            continue
+        strength = named.strength
+        if recovered is not None:
+            red, green, blue = (float(x) for x in recovered[i])
+            strength = (red, green, blue)
+        found.append(
+            Light(
+                named.name,
+                node,
+                props.plugin_name(),
+                strength,
+                recovered is not None,
+                _placement(props),
+                _cone(props),
+            )
+        )
+    return found
+
+
+def environment_picture(problem: Problem) -> np.ndarray | None:
+    """The recovered environment as Mitsuba's `envmap` reads it; None where none was recovered."""
+    if problem.environment is None:
+        return None
+    return problem.environment.to_latlong(max(ROWS, 2 * problem.environment.resolution))
+
+
+def _placement(props: mi.Properties) -> np.ndarray:
+    matrix = np.eye(4)
+    if "to_world" in props:
+        matrix = np.array(props["to_world"].matrix, np.float64).reshape(4, 4)
+    elif "position" in props:
+        matrix[:3, 3] = np.ravel(np.array(props["position"], np.float64))
+    elif "direction" in props:
+        z = np.ravel(np.array(props["direction"], np.float64))
+        z = z / max(float(np.linalg.norm(z)), 1e-30)
+        x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+        x /= np.linalg.norm(x)
+        matrix[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    return matrix
+
+
+def _cone(props: mi.Properties) -> tuple[float, float]:
+    outer = float(props.get("cutoff_angle", 20.0))
+    inner = float(props.get("beam_width", outer * 3 / 4))
+    return np.radians(inner), np.radians(outer)

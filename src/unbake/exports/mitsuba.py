@@ -1,0 +1,291 @@
+"""The scene with its recovered materials as a Mitsuba scene that needs no unbake."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..imaging.pictures import write_exr
+from ..io import write_atomically
+from ..quantities import QUANTITIES
+from ..scene.emitters import ENVIRONMENTS, STRENGTHS
+from ..scene.parse import ParsedScene, is_reference, referenced, write
+from .bake import Baked, bake_texture, make_texture
+from .lights import Light
+from .parts import Part, bsdf_nodes, principled_numbers
+from .tessellate import Triangles
+from .textures import file_names
+
+_SLOTS = {quantity.slot for quantity in QUANTITIES.values()}
+_TEXTURES, _MESHES, _ENVIRONMENT = "textures", "meshes", "environment"
+
+
+@dataclass(frozen=True)
+class Written:
+    """A scene that was written."""
+
+    path: Path
+    notes: list[str]  #: what is not as it was
+
+
+def write_scene(
+    folder: Path,
+    scene: ParsedScene,
+    scratch: ParsedScene,
+    parts: Sequence[Part],
+    baked: Sequence[Baked],
+    lights: Sequence[Light],
+    environment: np.ndarray | None,
+    camera: Camera,
+) -> Written:
+    """Write `scene.xml`, meshes and textures.
+
+    Shapes whose materials are written as textures become PLY meshes with the coordinates of these
+    textures; so do shapes that instances place. All others stay as they are.
+
+    Args:
+        folder: to write to; it must be new.
+        scene: freshly parsed; it is changed.
+        scratch: the same scene once more; its nodes are used up.
+        parts: of the scene.
+        baked: the textures of all materials that were unknown, those of lights included.
+        lights: with recovered strengths.
+        environment: the recovered one, as `envmap` reads it.
+        camera: of the sensor that is added where the scene has none.
+
+    Raises:
+        UserError: a texture cannot be made, or a file cannot be written.
+    """
+    folder = folder.resolve()
+    notes: list[str] = []
+    stems = file_names([one.atlas.name for one in baked])
+    for stem, one in zip(stems, baked, strict=True):
+        _replace_textures(folder, stem, one, scene, scratch, notes)
+    placed = {id(p.part): p.triangles for one in baked for p in one.atlas.placed}
+    names = _replace_shapes(folder, scene, parts, placed)
+    for light in lights:
+        if light.recovered:
+            props = scene.state.nodes[light.node].props
+            props[STRENGTHS[light.plugin]] = mi.ScalarColor3d(list(light.strength or (0, 0, 0)))
+    if environment is not None:
+        _replace_environment(folder, scene, environment)
+    _require_sensor(scene, camera)
+    _forget_unused(scene)
+    path = write(scene, folder)
+    _name_shapes(path, names)
+    return Written(path, notes)
+
+
+# ----------------------------------------------------------------------------------------- textures
+
+
+def _replace_textures(
+    folder: Path,
+    stem: str,
+    baked: Baked,
+    scene: ParsedScene,
+    scratch: ParsedScene,
+    notes: list[str],
+) -> None:
+    """Give the BSDFs of a material its baked textures."""
+    nodes = {number: node for node, number in principled_numbers(scene).items()}
+    for name, values in baked.values.items():
+        single = values[..., 0] if values.shape[-1] == 1 else values
+        texture = _bitmap(scene, folder / _TEXTURES / f"{stem}_{name}.exr", single)
+        for number in baked.atlas.materials:
+            props = scene.state.nodes[nodes[number]].props
+            props[QUANTITIES[name].slot] = mi.Properties.ResolvedReference(texture)
+    if baked.atlas.method != "own":
+        _move_others(folder, stem, baked, scene, scratch, notes)
+
+
+def _move_others(
+    folder: Path,
+    stem: str,
+    baked: Baked,
+    scene: ParsedScene,
+    scratch: ParsedScene,
+    notes: list[str],
+) -> None:
+    """Bring the other textures of a material's BSDFs into the coordinates of its atlas."""
+    parts = [placed.part for placed in baked.atlas.placed]
+    outer = {part.bsdf for part in parts if part.bsdf is not None}
+    inside = {i for bsdf in outer for i in bsdf_nodes(scene, bsdf)}
+    moved: dict[int, int] = {}
+    for i in sorted(inside):
+        node = scene.state.nodes[i]
+        if node.type != mi.ObjectType.BSDF:
+            continue
+        plugin = node.props.plugin_name()
+        for key in list(node.props):
+            inner = referenced(scene, node.props[key])
+            baked_here = plugin == "principled" and key in _SLOTS
+            if inner is None or inner.type != mi.ObjectType.Texture or baked_here:
+                continue
+            if plugin == "normalmap":
+                # Its vectors are in the frame of the old coordinates.
+                node.props[key] = mi.ScalarColor3d([0.5, 0.5, 1.0])
+                notes.append(f"{baked.atlas.name}: the normal map is left out")
+                continue
+            old = node.props[key].index()
+            if old not in moved:
+                pixels = bake_texture(baked, make_texture(scratch, old))
+                file = folder / _TEXTURES / f"{stem}_texture-{len(moved)}.exr"
+                moved[old] = _bitmap(scene, file, pixels)
+            node.props[key] = mi.Properties.ResolvedReference(moved[old])
+
+
+def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
+    """Write an image and append a texture of it; the number of the texture's node."""
+    write_exr(file, values)
+    node = mi.parser.SceneNode()
+    node.type = mi.ObjectType.Texture
+    node.props.set_plugin_name("bitmap")
+    node.props["filename"] = str(file)
+    node.props["raw"] = True
+    node.props["wrap_mode"] = "clamp"
+    return _append(scene, node)
+
+
+def _append(scene: ParsedScene, node: mi.parser.SceneNode) -> int:
+    scene.state.nodes.append(node)
+    return len(scene.state.nodes) - 1
+
+
+# ------------------------------------------------------------------------------------------- shapes
+
+
+def _replace_shapes(
+    folder: Path, scene: ParsedScene, parts: Sequence[Part], placed: dict[int, Triangles]
+) -> dict[str, str]:
+    """Put PLY meshes in the place of shapes; returns names of parts by file."""
+    chosen = [part for part in parts if id(part) in placed or part.instanced]
+    replaced = {part.node for part in chosen if not part.instanced}
+    instances = any(part.instanced for part in parts)
+    root = scene.state.root.props
+    for key in list(root):
+        node = referenced(scene, root[key])
+        if node is None:
+            continue
+        grouped = instances and node.props.plugin_name() in ("shapegroup", "instance")
+        if grouped or root[key].index() in replaced:
+            del root[key]
+    names = {}
+    for number, (part, stem) in enumerate(
+        zip(chosen, file_names([part.name for part in chosen]), strict=True)
+    ):
+        file = folder / _MESHES / f"{stem}.ply"
+        triangles = placed.get(id(part), part.triangles)
+        write_ply(file, triangles)
+        node = mi.parser.SceneNode()
+        node.type = mi.ObjectType.Shape
+        node.props.set_plugin_name("ply")
+        node.props["filename"] = str(file)
+        node.props["face_normals"] = triangles.normals is None
+        old = scene.state.nodes[part.node].props
+        for key in list(old):
+            if is_reference(old[key]):
+                node.props[key] = old[key]
+        root[f"exported shape {number}"] = mi.Properties.ResolvedReference(_append(scene, node))
+        names[f"{_MESHES}/{stem}.ply"] = part.name
+    return names
+
+
+def write_ply(path: Path, mesh: Triangles) -> None:
+    """Write a binary PLY file with positions, normals and texture coordinates, if there are any."""
+    columns = {"x": mesh.positions[:, 0], "y": mesh.positions[:, 1], "z": mesh.positions[:, 2]}
+    if mesh.normals is not None:
+        columns |= {f"n{axis}": mesh.normals[:, i] for i, axis in enumerate("xyz")}
+    if mesh.uv is not None:
+        columns |= {axis: mesh.uv[:, i] for i, axis in enumerate("uv")}
+    vertices = np.stack(list(columns.values()), -1).astype("<f4")
+    faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<u4", 3)]))
+    faces["count"], faces["corners"] = 3, mesh.faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in columns]
+    header += [f"element face {len(faces)}", "property list uchar uint vertex_indices"]
+    text = "\n".join([*header, "end_header\n"]).encode()
+
+    def save(target: Path) -> None:
+        with target.open("wb") as file:
+            file.write(text)
+            file.write(np.ascontiguousarray(vertices).tobytes())
+            file.write(faces.tobytes())
+
+    write_atomically(path, save)
+
+
+def _name_shapes(path: Path, names: dict[str, str]) -> None:
+    """Give shapes their names again: `mi.parser.write_file` of Mitsuba 3.9 drops them."""
+    tree = ElementTree.parse(path)
+    taken = {node.get("id") for node in tree.iter() if node.get("id")}
+    for shape in tree.iter("shape"):
+        files = [s.get("value") for s in shape.findall("string") if s.get("name") == "filename"]
+        name = _as_id(names.get(files[0] or "", "")) if files else ""
+        if name and name not in taken:
+            taken.add(name)
+            shape.set("id", name)
+    ElementTree.indent(tree, "    ")
+    write_atomically(path, lambda p: tree.write(p, encoding="utf-8", xml_declaration=True))
+
+
+def _as_id(name: str) -> str:
+    """A name as Mitsuba takes ids: no dots, no control characters, none of its own marks."""
+    return re.sub(r"[^\w /-]", "_", name).lstrip("_")
+
+
+# ------------------------------------------------------------------------------- lights and sensors
+
+
+def _replace_environment(folder: Path, scene: ParsedScene, picture: np.ndarray) -> None:
+    file = folder / _TEXTURES / f"{_ENVIRONMENT}.exr"
+    write_exr(file, picture)
+    root = scene.state.root.props
+    for key in list(root):
+        node = referenced(scene, root[key])
+        if node is not None and node.props.plugin_name() in ENVIRONMENTS:
+            for name in list(node.props):
+                del node.props[name]
+            node.props.set_plugin_name("envmap")
+            node.props["filename"] = str(file)
+
+
+def _require_sensor(scene: ParsedScene, camera: Camera) -> None:
+    """Append a sensor where there is none."""
+    nodes = scene.state.nodes
+    if any(node.type == mi.ObjectType.Sensor for node in nodes):
+        return
+    wanted = camera.sensor(64)
+    film = mi.parser.SceneNode()
+    film.type = mi.ObjectType.Film
+    film.props.set_plugin_name("hdrfilm")
+    film.props["width"], film.props["height"] = camera.width, camera.height
+    sensor = mi.parser.SceneNode()
+    sensor.type = mi.ObjectType.Sensor
+    sensor.props.set_plugin_name("perspective")
+    for key in ("fov", "fov_axis", "near_clip", "far_clip", "to_world"):
+        sensor.props[key] = wanted[key]
+    sensor.props["film"] = mi.Properties.ResolvedReference(_append(scene, film))
+    root = scene.state.root.props
+    root["exported sensor"] = mi.Properties.ResolvedReference(_append(scene, sensor))
+
+
+def _forget_unused(scene: ParsedScene) -> None:
+    """Take the files from nodes that nothing refers to, so that they are not copied."""
+    nodes, used, waiting = scene.state.nodes, set(), [0]
+    while waiting:
+        i = waiting.pop()
+        if i not in used:
+            used.add(i)
+            props = nodes[i].props
+            waiting += [props[key].index() for key in list(props) if is_reference(props[key])]
+    for i, node in enumerate(nodes):
+        if i not in used and "filename" in node.props:
+            del node.props["filename"]

@@ -1,0 +1,146 @@
+"""Which surface points training views saw, and values for those that none saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..scene import free_space
+
+#: How far from a point a ray towards it ends, as a fraction of the scene's diagonal.
+_OFFSET = 2e-4
+#: The cosine below which a surface is seen from its edge, where nothing can be read from it.
+_GRAZING = 0.02
+
+
+class Views:
+    """What cameras see of a scene's surfaces.
+
+    Points that are seen in mirrors or through glass alone count as not seen.
+
+    Args:
+        scene: what stands in the way.
+        cameras: those that a fit learned from.
+    """
+
+    def __init__(self, scene: mi.Scene, cameras: Sequence[Camera]) -> None:
+        self._scene, self._cameras = scene, cameras
+        self._offset = _OFFSET * free_space.bounds(scene)[2]
+
+    def see(self, p: mi.Point3f, n: mi.Normal3f, two_sided: mi.Bool, active: mi.Bool) -> mi.Bool:
+        """Whether any camera sees points.
+
+        Args:
+            p: in world space.
+            n: unit normals of the surface.
+            two_sided: whether the surface can be read from its back as well.
+            active: points that count.
+        """
+        seen = dr.zeros(mi.Bool, dr.width(p))
+        dr.eval(p, n, two_sided, active)
+        for camera in self._cameras:
+            seen |= self._sees(camera, p, n, two_sided, active & ~seen)
+            dr.eval(seen)
+        return seen
+
+    def _sees(
+        self,
+        camera: Camera,
+        p: mi.Point3f,
+        n: mi.Normal3f,
+        two_sided: mi.Bool,
+        active: mi.Bool,
+    ) -> mi.Bool:
+        # All numbers come as arrays, so that one kernel serves all cameras.
+        origin = _opaque(camera.origin)
+        right, up, back = (_opaque(camera.to_world[:3, k]) for k in range(3))
+        focal, centre, size = (
+            mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y))
+            for x, y in (
+                (camera.fl_x, camera.fl_y),
+                (camera.cx, camera.cy),
+                (camera.width, camera.height),
+            )
+        )
+        to_point = p - origin
+        depth = -dr.dot(to_point, back)
+        along = mi.Point2f(dr.dot(to_point, right), -dr.dot(to_point, up))
+        film = dr.fma(along / depth, focal, centre)
+        inside = (depth > 0) & dr.all((film >= 0) & (film < size))
+        distance = dr.norm(to_point)
+        d = to_point / distance
+        cosine = -dr.dot(d, n)
+        facing = dr.select(two_sided, dr.abs(cosine), cosine) > _GRAZING
+        tried = active & inside & facing & (distance > self._offset)
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(d))
+        ray.maxt = dr.maximum(distance - dr.opaque(mi.Float, self._offset), 0)
+        return tried & ~self._scene.ray_test(ray, tried)
+
+
+def _opaque(vector: np.ndarray) -> mi.Vector3f:
+    return mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in vector))
+
+
+def filled(values: np.ndarray, known: np.ndarray, default: Sequence[float]) -> np.ndarray:
+    """Values of texels that are not known, from those around them that are.
+
+    A pyramid of means over known texels; each unknown one takes the finest level that knows
+    something of its neighbourhood, interpolated.
+
+    Args:
+        values: (n, n, channels) float32, n a power of two.
+        known: (n, n) bool.
+        default: of each channel, where nothing is known.
+
+    Returns:
+        The same array of values, with those that are not known replaced.
+
+    Source: Gortler et al., The Lumigraph (1996), Sec. 3.4: pull and push.
+    """
+    if not known.any():
+        values[:] = np.asarray(default, np.float32)
+        return values
+    if known.all():
+        return values
+    weight = known[..., None].astype(np.float32)
+    coarse, sums = _halved(values * weight, weight)
+    guess = _doubled(_completed(coarse, sums))
+    np.copyto(values, guess, where=~known[..., None])
+    return values
+
+
+def _completed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """A level of the pyramid, filled from the coarser ones."""
+    if len(values) == 1 or (weight > 0).all():
+        return values
+    coarse = _doubled(_completed(*_halved(values * weight, weight)))
+    # What half is known of keeps half of its own value, so that no edge shows.
+    share = np.minimum(weight, 1)
+    return share * values + (1 - share) * coarse
+
+
+def _halved(weighted: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of two by two texels, and how much of them is known, at most 1 texel."""
+    total, known = (a[::2, ::2] + a[1::2, ::2] + a[::2, 1::2] + a[1::2, 1::2]
+                    for a in (weighted, weight))  # fmt: skip
+    return total / np.maximum(known, 1e-20), np.minimum(known, 1)
+
+
+def _doubled(values: np.ndarray) -> np.ndarray:
+    """Twice the resolution, bilinear."""
+    for axis in (0, 1):
+        before = np.concatenate([values.take([0], axis), values], axis).take(
+            range(values.shape[axis]), axis
+        )
+        after = np.concatenate([values, values.take([-1], axis)], axis).take(
+            range(1, values.shape[axis] + 1), axis
+        )
+        pair = np.stack([0.75 * values + 0.25 * before, 0.75 * values + 0.25 * after], axis + 1)
+        shape = list(values.shape)
+        shape[axis] *= 2
+        values = pair.reshape(shape).astype(np.float32)
+    return values

@@ -1,0 +1,234 @@
+"""The parts of a scene as its author gave them: shapes with names, triangles and materials."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from ..fields.shapes import PlacedShape, placed_shapes
+from ..scene import edit
+from ..scene.parse import ParsedScene, is_reference, parse
+from .tessellate import TESSELLATED, Triangles, tessellated, unit
+
+#: By which a shape that was made is found among the nodes.
+_ID = "shape node {}"
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A shape of the scene, once for each place that it stands at."""
+
+    name: str  #: unique: its id, else the name of its file, else its plugin and a number
+    node: int  #: among the nodes of the parsed scene
+    bsdf: int | None  #: the node of its outermost BSDF
+    emitter: int | None  #: the node of its emitter
+    materials: tuple[int, ...]  #: numbers of its `principled` BSDFs, as in `edit.material_names`
+    triangles: Triangles  #: in world space
+    two_sided: bool  #: both sides reflect
+    exact: bool  #: False: the shape was round, and became triangles
+    instanced: bool  #: it stands in a group, which instances place
+    dropped: int  #: triangles without an area, which were left out
+
+    @property
+    def is_optimized(self) -> bool:
+        """Whether a fit optimizes its material; see `transport/optimized.py`."""
+        return bool(self.materials) and self.emitter is None
+
+
+@dataclass(frozen=True)
+class Parts:
+    """All parts of a scene, and shapes that cannot become triangles."""
+
+    scene: ParsedScene  #: whose nodes the numbers of the parts are of
+    parts: list[Part]
+    left_out: list[str]  #: names of shapes that are no surfaces of triangles
+
+
+def principled_numbers(scene: ParsedScene) -> dict[int, int]:
+    """The numbers of the materials, by the numbers of their nodes."""
+    nodes = scene.state.nodes
+    found = [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
+    return {node: number for number, node in enumerate(found)}
+
+
+def parsed_principled(path: Path, root: Path) -> ParsedScene:
+    """The scene of a data set with the BSDFs that a fit sees."""
+    scene = parse(path, root)
+    edit.to_principled(scene)
+    return scene
+
+
+def read_parts(path: Path, root: Path) -> Parts:
+    """Load the scene of a data set, unmerged.
+
+    Raises:
+        UserError: the scene cannot be loaded, or holds nothing that can be exported.
+    """
+    scene = parsed_principled(path, root)
+    nodes = scene.state.nodes
+    names = _names(scene)
+    described = {i: _described(scene, i) for i in names}
+    made = _instantiated(path, root, list(names))
+    numbers = {_ID.format(i): i for i in names}
+    parts, left_out = [], []
+    taken: set[str] = set()
+    for placed in placed_shapes(made):
+        i = numbers[placed.shape.id()]
+        triangles = _triangles(placed, nodes[i].props)
+        if triangles is None:
+            left_out.append(names[i])
+            continue
+        sound, dropped = _sound(triangles)
+        if not len(sound.faces):
+            left_out.append(names[i])
+            continue
+        part = replace(
+            described[i],
+            name=_unique(names[i], taken),
+            triangles=sound,
+            exact=placed.shape.is_mesh(),
+            instanced=placed.to_world is not None,
+            dropped=dropped,
+        )
+        parts.append(part)
+    if not parts:
+        raise UserError("the scene has no shape that can be exported", path)
+    return Parts(scene, parts, left_out)
+
+
+def _instantiated(path: Path, root: Path, shapes: list[int]) -> mi.Scene:
+    """The scene, whose shapes have ids by the numbers of their nodes."""
+    scene = parsed_principled(path, root)
+    for i in shapes:
+        scene.state.nodes[i].props.set_id(_ID.format(i))
+    return scene.instantiate(merge=False)
+
+
+def bsdf_nodes(scene: ParsedScene, node: int) -> list[int]:
+    """A BSDF's node and those of all BSDFs and textures in it, each once."""
+    found, waiting = [], [node]
+    while waiting:
+        i = waiting.pop(0)
+        if i not in found:
+            found.append(i)
+            waiting += _references(scene, i)
+    return found
+
+
+def _references(scene: ParsedScene, node: int) -> list[int]:
+    props = scene.state.nodes[node].props
+    return [props[key].index() for key in list(props) if is_reference(props[key])]
+
+
+def _described(scene: ParsedScene, node: int) -> Part:
+    """What the nodes say of a shape."""
+    nodes, materials = scene.state.nodes, principled_numbers(scene)
+    inside = _references(scene, node)
+    bsdf = next((i for i in inside if nodes[i].type == mi.ObjectType.BSDF), None)
+    emitter = next((i for i in inside if nodes[i].type == mi.ObjectType.Emitter), None)
+    found = [] if bsdf is None else bsdf_nodes(scene, bsdf)
+    plugins = {nodes[i].props.plugin_name() for i in found}
+    return Part(
+        name="",
+        node=node,
+        bsdf=bsdf,
+        emitter=emitter,
+        materials=tuple(materials[i] for i in found if i in materials),
+        triangles=_NOTHING,
+        two_sided="twosided" in plugins,
+        exact=True,
+        instanced=False,
+        dropped=0,
+    )
+
+
+_NOTHING = Triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), None, None)
+
+
+def _names(scene: ParsedScene) -> dict[int, str]:
+    """The names of all shapes, by the numbers of their nodes."""
+    names = {}
+    for i, node in enumerate(scene.state.nodes):
+        if node.type == mi.ObjectType.Shape:
+            # `mi.parser.write_file` of Mitsuba 3.9 drops ids that nothing refers to.
+            stem = Path(str(node.props.get("filename", ""))).stem
+            names[i] = node.props.id() or stem or f"{node.props.plugin_name()}-{len(names)}"
+    return names
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    number, chosen = 1, name
+    while chosen in taken:
+        number += 1
+        chosen = f"{name}-{number}"
+    taken.add(chosen)
+    return chosen
+
+
+def unique_names(names: list[str], clean: Callable[[str], str] = str) -> list[str]:
+    """These names, with a number behind those that are taken."""
+    taken: set[str] = set()
+    return [_unique(clean(name), taken) for name in names]
+
+
+def _triangles(placed: PlacedShape, props: mi.Properties) -> Triangles | None:
+    """A shape in world space; None if it is no surface that becomes triangles."""
+    shape = placed.shape
+    if shape.is_mesh():
+        mesh = _of_mesh(shape)
+    elif props.plugin_name() in TESSELLATED:
+        matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+        mesh = tessellated(props.plugin_name()).moved(matrix)
+        mesh = mesh.turned() if props.get("flip_normals", False) else mesh
+    else:
+        return None
+    return mesh if placed.to_world is None else mesh.moved(placed.to_world)
+
+
+def _of_mesh(mesh: mi.Mesh) -> Triangles:
+    positions = np.array(mesh.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+    faces = np.array(mesh.faces_buffer(), np.uint32).reshape(-1, 3)
+    normals = uv = None
+    if mesh.has_vertex_normals() and not mesh.has_face_normals():
+        normals = unit(np.array(mesh.vertex_normals_buffer(), np.float32).reshape(-1, 3))
+    if mesh.has_vertex_texcoords():
+        uv = np.array(mesh.vertex_texcoords_buffer(), np.float32).reshape(-1, 2)
+    return _as_seen(mesh, Triangles(positions, faces, normals, uv))
+
+
+def _as_seen(mesh: mi.Mesh, triangles: Triangles) -> Triangles:
+    """The triangles with normals on the side where Mitsuba has them, which may flip them."""
+    if not mesh.has_flipped_normals():
+        return triangles
+    largest = int(np.argmax(triangles.areas()))
+    corners = triangles.faces[largest]
+    a, b, c = triangles.positions[corners].astype(np.float64)
+    hit = dr.zeros(mi.PreliminaryIntersection3f)
+    hit.t, hit.shape = mi.Float(1), mi.ShapePtr(mesh)
+    hit.prim_index, hit.prim_uv = mi.UInt32(largest), mi.Point2f(1 / 3)
+    si = mesh.compute_surface_interaction(dr.zeros(mi.Ray3f), hit)
+    n, shading = np.ravel(np.array(si.n)), np.ravel(np.array(si.sh_frame.n))
+    if n @ np.cross(b - a, c - a) < 0:
+        triangles = triangles.reversed_faces()
+    if triangles.normals is not None and shading @ triangles.normals[corners].sum(0) < 0:
+        triangles = replace(triangles, normals=-triangles.normals)
+    return triangles
+
+
+def _sound(triangles: Triangles) -> tuple[Triangles, int]:
+    """The triangles without those of no area, with the vertices that they use, and how many."""
+    kept = triangles.areas() > 0
+    used, faces = np.unique(triangles.faces[kept], return_inverse=True)
+    sound = Triangles(
+        triangles.positions[used],
+        faces.reshape(-1, 3).astype(np.uint32),
+        None if triangles.normals is None else triangles.normals[used],
+        None if triangles.uv is None else triangles.uv[used],
+    )
+    return sound, int((~kept).sum())

@@ -1,0 +1,102 @@
+"""Spheres, disks and cylinders as triangles, in Mitsuba's own texture coordinates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Around a circle, and from pole to pole.
+_AROUND, _ALONG = 128, 64
+#: Plugins that become triangles.
+TESSELLATED = ("sphere", "disk", "cylinder")
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """A triangle mesh: arrays of float32, and indices of corners."""
+
+    positions: np.ndarray  #: (n, 3)
+    faces: np.ndarray  #: (m, 3) uint32, counterclockwise seen from the side of the normal
+    normals: np.ndarray | None  #: (n, 3), unit; None: faces are flat
+    uv: np.ndarray | None  #: (n, 2), Mitsuba's texture coordinates; None: there are none
+
+    def moved(self, matrix: np.ndarray) -> Triangles:
+        """The same after an affine map (4, 4); a mirroring one turns the triangles around."""
+        linear = matrix[:3, :3].astype(np.float64)
+        positions = self.positions @ linear.T + matrix[:3, 3]
+        normals = None
+        if self.normals is not None:
+            normals = unit(self.normals @ np.linalg.pinv(linear))
+        moved = Triangles(positions.astype(np.float32), self.faces, normals, self.uv)
+        return moved.reversed_faces() if np.linalg.det(linear) < 0 else moved
+
+    def reversed_faces(self) -> Triangles:
+        """The same with triangles of the other orientation; normals stay."""
+        faces = np.ascontiguousarray(self.faces[:, ::-1])
+        return Triangles(self.positions, faces, self.normals, self.uv)
+
+    def turned(self) -> Triangles:
+        """The same seen from the other side: triangles and normals are turned around."""
+        normals = None if self.normals is None else -self.normals
+        faces = np.ascontiguousarray(self.faces[:, ::-1])
+        return Triangles(self.positions, faces, normals, self.uv)
+
+    def areas(self) -> np.ndarray:
+        """The areas of the triangles, (m,) float64."""
+        a, b, c = np.moveaxis(self.positions[self.faces].astype(np.float64), 1, 0)
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) of length 1, float32; those of length 0 become +z."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    known = np.isfinite(length) & (length > 0)
+    scaled = np.where(known, vectors, [0.0, 0.0, 1.0]) / np.where(known, length, 1)
+    return scaled.astype(np.float32)
+
+
+def tessellated(plugin: str) -> Triangles:
+    """A shape of `TESSELLATED` in its own space, with the parameters that Mitsuba gives points.
+
+    The vertices lie on the shape. Triangles of a sphere are inside of it by 0.03 % of its radius
+    at most.
+    """
+    if plugin == "sphere":
+        u, v = _lattice(_AROUND, _ALONG)
+        sin, cos = np.sin(v * math.pi), np.cos(v * math.pi)
+        across = 2 * math.pi * u
+        positions = np.stack([sin * np.cos(across), sin * np.sin(across), cos], -1)
+        return _mesh(positions, positions, np.stack([u, v], -1), _ALONG, turned=True)
+    if plugin == "disk":
+        v, u = _lattice(_AROUND, 8)  # Mitsuba: the first coordinate is the radius
+        across = 2 * math.pi * v
+        positions = np.stack([u * np.cos(across), u * np.sin(across), 0 * u], -1)
+        normals = np.broadcast_to([0.0, 0.0, 1.0], positions.shape)
+        return _mesh(positions, normals, np.stack([u, v], -1), 8, turned=True)
+    u, v = _lattice(_AROUND, 1)
+    across = 2 * math.pi * u
+    normals = np.stack([np.cos(across), np.sin(across), 0 * u], -1)
+    positions = np.stack([np.cos(across), np.sin(across), v], -1)
+    return _mesh(positions, normals, np.stack([u, v], -1), 1, turned=False)
+
+
+def _lattice(across: int, along: int) -> tuple[np.ndarray, np.ndarray]:
+    u, v = np.meshgrid(np.arange(across + 1) / across, np.arange(along + 1) / along)
+    return u.ravel(), v.ravel()
+
+
+def _mesh(
+    positions: np.ndarray, normals: np.ndarray, uv: np.ndarray, along: int, *, turned: bool
+) -> Triangles:
+    first = np.arange(along)[:, None] * (_AROUND + 1) + np.arange(_AROUND)
+    a, b, c, d = (np.ravel(first + k) for k in (0, 1, _AROUND + 1, _AROUND + 2))
+    faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).astype(np.uint32)
+    mesh = Triangles(
+        positions.astype(np.float32), faces, unit(np.array(normals)), uv.astype(np.float32)
+    )
+    mesh = mesh.reversed_faces() if turned else mesh
+    # Poles and centres are one point: half of the triangles there have no area.
+    kept = mesh.areas() > 1e-12
+    return Triangles(mesh.positions, mesh.faces[kept], mesh.normals, mesh.uv)

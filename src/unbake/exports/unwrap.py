@@ -1,0 +1,299 @@
+"""Atlases: each material has a square of texture coordinates, which its parts share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from ..scene.parse import ParsedScene
+from .parts import Part, principled_numbers, unique_names
+from .tessellate import Triangles
+
+#: Texels along the edge of a texture.
+SMALLEST, LARGEST = 64, 8192
+#: Points by which texture coordinates are tried, and the share that must find back.
+POINTS, UNIQUE = 20_000, 0.999
+#: Empty texels around charts.
+_PADDING = 2
+#: Of the extent of a material's parts: how near a point must come back.
+_NEAR = 1e-3
+#: The share of a square that charts are expected to fill.
+_FILLED = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A part with the texture coordinates of its material's atlas."""
+
+    part: Part
+    triangles: Triangles  #: `uv` is that of the atlas
+    own_uv: np.ndarray | None  #: (n, 2), those of the scene, vertex by vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """What the parts of a material share: texture coordinates, and so textures."""
+
+    name: str
+    materials: tuple[int, ...]  #: numbers of its BSDFs: several where one holds several
+    placed: list[Placed]
+    method: str  #: "own", "uvunwrap" or "xatlas"
+    unique: float  #: share of points whose texture coordinates lead back to them
+    resolution: int  #: texels along an edge
+    wanted: int  #: the resolution before it was limited
+
+    @property
+    def is_optimized(self) -> bool:
+        """Whether any part shows what the fit recovered."""
+        return any(placed.part.is_optimized for placed in self.placed)
+
+    def area(self) -> float:
+        """Of the surface, in square world units."""
+        return sum(float(placed.triangles.areas().sum()) for placed in self.placed)
+
+
+def make_atlases(
+    scene: ParsedScene,
+    parts: Sequence[Part],
+    texels: float,
+    advance: Callable[[str], object] = lambda name: None,
+) -> list[Atlas]:
+    """An atlas for each material that parts have.
+
+    Args:
+        scene: the nodes that the parts are of.
+        parts: those with materials are placed, the others are passed over.
+        texels: wanted along a scene unit.
+        advance: called with the name of each material before it is unwrapped.
+
+    Raises:
+        UserError: a material's parts cannot be unwrapped.
+    """
+    groups = _groups([part for part in parts if part.materials])
+    names = _material_names(scene, groups)
+    atlases = []
+    for name, group in zip(names, groups, strict=True):
+        advance(name)
+        atlases.append(_atlas(name, group, texels))
+    return atlases
+
+
+def _groups(parts: Sequence[Part]) -> list[list[Part]]:
+    """Parts that share a material, also through others: a BSDF may hold several materials."""
+    first: dict[int, int] = {}
+
+    def root(number: int) -> int:
+        while first.setdefault(number, number) != number:
+            number = first[number]
+        return number
+
+    for part in parts:
+        for number in part.materials:
+            low, high = sorted((root(part.materials[0]), root(number)))
+            first[high] = low
+    found: dict[int, list[Part]] = {}
+    for part in parts:
+        found.setdefault(root(part.materials[0]), []).append(part)
+    return list(found.values())
+
+
+def _material_names(scene: ParsedScene, groups: list[list[Part]]) -> list[str]:
+    """The id of a group's material or of the BSDF around it, else the name of its first part."""
+    nodes = {number: node for node, number in principled_numbers(scene).items()}
+    names = []
+    for group in groups:
+        part = group[0]
+        known = [scene.state.nodes[nodes[part.materials[0]]].props.id()]
+        if part.bsdf is not None:
+            known.append(scene.state.nodes[part.bsdf].props.id())
+        names.append(next(filter(None, known), part.name))
+    return unique_names(names)
+
+
+def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
+    materials = tuple(sorted({number for part in parts for number in part.materials}))
+    own = _with_own(parts)
+    if own is not None and (share := unique_share(own)) >= UNIQUE:
+        filled = sum(_uv_areas(placed.triangles).sum() for placed in own)
+        wanted, resolution = _resolution(own, texels, float(filled))
+        return Atlas(name, materials, own, "own", share, resolution, wanted)
+    whole = [Placed(part, part.triangles, part.triangles.uv) for part in parts]
+    wanted, resolution = _resolution(whole, texels, _FILLED)
+    found: list[Atlas] = []
+    failures = []
+    for method, unwrap in (("uvunwrap", _by_uvunwrap), ("xatlas", _by_xatlas)):
+        try:
+            corners = unwrap([part.triangles for part in parts], resolution)
+        except (RuntimeError, ValueError, ImportError) as error:
+            failures.append(f"{method}: {error}")
+            continue
+        placed = [_split(part, uv) for part, uv in zip(parts, corners, strict=True)]
+        share = unique_share(placed)
+        found.append(Atlas(name, materials, placed, method, share, resolution, wanted))
+        if share >= UNIQUE:
+            break
+    if not found:
+        why = " ".join("; ".join(failures).split())[:200]
+        raise UserError(f"the material {name!r} cannot be unwrapped ({why})", None, "Unwrap it")
+    return max(found, key=lambda atlas: atlas.unique)
+
+
+def _resolution(placed: list[Placed], texels: float, filled: float) -> tuple[int, int]:
+    """Texels along an edge: what is wanted, and within the limits; powers of two."""
+    area = sum(float(each.triangles.areas().sum()) for each in placed)
+    edge = texels * math.sqrt(area / max(filled, 1e-9))
+    wanted = 1 << max(0, math.ceil(math.log2(max(edge, 1.0)) - 1e-9))
+    return wanted, min(max(wanted, SMALLEST), LARGEST)
+
+
+# ------------------------------------------------------------------------- coordinates of the scene
+
+
+def _with_own(parts: list[Part]) -> list[Placed] | None:
+    """The parts with their own coordinates; None where some have none, or leave the square."""
+    placed = []
+    for part in parts:
+        uv = part.triangles.uv
+        # Not a number is outside as well.
+        if uv is None or not ((uv > -1e-4) & (uv < 1 + 1e-4)).all():
+            return None
+        placed.append(Placed(part, replace(part.triangles, uv=uv.clip(0, 1)), uv))
+    return placed
+
+
+def unique_share(placed: list[Placed], seed: int = 0) -> float:
+    """The share of random surface points that texture coordinates lead back to."""
+    positions, faces, uv = joined(placed)
+    mesh = parameterized(positions, faces, uv)
+    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(faces), POINTS, p=areas / areas.sum())
+    weights = _barycentric(rng, POINTS)
+    points = np.einsum("nk,nkd->nd", weights, positions[faces[chosen]])
+    coordinates = np.einsum("nk,nkd->nd", weights, uv[faces[chosen]])
+    si = mesh.eval_parameterization(mi.Point2f(coordinates.T.astype(np.float32)))
+    back, valid = np.array(si.p).T, np.array(si.is_valid())
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    near = np.linalg.norm(np.where(valid[:, None], back, np.inf) - points, axis=1)
+    return float((near < _NEAR * extent).mean())
+
+
+def _barycentric(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Uniform weights of corners, (count, 3); never on an edge."""
+    root, other = np.sqrt(rng.random(count)), rng.random(count)
+    weights = np.stack([1 - root, root * (1 - other), root * other], -1)
+    return 0.998 * weights + 0.002 / 3
+
+
+def joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, faces and texture coordinates of parts as one mesh."""
+    counts = np.cumsum([0, *(len(each.triangles.positions) for each in placed)])
+    faces = [each.triangles.faces + int(n) for each, n in zip(placed, counts, strict=False)]
+    return (
+        np.concatenate([each.triangles.positions for each in placed]),
+        np.concatenate(faces).astype(np.uint32),
+        np.concatenate([_uv(each.triangles) for each in placed]),
+    )
+
+
+def parameterized(positions: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> mi.Mesh:
+    """A mesh of Mitsuba whose surface is looked up by its texture coordinates."""
+    mesh = mi.Mesh("atlas", len(positions), len(faces), has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(positions.ravel())
+    params["faces"] = mi.UInt32(faces.ravel())
+    params["vertex_texcoords"] = mi.Float(uv.ravel().astype(np.float32))
+    params.update()
+    return mesh
+
+
+def _uv(triangles: Triangles) -> np.ndarray:
+    if triangles.uv is None:
+        raise ValueError("the triangles have no texture coordinates")
+    return triangles.uv
+
+
+def _uv_areas(triangles: Triangles) -> np.ndarray:
+    a, b, c = np.moveaxis(_uv(triangles)[triangles.faces].astype(np.float64), 1, 0)
+    (x, y), (z, w) = (b - a).T, (c - a).T
+    return np.abs(x * w - y * z) / 2
+
+
+# --------------------------------------------------------------------------------------- unwrapping
+
+
+def _by_uvunwrap(meshes: list[Triangles], resolution: int) -> list[np.ndarray]:
+    """Texture coordinates of each corner, (m, 3, 2) a mesh."""
+    import uvunwrap  # needs Python 3.11
+
+    given = [uvunwrap.Mesh(*_welded(mesh)) for mesh in meshes]
+    try:
+        atlas = uvunwrap.generate(given, page_size=resolution, padding=_PADDING)
+    except uvunwrap.UnwrapError as error:
+        raise RuntimeError(str(error)) from None
+    if atlas.page_count != 1:
+        raise RuntimeError(f"it needs {atlas.page_count} pages")
+    corners = [np.array(mesh.corner_uvs, np.float32).reshape(-1, 3, 2) for mesh in atlas.meshes]
+    # A page that is less high than wide becomes a square: its texels are only denser.
+    return _checked(corners, meshes)
+
+
+def _by_xatlas(meshes: list[Triangles], resolution: int) -> list[np.ndarray]:
+    """Texture coordinates of each corner, (m, 3, 2) a mesh."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
+    for mesh in meshes:
+        atlas.add_mesh(*_welded(mesh))
+    options = xatlas.PackOptions()
+    options.resolution, options.padding = resolution, _PADDING
+    atlas.generate(xatlas.ChartOptions(), options, False)
+    if atlas.atlas_count != 1:
+        raise RuntimeError(f"it needs {atlas.atlas_count} pages")
+    corners = []
+    for number in range(len(meshes)):
+        _, indices, uv = atlas.get_mesh(number)
+        corners.append(uv[indices].astype(np.float32))
+    return _checked(corners, meshes)
+
+
+def _welded(mesh: Triangles) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and faces with vertices of one place made one: only edges are seams."""
+    positions, number = np.unique(mesh.positions, axis=0, return_inverse=True)
+    faces = number.reshape(-1)[mesh.faces].astype(np.uint32)
+    return np.ascontiguousarray(positions, np.float32), np.ascontiguousarray(faces)
+
+
+def _checked(corners: list[np.ndarray], meshes: list[Triangles]) -> list[np.ndarray]:
+    for uv, mesh in zip(corners, meshes, strict=True):
+        if len(uv) != len(mesh.faces) or not np.isfinite(uv).all():
+            raise RuntimeError("it left triangles out")
+    return corners
+
+
+def _split(part: Part, corners: np.ndarray) -> Placed:
+    """A part whose vertices are split where charts meet."""
+    mesh = part.triangles
+    keys = np.empty((mesh.faces.size, 3), np.uint32)
+    keys[:, 0] = mesh.faces.ravel()
+    keys[:, 1:] = np.ascontiguousarray(corners.reshape(-1, 2), np.float32).view(np.uint32)
+    order = np.lexsort(keys.T)
+    new = np.ones(len(keys), bool)
+    new[1:] = (keys[order[1:]] != keys[order[:-1]]).any(1)
+    number = np.empty(len(keys), np.uint32)
+    number[order] = np.cumsum(new) - 1
+    first = order[new]
+    old = keys[first, 0]
+    split = Triangles(
+        mesh.positions[old],
+        number.reshape(-1, 3),
+        None if mesh.normals is None else mesh.normals[old],
+        corners.reshape(-1, 2)[first].astype(np.float32).clip(0, 1),
+    )
+    return Placed(part, split, None if mesh.uv is None else mesh.uv[old])

@@ -1,0 +1,504 @@
+"""What `unbake export` writes agrees with what was recovered, read by other programs."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from support import tiny_fields
+
+from unbake.dataset.camera import LookAt
+from unbake.dataset.views import Dataset, View
+from unbake.errors import UserError
+from unbake.exports import export as exporting
+from unbake.exports.mitsuba import write_ply
+from unbake.exports.observed import Views, filled
+from unbake.exports.parts import parsed_principled, read_parts
+from unbake.exports.tessellate import Triangles
+from unbake.exports.textures import file_names
+from unbake.exports.unwrap import make_atlases, unique_share
+from unbake.imaging.metrics import psnr
+from unbake.imaging.pictures import read_exr, write_exr
+from unbake.training.loop import fit
+from unbake.training.recovered import Recovered, load_run
+
+#: A floor with two sides, a pillar and a ball of one material, two meshes of one name, a group that
+#: stands at two places, glass, and lights of three kinds.
+SCENE = """<scene version="3.0.0">
+  <integrator type="path"/>
+  <sensor type="perspective"><float name="fov" value="60"/>
+    <transform name="to_world">
+      <lookat origin="0.5,-2.6,2.2" target="0,0,0.3" up="0,0,1"/></transform>
+    <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
+      <rfilter type="box"/></film></sensor>
+  <bsdf type="twosided" id="Floor"><bsdf type="principled" id="floor/paint">
+    <texture type="bitmap" name="metallic"><string name="filename" value="metal.exr"/>
+      <boolean name="raw" value="true"/></texture></bsdf></bsdf>
+  <bsdf type="diffuse" id="stone"/>
+  <bsdf type="principled" id="cloth"/>
+  <bsdf type="dielectric" id="glass"/>
+  <shape type="rectangle" id="ground"><ref id="Floor"/>
+    <transform name="to_world"><scale x="1.5" y="1.2"/></transform></shape>
+  <shape type="sphere" id="ball"><ref id="stone"/><float name="radius" value="0.3"/>
+    <point name="center" x="-0.7" y="0.2" z="0.5"/></shape>
+  <shape type="sphere" id="shell"><ref id="stone"/><float name="radius" value="0.2"/>
+    <boolean name="flip_normals" value="true"/>
+    <point name="center" x="-0.7" y="-0.7" z="0.5"/></shape>
+  <shape type="cylinder" id="pillar"><ref id="stone"/><float name="radius" value="0.15"/>
+    <point name="p0" x="0.8" y="0.6" z="0.02"/><point name="p1" x="0.8" y="0.6" z="0.9"/></shape>
+  <shape type="ply"><string name="filename" value="a/part.ply"/><ref id="cloth"/></shape>
+  <shape type="ply"><string name="filename" value="b/part.ply"/><ref id="cloth"/></shape>
+  <shape type="shapegroup" id="stack"><shape type="cube" id="block"><ref id="cloth"/>
+    <transform name="to_world"><scale value="0.12"/></transform></shape></shape>
+  <shape type="instance"><ref id="stack"/><transform name="to_world">
+    <translate x="0.2" y="-0.6" z="0.2"/></transform></shape>
+  <shape type="instance"><ref id="stack"/><transform name="to_world">
+    <scale x="-1"/><translate x="0.7" y="-0.6" z="0.2"/></transform></shape>
+  <shape type="sphere" id="lens"><ref id="glass"/><float name="radius" value="0.1"/>
+    <point name="center" x="0" y="-0.9" z="0.2"/></shape>
+  <shape type="disk" id="lamp"><emitter type="area"><rgb name="radiance" value="6 4 2"/></emitter>
+    <transform name="to_world"><scale value="0.3"/><rotate x="1" angle="180"/>
+      <translate z="1.6"/></transform></shape>
+  <emitter type="spot" id="torch"><rgb name="intensity" value="1 2 4"/>
+    <transform name="to_world"><lookat origin="1,-1,1.5" target="0,0,0" up="0,0,1"/></transform>
+  </emitter>
+  <emitter type="constant"><rgb name="radiance" value="0.5"/></emitter>
+</scene>
+"""
+
+
+def triangle(*corners, extra=()):
+    """A mesh of one triangle, and triangles of these corners."""
+    faces = np.array([[0, 1, 2], *extra], np.uint32)
+    return Triangles(np.array(corners, np.float32), faces, None, None)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A run, what was read of it, and a folder of an export as if all had been seen."""
+
+    run: Path
+    recovered: Recovered
+    folder: Path
+    manifest: dict
+
+    def use(self, monkeypatch):
+        """Have exports read the random fields."""
+        monkeypatch.setattr(exporting, "load_run", lambda *_, **__: self.recovered)
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory) -> Path:
+    """The file of the scene."""
+    folder = tmp_path_factory.mktemp("mixed")
+    rng = np.random.default_rng(3)
+    write_exr(folder / "metal.exr", rng.random((4, 4)))
+    # Without texture coordinates; the second one with a triangle that has no area.
+    write_ply(folder / "a" / "part.ply", triangle((-1, 0.9, 0.3), (0, 0.9, 0.3), (-0.5, 0.9, 1)))
+    bent = triangle((0, 1, 0.3), (0.6, 1, 0.3), (0.3, 0.9, 1), extra=[(0, 1, 1)])
+    write_ply(folder / "b" / "part.ply", bent)
+    (folder / "scene.xml").write_text(SCENE)
+    return folder / "scene.xml"
+
+
+def grey_data(scene, folder) -> Path:
+    """A data set of two views of a scene, all grey: nothing is learned from them here."""
+    shutil.copytree(scene.parent, folder)
+    views = []
+    for i, origin in enumerate([(0.5, -2.6, 2.2), (-1.8, -1.5, 1.8)]):
+        camera = LookAt(origin, (0, 0, 0.3), (0, 0, 1), 60.0).camera(16, 16)
+        write_exr(folder / f"view_{i}.exr", np.full((16, 16, 4), (0.4, 0.4, 0.4, 1), np.float32))
+        views.append(View(f"view_{i}", "train", camera, folder / f"view_{i}.exr", {}))
+    Dataset(folder, folder / scene.name, "visible", tuple(views), {}, None).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(mixed, tmp_path_factory) -> Path:
+    """A data set of the scene."""
+    return grey_data(mixed, tmp_path_factory.mktemp("seen") / "data")
+
+
+def randomise(fields, scale=0.7):
+    """Give fields random parameters."""
+    rng = np.random.default_rng(1)
+    fields.assign(
+        {
+            k: type(v)(rng.normal(0, scale, v.shape).astype(np.float32))
+            for k, v in fields.parameters().items()
+        }
+    )
+
+
+def as_if_seen(patch):
+    """Have exports take every point as seen."""
+    patch.setattr(Views, "see", lambda self, p, n, two_sided, active: active & mi.Bool(True))
+
+
+@pytest.fixture(scope="module")
+def exported(data, tmp_path_factory) -> Exported:
+    """All formats, with texels enough for the fields, and as if every point had been seen."""
+    folder = tmp_path_factory.mktemp("exported")
+    run = folder / "run"
+    config = replace(tiny_fields("grid"), method="direct", unknown="materials+lighting", steps=0)
+    config = replace(config, lighting=replace(config.lighting, resolution=8))
+    fit(data, run, config)
+    recovered = load_run(run)
+    problem = recovered.problem
+    assert problem.materials is not None and problem.environment is not None
+    randomise(problem.materials)
+    randomise(problem.environment, 0.4)
+    problem.environment.prepare()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exporting, "load_run", lambda *_, **__: recovered)
+        as_if_seen(patch)
+        formats = ("gltf", "textures", "mitsuba")
+        out, silent = folder / "out", {"tell": lambda line: None}
+        manifest = exporting.export(run, out, formats, texels=60.0, **silent)
+    return Exported(run, recovered, out, manifest)
+
+
+def material_at(recovered, points):
+    """The recovered quantities at world positions (n, 3)."""
+    si = dr.zeros(mi.SurfaceInteraction3f, len(points))
+    si.p = mi.Point3f(np.ascontiguousarray(np.asarray(points).T, np.float32))
+    found = recovered.problem.materials.evaluate(si, dr.ones(mi.Bool, len(points)))
+    return {name: np.array(value).T for name, value in found.items()}
+
+
+def srgb(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def looked_up(image, uv):
+    """Bilinear values of a picture at (n, 2) coordinates of glTF: (0, 0) is the first texel."""
+    pixels = np.asarray(image, np.float64)
+    n = len(pixels)
+    at = np.clip(uv * n - 0.5, 0, n - 1.000001)
+    (x, y), (fx, fy) = at.astype(int).T, (at - at.astype(int)).T[..., None]
+    top = pixels[y, x] * (1 - fx) + pixels[y, x + 1] * fx
+    return top * (1 - fy) + (pixels[y + 1, x] * (1 - fx) + pixels[y + 1, x + 1] * fx) * fy
+
+
+# ---------------------------------------------------------------------------------------- the parts
+
+
+def test_parts_keep_names_and_places(mixed):
+    found = read_parts(mixed, mixed.parent)
+    parts = {part.name: part for part in found.parts}
+    assert list(parts) == ["ground", "ball", "shell", "pillar", "part", "part-2", "block",
+                           "block-2", "lens", "lamp"]  # fmt: skip
+    assert [name for name, part in parts.items() if not part.is_optimized] == ["lens", "lamp"]
+    assert parts["ground"].two_sided and not parts["ball"].two_sided
+    assert parts["part-2"].dropped == 1 and len(parts["part-2"].triangles.faces) == 1
+    assert not parts["ball"].exact and parts["ground"].exact
+
+
+def test_parts_are_where_mitsuba_has_them(mixed, tmp_path):
+    """Distance, normals of both kinds and texture coordinates, of flipped and mirrored ones too."""
+    original = parsed_principled(mixed, mixed.parent).instantiate(merge=False)
+    scene = {"type": "scene"}
+    for i, part in enumerate(read_parts(mixed, mixed.parent).parts):
+        write_ply(tmp_path / f"{i}.ply", part.triangles)
+        flat = part.triangles.normals is None
+        ply = {"type": "ply", "filename": str(tmp_path / f"{i}.ply"), "face_normals": flat}
+        scene[f"shape{i}"] = ply
+    rng = np.random.default_rng(0)
+    origins = rng.normal(0, 1, (3, 20_000))
+    origins *= 3 / np.linalg.norm(origins, axis=0)
+    d = rng.normal(0, 0.5, origins.shape) - origins
+    d /= np.linalg.norm(d, axis=0)
+    ray = mi.Ray3f(mi.Point3f(origins.astype(np.float32)), mi.Vector3f(d.astype(np.float32)))
+    a, b = original.ray_intersect(ray), mi.load_dict(scene).ray_intersect(ray)
+    both = np.array(a.is_valid()) & np.array(b.is_valid())
+    assert both.sum() > 5000 and (np.array(a.is_valid()) == np.array(b.is_valid())).mean() > 0.998
+    for near, x, y in (
+        (5e-3, a.t, b.t), (0.1, a.n, b.n), (0.01, a.sh_frame.n, b.sh_frame.n), (2e-3, a.uv, b.uv)
+    ):  # fmt: skip
+        x, y = (np.atleast_2d(np.array(each))[:, both] for each in (x, y))
+        error = np.abs(x - y).max(0)
+        # Meshes without coordinates have Mitsuba's, which are those of each triangle.
+        assert (error < near).mean() > 0.99
+
+
+# --------------------------------------------------------------------------- what others read of it
+
+
+def test_what_was_written_is_told(exported):
+    manifest = json.loads((exported.folder / "export.json").read_text())
+    assert manifest == json.loads(json.dumps(exported.manifest))
+    written = {p.relative_to(exported.folder).as_posix() for p in exported.folder.rglob("*.*")}
+    assert set(manifest["files"]) | {"export.json"} == written
+    materials = {row["name"]: row for row in manifest["materials"]}
+    assert {name: row["coordinates"] for name, row in materials.items()} == {
+        "floor/paint": "own", "stone": "uvunwrap", "cloth": "uvunwrap"
+    }  # fmt: skip
+    assert all(row["unique_share"] >= 0.999 for row in materials.values())
+    assert manifest["learned"] == ["albedo", "roughness"]
+    assert not list(exported.folder.parent.glob(".*"))
+
+
+def test_gltf_has_the_recovered_materials(exported):
+    loaded = trimesh.load(exported.folder / "scene.glb")
+    textured = {n: g for n, g in loaded.geometry.items() if g.visual.material.baseColorTexture}
+    told = {part["name"]: part["material"] for part in exported.manifest["parts"]}
+    assert {name: g.visual.material.name for name, g in textured.items()} == {
+        name: material for name, material in told.items() if material
+    }
+    for name, geometry in textured.items():
+        points, faces = trimesh.sample.sample_surface(geometry, 500, seed=1)
+        weights = trimesh.triangles.points_to_barycentric(geometry.triangles[faces], points)
+        uv = np.einsum("nk,nkd->nd", weights, geometry.visual.uv[geometry.faces[faces]])
+        uv[:, 1] = 1 - uv[:, 1]  # trimesh counts v from the last row
+        truth, material = material_at(exported.recovered, points), geometry.visual.material
+        colour = looked_up(material.baseColorTexture.convert("RGB"), uv)
+        both = looked_up(material.metallicRoughnessTexture.convert("RGB"), uv)
+        close = np.abs(colour - 255 * srgb(truth["albedo"])).max(1) <= 2
+        assert close.mean() > 0.98, name
+        assert (np.abs(both[:, 1] - 255 * truth["roughness"]) <= 2).mean() > 0.98, name
+        own = np.ptp(both[:, 2]) > 100 if told[name] == "floor/paint" else both[:, 2].max() == 0
+        assert own, "metallic is that of the scene"
+        assert material.doubleSided == (name == "ground")
+
+
+def test_gltf_has_the_lights(exported):
+    data = (exported.folder / "scene.glb").read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    used = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_transmission"}
+    assert used <= set(document["extensionsUsed"])
+    (light,) = document["extensions"]["KHR_lights_punctual"]["lights"]
+    assert light["type"] == "spot" and light["intensity"] == 4 and light["color"] == [0.25, 0.5, 1]
+    (node,) = (n for n in document["nodes"] if "extensions" in n)
+    matrix = np.array(node["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[:3, 3], [1, -1, 1.5], atol=1e-5)
+    ahead = np.array([-1, 1, -1.5]) / np.linalg.norm([-1, 1, -1.5])
+    np.testing.assert_allclose(-matrix[:3, 2], ahead, atol=1e-5)
+    (lamp,) = (m for m in document["materials"] if "emissiveFactor" in m)
+    assert lamp["emissiveFactor"] == pytest.approx([1, 4 / 6, 2 / 6])
+    assert lamp["extensions"]["KHR_materials_emissive_strength"]["emissiveStrength"] == 6
+
+
+RENDER = """
+import sys
+import mitsuba as mi, numpy as np
+mi.set_variant(sys.argv[1])
+scene = mi.load_file(sys.argv[2], parallel=False, optimize=False)
+integrator = mi.load_dict({"type": "path", "max_depth": 4})
+np.save(sys.argv[3], np.array(mi.render(scene, integrator=integrator, spp=2048, seed=0)))
+print([shape.id() for shape in scene.shapes()])
+assert not [name for name in sys.modules if name.startswith("unbake")]
+"""
+
+
+def test_mitsuba_alone_renders_what_was_recovered(exported, tmp_path):
+    scene, picture = exported.folder / "mitsuba" / "scene.xml", tmp_path / "picture.npy"
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", RENDER, mi.variant(), str(scene), str(picture)],
+        env=environment, cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "'ground'" in done.stdout and "'block-2'" in done.stdout
+    problem = exported.recovered.problem
+    problem.materials.stand_alone()
+    integrator = mi.load_dict({"type": "path", "max_depth": 4})
+    reference = mi.render(problem.scene_view.scene, integrator=integrator, spp=2048, seed=0)
+    problem.materials.carried = True
+    reference, found = (np.array(x)[..., :3] for x in (reference, np.load(picture)))
+    scale = np.percentile(reference, 99)
+    assert psnr(np.minimum(found / scale, 1), np.minimum(reference / scale, 1)) > 40
+
+
+def test_the_environment_is_where_mitsuba_looks_for_it(exported):
+    (file,) = exported.folder.glob("environment.*")
+    emitter = mi.load_dict({"type": "envmap", "filename": str(file)})
+    rng = np.random.default_rng(4)
+    d = rng.normal(size=(3, 200))
+    d = mi.Vector3f((d / np.linalg.norm(d, axis=0)).astype(np.float32))
+    si = dr.zeros(mi.SurfaceInteraction3f, 200)
+    si.wi = -d
+    found, truth = np.array(emitter.eval(si)), exported.recovered.problem.environment.radiance(d)
+    np.testing.assert_allclose(found, np.array(truth), rtol=0.05)
+    # As `export.json` says: +y is the first row, +x at a quarter of the width.
+    picture = read_exr(file)
+    n = len(picture)
+    for d, texel in (((0, 1, 0), (0, 0)), ((1, 0, 0), (n // 2, n // 2)), ((0, 0, 1), (n // 2, n))):
+        truth = np.ravel(exported.recovered.problem.environment.radiance(mi.Vector3f(*d)))
+        np.testing.assert_allclose(picture[texel], truth, rtol=0.1)
+
+
+def test_what_no_view_saw_is_filled_and_marked(exported, tmp_path, monkeypatch):
+    exported.use(monkeypatch)
+    lines = []
+    out = tmp_path / "out"
+    manifest = exporting.export(exported.run, out, ["textures"], texels=20.0, tell=lines.append)
+    stone = next(row for row in manifest["materials"] if row["name"] == "stone")
+    assert 0.3 < stone["unobserved_share"] < 0.95  # balls have backs, and both views are in front
+    assert any("unobserved" in line for line in lines)
+    unseen = np.array(mi.Bitmap(str(out / "textures" / "stone_unobserved.png")))
+    albedo = read_exr(out / "textures" / "stone_albedo.exr")
+    assert 0 < (unseen == 255).mean() < 1 and np.isfinite(albedo).all()
+    # Filled values are means of seen ones, and so never beyond them.
+    seen = albedo[unseen == 0]
+    assert (albedo[unseen == 255] >= seen.min(0) - 1e-5).all()
+    assert (albedo[unseen == 255] <= seen.max(0) + 1e-5).all()
+
+
+def test_recovered_strengths_are_numbers_of_the_scene(data, tmp_path, monkeypatch):
+    config = replace(tiny_fields("grid"), method="direct", unknown="emission", steps=0)
+    fit(data, tmp_path / "run", config)
+    options = {"texels": 4.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba", "gltf"], **options)
+    assert [light["recovered"] for light in manifest["lights"]] == [True] * 3
+    (start,) = {x for light in manifest["lights"] for x in light["strength"]}
+    text = (tmp_path / "out" / "mitsuba" / "scene.xml").read_text()
+    assert text.count(f"{start:.6g}"[:6]) >= 3
+    assert any("learned no materials" in note for note in manifest["notes"])
+
+
+# ------------------------------------------------------------------------------- the parts of a job
+
+
+def test_bitmaps_are_looked_up_in_the_coordinates_of_the_scene(mixed, tmp_path, monkeypatch):
+    config = replace(tiny_fields("bitmap"), method="direct", steps=0)
+    # Those without texture coordinates cannot have bitmaps.
+    text = re.sub(r'<shape type="ply">.*?</shape>', "", SCENE)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "scene.xml").write_text(text)
+    shutil.copy(mixed.parent / "metal.exr", tmp_path / "scene")
+    data = grey_data(tmp_path / "scene" / "scene.xml", tmp_path / "data")
+    fit(data, tmp_path / "run", config)
+    recovered = load_run(tmp_path / "run")
+    materials, scene = recovered.problem.materials, recovered.problem.scene_view.scene
+    assert materials is not None
+    randomise(materials)
+    monkeypatch.setattr(exporting, "load_run", lambda *_, **__: recovered)
+    as_if_seen(monkeypatch)
+    options = {"texels": 60.0, "tell": lambda line: None}
+    exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba"], **options)
+    written = mi.load_file(str(tmp_path / "out" / "mitsuba" / "scene.xml"), optimize=False)
+    rays = recovered.dataset.train[0].camera.rays(
+        *(np.random.default_rng(0).random((2, 2000)) * 16)
+    )
+    origin, d = (np.ascontiguousarray(x.T, np.float32) for x in rays)
+    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(d))
+    a, b = scene.ray_intersect(ray), written.ray_intersect(ray)
+    truth = np.array(materials.evaluate(a, a.is_valid())["albedo"])
+    found = np.array(b.bsdf().eval_diffuse_reflectance(b))
+    painted = np.array(recovered.problem.scene_view.is_optimized(a.shape))
+    assert painted.mean() > 0.3 and np.ptp(truth[:, painted]) > 0.3
+    # Their texels have edges, which other texels blur.
+    assert (np.abs(found - truth).max(0)[painted] < 0.02).mean() > 0.95
+
+
+def test_own_coordinates_count_where_they_are_unique(mixed):
+    found = read_parts(mixed, mixed.parent)
+    ground = next(part for part in found.parts if part.name == "ground")
+    uv = ground.triangles.uv
+    methods = {}
+    for name, given in {
+        "unique": uv, "out of range": 3 * uv, "folded": np.abs(uv - 0.5), "none": None,
+        "not a number": np.full_like(uv, np.nan), "a line": uv * [1, 0],
+    }.items():  # fmt: skip
+        triangles = replace(ground.triangles, uv=given)
+        (atlas,) = make_atlases(found.scene, [replace(ground, triangles=triangles)], 10.0)
+        methods[name] = atlas.method
+        assert atlas.unique >= 0.999 and atlas.resolution == 64
+    assert methods.pop("unique") == "own" and set(methods.values()) == {"uvunwrap"}
+    # Two parts of one material in one place of the square.
+    both = [ground, replace(ground, name="again")]
+    moved = replace(ground.triangles, positions=ground.triangles.positions + np.float32(1))
+    both[1] = replace(both[1], triangles=moved)
+    (atlas,) = make_atlases(found.scene, both, 10.0)
+    assert atlas.method == "uvunwrap" and len(atlas.placed) == 2
+
+
+def test_xatlas_takes_over_where_uvunwrap_fails(mixed, monkeypatch):
+    import uvunwrap
+
+    def fails(*words, **named):
+        raise uvunwrap.UnwrapError("it fails")
+
+    monkeypatch.setattr(uvunwrap, "generate", fails)
+    found = read_parts(mixed, mixed.parent)
+    cloth = [part for part in found.parts if part.name in ("part", "part-2", "block")]
+    (atlas,) = make_atlases(found.scene, cloth, 40.0)
+    assert atlas.method == "xatlas" and atlas.unique >= 0.999
+    assert unique_share(atlas.placed, seed=7) >= 0.999
+
+
+def test_resolutions_are_powers_of_two_within_limits(mixed):
+    found = read_parts(mixed, mixed.parent)
+    ground = [part for part in found.parts if part.name == "ground"]
+    sizes = [make_atlases(found.scene, ground, texels)[0] for texels in (1.0, 100.0, 1e6)]
+    assert [atlas.resolution for atlas in sizes] == [64, 512, 8192]
+    assert sizes[0].wanted < 64 and sizes[2].wanted > 8192
+
+
+def test_views_see_what_is_in_front_of_them(mixed):
+    """The floor below the ball is hidden from above, its underside is seen from below alone."""
+    scene = parsed_principled(mixed, mixed.parent).instantiate()
+    above = LookAt((-0.7, 0.2, 3.0), (-0.7, 0.2, 0.0), (0, 1, 0), 50.0).camera(8, 8)
+    places = [(-0.7, 0.2, 0), (0.1, 0.2, 0), (1.45, 1.1, 0), (0.1, 0.2, 0)]
+    p = mi.Point3f(np.array(places, np.float32).T.copy())
+    up = mi.Normal3f(0, 0, mi.Float([1, 1, 1, -1]))
+    one, both = dr.zeros(mi.Bool, 4), dr.ones(mi.Bool, 4)
+    views = Views(scene, [above])
+    assert np.array(views.see(p, up, one, both)).tolist() == [False, True, False, False]
+    assert np.array(views.see(p, up, both, both)).tolist() == [False, True, False, True]
+
+
+def test_filling_keeps_what_is_known_and_takes_the_rest_from_it():
+    rng = np.random.default_rng(0)
+    values = rng.random((32, 32, 2)).astype(np.float32)
+    known = np.zeros((32, 32), bool)
+    known[4:9, 4:9] = True
+    before = values[known]
+    values[~known] = 1e6
+    found = filled(values, known, (0.5, 0.5))
+    np.testing.assert_array_equal(found[known], before)
+    assert found.min() >= before.min() - 1e-6 and found.max() <= before.max() + 1e-6
+    nothing = filled(np.ones((8, 8, 2), np.float32), np.zeros((8, 8), bool), (0.2, 0.7))
+    assert (nothing == np.array([0.2, 0.7], np.float32)).all()
+
+
+def test_names_of_files_are_safe_and_different():
+    names = file_names(["a/b", "A_b", "..", "", "x" * 300, "père"])
+    assert names[:4] == ["a_b", "A_b-2", "material", "material-2"]
+    assert all(len(name) <= 60 and "/" not in name for name in names)
+
+
+@pytest.mark.parametrize("words", [{"formats": ["obj"]}, {"texels": -1.0}, {"formats": []}])
+def test_wrong_words_are_told_before_anything_is_read(words, tmp_path):
+    with pytest.raises(UserError) as error:
+        exporting.export(tmp_path / "none", tmp_path / "out", **words)
+    assert "no run" in str(error.value) and "--" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_something_in_it_is_left_alone(exported, tmp_path, unbake):
+    (tmp_path / "mine").write_text("")
+    outcome = unbake("export", exported.run, "--out", tmp_path)
+    assert outcome.status == 2 and "the folder is not empty" in outcome.err
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_failure_leaves_nothing(exported, tmp_path, monkeypatch):
+    exported.use(monkeypatch)
+
+    def fails(*words, **named):
+        raise UserError("it fails")
+
+    monkeypatch.setattr(exporting, "write_glb", fails)
+    with pytest.raises(UserError, match="it fails"):
+        exporting.export(exported.run, tmp_path / "out", ["gltf"], texels=2.0)
+    assert list(tmp_path.iterdir()) == []
