@@ -368,6 +368,43 @@ def test_recovered_strengths_are_numbers_of_the_scene(data, tmp_path, monkeypatc
 # ------------------------------------------------------------------------------- the parts of a job
 
 
+LAYERS = """<scene version="3.0.0">
+  <bsdf type="mask" id="layers">
+    <texture type="bitmap" name="opacity"><string name="filename" value="metal.exr"/>
+      <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/></texture>
+    <bsdf type="twosided"><bsdf type="normalmap">
+      <texture type="bitmap" name="normalmap"><string name="filename" value="up.exr"/>
+        <boolean name="raw" value="true"/></texture>
+      <bsdf type="principled"><float name="metallic" value="0.25"/></bsdf></bsdf></bsdf></bsdf>
+  <shape type="rectangle"><ref id="layers"/></shape>
+  <shape type="rectangle"><ref id="layers"/><transform name="to_world"><translate z="-0.5"/>
+    </transform></shape>
+  <shape type="sphere"><float name="radius" value="0.1"/><bsdf type="conductor"/>
+    <point name="center" x="0" y="0" z="2"/></shape>
+  <emitter type="constant"/></scene>"""
+
+
+def test_other_textures_of_unwrapped_materials_move_along(mixed, tmp_path, monkeypatch):
+    (tmp_path / "scene").mkdir()
+    shutil.copy(mixed.parent / "metal.exr", tmp_path / "scene")
+    write_exr(tmp_path / "scene" / "up.exr", np.full((4, 4, 3), (0.5, 0.5, 1.0)))
+    (tmp_path / "scene" / "scene.xml").write_text(LAYERS)
+    data = grey_data(tmp_path / "scene" / "scene.xml", tmp_path / "data")
+    fit(data, tmp_path / "run", replace(tiny_fields("grid"), method="direct", steps=0))
+    options = {"texels": 100.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba"], **options)
+    assert any("the normal map is left out" in note for note in manifest["notes"])
+    written = mi.load_file(str(tmp_path / "out" / "mitsuba" / "scene.xml"), optimize=False)
+    original = parsed_principled(data / "scene.xml", data).instantiate(merge=False)
+    x = np.random.default_rng(0).uniform(-1, 1, (2, 1000)).astype(np.float32)
+    ray = mi.Ray3f(mi.Point3f(*x, 1), mi.Vector3f(0, 0, -1))
+    a, b = original.ray_intersect(ray), written.ray_intersect(ray)
+    truth, found = (np.array(si.bsdf().eval_null_transmission(si))[0] for si in (a, b))
+    assert np.ptp(truth) > 0.5 and (np.abs(found - truth) < 0.01).mean() > 0.95
+    assert written.sensors(), "one is added where there is none"
+    assert '"metallic" value="0.25"' in (tmp_path / "out/mitsuba/scene.xml").read_text()
+
+
 def test_bitmaps_are_looked_up_in_the_coordinates_of_the_scene(mixed, tmp_path, monkeypatch):
     config = replace(tiny_fields("bitmap"), method="direct", steps=0)
     # Those without texture coordinates cannot have bitmaps.
@@ -463,7 +500,7 @@ def test_filling_keeps_what_is_known_and_takes_the_rest_from_it():
     known = np.zeros((32, 32), bool)
     known[4:9, 4:9] = True
     before = values[known]
-    values[~known] = 1e6
+    values[~known] = np.nan
     found = filled(values, known, (0.5, 0.5))
     np.testing.assert_array_equal(found[known], before)
     assert found.min() >= before.min() - 1e-6 and found.max() <= before.max() + 1e-6
@@ -490,6 +527,19 @@ def test_a_folder_with_something_in_it_is_left_alone(exported, tmp_path, unbake)
     outcome = unbake("export", exported.run, "--out", tmp_path)
     assert outcome.status == 2 and "the folder is not empty" in outcome.err
     assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_the_command_tells_what_it_wrote(exported, tmp_path, unbake, monkeypatch):
+    exported.use(monkeypatch)
+    out = tmp_path / "out"
+    outcome = unbake("export", exported.run, "--out", out, "--format", "gltf", "--texels", 2)
+    assert outcome.status == 0 and outcome.err == ""
+    lines = outcome.out.splitlines()
+    assert "floor/paint: 64 x 64 texels, its own coordinates" in outcome.out
+    assert lines[-1] == f"wrote {out}: scene.glb, export.json" and max(map(len, lines[:-1])) < 80
+    assert sorted(p.name for p in out.iterdir()) == sorted(
+        ["environment" + ".exr", "export.json", "scene.glb"]
+    )
 
 
 def test_a_failure_leaves_nothing(exported, tmp_path, monkeypatch):

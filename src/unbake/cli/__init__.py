@@ -280,8 +280,8 @@ def export(
     Args:
         run: Folder that `unbake fit` wrote.
         out: Folder to write to, new or empty.
-        format: gltf, one file, scene.glb, with parts, textures and lights; textures, OpenEXR and
-            PNG; mitsuba, a scene that Mitsuba renders without unbake.
+        format: One or more of gltf (one file, scene.glb, with parts, textures and lights), textures
+            (OpenEXR and PNG) and mitsuba (a scene that Mitsuba renders without unbake).
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
             surfaces). A texture has from 64 to 8192 along an edge.
         allow_outside: Read files that the data set or its scene names outside of its folder.
@@ -292,7 +292,8 @@ def export(
     console = Console(highlight=False)
     options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
     run_export(run, out, format, texels=texels, **options)
-    _say(f"wrote {out}")
+    files = {"gltf": "scene.glb", "textures": "textures", "mitsuba": "mitsuba/scene.xml"}
+    _say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")
 
 
 def compare(

@@ -21,7 +21,7 @@ Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 Formats = Annotated[
     tuple[Literal["gltf", "textures", "mitsuba"], ...],
-    arg(metavar="{gltf,textures,mitsuba} ...", help_behavior_hint="(default: gltf textures)"),
+    arg(metavar="FORMATS", help_behavior_hint="(default: gltf textures)"),
 ]
 #: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]

@@ -23,7 +23,6 @@ from .parts import Part, bsdf_nodes, principled_numbers
 from .tessellate import Triangles
 from .textures import file_names
 
-_SLOTS = {quantity.slot for quantity in QUANTITIES.values()}
 _TEXTURES, _MESHES, _ENVIRONMENT = "textures", "meshes", "environment"
 
 
@@ -94,9 +93,10 @@ def _replace_textures(
     scratch: ParsedScene,
     notes: list[str],
 ) -> None:
-    """Give the BSDFs of a material its baked textures."""
+    """Give the BSDFs of a material its baked textures; what was not learned stays as it is."""
     nodes = {number: node for node, number in principled_numbers(scene).items()}
-    for name, values in baked.values.items():
+    for name in baked.learned:
+        values = baked.values[name]
         single = values[..., 0] if values.shape[-1] == 1 else values
         texture = _bitmap(scene, folder / _TEXTURES / f"{stem}_{name}.exr", single)
         for number in baked.atlas.materials:
@@ -116,6 +116,7 @@ def _move_others(
 ) -> None:
     """Bring the other textures of a material's BSDFs into the coordinates of its atlas."""
     parts = [placed.part for placed in baked.atlas.placed]
+    learned = {QUANTITIES[name].slot for name in baked.learned}
     outer = {part.bsdf for part in parts if part.bsdf is not None}
     inside = {i for bsdf in outer for i in bsdf_nodes(scene, bsdf)}
     moved: dict[int, int] = {}
@@ -125,8 +126,9 @@ def _move_others(
             continue
         plugin = node.props.plugin_name()
         for key in list(node.props):
+            node = scene.state.nodes[i]  # anew: a node that is appended moves all others
             inner = referenced(scene, node.props[key])
-            baked_here = plugin == "principled" and key in _SLOTS
+            baked_here = plugin == "principled" and key in learned
             if inner is None or inner.type != mi.ObjectType.Texture or baked_here:
                 continue
             if plugin == "normalmap":
@@ -137,9 +139,12 @@ def _move_others(
             old = node.props[key].index()
             if old not in moved:
                 pixels = bake_texture(baked, make_texture(scratch, old))
+                if (pixels == pixels[..., :1]).all():
+                    pixels = pixels[..., 0]
                 file = folder / _TEXTURES / f"{stem}_texture-{len(moved)}.exr"
                 moved[old] = _bitmap(scene, file, pixels)
-            node.props[key] = mi.Properties.ResolvedReference(moved[old])
+            props = scene.state.nodes[i].props
+            props[key] = mi.Properties.ResolvedReference(moved[old])
 
 
 def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
@@ -155,8 +160,14 @@ def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
 
 
 def _append(scene: ParsedScene, node: mi.parser.SceneNode) -> int:
+    """Append a node and return its number; all handles of other nodes are void after it."""
     scene.state.nodes.append(node)
     return len(scene.state.nodes) - 1
+
+
+def _append_to_root(scene: ParsedScene, key: str, node: mi.parser.SceneNode) -> None:
+    number = _append(scene, node)
+    scene.state.root.props[key] = mi.Properties.ResolvedReference(number)
 
 
 # ------------------------------------------------------------------------------------------- shapes
@@ -193,7 +204,7 @@ def _replace_shapes(
         for key in list(old):
             if is_reference(old[key]):
                 node.props[key] = old[key]
-        root[f"exported shape {number}"] = mi.Properties.ResolvedReference(_append(scene, node))
+        _append_to_root(scene, f"exported shape {number}", node)
         names[f"{_MESHES}/{stem}.ply"] = part.name
     return names
 
@@ -273,8 +284,7 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> None:
     for key in ("fov", "fov_axis", "near_clip", "far_clip", "to_world"):
         sensor.props[key] = wanted[key]
     sensor.props["film"] = mi.Properties.ResolvedReference(_append(scene, film))
-    root = scene.state.root.props
-    root["exported sensor"] = mi.Properties.ResolvedReference(_append(scene, sensor))
+    _append_to_root(scene, "exported sensor", sensor)
 
 
 def _forget_unused(scene: ParsedScene) -> None:

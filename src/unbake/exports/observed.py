@@ -106,6 +106,7 @@ def filled(values: np.ndarray, known: np.ndarray, default: Sequence[float]) -> n
         return values
     if known.all():
         return values
+    np.copyto(values, 0, where=~known[..., None])  # they may be no numbers
     weight = known[..., None].astype(np.float32)
     coarse, sums = _halved(values * weight, weight)
     guess = _doubled(_completed(coarse, sums))
