@@ -9,6 +9,7 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, final
 
@@ -29,11 +30,9 @@ IN_MEMORY = 512 << 20
 _COLUMNS, _WITH_BLURRED = 3, 6
 #: Half the edge of the blur, in pixels.
 _RADIUS = 2
-#: Blurred photographs are no darker than this share of the photograph, so that no pixel weighs
-#: more than 1 / share² = 16 times as much in the relative loss as it does relative to itself. The
-#: blur is there against noise, and noise does not make a pixel four times as bright as the mean
-#: around it. A brighter one is a firefly, which weighed up to 25² = 625 times as much.
-DARKEST_BLUR = 0.25
+#: A mask whose response to constant and to linear images is zero, and has the variance of the noise
+#: (Immerkær 1996, Fast Noise Variance Estimation).
+_NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
 #: Pixels are numbered in 32 bits.
 _MOST_PIXELS = (1 << 32) - 1
 
@@ -44,8 +43,8 @@ class Photographs:
     """Linear RGB of all pixels of several views, row by row and view after view.
 
     Args:
-        table: float32, shape (pixels, 3): radiance; or (pixels, 6): radiance, and radiance blurred
-            over those of 5 x 5 pixels that can be trained on, no darker than `DARKEST_BLUR` of it.
+        table: float32, shape (pixels, 3): radiance; or (pixels, 6): radiance, and the radiance that
+            errors are relative to, which is blurred over 5 x 5 pixels and knows the noise.
         chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
             background pixels say nothing about the scene and only those with alpha > 0 are taken
             (the paper: at least half of them).
@@ -162,7 +161,7 @@ def _fill(
         table[start:stop, :3] = rgb
         if table.shape[1] == _WITH_BLURRED:
             counts = foreground if foreground_only else np.ones_like(foreground)
-            table[start:stop, 3:] = _blurred(rgb, counts, camera)
+            table[start:stop, 3:] = _reference(rgb, counts, camera)
         counted = rgb[foreground] if foreground_only else rgb
         total += float(counted.sum(dtype=np.float64))
         if foreground_only:
@@ -173,26 +172,65 @@ def _fill(
     return Photographs(table, chosen, total / max(3 * count, 1))
 
 
-def _blurred(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarray:
-    """The mean of those of the 5 x 5 pixels around each one that count; itself where none does.
+def _reference(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarray:
+    """The radiance that errors of a pixel are relative to (ours).
+
+    √(mean² + noise² + peak²): the mean of those of the 5 x 5 pixels around each one that count; the
+    standard deviation of their noise; and how much brighter the pixel is than every other of the
+    3 x 3, as fireflies are. The first two have next to nothing of the pixel's own noise in them, so
+    that errors are not weighed by their sign. Where photographs are noisy they weigh less.
 
     Args:
-        rgb: of one view, shape (pixels, 3).
+        rgb: of one view, linear, shape (pixels, 3).
         counts: whether a pixel counts, shape (pixels,). Background that is hidden is black, and
             says nothing about the noise of the foreground.
     """
-    weight = counts.astype(np.float32)[:, None]
-    share = _window_means(weight, camera)
-    blurred = _window_means(rgb * weight, camera) / np.where(share > 0, share, 1)
-    return np.maximum(np.where(share > 0, blurred, rgb), DARKEST_BLUR * rgb)
+    shape = (camera.height, camera.width, -1)
+    image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
+    mean = _mean_of_counted(image, weight)
+    mean = np.where(np.isnan(mean), image, mean)
+    # Pixels that do not count are no peaks, and no noise is told from them.
+    known = np.where(weight > 0, image, mean)
+    response, inside = np.zeros_like(known), np.ones_like(weight)
+    first, second = (np.full_like(known, -np.inf) for _ in range(2))
+    neighbours = zip(_NOISE.ravel(), _around(known, 1), _around(weight, 1), strict=True)
+    for share, there, counted in neighbours:
+        response += share * there
+        inside *= counted
+        np.maximum(second, np.minimum(first, there), out=second)
+        np.maximum(first, there, out=first)
+    noise = np.nan_to_num(_mean_of_counted(response**2, inside))
+    peak = np.maximum(known - second, 0)
+    return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)
 
 
-def _window_means(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    """The mean of 5 x 5 pixels around each one, edges repeated; shape (pixels, channels)."""
-    image = pixels.reshape(camera.height, camera.width, -1)
-    padded = np.pad(image, ((_RADIUS, _RADIUS), (_RADIUS, _RADIUS), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * _RADIUS + 1,) * 2, (0, 1))
-    return windows.mean((-2, -1), dtype=np.float32).reshape(len(pixels), -1)
+def _mean_of_counted(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The mean of those of 5 x 5 pixels around each one that have weight 1; NaN where none has."""
+    if weight.all():
+        return _window_sums(image) / np.float32((2 * _RADIUS + 1) ** 2)
+    share = _window_sums(weight)
+    return _window_sums(image * weight) / np.where(share > 0, share, np.nan)
+
+
+def _window_sums(image: np.ndarray) -> np.ndarray:
+    """The sum of 5 x 5 pixels around each one, edges repeated; (height, width, channels)."""
+    for axis in (0, 1):
+        image = reduce(np.add, _along(image, axis, _RADIUS))
+    return image
+
+
+def _around(image: np.ndarray, radius: int) -> Iterator[np.ndarray]:
+    """The image moved to every place of a window, row by row, edges repeated."""
+    for moved in _along(image, 0, radius):
+        yield from _along(moved, 1, radius)
+
+
+def _along(image: np.ndarray, axis: int, radius: int) -> Iterator[np.ndarray]:
+    """The image moved along an axis by -radius to radius pixels, edges repeated."""
+    padded = np.pad(image, [(radius, radius) if i == axis else (0, 0) for i in range(3)], "edge")
+    for start in range(2 * radius + 1):
+        part = slice(start, start + image.shape[axis])
+        yield padded[part] if axis == 0 else padded[:, part]
 
 
 # ------------------------------------------------------------------------------- The mapped file
@@ -215,7 +253,7 @@ def _cached(
         "clip_negative": clip_negative,
         "foreground_only": hidden,
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
-        "blur": {"radius": _RADIUS, "darkest": DARKEST_BLUR, "within": "pixels to train on"},
+        "blur": {"radius": _RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
     data.require_own_cache()
     found = _find_cache(data, key)

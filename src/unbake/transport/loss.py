@@ -15,8 +15,8 @@ class RelativeL2:
     The paper divides by the photograph. A photograph that is too dark by chance then weighs more
     than one that is too bright, and the optimum is darker than the scene: with noisy photographs a
     few percent, which is as much as roughness does. A smoothed photograph has next to no such
-    noise. It must not be much darker than the photograph itself, or else a firefly outweighs all
-    other pixels: see `dataset/photographs.py`.
+    noise. Where it is noisy it must be larger, or else a firefly outweighs all other pixels: see
+    `dataset/photographs.py`.
 
     Args:
         epsilon: added to the squared reference.
