@@ -91,10 +91,9 @@ def test_a_ceiling_is_measured_once_and_stands_beside_every_result(
     assert "ceiling" in metrics["definitions"]["yardsticks"]
 
 
-def test_fields_are_scored_as_those_of_a_run(data, untrained):
+def test_fields_are_scored_as_those_of_a_run(data, untrained, tiny):
     # Before their first step the fields are those of the run of no steps.
-    config = read_toml(untrained / "config.toml")
-    found = measure_ceiling(Dataset.load(data), config, steps=0, tell=lambda line: None)
+    found = measure_ceiling(Dataset.load(data), read_toml(tiny), steps=0, tell=lambda line: None)
     heldout = evaluate(untrained, FEW, tell=lambda line: None)["heldout"]
     for key in KEYS:
         assert found["yardsticks"]["ceiling"][key] == pytest.approx(heldout[key], abs=1e-6)

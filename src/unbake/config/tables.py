@@ -82,7 +82,7 @@ def typed(value: object, hint: Any, where: str) -> Any:
         return value
     if origin in (types.UnionType, typing.Union):  # such as `int | None`: TOML has no None
         (kind,) = (kind for kind in inner if kind is not types.NoneType)
-        return None if value is None else typed(value, kind, where)
+        return typed(value, kind, where)
     if origin is tuple:
         item = inner[0]
         if not isinstance(value, list | tuple):

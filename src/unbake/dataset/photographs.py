@@ -161,7 +161,9 @@ def _fill(
         table[start:stop, :3] = rgb
         if table.shape[1] == _WITH_BLURRED:
             counts = foreground if foreground_only else np.ones_like(foreground)
-            table[start:stop, 3:] = _reference(rgb, counts, camera)
+            # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
+            with np.errstate(over="ignore", invalid="ignore"):
+                table[start:stop, 3:] = _reference(rgb, counts, camera)
         counted = rgb[foreground] if foreground_only else rgb
         total += float(counted.sum(dtype=np.float64))
         if foreground_only:

@@ -29,14 +29,13 @@ class Guide:
 
     def __init__(self, settings: GuideConfig, outputs: int) -> None:
         self._settings = settings
-        self._levels = settings.levels or 0
         self._outputs = outputs
         bins = settings.brightnesses
         self._grids = [
             nn.HashGridEncoding(
                 mi.Float,
                 3,
-                n_levels=self._levels,
+                n_levels=settings.levels,
                 n_features_per_level=bins,
                 hashmap_size=settings.numbers(1),
                 base_resolution=settings.base_resolution + 1,
@@ -66,7 +65,7 @@ class Guide:
         for grid in self._grids:
             features = grid(position)
             value = mi.Float(0)
-            for level in range(self._levels):
+            for level in range(s.levels):
                 share = s.gain * s.falloff**level
                 for i, weight in enumerate(weights):
                     value = dr.fma(share * weight, features[level * s.brightnesses + i], value)
@@ -76,7 +75,7 @@ class Guide:
     @property
     def features(self) -> int:
         """Numbers that are looked up at each corner of a cell, over all levels."""
-        return self._outputs * self._levels * self._settings.brightnesses
+        return self._outputs * self._settings.levels * self._settings.brightnesses
 
 
 def _hats(albedo: mi.Color3f | None, count: int) -> list[mi.Float]:

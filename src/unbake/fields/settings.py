@@ -84,9 +84,7 @@ class GuideConfig:
     See `guide.py`. Resolutions double from level to level.
     """
 
-    #: Number of resolutions; 0: there is no guide. None: a fit decides (`training/guides.py`), and
-    #: a run that was started has a number.
-    levels: int | None = None
+    levels: int = 0  #: number of resolutions; 0: there is no guide. 4 suits rooms
     base_resolution: int = 1  #: cells along an axis of the coarsest level
     brightnesses: int = 8  #: of the albedo, from black to white
     gain: float = 15.0  #: how much faster the coarsest level learns than the network would alone
@@ -95,17 +93,17 @@ class GuideConfig:
 
     def __post_init__(self) -> None:
         sizes = {"base_resolution": (1, 64), "falloff": (POSITIVE, 1.0), "network": (POSITIVE, 1.0)}
-        sizes |= {"gain": (POSITIVE, 1e4)} | ({"levels": (0, 8)} if self.levels else {})
+        sizes |= {"gain": (POSITIVE, 1e4), "levels": (0, 8)}
         require_ranges(self, sizes)
         few = self.brightnesses
         require(few in (2, 4, 8), "brightnesses", "2, 4 or 8", few)
-        finest = self.base_resolution << max(0, (self.levels or 0) - 1)
+        finest = self.base_resolution << max(0, self.levels - 1)
         bound = "such that base_resolution * 2^(levels - 1) is 256 or less"
         require(finest <= 256, "levels", bound, self.levels)
 
     def numbers(self, outputs: int) -> int:
         """How many numbers are learned, or slightly more."""
-        cells = [self.base_resolution << level for level in range(self.levels or 0)]
+        cells = [self.base_resolution << level for level in range(self.levels)]
         return outputs * self.brightnesses * sum((count + 2) ** 3 for count in cells)
 
 

@@ -14,7 +14,7 @@ from ..dataset.views import Dataset
 from ..evaluation.yardsticks import DEFINITIONS, STEPS, measure_ceiling
 from ..io import write_json
 from ..machine import machine
-from ..training.defaults import with_data_defaults
+from ..training.grid_sizes import with_grid_sizes
 from ..training.validation import psnr_keys
 from ..version import VERSION
 
@@ -49,7 +49,7 @@ def bench_ceiling(
     Paper: Sec. 5.3.
     """
     dataset = Dataset.load(data, allow_outside=allow_outside)
-    config = with_data_defaults(config, dataset)
+    config = with_grid_sizes(config, dataset)
 
     def tell(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)

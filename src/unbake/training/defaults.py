@@ -13,7 +13,6 @@ from ..dataset.views import Dataset
 from ..quantities import QUANTITIES
 from ..transport.objective import has_radiance
 from .grid_sizes import with_grid_sizes
-from .guides import with_guides
 from .path_depth import with_path_depth
 
 Number = TypeVar("Number", int, float)
@@ -34,8 +33,7 @@ def with_data_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     Raises:
         UserError: the scene cannot be loaded.
     """
-    config = with_guides(with_path_depth(config, dataset), dataset.kind)
-    return with_grid_sizes(config, dataset)
+    return with_grid_sizes(with_path_depth(config, dataset), dataset)
 
 
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
