@@ -13,6 +13,7 @@ fit is the usual one. Offsets of --at are those of the last group; a positive gr
 from __future__ import annotations
 
 import argparse
+import gc
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -98,6 +99,7 @@ def main() -> None:
     config = FitConfig() if args.settings is None else read_toml(args.settings)
     config = with_defaults(replace(config, steps=args.steps), dataset)
     true = true_parameters(dataset, config, args.edges[-1], args.shift) if args.true else {}
+    gc.collect()  # Dr.Jit 1.5 aborts if objects of an earlier fit are freed in a recording
     fit = begin_fit(dataset, config)
     train(fit, true)
     score = Score(fit.problem, dataset.heldout).measure()
@@ -129,8 +131,10 @@ def true_parameters(
 def train(fit: FreshFit, true: dict[str, np.ndarray]) -> None:
     """Take all steps; from true maps roughness stays."""
     fit.step.plan(fit.state)
-    for key, value in true.items():
-        fit.state.phi[key] = type(fit.state.phi[key])(value)
+    # Kept until all is recorded: Dr.Jit 1.5 aborts if an array of NumPy's is freed meanwhile.
+    start = {key: type(fit.state.phi[key])(value) for key, value in true.items()}
+    for key, value in start.items():
+        fit.state.phi[key] = value
     for number in range(fit.config.steps):
         rates = learning_rates(fit.config, number, number / fit.config.steps)
         fit.step(fit.state, number, rates | ({"roughness": 0.0} if true else {}))
