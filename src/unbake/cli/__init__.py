@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from .. import backend, experiments, signals
+from .. import backend, experiments, exports, signals
 from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig, with_quality
 from ..errors import UserError, printable
@@ -266,7 +266,7 @@ def export(
     run: Positional[Run],
     /,
     out: Path,
-    format: Formats = ("gltf", "textures"),
+    format: Formats = exports.DEFAULT_FORMATS,
     texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
     allow_outside: Flag = False,
 ) -> None:

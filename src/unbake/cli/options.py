@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from .. import config, experiments
+from .. import config, experiments, exports
 from ..errors import UserError
 from .flags import with_options
 
@@ -20,8 +20,8 @@ Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint=
 Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 Formats = Annotated[
-    tuple[Literal["gltf", "textures", "mitsuba"], ...],
-    arg(metavar="FORMATS", help_behavior_hint="(default: gltf textures)"),
+    tuple[exports.Format, ...],
+    arg(metavar="FORMATS", help_behavior_hint=f"(default: {' '.join(exports.DEFAULT_FORMATS)})"),
 ]
 #: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]

@@ -1,1 +1,7 @@
 """Results for other programs: textures, glTF, and scenes for Mitsuba without unbake."""
+
+from typing import Literal, get_args
+
+Format = Literal["gltf", "textures", "mitsuba"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+DEFAULT_FORMATS: tuple[Format, ...] = ("gltf", "textures")

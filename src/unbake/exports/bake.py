@@ -16,7 +16,6 @@ from ..memory import require_memory
 from ..quantities import QUANTITIES
 from ..scene.parse import ParsedScene, is_reference, reason
 from .observed import Views, filled
-from .parts import principled_numbers
 from .unwrap import Atlas, joined, parameterized
 
 #: Texels that are looked up at once; bounds the memory.
@@ -191,7 +190,7 @@ def own_textures(scene: ParsedScene, without: Sequence[str]) -> OwnTextures:
     """
     nodes = scene.state.nodes
     found: OwnTextures = {}
-    for node, number in principled_numbers(scene).items():
+    for number, node in enumerate(scene.principled_indices()):
         props, found[number] = nodes[node].props, {}
         for name, quantity in QUANTITIES.items():
             if name in without:
@@ -233,7 +232,7 @@ def _lookup(atlas: Atlas) -> mi.Mesh:
     mesh = parameterized(*joined(atlas.placed))
     info = [
         np.broadcast_to(
-            np.array([_first(each.part.materials), each.part.two_sided, 0], np.float32),
+            np.array([each.part.materials[0], each.part.two_sided, 0], np.float32),
             (len(each.triangles.faces), 3),
         )
         for each in atlas.placed
@@ -247,7 +246,3 @@ def _lookup(atlas: Atlas) -> mi.Mesh:
     mesh.add_attribute("face_info", 3, mi.Float(np.concatenate(info).ravel()))
     mesh.add_attribute("vertex_own", 3, mi.Float(np.concatenate(own).ravel().astype(np.float32)))
     return mesh
-
-
-def _first(materials: Sequence[int]) -> int:
-    return materials[0]

@@ -15,7 +15,7 @@ import secrets
 import shutil
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -29,6 +29,7 @@ from ..training.grid_sizes import surface_seen
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..version import VERSION
+from . import DEFAULT_FORMATS, FORMATS, Format
 from .bake import Baked, Baker, own_textures
 from .gltf import write_glb
 from .lights import Light, environment_picture, read_lights
@@ -36,11 +37,8 @@ from .mitsuba import write_scene
 from .observed import Views
 from .parts import Part, Parts, parsed_principled, read_parts
 from .textures import COLOUR_SPACES, file_names, write_textures
-from .unwrap import LARGEST, UNIQUE, Atlas, make_atlases
+from .unwrap import LARGEST, UNIQUE, make_atlases
 
-Format = Literal["gltf", "textures", "mitsuba"]
-FORMATS: tuple[Format, ...] = get_args(Format)
-DEFAULT_FORMATS: tuple[Format, ...] = ("gltf", "textures")
 #: Of `export.json`.
 EXPORT_FORMAT = 1
 #: The recovered environment, beside `export.json`.
@@ -161,7 +159,7 @@ def _export(
         seen = surface_seen(scene, cameras)
         texels = _BLIND / free_space.bounds(scene)[2] if seen is None else 1 / seen.footprint
     found = read_parts(dataset.scene, dataset.root)
-    lights = read_lights(parsed_principled(dataset.scene, dataset.root), problem)
+    lights = read_lights(found.scene, problem)
     learned = () if problem.materials is None else tuple(problem.materials)
     own = own_textures(parsed_principled(dataset.scene, dataset.root), learned)
     wanted = [p for p in found.parts if "mitsuba" in formats or p.is_optimized]
@@ -176,6 +174,7 @@ def _export(
         bar.says("writing …")
         environment = environment_picture(problem)
         files, notes = _write(recovered, out, formats, found, baked, lights, environment, learned)
+    names = {id(placed.part): atlas.name for atlas in atlases for placed in atlas.placed}
     manifest = {
         "format": EXPORT_FORMAT,
         "unbake": VERSION,
@@ -192,7 +191,7 @@ def _export(
         "materials": [
             _material(one, files.get(one.atlas.name, [])) for one in baked if one.atlas.is_optimized
         ],
-        "parts": [_part(part, atlases) for part in found.parts],
+        "parts": [_part(part, names.get(id(part))) for part in found.parts],
         "left_out": found.left_out,
         "lights": [
             {
@@ -269,11 +268,10 @@ def _material(baked: Baked, files: list[str]) -> dict[str, Any]:
     }
 
 
-def _part(part: Part, atlases: Sequence[Atlas]) -> dict[str, Any]:
-    names = [a.name for a in atlases for placed in a.placed if placed.part is part]
+def _part(part: Part, material: str | None) -> dict[str, Any]:
     return {
         "name": part.name,
-        "material": names[0] if names and part.is_optimized else None,
+        "material": material if part.is_optimized else None,
         "triangles": len(part.triangles.faces),
         "tessellated": not part.exact,
         "without_area": part.dropped,

@@ -25,7 +25,7 @@ from ..scene.parse import ParsedScene
 from ..version import VERSION
 from .bake import Baked
 from .lights import Light
-from .parts import Part, bsdf_nodes
+from .parts import Part
 from .tessellate import Triangles, unit
 from .textures import picture
 
@@ -199,7 +199,7 @@ def _plain(
 ) -> dict[str, Any]:
     """A material of numbers for what no fit optimizes: lights, glass, mirrors and the like."""
     nodes = scene.state.nodes
-    found = [] if part.bsdf is None else bsdf_nodes(scene, part.bsdf)
+    found = [] if part.bsdf is None else scene.reachable(part.bsdf)
     props = {nodes[i].props.plugin_name(): nodes[i].props for i in reversed(found)}
     material: dict[str, Any] = {"name": part.name}
     factors: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}

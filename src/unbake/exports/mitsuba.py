@@ -19,9 +19,9 @@ from ..scene.emitters import ENVIRONMENTS, STRENGTHS
 from ..scene.parse import ParsedScene, is_reference, referenced, write
 from .bake import Baked, bake_texture, make_texture
 from .lights import Light
-from .parts import Part, bsdf_nodes, principled_numbers
+from .parts import Part
 from .tessellate import Triangles
-from .textures import file_names
+from .textures import as_image, file_names
 
 _TEXTURES, _MESHES, _ENVIRONMENT = "textures", "meshes", "environment"
 
@@ -66,7 +66,9 @@ def write_scene(
     notes: list[str] = []
     stems = file_names([one.atlas.name for one in baked])
     for stem, one in zip(stems, baked, strict=True):
-        _replace_textures(folder, stem, one, scene, scratch, notes)
+        _replace_textures(folder, stem, one, scene)
+        if one.atlas.method != "own":
+            notes += _move_others(folder, stem, one, scene, scratch)
     placed = {id(p.part): p.triangles for one in baked for p in one.atlas.placed}
     names = _replace_shapes(folder, scene, parts, placed)
     for light in lights:
@@ -85,40 +87,30 @@ def write_scene(
 # ----------------------------------------------------------------------------------------- textures
 
 
-def _replace_textures(
-    folder: Path,
-    stem: str,
-    baked: Baked,
-    scene: ParsedScene,
-    scratch: ParsedScene,
-    notes: list[str],
-) -> None:
+def _replace_textures(folder: Path, stem: str, baked: Baked, scene: ParsedScene) -> None:
     """Give the BSDFs of a material its baked textures; what was not learned stays as it is."""
-    nodes = {number: node for node, number in principled_numbers(scene).items()}
+    nodes = scene.principled_indices()
     for name in baked.learned:
         values = baked.values[name]
-        single = values[..., 0] if values.shape[-1] == 1 else values
-        texture = _bitmap(scene, folder / _TEXTURES / f"{stem}_{name}.exr", single)
+        texture = _bitmap(scene, folder / _TEXTURES / f"{stem}_{name}.exr", as_image(values))
         for number in baked.atlas.materials:
             props = scene.state.nodes[nodes[number]].props
             props[QUANTITIES[name].slot] = mi.Properties.ResolvedReference(texture)
-    if baked.atlas.method != "own":
-        _move_others(folder, stem, baked, scene, scratch, notes)
 
 
 def _move_others(
-    folder: Path,
-    stem: str,
-    baked: Baked,
-    scene: ParsedScene,
-    scratch: ParsedScene,
-    notes: list[str],
-) -> None:
-    """Bring the other textures of a material's BSDFs into the coordinates of its atlas."""
+    folder: Path, stem: str, baked: Baked, scene: ParsedScene, scratch: ParsedScene
+) -> list[str]:
+    """Bring the other textures of a material's BSDFs into the coordinates of its atlas.
+
+    Returns:
+        What is not as it was.
+    """
+    notes = []
     parts = [placed.part for placed in baked.atlas.placed]
     learned = {QUANTITIES[name].slot for name in baked.learned}
     outer = {part.bsdf for part in parts if part.bsdf is not None}
-    inside = {i for bsdf in outer for i in bsdf_nodes(scene, bsdf)}
+    inside = {i for bsdf in outer for i in scene.reachable(bsdf)}
     moved: dict[int, int] = {}
     for i in sorted(inside):
         node = scene.state.nodes[i]
@@ -145,6 +137,7 @@ def _move_others(
                 moved[old] = _bitmap(scene, file, pixels)
             props = scene.state.nodes[i].props
             props[key] = mi.Properties.ResolvedReference(moved[old])
+    return notes
 
 
 def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
@@ -289,13 +282,7 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> None:
 
 def _forget_unused(scene: ParsedScene) -> None:
     """Take the files from nodes that nothing refers to, so that they are not copied."""
-    nodes, used, waiting = scene.state.nodes, set(), [0]
-    while waiting:
-        i = waiting.pop()
-        if i not in used:
-            used.add(i)
-            props = nodes[i].props
-            waiting += [props[key].index() for key in list(props) if is_reference(props[key])]
-    for i, node in enumerate(nodes):
+    used = set(scene.reachable(0))
+    for i, node in enumerate(scene.state.nodes):
         if i not in used and "filename" in node.props:
             del node.props["filename"]

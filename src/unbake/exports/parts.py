@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import UserError
 from ..fields.shapes import PlacedShape, placed_shapes
 from ..scene import edit
-from ..scene.parse import ParsedScene, is_reference, parse
+from ..scene.parse import ParsedScene, parse
 from .tessellate import TESSELLATED, Triangles, tessellated, unit
 
 #: By which a shape that was made is found among the nodes.
@@ -50,13 +50,6 @@ class Parts:
     left_out: list[str]  #: names of shapes that are no surfaces of triangles
 
 
-def principled_numbers(scene: ParsedScene) -> dict[int, int]:
-    """The numbers of the materials, by the numbers of their nodes."""
-    nodes = scene.state.nodes
-    found = [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
-    return {node: number for number, node in enumerate(found)}
-
-
 def parsed_principled(path: Path, root: Path) -> ParsedScene:
     """The scene of a data set with the BSDFs that a fit sees."""
     scene = parse(path, root)
@@ -73,7 +66,8 @@ def read_parts(path: Path, root: Path) -> Parts:
     scene = parsed_principled(path, root)
     nodes = scene.state.nodes
     names = _names(scene)
-    described = {i: _described(scene, i) for i in names}
+    materials = {node: number for number, node in enumerate(scene.principled_indices())}
+    described = {i: _described(scene, i, materials) for i in names}
     made = _instantiated(path, root, list(names))
     numbers = {_ID.format(i): i for i in names}
     parts, left_out = [], []
@@ -110,29 +104,17 @@ def _instantiated(path: Path, root: Path, shapes: list[int]) -> mi.Scene:
     return scene.instantiate(merge=False)
 
 
-def bsdf_nodes(scene: ParsedScene, node: int) -> list[int]:
-    """A BSDF's node and those of all BSDFs and textures in it, each once."""
-    found, waiting = [], [node]
-    while waiting:
-        i = waiting.pop(0)
-        if i not in found:
-            found.append(i)
-            waiting += _references(scene, i)
-    return found
+def _described(scene: ParsedScene, node: int, materials: Mapping[int, int]) -> Part:
+    """What the nodes say of a shape.
 
-
-def _references(scene: ParsedScene, node: int) -> list[int]:
-    props = scene.state.nodes[node].props
-    return [props[key].index() for key in list(props) if is_reference(props[key])]
-
-
-def _described(scene: ParsedScene, node: int) -> Part:
-    """What the nodes say of a shape."""
-    nodes, materials = scene.state.nodes, principled_numbers(scene)
-    inside = _references(scene, node)
+    Args:
+        materials: numbers of the `principled` BSDFs, by their nodes.
+    """
+    nodes = scene.state.nodes
+    inside = scene.references(node)
     bsdf = next((i for i in inside if nodes[i].type == mi.ObjectType.BSDF), None)
     emitter = next((i for i in inside if nodes[i].type == mi.ObjectType.Emitter), None)
-    found = [] if bsdf is None else bsdf_nodes(scene, bsdf)
+    found = [] if bsdf is None else scene.reachable(bsdf)
     plugins = {nodes[i].props.plugin_name() for i in found}
     return Part(
         name="",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,14 +34,12 @@ class Triangles:
 
     def reversed_faces(self) -> Triangles:
         """The same with triangles of the other orientation; normals stay."""
-        faces = np.ascontiguousarray(self.faces[:, ::-1])
-        return Triangles(self.positions, faces, self.normals, self.uv)
+        return replace(self, faces=np.ascontiguousarray(self.faces[:, ::-1]))
 
     def turned(self) -> Triangles:
         """The same seen from the other side: triangles and normals are turned around."""
         normals = None if self.normals is None else -self.normals
-        faces = np.ascontiguousarray(self.faces[:, ::-1])
-        return Triangles(self.positions, faces, normals, self.uv)
+        return replace(self.reversed_faces(), normals=normals)
 
     def areas(self) -> np.ndarray:
         """The areas of the triangles, (m,) float64."""

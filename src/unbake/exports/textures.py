@@ -38,13 +38,17 @@ def write_textures(folder: Path, stem: str, baked: Baked) -> list[str]:
     """Write the textures of a material; returns the names of the files."""
     names = []
     for name, values in baked.values.items():
-        single = values[..., 0] if values.shape[-1] == 1 else values
-        write_exr(folder / f"{stem}_{name}.exr", single)
+        write_exr(folder / f"{stem}_{name}.exr", as_image(values))
         write_png(folder / f"{stem}_{name}.png", picture(name, values))
         names += [f"{stem}_{name}.exr", f"{stem}_{name}.png"]
     mask = np.where(baked.covered & ~baked.observed, 255, 0).astype(np.uint8)
     write_png(folder / f"{stem}_unobserved.png", mask)
     return [*names, f"{stem}_unobserved.png"]
+
+
+def as_image(values: np.ndarray) -> np.ndarray:
+    """The same without the axis of channels where there is one channel."""
+    return values[..., 0] if values.shape[-1] == 1 else values
 
 
 def picture(name: str, values: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..scene.parse import ParsedScene
-from .parts import Part, principled_numbers, unique_names
+from .parts import Part, unique_names
 from .tessellate import Triangles
 
 #: Texels along the edge of a texture.
@@ -104,7 +104,7 @@ def _groups(parts: Sequence[Part]) -> list[list[Part]]:
 
 def _material_names(scene: ParsedScene, groups: list[list[Part]]) -> list[str]:
     """The id of a group's material or of the BSDF around it, else the name of its first part."""
-    nodes = {number: node for node, number in principled_numbers(scene).items()}
+    nodes = scene.principled_indices()
     names = []
     for group in groups:
         part = group[0]

@@ -84,7 +84,7 @@ class GuideConfig:
     See `guide.py`. Resolutions double from level to level.
     """
 
-    levels: int = 0  #: number of resolutions; 0: there is no guide. 4 suits rooms
+    levels: int = 0  #: number of resolutions; 0: there is no guide. 4 is for rooms
     base_resolution: int = 1  #: cells along an axis of the coarsest level
     brightnesses: int = 8  #: of the albedo, from black to white
     gain: float = 15.0  #: how much faster the coarsest level learns than the network would alone

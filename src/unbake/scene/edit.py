@@ -148,8 +148,7 @@ def wrap_textures(
     defaults = {quantity.slot: quantity.default for quantity in QUANTITIES.values()}
     nodes = scene.state.nodes
     # By number: a node that is appended moves all others.
-    numbers = [i for i, n in enumerate(nodes) if n.props.plugin_name() == "principled"]
-    for number, others in zip(numbers, textures, strict=True):
+    for number, others in zip(scene.principled_indices(), textures, strict=True):
         for slot, other in others.items():
             around = mi.parser.SceneNode()
             around.type = mi.ObjectType.Texture

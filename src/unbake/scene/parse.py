@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,27 @@ class ParsedScene:
 
     def principled_nodes(self) -> list:
         """The BSDF nodes whose textures can be replaced."""
-        return [n for n in self.state.nodes if n.props.plugin_name() == "principled"]
+        return [self.state.nodes[i] for i in self.principled_indices()]
+
+    def principled_indices(self) -> list[int]:
+        """Their places among the nodes; their places in this list are the numbers of materials."""
+        nodes = self.state.nodes
+        return [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
+
+    def references(self, index: int) -> list[int]:
+        """The places of the nodes that a node refers to, in the order of its properties."""
+        props = self.state.nodes[index].props
+        return [props[key].index() for key in list(props) if is_reference(props[key])]
+
+    def reachable(self, index: int) -> list[int]:
+        """The places of a node and of all nodes in it, each once, nearer ones first."""
+        found = {index: None}
+        waiting = deque(found)
+        while waiting:
+            inner = [i for i in self.references(waiting.popleft()) if i not in found]
+            waiting.extend(dict.fromkeys(inner))
+            found |= dict.fromkeys(inner)
+        return list(found)
 
 
 def parse(path: Path, root: Path | None = None) -> ParsedScene:
