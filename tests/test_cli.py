@@ -27,6 +27,8 @@ from unbake.config import (
 from unbake.errors import UserError
 from unbake.fields import registry
 from unbake.imaging.pictures import read_exr
+from unbake.training.monitor import SHORT
+from unbake.transport.methods import METHODS
 
 SOURCE = str(Path(cli.__file__).parents[2])
 COMMANDS = (
@@ -202,6 +204,12 @@ def test_the_help_of_a_terminal_without_width_ends():
         env=os.environ | {"PYTHONPATH": SOURCE, "COLUMNS": "1"}, text=True,
     )  # fmt: skip
     assert done.returncode == 0 and "usage" in done.stdout
+
+
+def test_the_terms_of_the_progress_are_explained(unbake):
+    text = " ".join(unbake("fit", "--help").out.split())
+    for term in METHODS["ours"].terms:
+        assert f"{SHORT.get(term, term)}: " in text
 
 
 def test_a_working_folder_that_was_deleted_is_one_line(tmp_path):

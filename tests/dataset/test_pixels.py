@@ -262,3 +262,62 @@ def test_a_crop_larger_than_a_view_is_told_in_one_line():
     assert "--batch 9 or less" in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(UserError, match=r"cannot have 8 pixels\. Use --batch 4, or"):
         made.require_crops(8)
+
+
+# ----------------------------------------------------------------------------------- held aside
+
+
+@pytest.fixture
+def large():
+    """Pixels of two views, 40 x 20 each, whose colour is their number; a third are background."""
+
+    def make(foreground_only=False):
+        pose = cameras()[0].to_world
+        views = [Camera(pose, 30, 30, 20, 10, 40, 20)] * 2
+        number = np.arange(1600, dtype=np.float32)
+        alpha = (number % 3 > 0).astype(np.float32)
+        rgb = np.stack([number] * 3, 1)
+        return PixelSource.of(views, rgb, alpha, foreground_only=foreground_only)
+
+    return make
+
+
+@pytest.mark.parametrize("foreground_only", [False, True])
+def test_pixels_that_are_held_aside_are_never_drawn_and_all_others_are(large, foreground_only):
+    every = large(foreground_only)
+    source = every.holding_aside(0.25, seed=5)
+    held, colours = source.held_aside().read()
+    count = every.photographs.count // 4 // 16 * 16
+    assert len(set(held.tolist())) == len(held) == count
+    assert np.array_equal(colours[:, 0], held)
+    if foreground_only:
+        assert (held % 3 > 0).all()
+    drawn = np.concatenate([source.draw(seed, 5000).read()[0] for seed in range(10)])
+    assert not set(drawn.tolist()) & set(held.tolist())
+    left = every.photographs.count - count
+    numbers, times = np.unique(drawn, return_counts=True)
+    assert len(numbers) == left
+    # Each as often as any other: χ² within five standard deviations
+    expected = len(drawn) / left
+    assert abs(((times - expected) ** 2 / expected).sum() - left) < 5 * np.sqrt(2 * left)
+
+
+def test_crops_have_no_pixel_that_is_held_aside(large):
+    source = large().holding_aside(0.5, seed=1)
+    held = set(source.held_aside().read()[0].tolist())
+    for seed in range(50):
+        numbers, colours = source.draw_crop(seed, 16).read()
+        assert len(numbers) == 16 and not held & set(numbers.tolist())
+        assert np.array_equal(colours[:, 0], numbers)
+        assert not held & set(source.draw_crop(seed, 1).read()[0].tolist())
+
+
+def test_the_seed_decides_what_is_held_aside(large):
+    held = [large().holding_aside(0.1, seed).held.tolist() for seed in (3, 3, 4)]
+    assert held[0] == held[1] != held[2]
+    plain = large()
+    assert plain.held_aside() is None
+    # 2 % of these are 32, which tell nothing.
+    assert plain.holding_aside(0.02, 0) is plain and plain.holding_aside(0.0, 0) is plain
+    same = plain.draw(9, 50).read()[0], large().holding_aside(0.0, 1).draw(9, 50).read()[0]
+    assert np.array_equal(*same)

@@ -172,6 +172,19 @@ def test_skipped_steps_and_what_was_noted_of_a_fit_are_told(made, tmp_path: Path
     assert EVIL not in text
 
 
+def test_whether_a_fit_was_still_improving_is_told(made, tmp_path: Path):
+    metrics = made[1][0] / "evaluation" / "metrics.json"
+    found = {"trend": "improving", "change": -0.031, "noise": 0.004, "share": 0.25}
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"convergence": found}))
+    log = made[1][0] / "log.jsonl"
+    lines = [{"step": s, "seconds": 1.0 * s, "held_aside": 1 / s} for s in (50, 100, 150, 200)]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    told = "still improving (the error on held-aside pixels fell by 3.1 % over the last 25 % of"
+    assert text.count(told) == 1
+    assert "<title>Photometric loss, held-aside pixels over" in text
+
+
 def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
     text = write_report(made[1], tmp_path / "report.html").read_text()
     differing, shared = text.split("What differs between the runs.")[1].split("<details>")

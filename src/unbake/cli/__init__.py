@@ -155,6 +155,13 @@ def fit(
     Ctrl-C, SIGTERM, SIGHUP and a closed pipe stop it after the present step, with a checkpoint from
     which --resume continues. A second Ctrl-C ends it at once.
 
+    While it runs it tells the terms of its loss, smaller is better. photo: the photographs against
+    the pictures of the unknowns; what remains in the end is mostly noise. prior: where L, the
+    network that stands for all further light, breaks the rendering equation, at the first point
+    that a camera sees; extra: the same one bounce further. These two keep the noise of one sample
+    and need not fall. lhs: the photographs against L seen directly. In the end the error on pixels
+    that were held aside tells whether a longer fit would be better.
+
     Args:
         data: Folder of the data set, with its transforms.json.
         out: Folder to write the run to: settings, log, checkpoints, previews.

@@ -241,6 +241,15 @@ class FitConfig:
     pixel_sampling: Annotated[
         PixelSampling, Flag("Where the pixels of a step lie: anywhere, or in one crop of one view")
     ] = "all-views"
+    #: Pixels that no step draws, for the error that is measured on them (ours).
+    held_aside: Annotated[
+        float,
+        Flag(
+            "Share of the training pixels that no step draws, 4096 at most: the error on these "
+            "tells how the fit goes; 0: none",
+            metavar="SHARE",
+        ),
+    ] = 0.02
     #: Camera samples a pixel a step (Table 1); even, for the split halves.
     spp: Annotated[int, Flag("Samples per pixel in a step, an even number")] = 8
     radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
@@ -281,6 +290,7 @@ class FitConfig:
             | {
                 "seed": (0, (1 << 63) - 1),  # as TOML has them
                 "pixels": (1, MOST_SAMPLES),
+                "held_aside": (0, 0.5),
                 "final_learning_rate": (POSITIVE, 1e3),
                 "loss_epsilon": (1e-12, 1e20),  # its inverse is a weight, in single precision
             },

@@ -33,6 +33,8 @@ _MOVED = {
     "regularisation": "regularization",
 }
 _GROUPS = ("grid", "bitmap")
+#: Settings that came later, at their value before: a run of an earlier version goes on as it began.
+_AS_BEFORE = {"held_aside": 0.0}
 
 
 def migrated(table: dict[str, Any]) -> dict[str, Any]:
@@ -48,6 +50,8 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
     if version is not None:
         check_format(table, FORMAT, "format")
         del table["format"]
+        # Where unbake wrote the file, all settings are in it but those of later versions.
+        table = _AS_BEFORE | table
     if version == FORMAT:
         return table
     found: dict[str, Any] = {}

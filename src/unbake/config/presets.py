@@ -27,6 +27,7 @@ def _paper() -> FitConfig:
         steps=18_000,
         pixels=16_384,
         pixel_sampling="one-view-crop",
+        held_aside=0.0,
         spp=16,
         radiance_spp=0,
         final_learning_rate=1.0,

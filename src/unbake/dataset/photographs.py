@@ -34,7 +34,7 @@ _RADIUS = 2
 #: (Immerkær 1996, Fast Noise Variance Estimation).
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
 #: Pixels are numbered in 32 bits.
-_MOST_PIXELS = (1 << 32) - 1
+MOST_PIXELS = (1 << 32) - 1
 
 
 @final
@@ -113,8 +113,8 @@ class Photographs:
         hidden = dataset.background == "hidden"
         count = sum(view.camera.width * view.camera.height for view in views)
         remedy = "Use fewer views, or smaller images"
-        if count > _MOST_PIXELS:
-            what = f"the training views have {count:,} pixels, more than {_MOST_PIXELS:,}"
+        if count > MOST_PIXELS:
+            what = f"the training views have {count:,} pixels, more than {MOST_PIXELS:,}"
             raise UserError(what, dataset.folder, remedy)
         columns = _WITH_BLURRED if smoothed else _COLUMNS
         # Views are decoded one after the other

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -16,6 +16,14 @@ from ..errors import UserError
 from ..fields.arrays import from_numpy
 from .camera import Camera
 from .photographs import Photographs
+
+#: Pixels that are held aside, at least (or none are) and at most: enough to see an error change by
+#: one percent, few enough to be rendered in the time of some steps.
+FEWEST_HELD, MOST_HELD = 64, 4096
+#: Their number is a multiple of this, so that they can be parted into equal groups.
+HELD_GROUPS = 16
+#: Tells their random numbers from those of steps, which start at the same seed.
+_HELD = 0x48454C44
 
 
 @dataclass
@@ -130,10 +138,13 @@ class PixelSource:
     Args:
         rays: through the pixels of all views.
         photographs: of the same views.
+        held: places among the pixels to train on that are never drawn, in rising order, shape
+            (n,); None: all are drawn.
     """
 
     rays: CameraRays
     photographs: Photographs
+    held: np.ndarray | None = None
 
     @staticmethod
     def of(
@@ -150,23 +161,46 @@ class PixelSource:
         )
         return PixelSource(CameraRays.of(cameras), found)
 
+    def holding_aside(self, share: float, seed: int) -> PixelSource:
+        """The same pixels without some random ones, which are then never drawn (ours).
+
+        What these tell of a fit was not learned by heart. Fewer than `FEWEST_HELD` tell nothing, so
+        that none are held aside then.
+
+        Args:
+            share: of the pixels to train on, [0,1); at most `MOST_HELD` are taken.
+            seed: decides which.
+        """
+        count = min(int(share * self.photographs.count), MOST_HELD) // HELD_GROUPS * HELD_GROUPS
+        if count < FEWEST_HELD:
+            return self
+        rng = np.random.default_rng([seed, _HELD])
+        places = rng.choice(self.photographs.count, count, replace=False, shuffle=False)
+        return replace(self, held=np.sort(places))
+
+    def held_aside(self) -> PixelBatch | None:
+        """The pixels that are never drawn; None if there are none."""
+        return None if self.held is None else self._batch(self._numbers(self.held))
+
     def draw(self, seed: int, count: int) -> PixelBatch:
         """Draw random pixels of all views, each as likely as any other (ours).
 
         Neighbouring pixels tell much the same, so that scattered ones learn faster at equal cost
         than those of `draw_crop`.
         """
-        every = self.photographs
-        slots = np.random.default_rng(seed).integers(0, every.count, count)
-        numbers = slots if every.chosen is None else every.chosen[slots]
-        return PixelBatch.of(numbers, every.table[numbers])
+        left = self.photographs.count - len(self._before_held)
+        places = np.random.default_rng(seed).integers(0, left, count)
+        # Places are among those left: each moves on by the number of held ones before it.
+        places += np.searchsorted(self._before_held, places, "right")
+        return self._batch(self._numbers(places))
 
     def draw_crop(self, seed: int, count: int) -> PixelBatch:
         """Draw a square crop of one random view, with all its pixels.
 
-        Each view is as likely as any other, and so is each place in it. Where the background is
-        hidden, at least half of the crop are foreground pixels; in a view that has no such place,
-        it is one of those with the most of them, and a view without any is never drawn.
+        Each view is as likely as any other, and so is each place in it. Pixels that are held aside
+        are replaced by others of the crop, or of all views if these are all held aside. Where the
+        background is hidden, at least half of the crop are foreground pixels; in a view that has no
+        such place, it is one of those with the most of them, and a view without any is never drawn.
 
         Args:
             count: pixels of the crop; see `require_crops`.
@@ -186,7 +220,12 @@ class PixelSource:
             place = int(places[rng.integers(len(places))])
         row, column = np.divmod(np.arange(edge * edge), edge)
         numbers = first + (place // across + row) * width + place % across + column
-        return PixelBatch.of(numbers, self.photographs.table[numbers])
+        if self.held is not None:
+            held = np.isin(numbers, self._numbers(self.held))
+            if held.all():
+                return self.draw(seed, count)
+            numbers[held] = rng.choice(numbers[~held], int(held.sum()))
+        return self._batch(numbers)
 
     def place(self, number: int) -> tuple[int, int, int]:
         """The view of a pixel, from 0, and its column and row in it."""
@@ -207,6 +246,20 @@ class PixelSource:
             what = f"a crop of {edge} x {edge} pixels is larger than the smallest photograph"
             remedy = f"Use --batch {short**2} or less, or --pixel-sampling all-views"
             raise UserError(f"{what}, whose shorter edge has {short}", remedy=remedy)
+
+    @cached_property
+    def _before_held(self) -> np.ndarray:
+        """How many places that are left lie before each one that is held aside."""
+        held = np.arange(0) if self.held is None else self.held
+        return held - np.arange(len(held))
+
+    def _numbers(self, places: np.ndarray) -> np.ndarray:
+        """Numbers of pixels by their places among those to train on."""
+        chosen = self.photographs.chosen
+        return places if chosen is None else chosen[places]
+
+    def _batch(self, numbers: np.ndarray) -> PixelBatch:
+        return PixelBatch.of(numbers, self.photographs.table[numbers])
 
     @cached_property
     def _layout(self) -> list[tuple[int, int, int]]:

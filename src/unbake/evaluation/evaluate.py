@@ -20,6 +20,7 @@ from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
 from ..quantities import QUANTITIES
 from ..scene import edit
 from ..scene.parse import parse
+from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.run_lock import RunLock
@@ -41,6 +42,8 @@ DEFINITIONS = {
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
+    "convergence": "of the photometric error on training pixels that no step drew, relative: its "
+    "change over the last part of the fit (share), and the standard error of that (noise)",
     "samples": "camera samples traced in training; of an estimator with two passes, both count",
     "data_changed": "parts of the data set that differ from those that the run was fit to",
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
@@ -125,6 +128,7 @@ def _evaluate(
         # Not what the checkpoint says: version 0.1 counts one of two passes.
         "samples": recovered.progress.step * recovered.config.samples_per_step,
         "seconds": round(recovered.progress.seconds, 2),
+        "convergence": _convergence(recovered, folder),
         "heldout": _summary(rows, "heldout"),
         "train": _summary(rows, "train"),
         **measures,
@@ -303,6 +307,18 @@ def _render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray)
         "render_psnr": finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)),
         "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
     }
+
+
+def _convergence(recovered: Recovered, folder: RunFolder) -> dict | None:
+    """What the error on held-aside pixels says of the fit; None where too little was measured."""
+    try:
+        log = folder.log()
+    except UserError:  # a run may be evaluated without its log
+        return None
+    last = recovered.progress.step
+    kept = [line for line in log if line.get("step", 0) <= last]
+    found = convergence(kept, "seconds" if recovered.config.seconds else "step")
+    return None if found is None else asdict(found)
 
 
 def _summary(rows: list[dict], split: str) -> dict:

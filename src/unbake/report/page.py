@@ -69,6 +69,7 @@ OPTIMIZED = {
     "emission": "Lights",
 }
 VALIDATION = {f"{name}_psnr": f"{row.title} PSNR" for name, row in QUANTITIES.items()}
+VALIDATION |= {"render_psnr": "Rendering PSNR"}
 AXES = {"step": "step", "seconds": "training time, seconds"}  # key in the log: title of the axis
 
 
@@ -305,7 +306,19 @@ def _yardsticks(runs: list[Run]) -> list[dict[str, Any]]:
 
 def _details(run: Run) -> list[tuple[str, str, str]]:
     """What is to be known of a run, in a few words each: text, symbol and subscript."""
-    return [*_described(run), *((text, "", "") for text in _warnings(run))]
+    return [*_described(run), *((text, "", "") for text in [*_trend(run), *_warnings(run)])]
+
+
+def _trend(run: Run) -> list[str]:
+    """Whether the fit was still improving, by the error on pixels that it did not learn from."""
+    found = run.metrics.get("convergence") or {}
+    change, share = (display.number(found.get(key)) for key in ("change", "share"))
+    word = {"improving": "still improving", "plateau": "at a plateau", "rising": "getting worse"}
+    if change is None or share is None or found.get("trend") not in word:
+        return []
+    moved = f"{'rose' if change > 0 else 'fell'} by {100 * abs(change):.1f} %"
+    told = f"the error on held-aside pixels {moved} over the last {100 * share:.0f} % of the fit"
+    return [f"{word[found['trend']]} ({told})"]
 
 
 def _warnings(run: Run) -> list[str]:
@@ -449,6 +462,8 @@ def _loss_charts(runs: list[Run]) -> list[dict[str, Any]]:
     logged = dict.fromkeys(name for run in runs for line in run.log for name in loss_terms(line))
     names = [*(name for name in TERMS if name in logged), *(n for n in logged if n not in TERMS)]
     titles = {name: _term_title(name) for name in names}
+    if any("held_aside" in line for run in runs for line in run.log):
+        titles["held_aside"] = "Photometric loss, held-aside pixels"
     return _charts(
         runs, [run.log for run in runs], titles, "relative L2, no unit", logarithmic=True
     )

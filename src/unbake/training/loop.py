@@ -16,11 +16,14 @@ from rich.console import Console
 
 from ..config import FitConfig, to_toml
 from ..dataset.fingerprint import changed, fingerprint
+from ..dataset.photographs import MOST_PIXELS
+from ..dataset.pixels import CameraRays, PixelSource
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..signals import deferred
 from .checkpoint import Progress, load_checkpoint
 from .defaults import with_defaults
+from .held_aside import ERROR, ErrorCurve, HeldAside, HeldOutPhotographs
 from .memory import memory_mb
 from .monitor import Monitor
 from .path_depth import told_depth, with_path_depth
@@ -115,6 +118,8 @@ class _Begun:
     restored: Progress | None  #: of the checkpoint that it goes on with
     preview: Preview
     score: Score | None
+    aside: HeldAside | None  #: None where no pixels are held aside
+    photographs: HeldOutPhotographs | None  #: None where the truth of held-out views is known
     views: list[str]  #: names of those that it learns from
 
 
@@ -135,6 +140,7 @@ def _begin(
     pixels = training_pixels(
         dataset, clip_negative=clip_negative, smoothed=config.loss_reference == "smoothed"
     )
+    pixels = pixels.holding_aside(config.held_aside, config.seed)
     origin = Origin(
         data=str(data.resolve()),
         mean_radiance=pixels.photographs.mean,
@@ -160,9 +166,34 @@ def _begin(
     preview = Preview(problem, dataset, folder)
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
+    aside, photographs = _probes(dataset, pixels, step, config, preview, clip_negative)
     step.require_memory(state)
     names = [view.name for view in dataset.train]
-    return _Begun(config, origin, problem, step, state, restored, preview, score, names)
+    return _Begun(
+        config, origin, problem, step, state, restored, preview, score, aside, photographs, names
+    )
+
+
+def _probes(
+    dataset: Dataset,
+    pixels: PixelSource,
+    step: TrainingStep,
+    config: FitConfig,
+    preview: Preview,
+    clip_negative: bool,
+) -> tuple[HeldAside | None, HeldOutPhotographs | None]:
+    """What is measured beside the training, from photographs alone."""
+    compared = [] if preview.has_truth else dataset.heldout
+    every = sum(view.camera.width * view.camera.height for view in dataset.views)
+    if every > MOST_PIXELS:
+        compared = []
+    rays = CameraRays.of([view.camera for view in (*dataset.train, *compared)])
+    held = pixels.held_aside()
+    aside = None if held is None else HeldAside(step, rays, held, config)
+    photographs = None
+    if compared:
+        photographs = HeldOutPhotographs(step, rays, dataset, config, clip_negative=clip_negative)
+    return aside, photographs
 
 
 def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
@@ -181,6 +212,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     folder.forget_after(progress.step)
     folder.write_origin(begun.origin)
     folder.write_settings(config)  # from here on there is a run, which can be resumed
+    errors = ErrorCurve(begun.aside, config, _measured_before(folder), progress)
 
     unknown = next(iter(state.phi)).partition(".")[0]  # the first one, whose rate is logged
     total = config.seconds or config.steps
@@ -208,16 +240,17 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             progress.samples = progress.step * config.samples_per_step
             last = _done(config, progress) >= total or bool(stop)
 
+            tell = errors.due(progress)
             full = len(recent) >= READ_EVERY
             timed = config.seconds or score is not None
             # This clock does not wait for the machine, so that slow steps are saved in time, too.
             save = saving.due(time.perf_counter() - clock)
-            if full or last or save or (timed and progress.step % TIME_EVERY == 0):
+            if full or last or save or tell or (timed and progress.step % TIME_EVERY == 0):
                 dr.sync_thread()
                 progress.seconds = time.perf_counter() - clock
                 last = last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
-            if not (full or last or due or save):
+            if not (full or last or due or save or tell):
                 continue
 
             readings = [{term: float(x[0]) for term, x in losses.items()} for losses in recent]
@@ -228,6 +261,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 state.publish(problem)
                 entry["score"] = score.measure()
                 scored_at = progress.seconds
+            if tell or (last and not stop):
+                errors.measure(state, entry, progress)
             lock.require_held()
             monitor.record(_done(config, progress), entry)
             ended = last and not stop  # one that was stopped is not judged by its few steps
@@ -240,7 +275,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 monitor.say(f"warning: {failure}; the fit goes on, and tries again later")
             clock = time.perf_counter() - progress.seconds
         if not stop and not failures:
-            _judge(watchdog, monitor, progress, config)
+            _judge(watchdog, monitor, progress, config, errors)
     for failure in [*failures, *monitor.failures]:
         raise failure
     return progress
@@ -265,11 +300,20 @@ def _watch(
         raise
 
 
-def _judge(watchdog: Watchdog, monitor: Monitor, progress: Progress, config: FitConfig) -> None:
-    """Note what is wrong with a fit that has ended."""
+def _judge(
+    watchdog: Watchdog,
+    monitor: Monitor,
+    progress: Progress,
+    config: FitConfig,
+    errors: ErrorCurve,
+) -> None:
+    """Note what is wrong with a fit that has ended, or tell whether it was still improving."""
     progress.warning = watchdog.verdict(learning_rates(config, progress.step, 0.0))
     if progress.warning is not None:
         monitor.note(progress.step, progress.seconds, progress.warning)
+        return
+    for line in errors.told():
+        monitor.say(line)
 
 
 def _show(begun: _Begun, monitor: Monitor, progress: Progress) -> list[UserError]:
@@ -279,9 +323,23 @@ def _show(begun: _Begun, monitor: Monitor, progress: Progress) -> list[UserError
         lines = begun.preview.show(progress)
     except UserError as error:
         return [error]
+    if begun.photographs is not None:
+        found = begun.photographs.measure(begun.state)
+        lines += [{**progress.counted(), "validation": found}] if found else []
+    elif not lines and begun.aside is not None:
+        error = begun.aside.measure(begun.state)[ERROR]
+        lines.append({**progress.counted(), "validation": {ERROR: error}})
     for line in lines:
         monitor.validation(line)
     return []
+
+
+def _measured_before(folder: RunFolder) -> list[dict]:
+    """Lines of the log of the steps before, with errors on held-aside pixels."""
+    try:
+        return [line for line in folder.log() if ERROR in line]
+    except UserError:  # what a user made of the log is no reason not to go on
+        return []
 
 
 def _done(config: FitConfig, progress: Progress) -> float:

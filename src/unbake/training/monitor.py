@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +17,10 @@ from ..transport.terms import LOGGED
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
+#: Columns of the bar, and of what stands beside it: percentage, time left, and spaces between them.
+_BAR, _BESIDE = 10, 16
+#: Short names of loss terms in the line of progress.
+SHORT = {"photometric": "photo", "prior_extra": "extra"}
 
 
 def loss_terms(entry: Mapping[str, Any]) -> list[str]:
@@ -40,7 +45,7 @@ class Monitor:
         self._last_line = -QUIET_SECONDS
         self._bar = Progress(
             TextColumn("{task.percentage:3.0f} %"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=_BAR),
             TimeRemainingColumn(compact=True),
             TextColumn("{task.description}"),
             console=console,
@@ -76,22 +81,31 @@ class Monitor:
             entry: the line of the log; its loss terms are shown.
         """
         self._write(entry)
-        losses = "  ".join(f"{t} {entry[t]:.4f}" for t in loss_terms(entry))
-        speed = f"{entry['samples_per_second'] / 1e3:.0f} k samples/s"
-        line = f"step {entry['step']}  {losses}  {speed}  {entry['memory_mb']:.0f} MB"
-        self._bar.update(self._task, completed=done, description=line)
+        parts = [f"step {entry['step']}"]
+        parts += [f"{SHORT.get(t, t)} {_number(entry[t])}" for t in loss_terms(entry)]
+        parts.append(f"{entry['samples_per_second'] / 1e3:.0f} k samples/s")
+        parts.append(f"{entry['memory_mb']:.0f} MB")
+        width = self._console.width
+        self._bar.update(
+            self._task, completed=done, description=_fitting(parts, width - _BAR - _BESIDE)
+        )
         if not self._console.is_terminal and entry["seconds"] - self._last_line >= QUIET_SECONDS:
             self._last_line = entry["seconds"]
             ahead = entry["seconds"] * max(0.0, self._total / done - 1) if done else None
-            left = "" if ahead is None else f"  {ahead:.0f} s left"
+            left = "" if ahead is None else f"  {_duration(ahead)} left"
             share = min(1.0, done / self._total) if self._total else 1.0
-            self.say(f"{100 * share:3.0f} %  {line}{left}")
+            start = f"{100 * share:3.0f} %  "
+            self.say(f"{start}{_fitting(parts, width - len(start) - len(left))}{left}")
 
     def validation(self, entry: dict) -> None:
-        """Log and print how good the materials are by now, or how strong the lights."""
+        """Log and print how good the materials or pictures are by now, or how strong the lights."""
         self._write(entry)
         v = entry["validation"]
-        if "emission" in v:
+        if "held_aside" in v:
+            text = f"held-aside pixels, error {_number(v['held_aside'])}"
+        elif "render_psnr" in v:
+            text = f"photographs of held-out views, explained to {v['render_psnr']:.1f} dB"
+        elif "emission" in v:
             strengths = ((name, *(f"{x:.4g}" for x in rgb)) for name, rgb in v["emission"].items())
             text = ", ".join(" ".join(words) for words in strengths)
         else:
@@ -111,3 +125,28 @@ class Monitor:
             self.failures = [UserError(what, self._path, "Make room")]
             if not told:
                 self.say(f"warning: {self.failures[0]}; the fit goes on")
+
+
+def _number(value: float) -> str:
+    """A number in three digits: 0.0912, 1.39, 26.7, 641."""
+    if not math.isfinite(value):
+        return str(value)
+    return f"{value:.{max(0, 2 - max(-2, math.floor(math.log10(abs(value) or 1))))}f}"
+
+
+def _duration(seconds: float) -> str:
+    """A time in a few characters: 59 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+
+
+def _fitting(parts: list[str], columns: int) -> str:
+    """The first of some parts, as many as fit the columns; the very first one always."""
+    line = parts[0]
+    for part in parts[1:]:
+        if len(line) + 2 + len(part) > columns:
+            break
+        line += "  " + part
+    return line

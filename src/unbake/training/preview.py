@@ -34,6 +34,11 @@ class Preview:
             known = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
         self._environment = [] if known is None else [[tonemap(known)]]
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether it compares materials with the truth."""
+        return self._truth is not None
+
     def show(self, progress: Progress) -> list[dict]:
         """Show the present values of the fields.
 

@@ -95,6 +95,8 @@ def _yardsticks(value: Any) -> bool:
 _LOG: Mapping[str, Check] = {
     **dict.fromkeys(("step", "seconds", "samples", "skipped"), _count),
     **dict.fromkeys(("samples_per_second", "memory_mb", "learning_rate"), _number),
+    "held_aside": _score,
+    "held_aside_groups": _NUMBERS,
     "note": _text,
     "score": _SCORES,
     "validation": _object_of(_score, split=_text, emission=_object_of(_NUMBERS)),
@@ -107,6 +109,7 @@ _METRICS: Mapping[str, Check] = {
     **dict.fromkeys(("quantities", "data_changed"), _list_of(_text)),
     **dict.fromkeys(("heldout", "train"), _or_none(_SCORES)),
     "yardsticks": _yardsticks,
+    "convergence": _or_none(_object_of(_score, trend=_text)),
     "per_view": _list_of(_object_of(_score, name=_text, split=_text)),
     "environment": _or_none(_SCORES),
     "emission": _or_none(

@@ -83,6 +83,8 @@ class TrainingStep:
             field.recordable for field in problem.fields()
         )
         self._frozen = dr.freeze(self._step) if recordable else None
+        self._probed = mi.load_dict({"type": "independent"})
+        self._frozen_probe = dr.freeze(self._probe) if recordable else None
         self._fits_memory = False  # as far as is known
         self._planned = not self._path_sampler.keeps_paths
 
@@ -219,6 +221,43 @@ class TrainingStep:
             photograph,
             errors,
         )
+
+    def probe(self, state: State, rays: CameraRays, pixels: PixelBatch, seed: int) -> np.ndarray:
+        """Two independent estimates of some pixels, as steps see them; nothing is learned.
+
+        Args:
+            rays: through the pixels, and maybe others.
+            pixels: as many as a step has, at most. The first call traces and compiles, and further
+                ones with as many pixels and the same rays only replay.
+            seed: decides the random numbers.
+
+        Returns:
+            Linear RGB, from half of the `spp` samples each, shape (pixels, 2, 3).
+        """
+        self.plan(state)
+        inputs = Inputs(
+            scene=self._problem.scene_view.scene,
+            rays=rays,
+            pixels=pixels,
+            sampler=self._probed,
+            second=self._second,
+            seed=dr.opaque(mi.UInt32, seed),
+        )
+        probe = self._probe if self._frozen_probe is None else self._frozen_probe
+        with without_garbage_collection():
+            halves = probe(inputs, state)
+        return np.array(halves).T.reshape(-1, 2, 3)
+
+    def _probe(self, inputs: Inputs, state: State) -> mi.Color3f:
+        config, pixels, sampler = self._config, inputs.pixels, inputs.sampler
+        with dr.suspend_grad(), self._path_sampler.prepared():
+            state.publish(self._problem)
+            sampler.seed(inputs.seed, pixels.count * config.spp)
+            batch = pixels.batch(inputs.rays, sampler, config.spp)
+            image = self._path_sampler.image(inputs.scene, batch.ray, sampler)
+            halves = pixel_means(image, config.spp // 2)
+            dr.eval(halves)
+        return halves
 
     def place(self, pixel: int) -> tuple[int, int, int]:
         """The training view of a pixel, from 0, and its column and row in it."""

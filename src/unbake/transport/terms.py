@@ -20,7 +20,10 @@ from .prior import residual, residual_norm
 
 #: Numbers that stand beside the terms in a line of the log: no term may have such a name.
 LOGGED = frozenset(
-    ["step", "seconds", "samples", "samples_per_second", "memory_mb", "learning_rate", "skipped"]
+    [
+        *("step", "seconds", "samples", "samples_per_second", "memory_mb", "learning_rate"),
+        *("skipped", "held_aside"),
+    ]
 )
 
 

@@ -1,0 +1,280 @@
+"""The error on pixels that no step draws, and what it says of a fit: is it still improving?"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import numpy as np
+
+from ..config import FitConfig
+from ..dataset.pixels import HELD_GROUPS, MOST_HELD, CameraRays, PixelBatch
+from ..dataset.views import Dataset, read_image
+from .checkpoint import Progress
+from .state import State
+from .step import TrainingStep
+
+#: The error is measured after each quarter of a fit. In between it is after each of so many parts,
+#: as long as all of it takes less than this share of the training time.
+PARTS, QUARTER = 16, 4
+_SHARE = 0.005
+#: The last part of a fit, over which a change of the error is told.
+LAST = 0.25
+#: The least relative change of the error that is told as one, and how many standard errors it is.
+_LEAST, _SURE = 0.005, 2.0
+#: Keys of a line of the log: the error, and those of groups of the pixels.
+ERROR, GROUPS = "held_aside", "held_aside_groups"
+
+Trend = Literal["improving", "plateau", "rising"]
+
+
+class _Probe:
+    """Renders the same pixels with the same samples each time, as the steps of a fit see them.
+
+    Args:
+        step: of the fit.
+        rays: through all views, so that all probes of a fit share one kernel.
+        numbers: of the pixels, shape (n,).
+        colours: of the pixels in the photographs, linear RGB, shape (n, 3 or more).
+        config: of the fit.
+    """
+
+    def __init__(
+        self,
+        step: TrainingStep,
+        rays: CameraRays,
+        numbers: np.ndarray,
+        colours: np.ndarray,
+        config: FitConfig,
+    ) -> None:
+        self._step, self._rays = step, rays
+        self.target = colours[:, :3].astype(np.float64)
+        # Passes have as many pixels as a step: they take no more memory, and are compiled once.
+        passes, size = math.ceil(len(numbers) / config.pixels), config.pixels
+        filled = np.resize(np.arange(len(numbers)), passes * size).reshape(passes, size)
+        self._passes = [PixelBatch.of(numbers[part], colours[part, :3]) for part in filled]
+        seeds = np.random.SeedSequence([config.seed, len(numbers)])
+        self._seeds = [int(seed) for seed in seeds.generate_state(passes)]
+
+    def halves(self, state: State) -> np.ndarray:
+        """Two independent estimates of each pixel, linear RGB, shape (n, 2, 3)."""
+        found = [
+            self._step.probe(state, self._rays, pixels, seed)
+            for pixels, seed in zip(self._passes, self._seeds, strict=True)
+        ]
+        return np.concatenate(found)[: len(self.target)].astype(np.float64)
+
+    def squared_errors(self, state: State, limit: float = math.inf) -> np.ndarray:
+        """Squared errors without the noise of the rendering, shape (n, 3); single ones may be < 0.
+
+        Args:
+            limit: radiance above which pictures and photographs are clipped.
+        """
+        first, second = np.moveaxis(self.halves(state), 1, 0)
+        target = np.minimum(self.target, limit)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (np.minimum(first, limit) - target) * (np.minimum(second, limit) - target)
+
+
+@final
+class HeldAside:
+    """Measures the error on the pixels that are held aside.
+
+    It is the photometric one, without the noise of the rendering: what is left in the end is the
+    noise of the photographs and what the fields cannot explain. With the same samples each time,
+    two errors differ by what was learned.
+
+    Args:
+        step: of the fit.
+        rays: through the training views and maybe others after them.
+        held: the pixels that are held aside.
+        config: of the fit.
+    """
+
+    def __init__(
+        self, step: TrainingStep, rays: CameraRays, held: PixelBatch, config: FitConfig
+    ) -> None:
+        numbers, colours = held.read()
+        self._probe = _Probe(step, rays, numbers, colours, config)
+        smoothed = config.loss_reference == "smoothed"
+        reference = colours[:, 3:].astype(np.float64) if smoothed else self._probe.target
+        self._weight = 1 / (reference**2 + config.loss_epsilon)
+
+    def measure(self, state: State) -> dict[str, Any]:
+        """The error now, as numbers of a line of the log: its mean, and those of 16 groups."""
+        errors = (self._probe.squared_errors(state) * self._weight).mean(-1)
+        # Pixels are in the order of views: every 16th is in a group, so that each has all views.
+        groups = errors.reshape(-1, HELD_GROUPS).mean(0)
+        return {ERROR: float(errors.mean()), GROUPS: [round(float(e), 7) for e in groups]}
+
+
+@final
+class ErrorCurve:
+    """When a fit measures the error on held-aside pixels, and what came out so far.
+
+    Args:
+        aside: measures it; None: nothing is measured.
+        config: of the fit.
+        before: the log of the steps before, of a resumed fit.
+        progress: of the fit, with at least one step to come.
+    """
+
+    def __init__(
+        self,
+        aside: HeldAside | None,
+        config: FitConfig,
+        before: Sequence[dict[str, Any]],
+        progress: Progress,
+    ) -> None:
+        self._aside = aside
+        self._by = "seconds" if config.seconds else "step"
+        self._total = config.seconds or config.steps or 1
+        self._lines: list[Mapping[str, Any]] = list(before)
+        self._next = self._after(progress)
+        self._cost = self._spent = 0.0
+
+    def due(self, progress: Progress) -> bool:
+        """Whether it is time to measure."""
+        if self._aside is None or self._after(progress) <= self._next:
+            return False
+        if self._next % QUARTER == 0 or self._spent + self._cost <= _SHARE * progress.seconds:
+            return True
+        self._next += 1
+        return False
+
+    def measure(self, state: State, entry: dict[str, Any], progress: Progress) -> None:
+        """Measure, and add the numbers to a line of the log."""
+        if self._aside is None:
+            return
+        start = time.perf_counter()
+        entry |= self._aside.measure(state)
+        self._cost = time.perf_counter() - start
+        self._spent += self._cost
+        self._lines.append(entry)
+        self._next = self._after(progress)
+
+    def told(self) -> list[str]:
+        """What it says of a fit that has ended, if it says anything; lines for a terminal."""
+        found = convergence(self._lines, self._by)
+        return [] if found is None else found.told().splitlines()
+
+    def _after(self, progress: Progress) -> int:
+        """The number of the part that begins now, from 1."""
+        return math.floor(PARTS * getattr(progress, self._by) / self._total) + 1
+
+
+@final
+class HeldOutPhotographs:
+    """Measures how well photographs of held-out views are explained, where no truth is known.
+
+    Args:
+        step: of the fit.
+        rays: through the training views, and the held-out views after them.
+        dataset: of the fit, with held-out views.
+        config: of the fit.
+        clip_negative: take negative pixels of the photographs as zero.
+
+    Raises:
+        UserError: a photograph cannot be read.
+    """
+
+    def __init__(
+        self,
+        step: TrainingStep,
+        rays: CameraRays,
+        dataset: Dataset,
+        config: FitConfig,
+        *,
+        clip_negative: bool,
+    ) -> None:
+        start = sum(view.camera.width * view.camera.height for view in dataset.train)
+        each = max(MOST_HELD // len(dataset.heldout), 1)
+        rng, numbers, colours = np.random.default_rng(config.seed), [], []
+        for view in dataset.heldout:
+            camera = view.camera
+            pixels = read_image(view.image, camera.width, camera.height, clip_negative)
+            seen = np.flatnonzero(pixels[:, 3] >= 1)
+            chosen = seen[rng.permutation(len(seen))[:each]]
+            numbers.append(start + chosen)
+            colours.append(pixels[chosen, :3])
+            start += len(pixels)
+        found = np.concatenate(numbers).astype(np.uint32)
+        pixels = np.concatenate(colours)
+        self._probe = _Probe(step, rays, found, pixels, config) if len(found) else None
+
+    def measure(self, state: State) -> dict[str, Any] | None:
+        """The PSNR of their pictures in dB, clipped to [0,1]; None where no pixel is in the scene.
+
+        Pictures are as a step sees them, with L_θ after the first bounces, without their noise.
+        """
+        if self._probe is None:
+            return None
+        error = float(self._probe.squared_errors(state, limit=1.0).mean())
+        if not 0 < error < math.inf:
+            return None
+        return {"split": "heldout", "render_psnr": -10 * math.log10(error)}
+
+
+@final
+@dataclass(frozen=True)
+class Convergence:
+    """What the error on held-aside pixels says of a fit that has ended."""
+
+    trend: Trend
+    error: float  #: at the end
+    before: float  #: when the last quarter began
+    change: float  #: relative; below 0: it fell
+    noise: float  #: standard error of the change, relative
+    share: float  #: of the fit, over which the change is told
+
+    def told(self) -> str:
+        """Two lines for a terminal: what happened, and what can be done."""
+        verb = "rose" if self.change > 0 else "fell"
+        part = "the last quarter" if abs(self.share - LAST) < 0.05 else f"the last {self.share:.0%}"
+        sizes = f"{100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
+        word, advice = {
+            "improving": ("still improving", "a longer fit would be better: --quality high"),
+            "plateau": ("at a plateau", "a longer fit would gain little"),
+            "rising": ("getting worse", "more views would help, or a shorter fit"),
+        }[self.trend]
+        return f"held-aside pixels: {word}; error {verb} {sizes} in {part}\n  {advice}"
+
+
+def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergence | None:
+    """What the errors in a log say of the fit; None where they are too few.
+
+    Args:
+        log: lines of the log.
+        by: what the length of the fit is counted in, `step` or `seconds`.
+    """
+    lines = [line for line in log if _measured(line, by)]
+    if len(lines) < 2:
+        return None
+    end = lines[-1]
+    last = end[by]
+    # Of the lines at least a quarter before the end the last one; marks are a step or so late.
+    earlier = [line for line in lines if line[by] <= (1 - LAST + 1 / (4 * PARTS)) * last]
+    if not earlier or last <= 0:
+        return None
+    start = earlier[-1]
+    before, error = start[ERROR], end[ERROR]
+    if not before > 0:
+        return None
+    falls = np.subtract(end[GROUPS], start[GROUPS])
+    change = (error - before) / before
+    noise = float(falls.std(ddof=1) / math.sqrt(len(falls)) / before)
+    trend: Trend = "plateau"
+    if abs(change) > max(_LEAST, _SURE * noise):
+        trend = "improving" if change < 0 else "rising"
+    return Convergence(trend, error, before, change, noise, 1 - start[by] / last)
+
+
+def _measured(line: Mapping[str, Any], by: str) -> bool:
+    numbers = [line.get(by), line.get(ERROR)]
+    groups = line.get(GROUPS)
+    if not isinstance(groups, list) or len(groups) != HELD_GROUPS:
+        return False
+    return all(isinstance(x, int | float) and math.isfinite(x) for x in (*numbers, *groups))
