@@ -10,6 +10,7 @@ import json
 import math
 import os
 import secrets
+import shutil
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -91,6 +92,37 @@ def remove_unfinished(folder: Path) -> None:
     """Delete the temporary files that a killed `write_atomically` left in a folder."""
     for temporary in folder.glob(".*.tmp"):
         temporary.unlink(missing_ok=True)
+
+
+def require_new_folder(out: Path) -> None:
+    """Raise a `UserError` unless there is nothing at a path, or an empty folder."""
+    require_utf8(out, "folder")
+    if out.is_symlink() or (out.exists() and not out.is_dir()):
+        raise UserError("is no folder", out, "Give another --out")
+    if out.is_dir() and any(out.iterdir()):
+        raise UserError("the folder is not empty", out, "Give another --out, or empty it")
+
+
+@contextlib.contextmanager
+def filled_folder(out: Path) -> Iterator[Path]:
+    """A folder to write to, which gets the name `out` at the end; nothing is left of a failure.
+
+    Args:
+        out: as `require_new_folder` wants it.
+
+    Raises:
+        UserError: the folder cannot be made or written.
+    """
+    partial = out.with_name(f".{out.name[:100]}.{secrets.token_hex(8)}.partial")
+    with cleaned_up(lambda: shutil.rmtree(partial, ignore_errors=True)):
+        try:
+            partial.mkdir(parents=True)
+            yield partial
+            if out.is_dir():
+                out.rmdir()
+            partial.rename(out)
+        except OSError as error:
+            raise UserError(f"cannot be written ({error.strerror})", where=out) from None
 
 
 @contextlib.contextmanager

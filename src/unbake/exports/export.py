@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,9 +20,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
 from ..imaging.pictures import write_exr
-from ..io import require_utf8, write_json
+from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
-from ..signals import cleaned_up
 from ..training.grid_sizes import surface_seen
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
@@ -95,17 +92,9 @@ def export(
     run, out = Path(run), Path(out)
     chosen = _require_sound(run, out, formats, texels)
     recovered = load_run(run, allow_outside=allow_outside)
-    partial = out.with_name(f".{out.name[:100]}.{secrets.token_hex(8)}.partial")
-    with cleaned_up(lambda: shutil.rmtree(partial, ignore_errors=True)):
-        try:
-            partial.mkdir(parents=True)
-            manifest = _export(recovered, RunFolder(run), partial, chosen, texels, console, tell)
-            write_json(partial / "export.json", manifest, allow_nan=False)
-            if out.is_dir():
-                out.rmdir()
-            partial.rename(out)
-        except OSError as error:
-            raise UserError(f"cannot be written ({error.strerror})", where=out) from None
+    with filled_folder(out) as partial:
+        manifest = _export(recovered, RunFolder(run), partial, chosen, texels, console, tell)
+        write_json(partial / "export.json", manifest, allow_nan=False)
     return manifest
 
 
@@ -117,11 +106,7 @@ def _require_sound(
     with _collected(wrong):
         RunFolder(run).require_fitted()
     with _collected(wrong):
-        require_utf8(out, "folder")
-        if out.is_symlink() or (out.exists() and not out.is_dir()):
-            raise UserError("is no folder", out, "Give another --out")
-        if out.is_dir() and any(out.iterdir()):
-            raise UserError("the folder is not empty", out, "Give another --out, or empty it")
+        require_new_folder(out)
     unknown = [str(name) for name in formats if name not in FORMATS]
     if unknown or not formats:
         what = f"no format named {', '.join(map(repr, unknown))}" if unknown else "no format given"

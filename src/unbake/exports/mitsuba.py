@@ -149,18 +149,7 @@ def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
     node.props["filename"] = str(file)
     node.props["raw"] = True
     node.props["wrap_mode"] = "clamp"
-    return _append(scene, node)
-
-
-def _append(scene: ParsedScene, node: mi.parser.SceneNode) -> int:
-    """Append a node and return its number; all handles of other nodes are void after it."""
-    scene.state.nodes.append(node)
-    return len(scene.state.nodes) - 1
-
-
-def _append_to_root(scene: ParsedScene, key: str, node: mi.parser.SceneNode) -> None:
-    number = _append(scene, node)
-    scene.state.root.props[key] = mi.Properties.ResolvedReference(number)
+    return scene.append(node)
 
 
 # ------------------------------------------------------------------------------------------- shapes
@@ -197,7 +186,7 @@ def _replace_shapes(
         for key in list(old):
             if is_reference(old[key]):
                 node.props[key] = old[key]
-        _append_to_root(scene, f"exported shape {number}", node)
+        scene.append_to_root(f"exported shape {number}", node)
         names[f"{_MESHES}/{stem}.ply"] = part.name
     return names
 
@@ -276,8 +265,8 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> None:
     sensor.props.set_plugin_name("perspective")
     for key in ("fov", "fov_axis", "near_clip", "far_clip", "to_world"):
         sensor.props[key] = wanted[key]
-    sensor.props["film"] = mi.Properties.ResolvedReference(_append(scene, film))
-    _append_to_root(scene, "exported sensor", sensor)
+    sensor.props["film"] = mi.Properties.ResolvedReference(scene.append(film))
+    scene.append_to_root("exported sensor", sensor)
 
 
 def _forget_unused(scene: ParsedScene) -> None:

@@ -117,6 +117,16 @@ class ParsedScene:
         nodes = self.state.nodes
         return [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
 
+    def append(self, node: mi.parser.SceneNode) -> int:
+        """Append a node and return its number; all handles of other nodes are void after it."""
+        self.state.nodes.append(node)
+        return len(self.state.nodes) - 1
+
+    def append_to_root(self, key: str, node: mi.parser.SceneNode) -> None:
+        """Append a node, and refer to it from the scene itself by this name."""
+        number = self.append(node)
+        self.state.root.props[key] = mi.Properties.ResolvedReference(number)
+
     def references(self, index: int) -> list[int]:
         """The places of the nodes that a node refers to, in the order of its properties."""
         props = self.state.nodes[index].props
