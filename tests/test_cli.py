@@ -32,7 +32,8 @@ from unbake.transport.methods import METHODS
 
 SOURCE = str(Path(cli.__file__).parents[2])
 COMMANDS = (
-    "capture", "fit", "evaluate", "report", "export", "compare", "bench", "reproduce", "doctor"
+    "capture", "fit", "evaluate", "report", "export", "render", "relight", "compare", "bench",
+    "reproduce", "doctor"
 )  # fmt: skip
 PSNRS = ("render_psnr", "albedo_psnr", "roughness_psnr")
 

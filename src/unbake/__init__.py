@@ -9,6 +9,7 @@
     unbake.evaluate(Path("run"))
     unbake.write_report([Path("run")], Path("report.html"))
     unbake.export(Path("run"), Path("exported"))
+    unbake.relight(Path("run"), Path("relit"), unbake.LightConfig(envmap=Path("sky.exr")))
 
 `import unbake` loads neither Mitsuba nor Dr.Jit. A public name is loaded when it is first used; if
 it needs Mitsuba and no variant has been chosen, `activate()` chooses one for this machine.
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from .config import preset as preset
     from .config import read_toml as read_toml
     from .config import to_toml as to_toml
+    from .config.light import LightConfig as LightConfig
     from .dataset.camera import Camera as Camera
     from .dataset.data_folder import DataFolder as DataFolder
     from .dataset.photographs import Photographs as Photographs
@@ -43,7 +45,10 @@ if TYPE_CHECKING:
     from .dataset.views import Dataset as Dataset
     from .dataset.views import View as View
     from .evaluation.evaluate import evaluate as evaluate
+    from .evaluation.rendering import relight as relight
+    from .evaluation.rendering import render as render
     from .evaluation.settings import EvaluationSettings as EvaluationSettings
+    from .evaluation.settings import RenderSettings as RenderSettings
     from .exports.export import export as export
     from .fields.domain import SurfacePoint as SurfacePoint
     from .fields.field import Cost as Cost
@@ -121,8 +126,10 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "acquisition.capture": ("capture",),
     "training.loop": ("fit",),
     "training.recovered": ("load_run",),
-    "evaluation.settings": ("EvaluationSettings",),
+    "evaluation.settings": ("EvaluationSettings", "RenderSettings"),
     "evaluation.evaluate": ("evaluate",),
+    "config.light": ("LightConfig",),
+    "evaluation.rendering": ("relight", "render"),
     "report.page": ("write_report",),
     "exports.export": ("export",),
     "comparison.compare": ("compare",),
@@ -179,6 +186,7 @@ _PURE = frozenset(
         "evaluation.settings",
         "backend",
         "config",
+        "config.light",
         "errors",
         "fields.field",
         "fields.registry",

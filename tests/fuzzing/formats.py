@@ -246,6 +246,20 @@ def _make_scene(folder: Path) -> None:
     check_cameras(problem.scene_view.scene, {"view": _camera()})
 
 
+def _lit_anew(folder: Path) -> None:
+    """Light a scene by what lies in the folder, and make it."""
+    from unbake.scene import relight
+    from unbake.scene.parse import parse
+
+    scene = parse(folder / "scene.xml")
+    relight.turn_off(scene)
+    if (folder / "sky.exr").exists():
+        relight.put_environment(scene, folder / "sky.exr", 1.0, (0, 0, 1), 0.0)
+    else:
+        relight.put_lights(scene, folder / "lights.xml")
+    scene.instantiate()
+
+
 def _around_scene(text: str) -> Callable[[Path], None]:
     def prepare(folder: Path) -> None:
         (folder / "scene.xml").write_text(text)
@@ -415,6 +429,14 @@ FORMATS: dict[str, Format] = {
     "scene.xml": Format(
         "scene.xml", _texts(_MATERIALS, _LIT_BY_ALL), mutations.XML, _make_scene, _around_scene(""),
         2.5,
+    ),
+    "environment map": Format(
+        "sky.exr", _files("data/images/train_000.exr"), mutations.IMAGE, _lit_anew,
+        _around_scene(_MATERIALS),
+    ),
+    "lights": Format(
+        "lights.xml", _texts(_MATERIALS, _LIT_BY_ALL), mutations.XML, _lit_anew,
+        _around_scene(_MATERIALS),
     ),
     "ply": Format(
         "mesh.ply",

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..config.light import LightConfig
 from ..dataset.camera import Camera, frame_name, read_cameras
 from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
@@ -31,6 +32,7 @@ from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
+from .new_light import change_light
 from .placement import coverage, is_room, place
 from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
@@ -48,6 +50,7 @@ def capture(
     settings: CaptureSettings,
     *,
     cameras: Path | str | None = None,
+    light: LightConfig | None = None,
     allow_outside: bool = False,
     tell: Callable[[str], None] = print,
 ) -> Dataset:
@@ -57,6 +60,7 @@ def capture(
         scene: a Mitsuba XML file, or the name of a built-in scene.
         out: folder to write; it must not exist yet, and appears only when it is complete.
         cameras: a camera file; None: the built-in scene's own cameras, or automatic placement.
+        light: takes the place of the scene's own light.
         allow_outside: read files that the scene names and that lie outside of its folder.
         tell: called with lines of progress.
 
@@ -86,7 +90,7 @@ def capture(
             partial.mkdir(parents=True)
             with locked(partial):
                 dataset = _capture(
-                    str(scene), DataFolder(partial), settings, cameras, allow_outside, tell
+                    str(scene), DataFolder(partial), settings, cameras, light, allow_outside, tell
                 )
                 dataset.save(partial)
                 partial.rename(out)
@@ -135,10 +139,11 @@ def _capture(
     data: DataFolder,
     settings: CaptureSettings,
     camera_file: Path | None,
+    light: LightConfig | None,
     allow_outside: bool,
     tell: Callable[[str], None],
 ) -> Dataset:
-    path, scene = _copy_scene(name, data.scene, allow_outside, tell)
+    path, scene = _copy_scene(name, data.scene, light, allow_outside, tell)
     posed = _cameras(name, scene, settings, camera_file)
     counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
     seen = coverage(scene, [c for split, c in posed if split == "train"])
@@ -154,7 +159,7 @@ def _capture(
     rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
-    light = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
+    shares = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
     views, first, number = [], 0, {"train": 0, "heldout": 0}
     for split, camera in posed:
         shape = (camera.height, camera.width)
@@ -188,12 +193,16 @@ def _capture(
             "mitsuba": mi.__version__,
         },
         coverage=round(float(seen), 4),
-        light_by_depth=light,
+        light_by_depth=shares,
     )
 
 
 def _copy_scene(
-    name: str, folder: Path, allow_outside: bool, tell: Callable[[str], None]
+    name: str,
+    folder: Path,
+    light: LightConfig | None,
+    allow_outside: bool,
+    tell: Callable[[str], None],
 ) -> tuple[Path, mi.Scene]:
     """Write the scene and its files into the folder, opaque BSDFs turned into `principled`.
 
@@ -204,6 +213,8 @@ def _copy_scene(
     source = write_scene(name, made) if name in SCENES else Path(name)
     root = Path(source.resolve().anchor) if allow_outside else None
     parsed = parse(source, root)
+    if light is not None:
+        change_light(parsed, light, allow_outside, tell)
     changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")
@@ -212,6 +223,8 @@ def _copy_scene(
             "no material to fit: no shape has a principled, diffuse or roughplastic BSDF", source
         )
     original = parse(source, root)
+    if light is not None:
+        change_light(original, light, allow_outside, lambda line: None)
     edit.to_principled(original)
     scene = original.instantiate()
     emitters.require_emitters(scene, source)

@@ -21,12 +21,14 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from .. import backend, experiments, exports, signals
 from ..acquisition.settings import CaptureSettings
 from ..config import FitConfig, with_quality
+from ..config.light import LightConfig
 from ..errors import UserError, printable
-from ..evaluation.settings import EvaluationSettings
+from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..memory import lacks_memory
 from ..training.run_folder import RunFolder
 from .flags import flags, given, with_options
 from .options import (
+    Count,
     Data,
     Experiment,
     File,
@@ -34,12 +36,15 @@ from .options import (
     Folders,
     Formats,
     Methods,
+    OtherData,
     Preset,
     Quality,
     Run,
     Runs,
     Scale,
     Scene,
+    any_light,
+    chosen_light,
     chosen_settings,
     exclude,
     require,
@@ -52,11 +57,13 @@ _NARROWEST = 40
 _LONGEST = 1 << 14
 
 if TYPE_CHECKING:
-    CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = Any
+    CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = RenderFlags = LightFlags = Any
 else:
     CaptureFlags = flags(CaptureSettings)
     FitFlags = flags(FitConfig, presets=True)
     EvaluationFlags = flags(EvaluationSettings)
+    RenderFlags = flags(RenderSettings)
+    LightFlags = flags(LightConfig)
     CompareFlags = flags(FitConfig, presets=True, without=("method",))
 
 
@@ -71,6 +78,8 @@ def main() -> None:
         "evaluate": evaluate,
         "report": report,
         "export": export,
+        "render": render,
+        "relight": relight,
         "compare": compare,
         "bench": bench,
         "reproduce": reproduce,
@@ -113,9 +122,12 @@ def capture(
     /,
     out: Path,
     cameras: File = None,
+    envmap: File = None,
+    lights: File = None,
     allow_outside: Flag = False,
     *,
     capture: OmitArgPrefixes[CaptureFlags],
+    light: OmitArgPrefixes[LightFlags],
 ) -> None:
     """Render a data set from a Mitsuba scene: photographs, cameras, and the true materials.
 
@@ -124,15 +136,20 @@ def capture(
             of one), still, cornell, cube, furnace.
         out: Folder to write; it must not exist.
         cameras: Camera file (or transforms.json) to use instead of --views and --held-out.
+        envmap: Environment map (OpenEXR, HDR) to light the scene by, instead of its own light.
+        lights: Mitsuba XML file with lights to use instead of the scene's own.
         allow_outside: Read files that the scene names outside of its folder.
         capture: How the data set is rendered.
+        light: How the other light is put into the scene.
     """
     settings = with_options(CaptureSettings(), given(capture))
+    other = any_light(envmap, lights, given(light))
     backend.activate()
     from ..acquisition.capture import capture as run
 
     start = time.perf_counter()
-    run(scene, out, settings, cameras=cameras, allow_outside=allow_outside, tell=_say)
+    options: dict[str, Any] = {"allow_outside": allow_outside, "tell": _say}
+    run(scene, out, settings, cameras=cameras, light=other, **options)
     took = f"{time.perf_counter() - start:.0f} s"
     _say(f"wrote {out} in {took}; next: unbake fit {_word(out)} --out RUN")
 
@@ -301,6 +318,104 @@ def export(
     run_export(run, out, format, texels=texels, **options)
     files = {"gltf": "scene.glb", "textures": "textures", "mitsuba": "mitsuba/scene.xml"}
     _say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")
+
+
+def render(
+    run: Positional[Run],
+    /,
+    out: Path,
+    cameras: File = None,
+    turntable: Count = None,
+    width: Count = None,
+    height: Count = None,
+    allow_outside: Flag = False,
+    *,
+    render: OmitArgPrefixes[RenderFlags],
+) -> None:
+    """Render new pictures of the recovered scene, with all its light.
+
+    Writes NAME.exr (linear radiance) and NAME.png of each camera, and render.json.
+
+    Args:
+        run: Folder that `unbake fit` wrote.
+        out: Folder to write to, new or empty.
+        cameras: Camera file (or transforms.json) to render instead of views of the data set.
+        turntable: Render so many pictures on a circle around the scene. In rooms without a free
+            circle the camera turns on the spot.
+        width: Width of the pictures in pixels (default: as the photographs, or as --height).
+        height: Height of the pictures in pixels (default: as the photographs, or as --width).
+        allow_outside: Read files that the data set or its scene names outside of its folder.
+        render: How pictures are rendered.
+    """
+    settings = _render_settings(given(render), width, height)
+    backend.activate()
+    from ..evaluation.rendering import render as go
+
+    places: dict[str, Any] = {"cameras": cameras, "turntable": turntable}
+    made = go(run, out, settings, **places, allow_outside=allow_outside, tell=_say)
+    _say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
+
+
+def relight(
+    run: Positional[Run],
+    /,
+    out: Path,
+    envmap: File = None,
+    lights: File = None,
+    cameras: File = None,
+    turntable: Count = None,
+    truth: OtherData = None,
+    width: Count = None,
+    height: Count = None,
+    allow_outside: Flag = False,
+    *,
+    light: OmitArgPrefixes[LightFlags],
+    render: OmitArgPrefixes[RenderFlags],
+) -> None:
+    """Render the recovered scene under another light, which takes the place of its own.
+
+    Writes NAME.exr (linear radiance) and NAME.png of each camera, and render.json.
+
+    Args:
+        run: Folder that `unbake fit` wrote.
+        out: Folder to write to, new or empty.
+        envmap: Environment map (OpenEXR, HDR) to light the scene by.
+        lights: Mitsuba XML file with lights: emitters, and shapes that emit light.
+        cameras: Camera file (or transforms.json) to render instead of views of the data set.
+        turntable: Render so many pictures on a circle around the scene. In rooms without a free
+            circle the camera turns on the spot.
+        truth: Data set of the same scene under that light, from `unbake capture` with the same
+            --envmap or --lights: its views are rendered and compared.
+        width: Width of the pictures in pixels (default: as the photographs, or as --height).
+        height: Height of the pictures in pixels (default: as the photographs, or as --width).
+        allow_outside: Read files that data sets, scenes and --lights name outside of their folders.
+        light: How the light is put into the scene.
+        render: How pictures are rendered.
+    """
+    settings = _render_settings(given(render), width, height)
+    chosen = chosen_light(envmap, lights, given(light))
+    backend.activate()
+    from ..evaluation.rendering import relight as go
+
+    places: dict[str, Any] = {"cameras": cameras, "turntable": turntable, "truth": truth}
+    made = go(run, out, chosen, settings, **places, allow_outside=allow_outside, tell=_say)
+    if made["mean"] is not None:
+        scores = {k: v for k, v in made["mean"].items() if k != "views"}
+        shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in scores.items())
+        _say(f"mean over {made['mean']['views']} views: {shown}")
+    _say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
+
+
+def _render_settings(
+    values: dict[str, Any], width: int | None, height: int | None
+) -> RenderSettings:
+    settings = with_options(RenderSettings(), values)
+    for name, value in {"width": width, "height": height}.items():
+        try:
+            settings = dataclasses.replace(settings, **{name: value})
+        except UserError as error:
+            raise UserError(error.what, f"--{name}") from None
+    return settings
 
 
 def compare(

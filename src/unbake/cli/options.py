@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, arg
 
 from .. import config, experiments, exports
+from ..config.light import LightConfig
 from ..errors import UserError
 from .flags import with_options
 
@@ -25,7 +26,9 @@ Formats = Annotated[
 ]
 #: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
+OtherData = Annotated[Path | None, arg(metavar="DATA", help_behavior_hint="")]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
+Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
 Preset = Annotated[
     config.PresetName | None,
     arg(metavar="{cpu,paper,release,release-lighting}", help_behavior_hint=""),
@@ -43,6 +46,30 @@ def chosen_settings(preset: config.PresetName | None, settings: Path | None) -> 
         return config.preset(preset or "cpu")
     exclude("settings", {"preset": preset})
     return config.read_toml(settings)
+
+
+def chosen_light(envmap: Path | None, lights: Path | None, values: dict[str, Any]) -> LightConfig:
+    """The light that --envmap or --lights and the options beside them name."""
+    _require_envmap(envmap, values)
+    return with_options(LightConfig(envmap=envmap, lights=lights), values)
+
+
+def any_light(
+    envmap: Path | None, lights: Path | None, values: dict[str, Any]
+) -> LightConfig | None:
+    """The same; None where neither option was given."""
+    if envmap is None and lights is None:
+        _require_envmap(envmap, values)
+        return None
+    return chosen_light(envmap, lights, values)
+
+
+def _require_envmap(envmap: Path | None, values: dict[str, Any]) -> None:
+    """Refuse options that say something about a map that there is not."""
+    for name, value in values.items():
+        unchanged = value == getattr(LightConfig, name.replace("-", "_"))
+        if name.startswith("envmap-") and envmap is None and not unchanged:
+            raise UserError("needs --envmap", f"--{name}", "Give it, or leave this out")
 
 
 def with_length(settings: config.FitConfig, values: dict[str, Any]) -> config.FitConfig:

@@ -281,7 +281,9 @@ def write_camera_file(path: Path, cameras: Sequence[tuple[str, LookAt]]) -> None
     write_text(path, '{"cameras": [\n' + ",\n".join(lines) + "\n]}\n")
 
 
-def read_cameras(path: Path, width: int, height: int) -> list[tuple[str, Camera]]:
+def read_cameras(
+    path: Path, width: int, height: int, *, keep_size: bool = False
+) -> list[tuple[str, Camera]]:
     """Read (split, camera) pairs from a camera file or a nerfstudio `transforms.json`.
 
     A camera file is `{"cameras": [{"name", "split", "origin", "target", "up", "fov"}]}` or the
@@ -291,6 +293,7 @@ def read_cameras(path: Path, width: int, height: int) -> list[tuple[str, Camera]
     Args:
         path: the file.
         width, height: image size in pixels of the cameras returned.
+        keep_size: leave cameras the size that the file gives them, if it does.
 
     Raises:
         UserError: the file is missing or not JSON, or an entry lacks a key or is no valid camera.
@@ -312,7 +315,7 @@ def read_cameras(path: Path, width: int, height: int) -> list[tuple[str, Camera]
             camera = camera_from_frame(entry, content, where, (width, height))
         else:
             camera = _camera_from_entry(entry, where, width, height)
-        cameras.append((split, camera.rescaled(width, height)))
+        cameras.append((split, camera if keep_size else camera.rescaled(width, height)))
     return cameras
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.lighting import ROWS, true_environment
-from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr, psnr
@@ -26,9 +25,9 @@ from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.run_lock import RunLock
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
 from ..transport.objective import has_radiance
-from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
 from . import lighting, yardsticks
+from .renderings import METRICS, counted_pixels, render_camera, render_psnr
 from .settings import EvaluationSettings
 from .yardsticks import find_yardsticks, seen_materials
 
@@ -49,10 +48,6 @@ DEFINITIONS = {
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",
 }
-
-
-#: Of renderings; those of materials come after them.
-METRICS = ("render_psnr", "render_psnr_unclamped")
 
 
 def evaluate(
@@ -190,23 +185,6 @@ def _true_scene(recovered: Recovered) -> SceneView:
     return SceneView.of(parsed.instantiate(), None, specular)
 
 
-def _render(
-    scene_view: SceneView, view: View, settings: EvaluationSettings, hide_emitters: bool
-) -> np.ndarray:
-    camera = view.camera
-    rays = CameraRays.of([camera])
-    return render_radiance(
-        scene_view,
-        rays.through,
-        rays.pixels,
-        settings.spp,
-        seed=1,
-        max_depth=settings.max_depth,
-        rr_depth=settings.rr_depth,
-        hide_emitters=hide_emitters,
-    ).reshape(camera.height, camera.width, 3)
-
-
 def _evaluate_view(
     recovered: Recovered,
     view: View,
@@ -215,15 +193,13 @@ def _evaluate_view(
     true_scene: SceneView | None,
 ) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
     problem = recovered.problem
-    radiance = _render(problem.scene_view, view, settings, problem.hide_emitters)
+    radiance = render_camera(problem.scene_view, view.camera, settings, problem.hide_emitters)
     photograph = read_view(view.image, view, settings.clip_negative or recovered.clip_negative)
     truth, seen = GroundTruth.of(view, recovered.config.quantities), None
-    alpha, mask = photograph[..., 3], photograph[..., 3] >= 1
     if recovered.config.learns_materials:
-        seen = seen_materials(problem, view, settings)
-        alpha = seen.coverage
-    if truth is not None:
-        mask = truth.known if seen is None else seen.mask(truth)
+        seen = seen_materials(problem, view, settings.material_spp)
+    alpha = photograph[..., 3] if seen is None else seen.coverage
+    mask = counted_pixels(photograph, seen, truth)
 
     pictures = {"render": (radiance, tonemap(radiance))}
     if seen is not None:
@@ -238,10 +214,10 @@ def _evaluate_view(
     limits = () if true_scene is None else ("true_render_psnr",)
     row = {"name": view.name, "split": view.split} | dict.fromkeys((*keys, *limits))
     if mask.any():
-        row |= _render_psnr(radiance, photograph[..., :3], mask)
+        row |= render_psnr(radiance, photograph[..., :3], mask)
         if true_scene is not None:
-            limit = _render(true_scene, view, settings, problem.hide_emitters)
-            row["true_render_psnr"] = _render_psnr(limit, photograph[..., :3], mask)["render_psnr"]
+            limit = render_camera(true_scene, view.camera, settings, problem.hide_emitters)
+            row["true_render_psnr"] = render_psnr(limit, photograph[..., :3], mask)["render_psnr"]
     if seen is not None and truth is not None:
         row |= seen.psnr(truth)
     return row, seen, truth
@@ -300,13 +276,6 @@ def _align_albedo(
             seen, truth, mask = view
             row["albedo_psnr_aligned"] = finite(psnr(seen * scale, truth, mask))
     return [float(x) for x in scale]
-
-
-def _render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> dict:
-    return {
-        "render_psnr": finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)),
-        "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
-    }
 
 
 def _convergence(recovered: Recovered, folder: RunFolder) -> dict | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from ..config.fit import DEEPEST
 from ..config.flag import Flag
@@ -11,6 +11,8 @@ from ..errors import require_ranges
 
 #: Samples of a pixel are all in flight at once; see `transport/render.py`.
 MOST_SAMPLES = 1 << 20
+#: Pixels along an edge of a picture, and pictures of a turntable.
+LARGEST_PICTURE, MOST_PICTURES = 16_384, 10_000
 
 
 @dataclass(frozen=True)
@@ -45,3 +47,44 @@ class EvaluationSettings:
         samples = dict.fromkeys(("spp", "material_spp"), (1, MOST_SAMPLES))
         depths = dict.fromkeys(("max_depth", "rr_depth"), (1, DEEPEST))
         require_ranges(self, samples | depths | {"train_views": (0, 10**6)})
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How new pictures of a recovered scene are rendered and shown.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    #: Without a camera file and without a turntable.
+    views: Annotated[
+        Literal["heldout", "train", "all"], Flag("Views of the data set to render")
+    ] = "heldout"
+    #: Pixels; None: as the photographs, or in the proportions of the other.
+    width: int | None = None
+    height: int | None = None
+    #: Camera samples a pixel.
+    spp: Annotated[int, Flag("Samples per pixel: more mean less noise, and more time")] = 128
+    max_depth: Annotated[int, Flag("Longest light path")] = 48
+    rr_depth: int = 5  #: bounces before Russian roulette
+    seed: Annotated[int, Flag("Seed of all random numbers")] = 1
+    #: Stops; of PNG files alone.
+    exposure: Annotated[float, Flag("Stops by which PNG files are brighter than the values")] = 0.0
+    denoise: Annotated[bool, Flag("Denoise pictures with OptiX, which needs an NVIDIA GPU")] = False
+    material_spp: int = 16  #: camera samples a pixel of the masks of scores
+
+    def __post_init__(self) -> None:
+        require_ranges(
+            self,
+            {
+                "width": (1, LARGEST_PICTURE),
+                "height": (1, LARGEST_PICTURE),
+                "spp": (1, MOST_SAMPLES),
+                "max_depth": (1, DEEPEST),
+                "rr_depth": (1, DEEPEST),
+                "seed": (0, 2**32 - 1),
+                "exposure": (-100, 100),
+                "material_spp": (1, MOST_SAMPLES),
+            },
+        )

@@ -68,9 +68,9 @@ class Yardsticks:
     untrained: Scores
 
 
-def seen_materials(problem: Problem, view: View, settings: EvaluationSettings) -> MaterialBuffers:
+def seen_materials(problem: Problem, view: View, spp: int) -> MaterialBuffers:
     """The present values of the fields in a view, as an evaluation measures them."""
-    (seen,) = MaterialBuffers.of(problem, [view], settings.material_spp, seed=1)
+    (seen,) = MaterialBuffers.of(problem, [view], spp, seed=1)
     return seen
 
 
@@ -167,7 +167,7 @@ def measure_ceiling(
     pairs: list[Seen] = []
     for view in dataset.heldout:
         truth = GroundTruth.of(view, names)
-        pairs.append((seen_materials(fit.problem, view, settings), truth))
+        pairs.append((seen_materials(fit.problem, view, settings.material_spp), truth))
     scores = _means(names, [seen.psnr(truth) for seen, truth in pairs if seen and truth])
     scores |= dict.fromkeys(psnr_keys(set(names) - set(fit.maps.names)))
     _keep(dataset, config, steps, scores, tell)

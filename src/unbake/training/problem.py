@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,7 +87,13 @@ class Problem:
 
 
 def make_problem(
-    scene: Path, background: str, config: FitConfig, scale: float, root: Path | None = None
+    scene: Path,
+    background: str,
+    config: FitConfig,
+    scale: float,
+    root: Path | None = None,
+    *,
+    change: Callable[[ParsedScene], object] | None = None,
 ) -> Problem:
     """Replace the unknowns of a scene by untrained fields.
 
@@ -97,6 +103,8 @@ def make_problem(
         scale: radiance of the untrained radiance field and emitters, and of the environment unless
             the settings say it.
         root: folder that the scene's files must not leave; None: the scene's own.
+        change: called with the scene once the fields are in it, such as to change its light. Points
+            are located in the scene without that change.
 
     Raises:
         UserError: the scene cannot be loaded, has no emitter or nothing to fit, has meshes without
@@ -116,9 +124,12 @@ def make_problem(
         edit.set_environment(parsed, environment_emitter(environment))
     if config.unknown == "emission":
         emission, emitter_names = _unknown_emission(parsed, scale)
+    if change is not None:
+        change(parsed)
     loaded = parsed.instantiate()
     emitters.require_emitters(loaded, scene)
-    domain = Domain.of(loaded.bbox())
+    unchanged = loaded if change is None else parse(scene, root).instantiate()
+    domain = Domain.of(unchanged.bbox())
     if materials is not None:
         materials.domain = domain
         if representation(config.representation).unwrapped:

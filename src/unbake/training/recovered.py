@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..errors import UserError
+from ..scene.parse import ParsedScene
 from .checkpoint import Progress, load_checkpoint
 from .problem import Problem, make_problem
 from .run_folder import RunFolder
@@ -25,7 +27,12 @@ class Recovered:
     clip_negative: bool
 
 
-def load_run(run: Path, *, allow_outside: bool = False) -> Recovered:
+def load_run(
+    run: Path,
+    *,
+    allow_outside: bool = False,
+    change: Callable[[ParsedScene], object] | None = None,
+) -> Recovered:
     """Read a run's newest checkpoint.
 
     `problem.scene_view.scene` is a Mitsuba scene with the recovered fields in the place of its
@@ -35,6 +42,7 @@ def load_run(run: Path, *, allow_outside: bool = False) -> Recovered:
     Args:
         run: folder of a fit.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
+        change: called with the scene before it is made, such as to give it another light.
 
     Raises:
         UserError: the folder holds no run, no checkpoint, or its data set is gone.
@@ -49,7 +57,12 @@ def load_run(run: Path, *, allow_outside: bool = False) -> Recovered:
         raise UserError(f"the data set of the run {run} is gone", data, moved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     problem = make_problem(
-        dataset.scene, dataset.background, config, origin.mean_radiance, dataset.root
+        dataset.scene,
+        dataset.background,
+        config,
+        origin.mean_radiance,
+        dataset.root,
+        change=change,
     )
     state = initial_state(problem)
     progress = load_checkpoint(folder, state)

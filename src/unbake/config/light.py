@@ -1,0 +1,69 @@
+"""Another light than a scene's own. Needs neither Mitsuba nor Dr.Jit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from ..errors import UserError, require_ranges
+from .flag import Flag
+
+#: World axes, with their signs.
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+@dataclass(frozen=True)
+class LightConfig:
+    """Light that takes the place of all the light of a scene.
+
+    Args:
+        envmap: an environment map, OpenEXR, Radiance HDR or PFM, linear RGB, in the layout of
+            Mitsuba's `envmap`.
+        lights: a Mitsuba XML file with emitters and shapes that emit light.
+
+    Raises:
+        UserError: none of the two is given, or both are, or a number is out of range.
+    """
+
+    envmap: Path | None = None
+    lights: Path | None = None
+    envmap_scale: Annotated[float, Flag("What the values of the environment map are times")] = 1.0
+    #: Degrees.
+    envmap_rotate: Annotated[
+        float,
+        Flag("Degrees to turn the environment map about its up axis, counterclockwise from above"),
+    ] = 0.0
+    envmap_up: Annotated[
+        Axis, Flag("World axis that the first row of the environment map lies at")
+    ] = "+y"
+    #: An environment map takes the place of the scene's own environment in any case.
+    keep_lights: Annotated[
+        bool, Flag("Keep the scene's own lights beside the new light, instead of turning them off")
+    ] = False
+
+    def __post_init__(self) -> None:
+        for name in ("envmap", "lights"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, Path(value))
+        if self.envmap is not None and self.lights is not None:
+            raise UserError("cannot be given together with --envmap", "--lights", "Give one")
+        if self.envmap is None and self.lights is None:
+            raise UserError("no light given", None, "Give --envmap FILE or --lights FILE")
+        require_ranges(self, {"envmap_scale": (0, 1e9), "envmap_rotate": (-1e6, 1e6)})
+        if self.envmap_scale == 0:
+            raise UserError("must be more than 0", "envmap_scale")
+
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """The world axis of the map's first row, (3,)."""
+        sign = -1.0 if self.envmap_up[0] == "-" else 1.0
+        x, y, z = (sign if self.envmap_up[1] == name else 0.0 for name in "xyz")
+        return x, y, z
+
+    @property
+    def turn(self) -> float:
+        """Radians to turn the map by, about its up axis."""
+        return math.radians(self.envmap_rotate)

@@ -1,0 +1,363 @@
+"""`unbake render` and `unbake relight`: new pictures of what a run recovered.
+
+DIR/
+  render.json      how the pictures were made, their cameras, and their scores where there are any
+  NAME.exr, .png   of each camera; numbered from 000 on a turntable
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..acquisition.new_light import change_light
+from ..backend import CUDA_VARIANT
+from ..config.light import LightConfig
+from ..dataset.camera import Camera, frame_name, read_cameras
+from ..dataset.views import Dataset, View
+from ..errors import UserError
+from ..imaging.metrics import mean_psnr
+from ..imaging.pictures import tonemap, write_exr, write_png
+from ..io import filled_folder, require_new_folder, write_json
+from ..memory import require_memory
+from ..training.recovered import Recovered, load_run
+from ..training.run_folder import RunFolder
+from ..training.validation import GroundTruth, read_view
+from ..version import VERSION
+from .evaluate import DEFINITIONS, description
+from .renderings import METRICS, counted_pixels, render_camera, render_psnr
+from .settings import MOST_PICTURES, RenderSettings
+from .turntable import turntable as make_turntable
+from .turntable import up_of
+from .yardsticks import seen_materials
+
+#: Of `render.json`.
+RENDER_FORMAT = 1
+#: Memory in bytes that a pixel of a picture takes, its copies included.
+_PIXEL_BYTES = 64
+#: Cosine below which an environment map that stands beside the cameras' upward direction is told.
+_UPRIGHT = 0.7
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A picture to make."""
+
+    name: str
+    camera: Camera
+    split: str | None = None
+    truth: View | None = None  #: a view under the same light
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """Which cameras are asked for; None and False: not these."""
+
+    file: Path | None
+    turntable: int | None
+    truth: Dataset | None = None
+
+
+def render(
+    run: Path | str,
+    out: Path | str,
+    settings: RenderSettings | None = None,
+    *,
+    cameras: Path | str | None = None,
+    turntable: int | None = None,
+    allow_outside: bool = False,
+    tell: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Path trace new pictures of a recovered scene, with full global illumination.
+
+    Args:
+        run: folder of a fit.
+        out: folder to write; it must be new or empty, and is filled only when all is complete.
+        settings: how to render; without cameras they say which views of the data set.
+        cameras: a camera file or a `transforms.json`.
+        turntable: number of cameras on a circle around the scene.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
+        tell: called with lines of progress.
+
+    Returns:
+        The contents of `render.json`.
+
+    Raises:
+        UserError: the run, its data set or the cameras cannot be read, the folder is not empty,
+            there is no place for a turntable, or the denoiser is not there.
+
+    Paper: Sec. 6.
+    """
+    settings = settings or RenderSettings()
+    _require_sound(run, Path(out), settings, cameras, turntable)
+    recovered = load_run(Path(run), allow_outside=allow_outside)
+    chosen = _Cameras(None if cameras is None else Path(cameras), turntable)
+    return _render(recovered, Path(run), Path(out), settings, chosen, None, tell)
+
+
+def relight(
+    run: Path | str,
+    out: Path | str,
+    light: LightConfig,
+    settings: RenderSettings | None = None,
+    *,
+    cameras: Path | str | None = None,
+    turntable: int | None = None,
+    truth: Path | str | None = None,
+    allow_outside: bool = False,
+    tell: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Path trace pictures of a recovered scene under another light.
+
+    Args:
+        run: folder of a fit.
+        out: folder to write; it must be new or empty, and is filled only when all is complete.
+        light: takes the place of all light of the scene, unless it says otherwise.
+        settings: how to render; without cameras they say which views of the data set.
+        cameras: a camera file or a `transforms.json`.
+        turntable: number of cameras on a circle around the scene.
+        truth: a data set of the same scene under that light, as `capture` makes it with the same
+            `light`. Its views are rendered and compared, as in an evaluation.
+        allow_outside: read files of data sets, scenes and the light that lie outside of their
+            folders.
+        tell: called with lines of progress.
+
+    Returns:
+        The contents of `render.json`.
+
+    Raises:
+        UserError: as of `render`; the light cannot be used, or the truth cannot be read.
+
+    Paper: Sec. 6.
+    """
+    settings = settings or RenderSettings()
+    _require_sound(run, Path(out), settings, cameras, turntable, truth)
+    true = None if truth is None else Dataset.load(Path(truth), allow_outside=allow_outside)
+    change = partial(change_light, light=light, allow_outside=allow_outside, tell=tell)
+    recovered = load_run(Path(run), allow_outside=allow_outside, change=change)
+    chosen = _Cameras(None if cameras is None else Path(cameras), turntable, true)
+    return _render(recovered, Path(run), Path(out), settings, chosen, light, tell)
+
+
+def _require_sound(
+    run: Path | str,
+    out: Path,
+    settings: RenderSettings,
+    cameras: Path | str | None,
+    turntable: int | None,
+    truth: Path | str | None = None,
+) -> None:
+    """Check what can be checked before anything is read."""
+    RunFolder(Path(run)).require_fitted()
+    require_new_folder(out)
+    given = {"--cameras": cameras, "--turntable": turntable, "--truth": truth}
+    named = [name for name, value in given.items() if value is not None]
+    if len(named) > 1:
+        raise UserError(f"cannot be given together with {named[1]}", named[0], "Give one of them")
+    if turntable is not None and not 1 <= turntable <= MOST_PICTURES:
+        raise UserError(f"must be from 1 to {MOST_PICTURES}, not {turntable}", "--turntable")
+    if truth is not None and not (settings.width is None and settings.height is None):
+        raise UserError("pictures have the size of the truth", "--truth", "Leave out their size")
+    if settings.denoise and mi.variant() != CUDA_VARIANT:
+        what = f"Mitsuba's denoiser needs an NVIDIA GPU, and {mi.variant()} runs on the CPU"
+        raise UserError(what, "--denoise", "Leave it out, and take a larger --spp")
+
+
+def _render(
+    recovered: Recovered,
+    run: Path,
+    out: Path,
+    settings: RenderSettings,
+    cameras: _Cameras,
+    light: LightConfig | None,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    if light is not None and light.envmap is not None:
+        _tell_tilt(light, recovered.dataset, tell)
+    shots, placed = _shots(recovered, settings, cameras, tell)
+    largest = max(shot.camera.width * shot.camera.height for shot in shots)
+    require_memory(_PIXEL_BYTES * largest, "a picture needs", "Lower --width and --height")
+    hide = recovered.problem.hide_emitters
+    if cameras.truth is not None:
+        hide = cameras.truth.background == "hidden"
+    frames, brightest = [], 0.0
+    with filled_folder(out) as folder:
+        for number, shot in enumerate(shots):
+            radiance = _picture(recovered, shot.camera, settings, hide, settings.seed + number)
+            brightest = max(brightest, float(radiance.max()))
+            write_exr(folder / f"{shot.name}.exr", radiance)
+            write_png(folder / f"{shot.name}.png", tonemap(radiance, settings.exposure))
+            frames.append(_frame(shot) | _scores(recovered, shot, radiance, settings))
+            _tell_progress(number, len(shots), frames[-1], tell)
+        notes = []
+        if brightest == 0:
+            notes.append("all pictures are black: no light reaches what they show; a closed room "
+                         "is lit by lights inside of it, as --lights puts them there")  # fmt: skip
+        manifest = {
+            "format": RENDER_FORMAT,
+            "unbake": VERSION,
+            "run": {
+                "folder": os.fspath(run.resolve()),
+                "data": RunFolder(run).origin().data,
+                "steps": recovered.progress.step,
+            }
+            | description(recovered.config),
+            "light": None if light is None else _told_light(light),
+            "cameras": placed,
+            "settings": asdict(settings),
+            "variant": mi.variant(),
+            "truth": None if cameras.truth is None else os.fspath(cameras.truth.folder),
+            "mean": _means(frames) if cameras.truth is not None else None,
+            "frames": frames,
+            "definitions": {
+                key: DEFINITIONS[key] for key in ("psnr", "colour_space", "mask")
+            }
+            | {"files": "OpenEXR: linear RGB radiance; PNG: the same times 2^exposure as sRGB"},
+            "notes": notes,
+        }  # fmt: skip
+        write_json(folder / "render.json", manifest, allow_nan=False)
+    for note in notes:
+        tell(f"note: {note}")
+    return manifest
+
+
+def _shots(
+    recovered: Recovered,
+    settings: RenderSettings,
+    cameras: _Cameras,
+    tell: Callable[[str], None],
+) -> tuple[list[_Shot], dict[str, Any]]:
+    """The pictures to make, and how their cameras were chosen."""
+    dataset = recovered.dataset
+    first = dataset.train[0].camera
+    width, height = _size(first, settings)
+    if cameras.file is not None:
+        found = read_cameras(cameras.file, first.width, first.height, keep_size=True)
+        counts: dict[str, int] = {}
+        shots = []
+        for split, camera in found:
+            counts[split] = counts.get(split, -1) + 1
+            name = frame_name(split, counts[split])
+            shots.append(_Shot(name, camera.rescaled(*_size(camera, settings)), split))
+        return shots, {"kind": "file", "file": os.fspath(cameras.file)}
+    if cameras.turntable is not None:
+        scene, count = recovered.problem.scene_view.scene, cameras.turntable
+        poses = [view.camera for view in dataset.train]
+        room = dataset.kind == "room"
+        table = make_turntable(scene, poses, count, width, height, room)
+        tell(table.told())
+        shots = [_Shot(frame_name("turntable", i), c) for i, c in enumerate(table.cameras)]
+        told = {"centre": table.centre.tolist(), "radius": table.radius, "up": table.up.tolist()}
+        return shots, {"kind": f"turntable, {table.kind}"} | told
+    source = cameras.truth or dataset
+    chosen = [v for v in source.views if settings.views in ("all", v.split)]
+    if not chosen:
+        tell(f"no view has the split {settings.views!r}: all views are rendered")
+        chosen = list(source.views)
+    shots = [
+        _Shot(
+            view.name,
+            view.camera.rescaled(*_size(view.camera, settings)),
+            view.split,
+            view if cameras.truth is not None else None,
+        )
+        for view in chosen
+    ]
+    return shots, {"kind": "views", "of": "truth" if cameras.truth else "data"}
+
+
+def _size(camera: Camera, settings: RenderSettings) -> tuple[int, int]:
+    """Width and height in pixels: the camera's own, or as the settings say."""
+    width, height = settings.width, settings.height
+    if width is None and height is None:
+        return camera.width, camera.height
+    if width is None:
+        width = max(1, round(camera.width * (height or 1) / camera.height))
+    if height is None:
+        height = max(1, round(camera.height * width / camera.width))
+    return width, height
+
+
+def _picture(
+    recovered: Recovered, camera: Camera, settings: RenderSettings, hide: bool, seed: int
+) -> np.ndarray:
+    seen = render_camera(recovered.problem.scene_view, camera, settings, hide, seed)
+    if not settings.denoise:
+        return seen
+    denoiser = mi.OptixDenoiser(mi.ScalarVector2u(camera.width, camera.height))
+    return np.array(denoiser(mi.TensorXf(seen)))
+
+
+def _scores(
+    recovered: Recovered, shot: _Shot, radiance: np.ndarray, settings: RenderSettings
+) -> dict[str, float | None]:
+    """PSNR of a picture against the truth, counted as in an evaluation; empty without truth."""
+    if shot.truth is None:
+        return {}
+    photograph = read_view(shot.truth.image, shot.truth, recovered.clip_negative)
+    truth = GroundTruth.of(shot.truth, recovered.config.quantities)
+    seen = None
+    if recovered.config.learns_materials:
+        seen = seen_materials(recovered.problem, shot.truth, settings.material_spp)
+    mask = counted_pixels(photograph, seen, truth)
+    if not mask.any():
+        return dict.fromkeys(METRICS)
+    return render_psnr(radiance, photograph[..., :3], mask)
+
+
+def _frame(shot: _Shot) -> dict[str, Any]:
+    """A picture in `render.json`, which is read as a camera file, too."""
+    camera = shot.camera
+    split = {} if shot.split is None else {"split": shot.split}
+    return {
+        "name": shot.name,
+        "file_path": f"{shot.name}.exr",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "transform_matrix": camera.to_world.tolist(),
+    } | split
+
+
+def _told_light(light: LightConfig) -> dict[str, Any]:
+    paths = {"envmap": light.envmap, "lights": light.lights}
+    return asdict(light) | {k: None if v is None else os.fspath(v) for k, v in paths.items()}
+
+
+def _means(frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    scores = {key: mean_psnr(frame[key] for frame in frames) for key in METRICS}
+    return {"views": len(frames)} | scores
+
+
+def _tell_progress(
+    number: int, count: int, frame: dict[str, Any], tell: Callable[[str], None]
+) -> None:
+    """Tell scores of each picture, else progress at every quarter."""
+    if METRICS[0] in frame:
+        value = frame[METRICS[0]]
+        tell(f"{frame['name']}: {'—' if value is None else f'render {value:.1f} dB'}")
+    elif (number + 1) * 4 // count > number * 4 // count:
+        tell(f"rendered {number + 1} of {count} pictures")
+
+
+def _tell_tilt(light: LightConfig, dataset: Dataset, tell: Callable[[str], None]) -> None:
+    """Tell of a map whose sky is not where the cameras have up."""
+    up = up_of([view.camera for view in dataset.train])
+    if up @ np.array(light.up) >= _UPRIGHT:
+        return
+    axis = int(np.argmax(np.abs(up)))
+    wanted = ("-" if up[axis] < 0 else "+") + "xyz"[axis]
+    tell(
+        f"the map's first row lies at {light.envmap_up}, while the cameras' up is {wanted}: "
+        f"--envmap-up {wanted} turns it"
+    )
