@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import fields
 from html.parser import HTMLParser
+from inspect import signature
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,12 +30,10 @@ from unbake.fields import registry
 from unbake.imaging.pictures import read_exr
 from unbake.training.monitor import SHORT
 from unbake.transport.methods import METHODS
+from unbake.version import VERSION
 
 SOURCE = str(Path(cli.__file__).parents[2])
-COMMANDS = (
-    "capture", "fit", "evaluate", "report", "export", "render", "relight", "compare", "bench",
-    "reproduce", "doctor"
-)  # fmt: skip
+COMMANDS = tuple(cli.COMMANDS)
 PSNRS = ("render_psnr", "albedo_psnr", "roughness_psnr")
 
 
@@ -45,7 +44,7 @@ def walked(unbake, tiny, tmp_path, monkeypatch) -> dict:
     sizes = ("--views", 2, "--held-out", 1, "--resolution", 16, "--spp", 8, "--max-depth", 6)
     return {
         "capture": unbake("capture", "cornell", "--out", "data", *sizes),
-        "fit": unbake("fit", "data", "--out", "run", "--settings", tiny, "--seed", 3),
+        "fit": unbake("fit", "data", "-o", "run", "--settings", tiny, "--seed", 3),
         "evaluate": unbake("evaluate", "run", "--spp", 4, "--max-depth", 4, "--train-views", 1),
         "report": unbake("report", "run", "--out", "page/report.html"),
     }
@@ -175,6 +174,45 @@ def test_the_help_leads_from_nothing_to_a_result(unbake):
                  "unbake evaluate RUN", "unbake report RUN --out report.html"):  # fmt: skip
         assert step in text
     assert all(command in text for command in COMMANDS)
+
+
+def test_the_help_groups_commands_by_task_at_any_width(unbake, monkeypatch):
+    for columns in (40, 80):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        lines = unbake("-h").out.splitlines()
+        assert max(map(len, lines)) <= columns
+        at = [lines.index(f"{group}:") for group in cli.GROUPS]
+        assert at == sorted(at) and len(at) >= 4
+        told = [line.split()[0] for line in lines if re.match(r"  \w+  +[A-Z]", line)]
+        assert told == list(cli.COMMANDS)
+
+
+def test_the_version_is_told(unbake):
+    outcome = unbake("--version")
+    assert (outcome.status, outcome.out) == (0, f"unbake {VERSION}\n")
+
+
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if "out" in signature(cli.COMMANDS[c]).parameters]
+)
+def test_o_is_short_for_out(command, unbake):
+    assert re.search(r"│ -o (PATH|FILE), --out (PATH|FILE) ", unbake(command, "--help").out)
+
+
+@pytest.mark.parametrize(
+    ("option", "choices"),
+    [
+        ("--unknown", "'materials', 'lighting', 'materials+lighting', 'emission'"),
+        ("--preset", "'cpu', 'paper', 'release', 'release-lighting'"),
+        ("--quality", "'draft', 'normal', 'high'"),
+        ("--pixel-sampling", "'all-views', 'one-view-crop'"),
+    ],
+)
+def test_choices_are_listed_in_their_order(option, choices, unbake):
+    outcome = unbake("fit", "data", "-o", "run", option, "None")
+    assert outcome.status == 2
+    assert f"invalid choice 'None' for argument '{option}'" in outcome.err
+    assert f"Expected one of ({choices})" in " ".join(re.sub("│", " ", outcome.err).split())
 
 
 @pytest.mark.parametrize("command", COMMANDS)

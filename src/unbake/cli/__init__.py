@@ -9,7 +9,9 @@ import re
 import shlex
 import shutil
 import sys
+import textwrap
 import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -26,6 +28,7 @@ from ..errors import UserError, printable
 from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..memory import lacks_memory
 from ..training.run_folder import RunFolder
+from ..version import VERSION
 from .flags import flags, given, with_options
 from .options import (
     Count,
@@ -37,6 +40,8 @@ from .options import (
     Formats,
     Methods,
     OtherData,
+    Out,
+    OutFile,
     Preset,
     Quality,
     Run,
@@ -56,6 +61,22 @@ _NARROWEST = 40
 #: Characters of a line that is printed: more than a path can have.
 _LONGEST = 1 << 14
 
+_DESCRIPTION = (
+    "Recovers the materials or the lighting of a scene with known geometry from posed HDR "
+    "photographs, with the global illumination taken out."
+)
+_START = (
+    "unbake capture demo --out DATA",
+    "unbake fit DATA --out RUN",
+    "unbake evaluate RUN",
+    "unbake report RUN --out report.html",
+)
+_STATUS = (
+    "Exit status: 0; 1 where a part failed or a fit learned nothing; 2 on bad input or a full "
+    "disk; ended early, with what was done saved: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 "
+    "(closed pipe). A second Ctrl-C ends at once."
+)
+
 if TYPE_CHECKING:
     CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = RenderFlags = LightFlags = Any
 else:
@@ -72,35 +93,21 @@ def main() -> None:
 
     2 on bad input; 130, 143, 129 or 141 if a signal or a closed pipe ended it (`signals.py`).
     """
-    commands = {
-        "capture": capture,
-        "fit": fit,
-        "evaluate": evaluate,
-        "report": report,
-        "export": export,
-        "render": render,
-        "relight": relight,
-        "compare": compare,
-        "bench": bench,
-        "reproduce": reproduce,
-        "doctor": doctor,
-    }
     if shutil.get_terminal_size().columns < _NARROWEST:
         os.environ["COLUMNS"] = str(_NARROWEST)  # Tyro 1.0 wraps texts forever below 10
-    for command in commands.values():
+    words = sys.argv[1:]
+    if words in ([], ["-h"], ["--help"]):
+        print(_overview(), file=sys.stdout if words else sys.stderr)
+        sys.exit(0 if words else 2)
+    if words == ["--version"]:
+        _say(f"unbake {VERSION}")
+        sys.exit(0)
+    for command in COMMANDS.values():
         # Tyro 1.0 keeps the line breaks of some arguments' texts.
         command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
     try:
         status = tyro.extras.subcommand_cli_from_dict(
-            commands,
-            prog="unbake",
-            description="Recovers the materials or the lighting of a scene with known geometry "
-            "from posed HDR photographs, with the global illumination taken out.\n\n"
-            "From nothing to a result: unbake capture demo --out DATA; unbake fit DATA --out RUN; "
-            "unbake evaluate RUN; unbake report RUN --out report.html\n\n"
-            "Exit status: 0; 1 where a part failed or a fit learned nothing; 2 on bad input or a "
-            "full disk; ended early, with what was done saved: 130 (Ctrl-C), 143 (SIGTERM), 129 "
-            "(SIGHUP), 141 (closed pipe). A second Ctrl-C ends at once.",
+            dict(COMMANDS), prog="unbake", description=_DESCRIPTION
         )
     except UserError as error:
         _fail(str(error))
@@ -120,7 +127,7 @@ def main() -> None:
 def capture(
     scene: Positional[Scene],
     /,
-    out: Path,
+    out: Out,
     cameras: File = None,
     envmap: File = None,
     lights: File = None,
@@ -157,7 +164,7 @@ def capture(
 def fit(
     data: Positional[Data],
     /,
-    out: Path,
+    out: Out,
     preset: Preset = None,
     settings: File = None,
     quality: Quality = None,
@@ -270,7 +277,7 @@ def evaluate(
     _say(f"{wrote}; next: unbake report {_word(run)} --out report.html")
 
 
-def report(runs: Positional[Runs], /, out: Path, allow_outside: Flag = False) -> None:
+def report(runs: Positional[Runs], /, out: Out, allow_outside: Flag = False) -> None:
     """Write one HTML page that shows evaluated runs of a data set side by side.
 
     Args:
@@ -289,7 +296,7 @@ def report(runs: Positional[Runs], /, out: Path, allow_outside: Flag = False) ->
 def export(
     run: Positional[Run],
     /,
-    out: Path,
+    out: Out,
     format: Formats = exports.DEFAULT_FORMATS,
     texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
     allow_outside: Flag = False,
@@ -323,7 +330,7 @@ def export(
 def render(
     run: Positional[Run],
     /,
-    out: Path,
+    out: Out,
     cameras: File = None,
     turntable: Count = None,
     width: Count = None,
@@ -359,7 +366,7 @@ def render(
 def relight(
     run: Positional[Run],
     /,
-    out: Path,
+    out: Out,
     envmap: File = None,
     lights: File = None,
     cameras: File = None,
@@ -422,7 +429,7 @@ def compare(
     data: Positional[Data],
     /,
     methods: Methods,
-    out: Path,
+    out: Out,
     preset: Preset = None,
     settings: File = None,
     score_seconds: Annotated[float, arg(metavar="SECONDS")] = 5.0,
@@ -505,7 +512,7 @@ def bench(
     allow_outside: Flag = False,
     preset: Preset = None,
     settings: File = None,
-    out: File = None,
+    out: OutFile = None,
 ) -> None:
     """Measure the training step, its gradients, learning rates, or the ceiling of the fields.
 
@@ -662,7 +669,7 @@ def reproduce(
     what: Positional[Experiment],
     /,
     scale: Scale = "cpu",
-    out: Path = Path("reproduction"),
+    out: Out = Path("reproduction"),
     scenes: Path = Path("scenes"),
     plan: Flag = False,
 ) -> None:
@@ -695,6 +702,53 @@ def doctor() -> int:
     from .. import doctor as module
 
     return module.main()
+
+
+#: The commands by what they are for, in the order of the help.
+GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
+    "Start": {
+        "capture": capture,
+        "fit": fit,
+    },
+    "Results": {
+        "evaluate": evaluate,
+        "report": report,
+        "export": export,
+        "render": render,
+        "relight": relight,
+    },
+    "Compare and measure": {
+        "compare": compare,
+        "bench": bench,
+        "reproduce": reproduce,
+    },
+    "Check": {
+        "doctor": doctor,
+    },
+}
+#: All commands by name.
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+
+
+def _overview() -> str:
+    """The help of `unbake` alone: its commands, a line or two each."""
+    columns = min(max(shutil.get_terminal_size().columns, _NARROWEST), 100)
+    indent = 4 + max(map(len, COMMANDS))
+
+    def wrapped(text: str, first: str = "", further: str = "") -> list[str]:
+        return textwrap.wrap(text, columns, initial_indent=first, subsequent_indent=further)
+
+    lines = ["usage: unbake COMMAND ...", "", *wrapped(_DESCRIPTION)]
+    for title, group in GROUPS.items():
+        lines += ["", f"{title}:"]
+        for name, command in group.items():
+            summary = (inspect.getdoc(command) or "").partition("\n\n")[0]
+            text = " ".join(summary.split()).removesuffix(".")
+            lines += wrapped(text, f"  {name:{indent - 2}}", " " * indent)
+    more = "unbake COMMAND --help tells its options; unbake --version tells the version."
+    lines += ["", *wrapped(more)]
+    lines += ["", "From nothing to a result:", *(f"  {command}" for command in _START)]
+    return "\n".join([*lines, "", *wrapped(_STATUS)])
 
 
 def _word(path: Path) -> str:

@@ -10,6 +10,7 @@ from functools import cache
 from typing import Annotated, Any, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from .. import config
 from ..config import FitConfig, Flag, with_method
@@ -75,11 +76,29 @@ def flags(settings: type, *, presets: bool = False, without: Collection[str] = (
         )
         if option.type is bool:
             fields.append((name, FlagCreatePairsOff[Annotated[bool, told]], False))
+        elif presets and typing.get_origin(option.type) is typing.Literal:
+            kind = one_of(*typing.get_args(option.type))
+            fields.append((name, Annotated[option.type | None, kind, told], None))
         elif presets:
             fields.append((name, Annotated[option.type | None, told], None))
         else:
             fields.append((name, Annotated[option.type, told], option.default))
     return dataclasses.make_dataclass(settings.__name__ + "Flags", fields, frozen=True)
+
+
+def one_of(*names: str) -> PrimitiveConstructorSpec[str | None]:
+    """The type of an option with these values, or None where it is not given.
+
+    Tyro 1.0 lists the values of optional literals in another order each time, with None as one.
+    """
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(names) + "}",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value is None or value in names,
+        str_from_instance=lambda value: [str(value)],
+        choices=names,
+    )
 
 
 def _help(option: Option, presets: bool) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import typing
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from .. import config, experiments, exports
 from ..config.light import LightConfig
 from ..errors import UserError
-from .flags import with_options
+from .flags import one_of, with_options
 
 Scene = Annotated[str, arg(metavar="SCENE")]
 Data = Annotated[Path, arg(metavar="DATA")]
@@ -24,17 +25,22 @@ Formats = Annotated[
     tuple[exports.Format, ...],
     arg(metavar="FORMATS", help_behavior_hint=f"(default: {' '.join(exports.DEFAULT_FORMATS)})"),
 ]
+#: Where a command writes to.
+Out = Annotated[Path, arg(aliases=("-o",))]
 #: None stands for the value of the preset or the file: the help says no "default: None".
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 OtherData = Annotated[Path | None, arg(metavar="DATA", help_behavior_hint="")]
+OutFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="", aliases=("-o",))]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
 Preset = Annotated[
     config.PresetName | None,
+    one_of(*typing.get_args(config.PresetName)),
     arg(metavar="{cpu,paper,release,release-lighting}", help_behavior_hint=""),
 ]
 Quality = Annotated[
     Literal["draft", "normal", "high"] | None,
+    one_of("draft", "normal", "high"),
     arg(metavar="{draft,normal,high}", help_behavior_hint=""),
 ]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
