@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -220,7 +221,12 @@ def test_photographs_without_truth_are_shown_as_recovered(tmp_path: Path):
     text = write_report([run], tmp_path / "report.html").read_text()
     images = [alt for alt in _Page(text).images() if "heldout_000" in alt]
     assert len(images) == 3 + 1 + 1
-    assert "no ground truth" in text and '<td class="n">—</td>' in text
+    assert "no ground truth" not in text and "round truth" not in _words(text)
+    assert 'class="box empty"' not in text and "—" not in _section(text, "numbers")
+    assert "Rendering, photograph, view heldout_000" in images
+    assert "<figcaption>Photograph</figcaption>" in text
+    heads = re.findall(r'scope="col">(\w+)</th>', _section(text, "numbers"))
+    assert "Rendering" in heads and "Albedo" not in heads
 
 
 def test_a_relative_data_path_starts_at_the_run(made, tmp_path: Path):
@@ -407,7 +413,7 @@ def test_maps_without_truth_stand_alone(made, tmp_path: Path):
         _optimize_environment(run, 0.05)
         _edit(run, lambda m: m.update(environment=None))
     light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
-    assert len(_Page(light).images()) == 2 and "no ground truth" in light
+    assert len(_Page(light).images()) == 2 and "round truth" not in light
     assert "<table" not in light and "The error is" not in light and "SH error" not in light
 
 
@@ -489,7 +495,45 @@ def test_what_failed_is_told_and_cannot_inject_markup(made, tmp_path: Path):
     page = tmp_path / "report.html"
     text = write_report(made[1], page, {"ad-pt": f"out of memory {EVIL}"}).read_text()
     assert "ad-pt failed: out of memory" in _words(text)
+    boxes = text.count('<div class="box empty failed">failed</div>')
+    assert boxes == 3 * 6 and '<figcaption title="ad-pt">' in text  # of each view and quantity
     assert _Page(text).count("script") == 1
+
+
+#: What a reader does: another quantity, a drag of the line, the wheel; each is written down.
+_READER = """<script>
+const told = [], stage = document.querySelector(".stage");
+const [under, over] = stage.querySelectorAll("img");
+const box = stage.getBoundingClientRect(), quantity = document.querySelector("[data-of=quantity]");
+told.push(document.querySelector(".compare").hidden, over.alt, under.alt);
+quantity.value = "Albedo"; quantity.dispatchEvent(new Event("change"));
+told.push(over.alt, under.alt);
+const at = {clientX: box.left + box.width / 4, clientY: box.top + box.height / 2, bubbles: true};
+try { stage.dispatchEvent(new PointerEvent("pointerdown", at)); } catch {}
+told.push(stage.style.getPropertyValue("--at"));
+stage.dispatchEvent(new WheelEvent("wheel", {...at, deltaY: -400, cancelable: true}));
+const moved = over.style.transform;
+told.push(moved === under.style.transform && moved.includes("scale(2.7"));
+stage.dispatchEvent(new MouseEvent("dblclick"));
+told.push(over.style.transform.includes("scale(1)"));
+document.querySelector(".zoom").click(); told.push(document.getElementById("zoom").open);
+document.body.dataset.told = JSON.stringify(told);
+</script>"""
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_browser_compares_pictures_and_enlarges_them(made, tmp_path: Path):
+    page = write_report(made[1], tmp_path / "report.html")
+    page.write_text(page.read_text().replace("</body>", f"{_READER}</body>"))
+    words = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1000,800"]
+    words += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    (body,) = [a for name, a in _Page(done.stdout).tags if name == "body"]
+    assert json.loads(body["data-told"] or "[]") == [
+        False, "Rendering, photograph, view heldout_000", "Rendering, ours, view heldout_000",
+        "Albedo, ground truth, view heldout_000", "Albedo, ours, view heldout_000",
+        "25%", True, True, True,
+    ]  # fmt: skip
 
 
 def _edit(run: Path, change: Callable[[dict], object]) -> None:

@@ -137,6 +137,7 @@ def write_report(
             light=lighting,
             optimized=_optimized(loaded),
             materials=bool(materials),
+            known=any(name in view.truth for view in views for name in QUANTITIES),
             recovered=_listed([*_words(materials), *(["light"] if lighting else [])]),
             colours=_listed(["renderings", *_words(materials, "colour")]).capitalize(),
             data=_words(materials, "data"),
@@ -234,14 +235,23 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
 
 
 def _psnrs(runs: list[Run]) -> dict[str, str]:
-    """Keys and headings of the columns: quantities that some run optimized, and aligned albedo."""
+    """Keys and headings of the columns: quantities that some run optimized, and aligned albedo.
+
+    Materials without a number in any run, as where no truth is known, have none.
+    """
     aligned = any("albedo_psnr_aligned" in (run.metrics.get("heldout") or {}) for run in runs)
     return {
         key: heading
         for key, quantity, heading in PSNRS
         if any(run.optimizes(quantity) for run in runs)
         and (aligned or key != "albedo_psnr_aligned")
+        and (quantity == "render" or any(_has_number(run, key) for run in runs))
     }
+
+
+def _has_number(run: Run, key: str) -> bool:
+    """Whether a PSNR of any split is a number."""
+    return any(display.number((run.metrics.get(s) or {}).get(key)) is not None for s in SPLITS)
 
 
 def _table(runs: list[Run]) -> list[dict[str, Any]]:

@@ -237,7 +237,10 @@ class Convergence:
         sizes = f"{100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
         word, advice = {
             "improving": ("still improving", "a longer fit would be better: --quality high"),
-            "plateau": ("at a plateau", "a longer fit would gain little"),
+            "plateau": (
+                "at a plateau",
+                "a longer fit explains photographs no better; materials may still gain",
+            ),
             "rising": ("getting worse", "more views would help, or a shorter fit"),
         }[self.trend]
         return f"held-aside pixels: {word}; error {verb} {sizes} in {part}\n  {advice}"
