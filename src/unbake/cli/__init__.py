@@ -45,6 +45,7 @@ from .options import (
     Preset,
     Quality,
     Run,
+    RunOrData,
     Runs,
     Scale,
     Scene,
@@ -425,6 +426,33 @@ def _render_settings(
     return settings
 
 
+def view(
+    folder: Positional[RunOrData],
+    /,
+    port: Annotated[int, arg(metavar="PORT")] = 8080,
+    allow_outside: Flag = False,
+) -> int:
+    """Show a run or a data set in the browser: surfaces, cameras, pictures, the log.
+
+    It prints the address of a page on this machine, which no other machine can open, and goes on
+    until Ctrl-C. Of a fit that still runs, new checkpoints are shown as they come; nothing is
+    written to its folder. It needs viser: pip install 'unbake[view]'
+
+    Args:
+        folder: Folder that `unbake fit` wrote, or of a data set.
+        port: Port of 127.0.0.1; 0 takes any that is free.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
+    """
+    from ..viewer.dependencies import require_viser
+
+    require_viser()
+    backend.activate()
+    from ..viewer.view import view as run
+
+    run(folder, port, allow_outside=allow_outside, tell=_say)
+    return signals.status()
+
+
 def compare(
     data: Positional[Data],
     /,
@@ -716,6 +744,7 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
         "export": export,
         "render": render,
         "relight": relight,
+        "view": view,
     },
     "Compare and measure": {
         "compare": compare,

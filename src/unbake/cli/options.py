@@ -17,6 +17,7 @@ from .flags import one_of, with_options
 Scene = Annotated[str, arg(metavar="SCENE")]
 Data = Annotated[Path, arg(metavar="DATA")]
 Run = Annotated[Path, arg(metavar="RUN")]
+RunOrData = Annotated[Path, arg(metavar="RUN|DATA")]
 Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]
 Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint="(required)")]
 Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]

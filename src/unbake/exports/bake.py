@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -139,24 +139,45 @@ class Baker:
         si = mi.SurfaceInteraction3f(si)
         si.uv = mi.Point2f(own.x, own.y)
         number = mi.UInt32(dr.round(info.x))
-        found: dict[str, list[mi.Float]] = {}
-        if self._materials is not None:
-            position = self._materials.domain.to_unit(si.p, valid)
-            point = SurfacePoint(position, si.uv, dr.select(valid, number, 0))
-            for name, value in self._materials.evaluate_at(point).items():
-                found[name] = list(value) if QUANTITIES[name].channels == 3 else [value]
-        for name, quantity in QUANTITIES.items():
-            if name in found:
-                continue
-            value = mi.Color3f(quantity.default)
-            for material in atlas.materials:
-                texture = self._own[material][name]
-                here = valid & (number == material)
-                three = quantity.channels == 3
-                looked_up = texture.eval(si, here) if three else texture.eval_1(si, here)
-                value = dr.select(here, mi.Color3f(looked_up), value)
-            found[name] = list(value)[: quantity.channels]
-        return found
+        return look_up(self._materials, self._own, atlas.materials, si, number, valid)
+
+
+def look_up(
+    materials: Materials | None,
+    own: OwnTextures,
+    numbers: Collection[int],
+    si: mi.SurfaceInteraction3f,
+    number: mi.UInt32,
+    valid: mi.Bool,
+) -> dict[str, list[mi.Float]]:
+    """All quantities at surface points, in linear space.
+
+    Args:
+        materials: what was recovered; None: nothing.
+        own: textures of the scene, for what was not recovered.
+        numbers: of the materials that there are at these points.
+        si: the points, of which position and texture coordinates are read.
+        number: of the material of each.
+        valid: points that count.
+    """
+    found: dict[str, list[mi.Float]] = {}
+    if materials is not None:
+        position = materials.domain.to_unit(si.p, valid)
+        point = SurfacePoint(position, si.uv, dr.select(valid, number, 0))
+        for name, value in materials.evaluate_at(point).items():
+            found[name] = list(value) if QUANTITIES[name].channels == 3 else [value]
+    for name, quantity in QUANTITIES.items():
+        if name in found:
+            continue
+        value = mi.Color3f(quantity.default)
+        for material in numbers:
+            texture = own[material][name]
+            here = valid & (number == material)
+            three = quantity.channels == 3
+            looked_up = texture.eval(si, here) if three else texture.eval_1(si, here)
+            value = dr.select(here, mi.Color3f(looked_up), value)
+        found[name] = list(value)[: quantity.channels]
+    return found
 
 
 def bake_texture(baked: Baked, texture: mi.Texture) -> np.ndarray:

@@ -37,7 +37,7 @@ _CONDUCTORS = ("conductor", "roughconductor")
 _SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
 
 
-class _Document:
+class Document:
     """A glTF document and its one buffer."""
 
     def __init__(self) -> None:
@@ -101,8 +101,8 @@ class _Document:
             self.add("samplers", {"magFilter": _LINEAR, "minFilter": _MIPMAPS, **clamped})
         return self.add("textures", {"sampler": 0, "source": image})
 
-    def write(self, path: Path) -> None:
-        """Write the file, complete or not at all."""
+    def content(self) -> list[bytes]:
+        """The file, in pieces."""
         self.json["buffers"] = [{"byteLength": self._length}]
         if self._extensions:
             self.json["extensionsUsed"] = sorted(self._extensions)
@@ -110,12 +110,20 @@ class _Document:
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + self._length
 
+        return [
+            struct.pack("<4sII", b"glTF", 2, total),
+            struct.pack("<I4s", len(text), b"JSON") + text,
+            struct.pack("<I4s", self._length, b"BIN\0"),
+            *self._parts,
+        ]
+
+    def write(self, path: Path) -> None:
+        """Write the file, complete or not at all."""
+        content = self.content()
+
         def save(target: Path) -> None:
             with target.open("wb") as file:
-                file.write(struct.pack("<4sII", b"glTF", 2, total))
-                file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-                file.write(struct.pack("<I4s", self._length, b"BIN\0"))
-                file.writelines(self._parts)
+                file.writelines(content)
 
         write_atomically(path, save)
 
@@ -137,7 +145,7 @@ def write_glb(
         lights: point, spot and directional lights are written as such, area lights as emission of
             their parts; environments are left out, as glTF knows none.
     """
-    document = _Document()
+    document = Document()
     placed = {id(p.part): (p.triangles, b) for b in baked for p in b.atlas.placed}
     glow = {light.node: light.strength for light in lights}
     textures: dict[int, dict[str, Any]] = {}
@@ -164,7 +172,7 @@ def write_glb(
     document.write(path)
 
 
-def _add_part(document: _Document, name: str, triangles: Triangles, material: int) -> None:
+def _add_part(document: Document, name: str, triangles: Triangles, material: int) -> None:
     attributes = {"POSITION": document.array(triangles.positions, "VEC3", bounds=True)}
     if triangles.normals is not None:
         attributes["NORMAL"] = document.array(unit(triangles.normals), "VEC3")
@@ -177,7 +185,7 @@ def _add_part(document: _Document, name: str, triangles: Triangles, material: in
     document.json["scenes"][0]["nodes"].append(node)
 
 
-def _textured(document: _Document, baked: Baked) -> dict[str, Any]:
+def _textured(document: Document, baked: Baked) -> dict[str, Any]:
     """A material of textures: roughness is the green channel and metallic the blue one."""
     name, values = baked.atlas.name, baked.values
     roughness, metallic = (picture(k, values[k]) for k in ("roughness", "metallic"))
@@ -192,7 +200,7 @@ def _textured(document: _Document, baked: Baked) -> dict[str, Any]:
 
 
 def _plain(
-    document: _Document,
+    document: Document,
     scene: ParsedScene,
     part: Part,
     strength: tuple[float, float, float] | None,
@@ -244,7 +252,7 @@ def _colour(value: Any) -> list[float]:
     return np.broadcast_to(rgb.clip(0, 1), 3).tolist()
 
 
-def _emissive(document: _Document, strength: Sequence[float]) -> Mapping[str, Any]:
+def _emissive(document: Document, strength: Sequence[float]) -> Mapping[str, Any]:
     """Emission: a colour in [0, 1] and what multiplies it."""
     largest = max(*strength, 1e-12)
     return {
@@ -255,7 +263,7 @@ def _emissive(document: _Document, strength: Sequence[float]) -> Mapping[str, An
     }
 
 
-def _add_light(document: _Document, light: Light) -> None:
+def _add_light(document: Document, light: Light) -> None:
     """A light without extent; glTF's look along -z, Mitsuba's along +z."""
     assert light.strength is not None
     largest = max(*light.strength, 1e-12)

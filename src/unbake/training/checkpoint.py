@@ -109,12 +109,33 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
             none can be used.
     """
     expected = _arrays(state)
-    most = 2 * sum(array.nbytes for array in expected.values()) + _MOST_TEXT
-    for path, arrays, progress in _whole(run, most):
+    for path, arrays, progress in _whole(run, _most(expected)):
         _require_fit(arrays, expected, path)
         _restore(state, arrays)
         return progress
     return None
+
+
+def load_written(run: RunFolder, state: State, path: Path) -> Progress | None:
+    """Put one checkpoint of the run into the state; None if it is not whole, or not of this run.
+
+    A running fit writes checkpoints and deletes them: one that cannot be read now may be whole a
+    moment later, or gone.
+
+    Args:
+        path: of `RunFolder.written_checkpoints`.
+
+    Raises:
+        UserError: it belongs to other settings or was written by a newer version.
+    """
+    expected = _arrays(state)
+    found = _good(path, _most(expected))
+    if found is None or found[2].get("run") != _identity(run):
+        return None
+    arrays, progress, _ = found
+    _require_fit(arrays, expected, path)
+    _restore(state, arrays)
+    return progress
 
 
 def newest_progress(run: RunFolder) -> Progress | None:
@@ -133,22 +154,12 @@ def _whole(run: RunFolder, most: int) -> Iterator[tuple[Path, dict[str, np.ndarr
             by a newer version.
     """
     written, others, found = run.written_checkpoints(), 0, 0
-    identity = run.origin().run if run.origin_file.exists() else None
+    identity = _identity(run)
     for path in written:
-        try:
-            arrays, manifest = _read(path, most)
-            progress = Progress(
-                int(manifest["step"]),
-                float(manifest["seconds"]),
-                int(manifest["samples"]),
-                int(manifest.get("skipped", 0)),
-                float(manifest.get("rate", 1.0)),
-                tuple(map(float, manifest.get("untrained", ()))),
-            )
-            if not all(np.isfinite(array).all() for array in arrays.values()):
-                raise _Damaged("a number is not finite")
-        except (_Damaged, OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError):
+        good = _good(path, most)
+        if good is None:
             continue
+        arrays, progress, manifest = good
         if manifest.get("run") != identity:
             others += 1
             continue
@@ -159,6 +170,38 @@ def _whole(run: RunFolder, most: int) -> Iterator[tuple[Path, dict[str, np.ndarr
         raise UserError(what, run.checkpoints, "Put the right ones back, or fit again")
     if written and not found:
         raise UserError("no checkpoint in this folder can be read", run.checkpoints, "Fit again")
+
+
+def _good(path: Path, most: int) -> tuple[dict[str, np.ndarray], Progress, dict[str, Any]] | None:
+    """The arrays, the progress and the manifest of a checkpoint; None if it is not whole.
+
+    Raises:
+        UserError: it was written by a newer version.
+    """
+    try:
+        arrays, manifest = _read(path, most)
+        progress = Progress(
+            int(manifest["step"]),
+            float(manifest["seconds"]),
+            int(manifest["samples"]),
+            int(manifest.get("skipped", 0)),
+            float(manifest.get("rate", 1.0)),
+            tuple(map(float, manifest.get("untrained", ()))),
+        )
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            raise _Damaged("a number is not finite")
+    except (_Damaged, OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError):
+        return None
+    return arrays, progress, manifest
+
+
+def _identity(run: RunFolder) -> str | None:
+    return run.origin().run if run.origin_file.exists() else None
+
+
+def _most(expected: Mapping[str, np.ndarray]) -> int:
+    """Bytes that a state with these arrays can have."""
+    return 2 * sum(array.nbytes for array in expected.values()) + _MOST_TEXT
 
 
 # ------------------------------------------------------------------------------------------ writing

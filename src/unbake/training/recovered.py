@@ -13,7 +13,7 @@ from ..scene.parse import ParsedScene
 from .checkpoint import Progress, load_checkpoint
 from .problem import Problem, make_problem
 from .run_folder import RunFolder
-from .state import initial_state
+from .state import State, initial_state
 
 
 @dataclass
@@ -25,6 +25,49 @@ class Recovered:
     config: FitConfig
     progress: Progress
     clip_negative: bool
+
+
+@dataclass
+class OpenedRun:
+    """A run whose checkpoints can be read, with fields that are untrained until one is."""
+
+    folder: RunFolder
+    problem: Problem
+    dataset: Dataset
+    config: FitConfig
+    state: State
+    clip_negative: bool
+
+
+def open_run(
+    run: Path,
+    *,
+    allow_outside: bool = False,
+    change: Callable[[ParsedScene], object] | None = None,
+) -> OpenedRun:
+    """Read settings and data set of a run, and make its fields.
+
+    Args:
+        run: folder of a fit.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
+        change: called with the scene before it is made, such as to give it another light.
+
+    Raises:
+        UserError: the folder holds no run, or its data set is gone.
+    """
+    folder = RunFolder(run)
+    folder.require_fitted()
+    config = folder.settings()
+    origin = folder.origin()
+    data = folder.data(origin.data)
+    if not data.is_dir():
+        moved = f"Put it back, or tell where it is now: unbake fit DATA --out {run} --resume"
+        raise UserError(f"the data set of the run {run} is gone", data, moved)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
+    problem = make_problem(
+        dataset.scene, dataset.background, config, origin.mean_radiance, dataset.root, change=change
+    )
+    return OpenedRun(folder, problem, dataset, config, initial_state(problem), origin.clip_negative)
 
 
 def load_run(
@@ -47,26 +90,9 @@ def load_run(
     Raises:
         UserError: the folder holds no run, no checkpoint, or its data set is gone.
     """
-    folder = RunFolder(run)
-    folder.require_fitted()
-    config = folder.settings()
-    origin = folder.origin()
-    data = folder.data(origin.data)
-    if not data.is_dir():
-        moved = f"Put it back, or tell where it is now: unbake fit DATA --out {run} --resume"
-        raise UserError(f"the data set of the run {run} is gone", data, moved)
-    dataset = Dataset.load(data, allow_outside=allow_outside)
-    problem = make_problem(
-        dataset.scene,
-        dataset.background,
-        config,
-        origin.mean_radiance,
-        dataset.root,
-        change=change,
-    )
-    state = initial_state(problem)
-    progress = load_checkpoint(folder, state)
+    opened = open_run(run, allow_outside=allow_outside, change=change)
+    progress = load_checkpoint(opened.folder, opened.state)
     if progress is None:
         raise UserError("no readable checkpoint", where=run, remedy="Fit again, or wait for one")
-    state.publish(problem)
-    return Recovered(problem, dataset, config, progress, origin.clip_negative)
+    opened.state.publish(opened.problem)
+    return Recovered(opened.problem, opened.dataset, opened.config, progress, opened.clip_negative)
