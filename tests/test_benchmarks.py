@@ -445,3 +445,19 @@ def test_a_soak_writes_what_it_has_seen(repository, ended, tmp_path):
     assert result["taken_steps"] >= 120 and len(result["samples"]) >= 6
     assert result["files"]["after"] > 0 and result["variables"]["after"] > 0
     assert process.returncode == (1 if result["problems"] else 0)
+
+
+@pytest.mark.slow
+def test_materials_are_compared_under_other_light(repository, tmp_path):
+    words = ["--steps", 2, "--spp", 2, "--true-spp", 4, "--resolution", 8, "--methods", "direct"]
+    work = tmp_path / "work"
+    call_words = [*words, "--work", work, "--out", tmp_path / "relit.json"]
+    done = call(repository, "relight_demo.py", *call_words)
+    assert done.returncode == 0, done.stderr[-3000:]
+    result = read(tmp_path / "relit.json")
+    assert result["steps"] == 2 and result["scenes"].keys() == {"demo", "still"}
+    for scene in result["scenes"].values():
+        assert scene["methods"].keys() == {"direct", "untrained"}
+        assert all(np.isfinite(row["relit_render_psnr"]) for row in scene["methods"].values())
+        assert scene["data"] == {"views": 4, "width": 8, "height": 8, "true_spp": 4}
+    assert len(list((work / "still-direct-relit").glob("*.png"))) == 4

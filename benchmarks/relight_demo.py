@@ -1,0 +1,188 @@
+"""How well recovered materials look under light that no photograph showed, by method.
+
+    python benchmarks/relight_demo.py --work FOLDER --out FILE.json [--scenes demo still]
+        [--methods ours direct prb] [--steps 1200] [--seed 0] [--spp 128]
+
+`demo`, a room, is lit by two lamps in other places and colours than its own; `still`, a few
+objects, by a sunny sky from another side than the hazy one of its photographs. Each method is
+fitted to the photographs, with default settings and the same number of steps. Its materials are
+rendered from the held-out cameras under the new light, and compared with a capture of the true
+scene under it. So are materials before the first step, `untrained`. What is done in the folder is
+kept: data sets, runs, scores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+SRC = str(ROOT / "src")
+sys.path.insert(0, SRC)
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+
+from unbake import backend  # noqa: E402
+
+backend.activate()
+
+import numpy as np  # noqa: E402
+
+from unbake.config.light import LightConfig  # noqa: E402
+from unbake.dataset.views import Dataset  # noqa: E402
+from unbake.evaluation.evaluate import evaluate  # noqa: E402
+from unbake.evaluation.rendering import relight  # noqa: E402
+from unbake.evaluation.settings import EvaluationSettings, RenderSettings  # noqa: E402
+from unbake.experiments.commands import unbake  # noqa: E402
+from unbake.imaging.pictures import write_exr  # noqa: E402
+from unbake.io import read_object, write_json, write_text  # noqa: E402
+from unbake.machine import machine  # noqa: E402
+
+#: Samples per pixel of the true pictures.
+TRUE_SAMPLES = 576
+UNTRAINED = "untrained"
+#: Two balls of light below the ceiling of `demo`, a warm and a cold one; its own lamp is off.
+LAMPS = """<scene version="3.0.0">
+  <shape type="sphere" id="warm"><point name="center" x="3.5" y="0.6" z="1.9"/>
+    <float name="radius" value="0.12"/>
+    <emitter type="area"><rgb name="radiance" value="30 20 11"/></emitter></shape>
+  <shape type="sphere" id="cold"><point name="center" x="0.5" y="0.3" z="2.3"/>
+    <float name="radius" value="0.1"/>
+    <emitter type="area"><rgb name="radiance" value="10 17 30"/></emitter></shape>
+</scene>
+"""
+
+
+def main() -> None:
+    """Fit, relight, print every score, and write the result after each method."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True, help="folder of data sets and runs")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--scenes", nargs="+", choices=("demo", "still"), default=["demo", "still"])
+    parser.add_argument("--methods", nargs="+", default=["ours", "direct", "prb"])
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--spp", type=int, default=128, help="samples per pixel of relit pictures")
+    parser.add_argument("--true-spp", type=int, default=TRUE_SAMPLES)
+    parser.add_argument("--resolution", type=int, default=128)
+    args = parser.parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    found: dict[str, Any] = {
+        "machine": machine(),
+        "steps": args.steps,
+        "seeds": [args.seed],
+        "spp": args.spp,
+        "scenes": {},
+    }
+    for scene in args.scenes:
+        light = light_of(scene, args.work)
+        data, truth = args.work / scene, args.work / f"{scene}-truth"
+        if not data.exists():
+            unbake("capture", scene, "--out", data, "--resolution", args.resolution)
+        if not truth.exists():
+            capture_truth(scene, data, truth, light, args.true_spp, args.resolution)
+        rows: dict[str, Any] = {}
+        found["scenes"][scene] = {"data": described(truth), "methods": rows}
+        for method in [*args.methods, UNTRAINED]:
+            run = args.work / f"{scene}-{method}"
+            if not run.exists():
+                chosen = "ours" if method == UNTRAINED else method
+                steps = 0 if method == UNTRAINED else args.steps
+                options = ["--method", chosen, "--steps", steps, "--seed", args.seed]
+                unbake("fit", data, "--out", run, *options)
+            kept = args.work / f"{run.name}-scores-{args.spp}.json"
+            if not kept.exists():
+                write_json(kept, measure(run, args.work, light, truth, args.spp))
+            rows[method] = row = read_object(kept)
+            write_json(args.out, found)
+            told = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if k.endswith("_psnr"))
+            print(f"{scene}, {method}: {told}", flush=True)
+
+
+def light_of(scene: str, work: Path) -> LightConfig:
+    """The light that no photograph of a scene showed; its file is written anew."""
+    if scene == "demo":
+        write_text(work / "lamps.xml", LAMPS)
+        return LightConfig(lights=work / "lamps.xml")
+    write_exr(work / "sunny.exr", sunny_sky(64))
+    return LightConfig(envmap=work / "sunny.exr", envmap_up="+z")
+
+
+def sunny_sky(rows: int) -> np.ndarray:
+    """A sky with a sun 35 degrees above the horizon: linear RGB radiance, (rows, 2 rows, 3).
+
+    The first row is the zenith.
+    """
+    θ = np.pi * (np.arange(rows) + 0.5) / rows
+    φ = 2 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
+    θ, φ = np.meshgrid(θ, φ, indexing="ij")
+    up = np.cos(θ)[..., None]
+    zenith, horizon = np.array([0.12, 0.25, 0.6]), np.array([0.7, 0.75, 0.8])
+    sky = horizon + (zenith - horizon) * np.sqrt(np.maximum(up, 0))
+    ground = np.array([0.16, 0.14, 0.1])
+    height, side = math.radians(35), 0.3 * math.pi
+    sun = np.sin(θ) * math.cos(height) * np.cos(φ - side) + np.cos(θ) * math.sin(height)
+    glow = 60 * np.exp((sun[..., None] - 1) * 1200) + 0.6 * np.exp((sun[..., None] - 1) * 20)
+    return (np.where(up > 0, sky, ground) + glow * np.array([1.0, 0.85, 0.6])).astype(np.float32)
+
+
+def capture_truth(
+    scene: str, data: Path, truth: Path, light: LightConfig, spp: int, resolution: int
+) -> None:
+    """Render the true scene under the new light, from the held-out cameras."""
+    dataset = Dataset.load(data)
+    # A data set needs a training view; it is not compared.
+    views = (dataset.train[0], *dataset.heldout)
+    cameras = data.parent / f"{scene}-cameras.json"
+    frames = [
+        {
+            "split": view.split,
+            "w": view.camera.width,
+            "h": view.camera.height,
+            "fl_x": view.camera.fl_x,
+            "transform_matrix": view.camera.to_world.tolist(),
+        }
+        for view in views
+    ]
+    write_json(cameras, {"frames": frames})
+    words = ["--cameras", cameras, "--spp", spp, "--resolution", resolution]
+    if light.lights is not None:
+        words += ["--lights", light.lights]
+    else:
+        words += ["--envmap", light.envmap, "--envmap-up", light.envmap_up]
+    unbake("capture", scene, "--out", truth, *words)
+
+
+def described(truth: Path) -> dict[str, int]:
+    """The pictures that are compared."""
+    dataset = Dataset.load(truth)
+    camera = dataset.heldout[0].camera
+    size = {"width": camera.width, "height": camera.height}
+    return {"views": len(dataset.heldout), **size, "true_spp": dataset.render["spp"]}
+
+
+def measure(
+    run: Path, work: Path, light: LightConfig, truth: Path, spp: int
+) -> dict[str, float | None]:
+    """Scores of a run under its own and under the new light, in dB."""
+    out = work / f"{run.name}-relit"
+    shutil.rmtree(out, ignore_errors=True)
+
+    def silent(line: str) -> None:
+        """Tell nothing."""
+
+    settings = RenderSettings(spp=spp)
+    made = relight(run, out, light, settings, truth=truth, tell=silent)
+    metrics = evaluate(run, EvaluationSettings(train_views=0), tell=silent)
+    keys = ("albedo_psnr", "roughness_psnr", "render_psnr")
+    mean = {f"relit_{key}": value for key, value in made["mean"].items() if key != "views"}
+    own = {key: metrics["heldout"][key] for key in keys}
+    return mean | own | {key: metrics[key] for key in ("steps", "samples", "seconds")}
+
+
+if __name__ == "__main__":
+    main()
