@@ -1,6 +1,7 @@
 """One Mitsuba variant for the whole session, and what tests of several folders share."""
 
 import os
+import signal
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from unbake import backend
+from unbake import backend, signals
 from unbake.errors import UserError
 from unbake.quantities import QUANTITIES
 
@@ -22,6 +23,13 @@ os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(1 << 30))
 
 # Test modules import `support`; pytest's importlib mode puts no folder on the path.
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+# Programs that tests start inherit which signals are ignored: in the background of a shell or by
+# nohup, some are.
+for number in signals.STOPPING:
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, signal.SIG_DFL)
 
 
 def pytest_addoption(parser):
