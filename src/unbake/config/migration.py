@@ -34,7 +34,9 @@ _MOVED = {
 }
 _GROUPS = ("grid", "bitmap")
 #: Settings that came later, at their value before: a run of an earlier version goes on as it began.
-_AS_BEFORE = {"held_aside": 0.0}
+_AS_BEFORE = {"held_aside": 0.0, "materials.roughness.neural.pieces.most": 0}
+#: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
+_OF_RUN = {"preset", "unknown", "method", "seed", "steps", "seconds", "pixels", "spp"}
 
 
 def migrated(table: dict[str, Any]) -> dict[str, Any]:
@@ -50,10 +52,25 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
     if version is not None:
         check_format(table, FORMAT, "format")
         del table["format"]
-        # Where unbake wrote the file, all settings are in it but those of later versions.
-        table = _AS_BEFORE | table
-    if version == FORMAT:
-        return table
+    # Where unbake wrote the file, all settings are in it but those of later versions.
+    written = version is not None or _OF_RUN <= table.keys()
+    found = table if version == FORMAT else _moved(table, version)
+    for key, value in _AS_BEFORE.items() if written else ():
+        if not _has(found, key):
+            _put(found, key, value, key)
+    return found
+
+
+def _has(table: Any, dotted: str) -> bool:
+    """Whether there is anything at a dotted key."""
+    first, _, rest = dotted.partition(".")
+    if not isinstance(table, dict) or first not in table:
+        return False
+    return not rest or _has(table[first], rest)
+
+
+def _moved(table: dict[str, Any], version: int | None) -> dict[str, Any]:
+    """A table of format 1, or of a file that does not tell it, with keys where they are now."""
     found: dict[str, Any] = {}
     for key, value in table.items():
         if key in _GROUPS and isinstance(value, dict):

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import UserError
 from ..fields.domain import SurfacePoint
 from ..fields.materials import Materials
+from ..fields.pieces import ATTRIBUTE, Piece, decoded
 from ..memory import require_memory
 from ..quantities import QUANTITIES
 from ..scene.parse import ParsedScene, is_reference, reason
@@ -139,7 +140,10 @@ class Baker:
         si = mi.SurfaceInteraction3f(si)
         si.uv = mi.Point2f(own.x, own.y)
         number = mi.UInt32(dr.round(info.x))
-        return look_up(self._materials, self._own, atlas.materials, si, number, valid)
+        piece = None
+        if self._materials is not None and self._materials.pieces is not None:
+            piece = decoded(mesh.eval_attribute_3(ATTRIBUTE, si, valid), valid)
+        return look_up(self._materials, self._own, atlas.materials, si, number, piece, valid)
 
 
 def look_up(
@@ -148,6 +152,7 @@ def look_up(
     numbers: Collection[int],
     si: mi.SurfaceInteraction3f,
     number: mi.UInt32,
+    piece: Piece | None,
     valid: mi.Bool,
 ) -> dict[str, list[mi.Float]]:
     """All quantities at surface points, in linear space.
@@ -158,12 +163,13 @@ def look_up(
         numbers: of the materials that there are at these points.
         si: the points, of which position and texture coordinates are read.
         number: of the material of each.
+        piece: of surface that each is on; None where no field asks for it.
         valid: points that count.
     """
     found: dict[str, list[mi.Float]] = {}
     if materials is not None:
         position = materials.domain.to_unit(si.p, valid)
-        point = SurfacePoint(position, si.uv, dr.select(valid, number, 0))
+        point = SurfacePoint(position, si.uv, dr.select(valid, number, 0), piece)
         for name, value in materials.evaluate_at(point).items():
             found[name] = list(value) if QUANTITIES[name].channels == 3 else [value]
     for name, quantity in QUANTITIES.items():
@@ -265,5 +271,8 @@ def _lookup(atlas: Atlas) -> mi.Mesh:
         for each in atlas.placed
     ]
     mesh.add_attribute("face_info", 3, mi.Float(np.concatenate(info).ravel()))
+    pieces = [each.part.pieces for each in atlas.placed if each.part.pieces is not None]
+    if pieces:
+        mesh.add_attribute(ATTRIBUTE, 3, mi.Float(np.concatenate(pieces).ravel()))
     mesh.add_attribute("vertex_own", 3, mi.Float(np.concatenate(own).ravel().astype(np.float32)))
     return mesh

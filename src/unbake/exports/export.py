@@ -143,7 +143,7 @@ def _export(
     if texels is None:
         seen = surface_seen(scene, cameras)
         texels = _BLIND / free_space.bounds(scene)[2] if seen is None else 1 / seen.footprint
-    found = read_parts(dataset.scene, dataset.root)
+    found = read_parts(dataset.scene, dataset.root, problem.pieces)
     lights = read_lights(found.scene, problem)
     learned = () if problem.materials is None else tuple(problem.materials)
     own = own_textures(parsed_principled(dataset.scene, dataset.root), learned)

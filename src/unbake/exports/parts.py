@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..fields.pieces import Pieces
 from ..fields.shapes import PlacedShape, placed_shapes
 from ..scene import edit
 from ..scene.parse import ParsedScene, parse
@@ -34,6 +35,7 @@ class Part:
     exact: bool  #: False: the shape was round, and became triangles
     instanced: bool  #: it stands in a group, which instances place
     dropped: int  #: triangles without an area, which were left out
+    pieces: np.ndarray | None = None  #: (m, 3) of each triangle, as `Pieces.of` tells them
 
     @property
     def is_optimized(self) -> bool:
@@ -57,8 +59,13 @@ def parsed_principled(path: Path, root: Path) -> ParsedScene:
     return scene
 
 
-def read_parts(path: Path, root: Path) -> Parts:
+def read_parts(path: Path, root: Path, pieces: Pieces | None = None) -> Parts:
     """Load the scene of a data set, unmerged.
+
+    Args:
+        path: the scene.
+        root: folder that its files must not leave.
+        pieces: of surface that fields tell apart.
 
     Raises:
         UserError: the scene cannot be loaded, or holds nothing that can be exported.
@@ -78,7 +85,7 @@ def read_parts(path: Path, root: Path) -> Parts:
         if triangles is None:
             left_out.append(names[i])
             continue
-        sound, dropped = _sound(triangles)
+        sound, kept = _sound(triangles)
         if not len(sound.faces):
             left_out.append(names[i])
             continue
@@ -88,8 +95,12 @@ def read_parts(path: Path, root: Path) -> Parts:
             triangles=sound,
             exact=placed.shape.is_mesh(),
             instanced=placed.to_world is not None,
-            dropped=dropped,
+            dropped=int((~kept).sum()),
         )
+        if pieces is not None:
+            known = pieces.of(placed.shape)
+            every = np.broadcast_to(known, (len(kept), 3)) if len(known) == 1 else known
+            part = replace(part, pieces=every[kept])
         parts.append(part)
     if not parts:
         raise UserError("the scene has no shape that can be exported", path)
@@ -203,8 +214,8 @@ def _as_seen(mesh: mi.Mesh, triangles: Triangles) -> Triangles:
     return triangles
 
 
-def _sound(triangles: Triangles) -> tuple[Triangles, int]:
-    """The triangles without those of no area, with the vertices that they use, and how many."""
+def _sound(triangles: Triangles) -> tuple[Triangles, np.ndarray]:
+    """The triangles without those of no area, with the vertices that they use; which are kept."""
     kept = triangles.areas() > 0
     used, faces = np.unique(triangles.faces[kept], return_inverse=True)
     sound = Triangles(
@@ -213,4 +224,4 @@ def _sound(triangles: Triangles) -> tuple[Triangles, int]:
         None if triangles.normals is None else triangles.normals[used],
         None if triangles.uv is None else triangles.uv[used],
     )
-    return sound, int((~kept).sum())
+    return sound, kept

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+if TYPE_CHECKING:
+    from .pieces import Piece
 
 
 @dataclass
@@ -16,6 +20,7 @@ class SurfacePoint:
     position: mi.Point3f  # [0,1]³
     uv: mi.Point2f | None = None  # texture coordinates: without bounds, maybe not finite
     material: mi.UInt32 | None = None  # its number, where each material has a field of its own
+    piece: Piece | None = None  # of surface, where fields ask for it
     albedo: mi.Color3f | None = None  # as it is fitted now, linear RGB; None where it is known
 
 

@@ -13,6 +13,7 @@ from ..quantities import CARRIED, QUANTITIES, Quantity, channels_of, in_order
 from . import registry
 from .domain import Domain, SurfacePoint
 from .field import Engine, Field, FieldSpec
+from .pieces import Pieces
 from .settings import FieldSettings
 from .shapes import registry_number
 
@@ -37,6 +38,8 @@ class Materials(Mapping[str, Field]):
         #: The number of each shape's material, by `registry_number`. It is needed where materials
         #: have fields of their own, and then set together with the domain.
         self.numbers: dict[int, int] = {}
+        #: Of the scene; set together with the domain, where fields have values of pieces.
+        self.pieces: Pieces | None = None
         #: Whether textures read the values put on the surface interaction by `carry`. It must not
         #: change between an evaluation and its differentiation, which calls the textures again.
         self.carried = True
@@ -124,7 +127,8 @@ class Materials(Mapping[str, Field]):
     def _locate(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> SurfacePoint:
         position = self.domain.to_unit(si.p, valid)
         number = self._number(si.shape) if self.numbers else mi.UInt32(0)
-        return SurfacePoint(position, si.uv, number)
+        piece = None if self.pieces is None else self.pieces.at(si, valid)
+        return SurfacePoint(position, si.uv, number, piece)
 
     def _number(self, shape: mi.ShapePtr) -> mi.UInt32:
         # Each shape is asked once, while this is recorded. (A table would be an array that comes

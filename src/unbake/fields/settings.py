@@ -78,33 +78,24 @@ class GridConfig:
 
 
 @dataclass(frozen=True)
-class GuideConfig:
-    """A coarse grid over position and brightness of the albedo, beside a network (ours).
+class PieceConfig:
+    """Values that pieces of surface share, beside a network (ours).
 
-    See `guide.py`. Resolutions double from level to level.
+    See `pieces.py` and `piece_values.py`.
     """
 
-    levels: int = 0  #: number of resolutions; 0: there is no guide. 4 is for rooms
-    base_resolution: int = 1  #: cells along an axis of the coarsest level
+    most: int = 0  #: pieces with values of their own; smaller ones share them. 0: there are none
     brightnesses: int = 8  #: of the albedo, from black to white
-    gain: float = 15.0  #: how much faster the coarsest level learns than the network would alone
-    falloff: float = 0.4  #: ratio of the gains of neighbouring levels
-    network: float = 0.2  #: how much slower the network learns beside a guide
+    gain: float = 7.0  #: how much faster a large piece learns than the network would alone
+    network: float = 0.2  #: how much slower the network learns beside pieces
 
     def __post_init__(self) -> None:
-        sizes = {"base_resolution": (1, 64), "falloff": (POSITIVE, 1.0), "network": (POSITIVE, 1.0)}
-        sizes |= {"gain": (POSITIVE, 1e4), "levels": (0, 8)}
-        require_ranges(self, sizes)
-        few = self.brightnesses
-        require(few in (2, 4, 8), "brightnesses", "2, 4 or 8", few)
-        finest = self.base_resolution << max(0, self.levels - 1)
-        bound = "such that base_resolution * 2^(levels - 1) is 256 or less"
-        require(finest <= 256, "levels", bound, self.levels)
+        sizes = {"most": (0, 1 << 20), "brightnesses": (2, 64)}
+        require_ranges(self, sizes | {"gain": (POSITIVE, 1e4), "network": (POSITIVE, 1.0)})
 
     def numbers(self, outputs: int) -> int:
-        """How many numbers are learned, or slightly more."""
-        cells = [self.base_resolution << level for level in range(self.levels)]
-        return outputs * self.brightnesses * sum((count + 2) ** 3 for count in cells)
+        """How many numbers are learned."""
+        return outputs * self.brightnesses * self.most
 
 
 @dataclass(frozen=True)
@@ -115,7 +106,7 @@ class NetworkConfig:
     width: int = 32  #: neurons of a hidden layer
     hidden: int = 2  #: number of hidden layers
     learning_rate: float = 0.01  #: Adam (Sec. 5.4: 5e-4)
-    guide: GuideConfig = field(default_factory=GuideConfig)
+    pieces: PieceConfig = field(default_factory=PieceConfig)
 
     def __post_init__(self) -> None:
         require_ranges(self, {"width": _WIDTH, "hidden": _HIDDEN, "learning_rate": RATES})
@@ -124,7 +115,7 @@ class NetworkConfig:
         """How many numbers are learned; see `SizedSettings`."""
         inputs = self.grid.levels * self.grid.features + extra
         layers = _of_layers(inputs, self.width, self.hidden, outputs)
-        return self.grid.numbers() + layers + self.guide.numbers(outputs)
+        return self.grid.numbers() + layers + self.pieces.numbers(outputs)
 
 
 @dataclass(frozen=True)

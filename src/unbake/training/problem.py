@@ -20,8 +20,10 @@ from ..fields.emission import Emission, emission_textures
 from ..fields.envmap import EnvironmentMap, environment_emitter
 from ..fields.field import Field
 from ..fields.materials import Materials, make_materials
+from ..fields.pieces import Pieces
 from ..fields.radiance import RadianceField, make_radiance
 from ..fields.registry import representation
+from ..fields.settings import NetworkConfig
 from ..fields.texture import material_numbers, material_textures
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
@@ -52,6 +54,11 @@ class Problem:
         """The fields of the materials, and the one of L_θ."""
         found = [] if self.materials is None else list(self.materials.values())
         return found if self.radiance is None else [*found, self.radiance.function]
+
+    @property
+    def pieces(self) -> Pieces | None:
+        """The pieces of surface that its materials tell apart, if they do."""
+        return None if self.materials is None else self.materials.pieces
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays φ by name; the first word is the unknown's."""
@@ -132,6 +139,9 @@ def make_problem(
     domain = Domain.of(unchanged.bbox())
     if materials is not None:
         materials.domain = domain
+        materials.pieces = _pieces(unchanged, config)
+        if materials.pieces is not None:
+            materials.pieces.attach(loaded)
         if representation(config.representation).unwrapped:
             edit.require_unwrapped(loaded, scene)
             materials.numbers = material_numbers(loaded)
@@ -174,6 +184,13 @@ def _unknown_materials(parsed: ParsedScene, config: FitConfig, seed: int) -> Mat
     else:
         edit.set_textures(parsed, material_textures(materials))
     return materials
+
+
+def _pieces(scene: mi.Scene, config: FitConfig) -> Pieces | None:
+    """The pieces of a scene, if any field has values of them."""
+    settings = [s for s in config.material_settings.values() if isinstance(s, NetworkConfig)]
+    most = max((s.pieces.most for s in settings), default=0)
+    return Pieces(scene, most) if most else None
 
 
 def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list[str]]:

@@ -32,6 +32,7 @@ class Surface:
     uv: np.ndarray  #: (n, 2) float32, the scene's texture coordinates; 0 where there are none
     materials: np.ndarray  #: (n,) uint32, numbers of materials as in `edit.material_names`
     optimized: np.ndarray  #: (n,) bool: a fit optimizes the material
+    pieces: np.ndarray | None  #: (n, 3), as `Pieces.of` tells them, where parts do
     plain: np.ndarray  #: (n, 3) uint8 sRGB, colours of what is not optimized
 
 
@@ -41,6 +42,7 @@ class _Mesh:
 
     rows: np.ndarray  # (n, 8) float64: position, normal, texture coordinates
     part: np.ndarray  # (n,) numbers of parts
+    pieces: np.ndarray  # (n, 3), zeros where parts tell none
     faces: np.ndarray  # (m, 3) int64
 
 
@@ -80,22 +82,31 @@ def make_surface(
         mesh.rows[:, 6:].astype(np.float32),
         numbers[mesh.part],
         optimized[mesh.part],
+        None if any(p.pieces is None for p in parts) else mesh.pieces.astype(np.float32),
         plain[mesh.part],
     )
 
 
 def _joined(parts: Sequence[Part]) -> _Mesh:
-    rows, numbers, faces, first = [], [], [], 0
+    rows, numbers, pieces, faces, first = [], [], [], [], 0
     for number, part in enumerate(parts):
         triangles, normals = _with_normals(part.triangles)
         count = len(triangles.positions)
         uv = np.zeros((count, 2)) if triangles.uv is None else triangles.uv
         rows.append(np.hstack([triangles.positions, normals, np.nan_to_num(uv)]))
         numbers.append(np.full(count, number))
+        # A vertex between pieces is of one of them.
+        of_vertex = np.zeros((count, 3))
+        if part.pieces is not None:
+            of_vertex[triangles.faces] = part.pieces[:, None]
+        pieces.append(of_vertex)
         faces.append(triangles.faces.astype(np.int64) + first)
         first += count
     return _Mesh(
-        np.concatenate(rows).astype(np.float64), np.concatenate(numbers), np.concatenate(faces)
+        np.concatenate(rows).astype(np.float64),
+        np.concatenate(numbers),
+        np.concatenate(pieces),
+        np.concatenate(faces),
     )
 
 
@@ -159,7 +170,9 @@ def _split(mesh: _Mesh, long: np.ndarray) -> _Mesh:
         }[n]
         pieces += [np.stack(piece, -1) for piece in new]
     rows = np.concatenate([mesh.rows, (mesh.rows[a] + mesh.rows[b]) / 2])
-    return _Mesh(rows, np.concatenate([mesh.part, mesh.part[a]]), np.concatenate(pieces))
+    part = np.concatenate([mesh.part, mesh.part[a]])
+    of_vertex = np.concatenate([mesh.pieces, mesh.pieces[a]])
+    return _Mesh(rows, part, of_vertex, np.concatenate(pieces))
 
 
 def _facing(mesh: _Mesh, two_sided: np.ndarray, views: Views) -> np.ndarray:

@@ -23,6 +23,7 @@ from ..exports.observed import Views
 from ..exports.parts import parsed_principled, read_parts
 from ..fields.arrays import from_numpy
 from ..fields.materials import Materials
+from ..fields.pieces import Pieces, decoded
 from ..imaging.pictures import absolute_error, block_means, false_colour, shown, tonemap
 from ..quantities import QUANTITIES
 from ..training.checkpoint import Progress, load_written
@@ -73,10 +74,10 @@ class ViewedData:
         scene = parsed_principled(dataset.scene, dataset.root).instantiate()
         self._open(dataset, scene)
 
-    def _open(self, dataset: Dataset, scene: mi.Scene) -> None:
+    def _open(self, dataset: Dataset, scene: mi.Scene, pieces: Pieces | None = None) -> None:
         self.dataset = dataset
         self._scene = scene
-        parts = read_parts(dataset.scene, dataset.root).parts
+        parts = read_parts(dataset.scene, dataset.root, pieces).parts
         views = Views(scene, [view.camera for view in dataset.train])
         self.surface: Surface = make_surface(parts, views)
         self._numbers = sorted({p.materials[0] for p in parts if p.is_optimized})
@@ -137,7 +138,11 @@ class ViewedData:
             si.n = mi.Normal3f(_columns(surface.normals, part))
             si.uv = mi.Point2f(_columns(surface.uv, part))
             number = from_numpy(mi.UInt32, surface.materials[part])
-            values = look_up(materials, own, numbers, si, number, mi.Bool(True))
+            piece = None
+            if surface.pieces is not None:
+                info = mi.Color3f(_columns(surface.pieces, part))
+                piece = decoded(info, mi.Bool(True))
+            values = look_up(materials, own, numbers, si, number, piece, mi.Bool(True))
             dr.eval(values)
             for name, channels in values.items():
                 rows = [np.broadcast_to(np.array(c), _CHUNK) for c in channels]
@@ -211,7 +216,7 @@ class ViewedRun(ViewedData):
         self._problem = self._run.problem
         #: That checkpoint.
         self.shown: Path | None = None
-        self._open(self._run.dataset, self._problem.scene_view.scene)
+        self._open(self._run.dataset, self._problem.scene_view.scene, self._problem.pieces)
         self._found: dict[str, np.ndarray] | None = None
         self._log: dict[str, str] = {}
         self._log_state = (-1, -1)  # its size and the time of its last change

@@ -1,0 +1,171 @@
+"""Points of a piece of surface with albedo of equal brightness share a value."""
+
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import randomised, seeded
+
+from unbake.config import FitConfig, from_toml, to_toml
+from unbake.errors import UserError
+from unbake.fields.domain import SurfacePoint
+from unbake.fields.field import FieldSpec
+from unbake.fields.materials import make_materials
+from unbake.fields.network import Network
+from unbake.fields.perceptron import can_record_layout
+from unbake.fields.piece_values import PieceValues
+from unbake.fields.pieces import Piece, Pieces
+from unbake.fields.settings import GridConfig, NetworkConfig, PieceConfig
+from unbake.quantities import QUANTITIES
+
+LANES = 300
+SMALL = PieceConfig(most=5, brightnesses=4, gain=3.0)
+NETWORK = NetworkConfig(GridConfig(2, 2, 8), width=8, hidden=1, pieces=SMALL)
+ENGINES = ("tensor", "coopvec", *(["fused"] if can_record_layout() else []))
+
+
+def points(albedo=None, seed=1, number=None, strength=1.0):
+    sampler = seeded(seed, LANES)
+    p = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
+    grey = mi.Color3f(sampler.next_1d()) if albedo is None else mi.Color3f(albedo)
+    piece = dr.arange(mi.UInt32, LANES) % 5 if number is None else mi.UInt32(number)
+    dr.eval(p, grey, piece)
+    return SurfacePoint(p, piece=Piece(piece, mi.Float(strength)), albedo=grey)
+
+
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_engines_agree_with_pieces(outputs):
+    results = []
+    for engine in ENGINES:
+        network = Network(NETWORK, FieldSpec(outputs, bounded=True, initial=0.3, seed=2))
+        parameters = randomised(network)
+        values = network.evaluate(points(), (), engine)
+        dr.backward(dr.sum(sum(values)))
+        gradients = {k: np.array(dr.grad(v).array) for k, v in parameters.items()}
+        results.append((np.array([np.array(v) for v in values]), gradients))
+    for values, gradients in results[1:]:
+        np.testing.assert_allclose(values, results[0][0], atol=2e-5)
+        for key, gradient in gradients.items():
+            np.testing.assert_allclose(gradient, results[0][1][key], atol=2e-3, err_msg=key)
+    assert all(np.abs(g).max() > 0 for g in results[0][1].values())
+
+
+def test_untrained_pieces_change_nothing():
+    network = Network(NETWORK, FieldSpec(1, bounded=True, initial=0.3, seed=2))
+    (value,) = network.evaluate(points())
+    np.testing.assert_allclose(np.array(value), 0.3, atol=5e-3)
+
+
+def test_piece_and_brightness_decide_which_numbers_are_read():
+    table = PieceValues(SMALL, 1)
+    values = randomised(table)
+    (dark,) = table.evaluate(points(0.0, number=2))
+    dr.backward(dr.sum(dark))
+    rows = np.array(dr.grad(values["pieces.0"])).reshape(-1, SMALL.brightnesses)
+    assert rows[2, 0] > 0
+    assert np.count_nonzero(rows) == 1  # all other pieces and brightnesses stay as they are
+    (white,) = table.evaluate(points(1.0, number=2))
+    assert np.abs(np.array(white) - np.array(dark)).mean() > 0.1
+
+
+def test_values_between_brightnesses_are_between_theirs():
+    table = PieceValues(SMALL, 1)
+    randomised(table)
+    low, middle, high = (
+        np.array(table.evaluate(points(level**2))[0]) for level in (1 / 3, 0.5, 2 / 3)
+    )
+    np.testing.assert_allclose(middle, (low + high) / 2, atol=1e-5)
+
+
+def test_weak_pieces_count_less():
+    table = PieceValues(SMALL, 1)
+    randomised(table)
+    full, half = (np.array(table.evaluate(points(strength=s))[0]) for s in (1.0, 0.5))
+    np.testing.assert_allclose(half, full / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("albedo", [-1.0, 2.0, float("nan")])
+def test_an_albedo_out_of_bounds_reads_no_other_memory(albedo):
+    table = PieceValues(SMALL, 1)
+    randomised(table)
+    bound = points(1.0 if albedo == 2.0 else 0.0)
+    found, wanted = (np.array(table.evaluate(p)[0]) for p in (points(albedo), bound))
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+def test_a_number_out_of_bounds_reads_no_other_memory():
+    # Another quantity may tell more pieces apart.
+    table = PieceValues(SMALL, 1)
+    randomised(table)
+    found, wanted = (np.array(table.evaluate(points(number=n))[0]) for n in (70, 4))
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_point_that_does_not_tell_its_piece_is_refused():
+    with pytest.raises(ValueError, match="without its piece"):
+        PieceValues(SMALL, 1).evaluate(SurfacePoint(mi.Point3f(0.5)))
+
+
+def test_roughness_does_not_pull_albedo():
+    settings = {name: NETWORK for name in ("albedo", "roughness")}
+    materials = with_pieces(make_materials("neural", settings, [], seed=1))
+    values = randomised(materials)
+    material = materials.evaluate(surface(materials), mi.Bool(True))
+    dr.backward(dr.sum(material["roughness"]))
+    reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
+    assert reached == {k for k in values if k.startswith("roughness.")}
+
+
+def test_roughness_alone_has_pieces():
+    materials = with_pieces(make_materials("neural", {"roughness": NETWORK}, [], seed=1))
+    randomised(materials)
+    values = np.array(materials.evaluate(surface(materials), mi.Bool(True))["roughness"])
+    bounds = QUANTITIES["roughness"]
+    assert np.ptp(values) > 0.005  # the network's share: all is one piece of one brightness
+    assert (values >= bounds.lower).all()
+    assert (values <= bounds.upper).all()
+
+
+def test_sizes_tell_the_memory():
+    for outputs in (1, 3):
+        counted = sum(dr.width(v) for v in PieceValues(SMALL, outputs).parameters().values())
+        assert counted == SMALL.numbers(outputs)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"most": -1}, {"brightnesses": 1}, {"gain": 0.0}, {"network": 0.0}],
+)
+def test_sizes_out_of_range_are_refused(wrong):
+    with pytest.raises(UserError, match=next(iter(wrong))):
+        PieceConfig(**wrong)
+
+
+def with_pieces(materials):
+    made = mi.load_dict({"type": "scene", "wall": {"type": "rectangle"}})
+    materials.pieces = Pieces(made, SMALL.most)
+    materials.pieces.attach(made)
+    materials.scene = made  # keeps it alive
+    return materials
+
+
+def surface(materials):
+    x = points().position.x
+    rays = mi.Ray3f(mi.Point3f(1.8 * x - 0.9, 0, 1), mi.Vector3f(0, 0, -1))
+    return materials.scene.ray_intersect(rays)
+
+
+def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
+    def most(text):
+        return from_toml(text).materials["roughness"]["neural"].pieces.most
+
+    now = to_toml(FitConfig())
+    assert most(now) == FitConfig().materials["roughness"]["neural"].pieces.most > 0
+    assert most("steps = 5") == most(now)
+    assert most("materials.roughness.neural.pieces.most = 7") == 7
+    before = re.sub(r"\[materials\.roughness\.neural\.pieces\]\n(.+\n)+", "", now)
+    assert before != now
+    assert most(before) == 0
+    assert most(before.replace("format = 2\n", "")) == 0
