@@ -27,6 +27,7 @@ def example(repository):
     return run
 
 
+@pytest.mark.slow
 def test_a_method_of_ones_own_is_compared_with_ours(example, tmp_path):
     out = example("custom_method.py", "--out", tmp_path, "--steps", 6, "--resolution", 12)
     result = json.loads((tmp_path / "comparison" / "compare.json").read_text("utf-8"))

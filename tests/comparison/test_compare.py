@@ -191,7 +191,14 @@ def test_another_quality_of_evaluation_is_evaluated_anew(compare, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"train_views": 1}, {"clip_negative": True}, {"material_spp": 3}, {"rr_depth": 2}]
+    "changes",
+    [
+        {"train_views": 1},
+        *(
+            pytest.param(changes, marks=pytest.mark.slow)
+            for changes in ({"clip_negative": True}, {"material_spp": 3}, {"rr_depth": 2})
+        ),
+    ],
 )
 def test_an_evaluation_with_other_settings_is_repeated(changes, cornell, tiny, tmp_path):
     config = dataclasses.replace(read_toml(tiny), steps=1)

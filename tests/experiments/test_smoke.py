@@ -59,6 +59,7 @@ def test_table2_knows_how_long_paths_are(rows):
         assert row["mean_without_limit"] == pytest.approx(1 / (1 - row["albedo"]), rel=0.03)
 
 
+@pytest.mark.slow
 def test_fig5_ours_does_not_grow_and_differentiated_paths_do(rows, out):
     found = rows("fig5")
     kept = {(row["method"], row["albedo"]): row for row in found}
@@ -144,7 +145,7 @@ def test_fig4_longer_paths_miss_less(rows, out, scenes_dir):
     [
         pytest.param(fig6, fig6.METHODS, marks=pytest.mark.slow, id="fig6"),
         pytest.param(fig7, fig7.METHODS, id="fig7"),
-        pytest.param(fig8, ABLATION, id="fig8"),
+        pytest.param(fig8, ABLATION, marks=pytest.mark.slow, id="fig8"),
     ],
 )
 def test_every_method_is_fitted_and_shown(rows, out, scenes_dir, figure, methods):

@@ -15,6 +15,7 @@ def bench(unbake, what, data, tiny, out, *methods):
     return unbake("bench", what, *words)
 
 
+@pytest.mark.slow
 def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
     out = tmp_path / "deep" / "methods.json"
     named = ("ours", "prb:grid:split-halves", "prb:grid:two-pass", "ad-pt", "direct:bitmap")
