@@ -70,6 +70,9 @@ if TYPE_CHECKING:
     from .quantities import QUANTITIES as QUANTITIES
     from .quantities import Quantity as Quantity
     from .report.page import write_report as write_report
+    from .solver.settings import SolveSettings as SolveSettings
+    from .solver.solve import load_radiance as load_radiance
+    from .solver.solve import solve as solve
     from .training.checkpoint import Progress as Progress
     from .training.checkpoint import load_checkpoint as load_checkpoint
     from .training.checkpoint import save_checkpoint as save_checkpoint
@@ -132,6 +135,8 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "evaluation.rendering": ("relight", "render"),
     "report.page": ("write_report",),
     "exports.export": ("export",),
+    "solver.settings": ("SolveSettings",),
+    "solver.solve": ("load_radiance", "solve"),
     "comparison.compare": ("compare",),
     "comparison.method_variant": ("MethodVariant",),
     # Data sets.
@@ -192,6 +197,7 @@ _PURE = frozenset(
         "fields.registry",
         "fields.settings",
         "quantities",
+        "solver.settings",
         "transport.methods",
     }
 )

@@ -70,7 +70,7 @@ def capture(
     Paper: Sec. 6.
     """
     out, cameras = Path(out), None if cameras is None else Path(cameras)
-    _require_scene(str(scene))
+    require_scene(str(scene))
     require_utf8(out, _KIND)
     if os.path.lexists(out):
         raise UserError("exists already", where=out, remedy="Give another --out, or remove it")
@@ -99,8 +99,12 @@ def capture(
     return Dataset.load(out)
 
 
-def _require_scene(name: str) -> None:
-    """Refuse a misspelt scene before anything is written."""
+def require_scene(name: str) -> None:
+    """Refuse a misspelt scene before anything is written.
+
+    Raises:
+        UserError: it is neither a file nor a built-in scene.
+    """
     if name in SCENES:
         return
     path = Path(name)
@@ -144,7 +148,10 @@ def _capture(
     tell: Callable[[str], None],
 ) -> Dataset:
     path, scene = _copy_scene(name, data.scene, light, allow_outside, tell)
-    posed = _cameras(name, scene, settings, camera_file)
+    posed = posed_cameras(name, scene, settings, camera_file)
+    if not any(split == "train" for split, _ in posed):
+        remedy = "Ask for at least one with --views"
+        raise UserError("no training view", where=camera_file, remedy=remedy)
     counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
     seen = coverage(scene, [c for split, c in posed if split == "train"])
     tell(
@@ -156,7 +163,7 @@ def _capture(
     # Stratified samples have a third less variance than independent ones at the same cost. The
     # sampler rounds their number up to a grid.
     sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
-    rgb, alpha = _photographs(scene, rays, settings, sampler, room, tell)
+    rgb, alpha = photographs(scene, rays, settings, sampler, room, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
     shares = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
@@ -233,26 +240,33 @@ def _copy_scene(
     return path, scene
 
 
-def _cameras(
+def posed_cameras(
     name: str, scene: mi.Scene, settings: CaptureSettings, file: Path | None
 ) -> list[tuple[str, Camera]]:
+    """The cameras of a scene and their splits.
+
+    Args:
+        name: of the scene, a file or a built-in one.
+        scene: the same.
+        settings: how many, and the size of their images.
+        file: a camera file; None: the built-in scene's own cameras, or automatic placement.
+
+    Raises:
+        UserError: the file cannot be used, or there is no place for cameras.
+    """
     size = settings.resolution
     if file is not None:
-        posed = read_cameras(file, size, size)
-    elif name in SCENES:
-        posed = [
+        return read_cameras(file, size, size)
+    if name in SCENES:
+        return [
             (c["split"], Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], size, size))
             for c in default_cameras(name, settings.views, settings.held_out)
         ]
-    else:
-        placed = place(scene, settings.views, settings.held_out, seed=settings.seed)
-        posed = [(split, look.camera(size, size)) for split, look in placed]
-    if not any(split == "train" for split, _ in posed):
-        raise UserError("no training view", where=file, remedy="Ask for at least one with --views")
-    return posed
+    placed = place(scene, settings.views, settings.held_out, seed=settings.seed)
+    return [(split, look.camera(size, size)) for split, look in placed]
 
 
-def _photographs(
+def photographs(
     scene: mi.Scene,
     rays: CameraRays,
     settings: CaptureSettings,
@@ -260,7 +274,22 @@ def _photographs(
     room: bool,
     tell: Callable[[str], None],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Path trace all pixels of all views with Mitsuba; RGB and alpha."""
+    """Path trace all pixels of all views with Mitsuba.
+
+    Args:
+        scene: the scene.
+        rays: of the views.
+        settings: lengths of paths, and the seed.
+        sampler: with the number of samples a pixel.
+        room: whether emitters are seen.
+        tell: called with lines of progress.
+
+    Returns:
+        Linear RGB (pixels, 3) and alpha (pixels,), float32.
+
+    Raises:
+        UserError: pixels are not finite.
+    """
     integrator = mi.load_dict(
         {
             "type": path_integrator(scene),

@@ -27,6 +27,7 @@ from ..config.light import LightConfig
 from ..errors import UserError, printable
 from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..memory import lacks_memory
+from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
 from ..version import VERSION
 from .flags import flags, given, with_options
@@ -80,12 +81,14 @@ _STATUS = (
 
 if TYPE_CHECKING:
     CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = RenderFlags = LightFlags = Any
+    SolveFlags = Any
 else:
     CaptureFlags = flags(CaptureSettings)
     FitFlags = flags(FitConfig, presets=True)
     EvaluationFlags = flags(EvaluationSettings)
     RenderFlags = flags(RenderSettings)
     LightFlags = flags(LightConfig)
+    SolveFlags = flags(SolveSettings)
     CompareFlags = flags(FitConfig, presets=True, without=("method",))
 
 
@@ -453,6 +456,45 @@ def view(
     return signals.status()
 
 
+def solve(
+    scene: Positional[Scene],
+    /,
+    out: Out,
+    cameras: File = None,
+    allow_outside: Flag = False,
+    *,
+    solve: OmitArgPrefixes[SolveFlags],
+) -> int:
+    """Learn the radiance of a scene whose materials and lights are known, without tracing paths.
+
+    This is the forward problem, Neural Radiosity: a network L is trained until both sides of the
+    rendering equation agree at random points of all surfaces. LHS shows L itself, RHS one bounce
+    that ends in L. relMSE is the mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of
+    the pictures, b being path traced.
+
+    Writes L (radiance.safetensors), pictures of both sides and of the reference, and relMSE over
+    time (solve.json). Ctrl-C ends it early, with what was learned.
+
+    Args:
+        scene: A Mitsuba 3 XML file, or a built-in scene: demo, annex, still, cornell, cube,
+            furnace.
+        out: Folder to write to, new or empty.
+        cameras: Camera file (or transforms.json) of the pictures, instead of --views.
+        allow_outside: Read files that the scene names outside of its folder.
+        solve: How L is learned and measured.
+    """
+    settings = with_options(SolveSettings(), given(solve))
+    backend.activate()
+    from ..solver.solve import solve as run
+
+    console = Console(highlight=False)
+    options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
+    made = run(scene, out, settings, cameras=cameras, **options)
+    last = made["measurements"][-1]
+    _say(f"{last['step']} steps in {last['seconds']:.0f} s; wrote {out}")
+    return 0 if made["finished"] else signals.status()
+
+
 def compare(
     data: Positional[Data],
     /,
@@ -745,6 +787,9 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
         "render": render,
         "relight": relight,
         "view": view,
+    },
+    "The forward problem": {
+        "solve": solve,
     },
     "Compare and measure": {
         "compare": compare,

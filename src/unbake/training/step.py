@@ -322,7 +322,7 @@ class TrainingStep:
             factor = dr.rcp(state.scale)
             state.scale = next_scale(state.scale, finite)
         for _, optimizer in state.optimizers():
-            _drop_broken_gradients(optimizer)
+            drop_broken_gradients(optimizer)
             optimizer.step(active=finite, grad_scale=factor, eval=False)
         terms["skipped"] = dr.select(finite, mi.Float(0), mi.Float(1))
         dr.eval(state, terms)
@@ -399,7 +399,7 @@ def without_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _drop_broken_gradients(optimizer: mi.ad.Adam) -> None:
+def drop_broken_gradients(optimizer: mi.ad.Adam) -> None:
     """Replace gradients that Adam cannot square by zero, so that it does not update those entries.
 
     A single NaN, or an infinite square, would stay in Adam's moments for the rest of the fit.

@@ -1,0 +1,1 @@
+"""The forward problem: the radiance of a scene with known materials and lights (Sec. 3.1)."""

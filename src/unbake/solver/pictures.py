@@ -1,0 +1,110 @@
+"""Pictures of both sides of the rendering equation, and how far they are from a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..acquisition.capture import photographs
+from ..acquisition.settings import CaptureSettings
+from ..dataset.camera import Camera
+from ..dataset.pixels import CameraRays
+from ..fields.radiance import RadianceField
+from ..transport.path_sample import Requirements, lhs, rhs, trace
+from ..transport.render import parts_of
+from ..transport.vertex import SceneView
+from .settings import SolveSettings
+
+#: Added to squared pixels of the reference in relMSE.
+EPSILON = 0.01
+#: One bounce, and L_θ as a constant at either end of it.
+_BOTH_SIDES = Requirements(bounces=1, constant=frozenset({1, 2}))
+#: Tells the random numbers of pictures from those of the reference.
+_PICTURES = 0x5049
+
+
+def both_sides(
+    scene_view: SceneView,
+    radiance: RadianceField,
+    cameras: Sequence[Camera],
+    settings: SolveSettings,
+    *,
+    hide_emitters: bool,
+) -> dict[str, list[np.ndarray]]:
+    """What cameras see of both sides: `lhs`, E + L_θ at x₁, and `rhs`, one bounce and L_θ at x₂.
+
+    Returns:
+        Pictures of each camera, linear RGB, float32, (H, W, 3).
+
+    Paper: Eq. 12, Eq. 13, Sec. 3.1.
+    """
+    rays, spp = CameraRays.of(cameras), settings.spp
+    images = {side: np.zeros((rays.pixels, 3), np.float32) for side in ("lhs", "rhs")}
+    sampler = mi.load_dict({"type": "independent"})
+    for part, ray, seed in parts_of(rays.through, rays.pixels, spp, settings.seed ^ _PICTURES):
+        sampler.seed(dr.opaque(mi.UInt32, seed), dr.width(ray))
+        with dr.suspend_grad():
+            sample = trace(
+                scene_view, radiance, ray, sampler, _BOTH_SIDES, hide_emitters=hide_emitters
+            )
+            left, right = lhs(sample, sample.radiance[0]), rhs(sample, sample.radiance[1])
+            dr.eval(left, right)
+        for side, value in (("lhs", left), ("rhs", right)):
+            images[side][part] = np.stack([np.array(dr.block_sum(c, spp)) / spp for c in value], -1)
+    return {side: _parted(image, cameras) for side, image in images.items()}
+
+
+def path_traced_halves(
+    scene: mi.Scene,
+    cameras: Sequence[Camera],
+    settings: SolveSettings,
+    *,
+    room: bool,
+    tell: Callable[[str], None],
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The reference by Mitsuba's path tracer, twice, of half of its samples each.
+
+    Args:
+        room: whether emitters are seen.
+        tell: called with lines of progress.
+
+    Returns:
+        Pictures of each camera, linear RGB, float32, (H, W, 3).
+    """
+    rays, halves = CameraRays.of(cameras), []
+    for half in (0, 1):
+        sampler = mi.load_dict({"type": "independent", "sample_count": settings.reference_spp // 2})
+        how = CaptureSettings(
+            max_depth=settings.max_depth,
+            rr_depth=settings.rr_depth,
+            seed=(2 * settings.seed + half) & 0x7FFFFFFF,
+        )
+        part = "first" if half == 0 else "second"
+        rgb, _ = photographs(
+            scene, rays, how, sampler, room, lambda line, part=part: tell(f"{part} half: {line}")
+        )
+        halves.append(_parted(rgb, cameras))
+    return halves[0], halves[1]
+
+
+def relative_mse(images: Sequence[np.ndarray], reference: Sequence[np.ndarray]) -> float:
+    """relMSE: the mean of (a − b)² / (b² + 0.01) over all pixels and channels of all pictures.
+
+    Args:
+        images: a, linear RGB, (H, W, 3) each.
+        reference: b, the same.
+    """
+    a, b = (
+        np.concatenate([x.ravel() for x in each]).astype(np.float64) for each in (images, reference)
+    )
+    return float(np.mean((a - b) ** 2 / (b**2 + EPSILON)))
+
+
+def _parted(pixels: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:
+    """The pixels of each camera, as pictures."""
+    ends = np.cumsum([camera.width * camera.height for camera in cameras])[:-1]
+    parts = zip(np.split(pixels, ends), cameras, strict=True)
+    return [part.reshape(camera.height, camera.width, 3) for part, camera in parts]

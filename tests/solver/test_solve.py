@@ -1,0 +1,192 @@
+"""The forward problem: the radiance of known scenes, from the residual alone."""
+
+import json
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import TINY, assert_only_replayed, seeded
+
+from unbake.errors import UserError
+from unbake.fields.domain import Domain
+from unbake.fields.radiance import make_radiance
+from unbake.fields.settings import GridConfig, NetworkConfig
+from unbake.imaging.pictures import read_exr
+from unbake.io import read_object
+from unbake.solver.pictures import relative_mse
+from unbake.solver.points import SurfacePoints
+from unbake.solver.settings import SolveSettings
+from unbake.solver.solve import load_radiance, solve
+from unbake.solver.step import SolverStep
+from unbake.transport.vertex import SceneView, find_vertex
+
+SMALL = NetworkConfig(
+    grid=GridConfig(levels=2, features=2, table_log2=10, base_resolution=2), width=16, hidden=1
+)
+SETTINGS = SolveSettings(
+    steps=400, batch=1024, samples=2, views=2, resolution=8, spp=64, reference_spp=8, radiance=SMALL
+)
+TRUTH = 2.0  # 1 / (1 - 0.5), the radiance in the furnace
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """The furnace, solved; the folder and what was told."""
+    out, lines = tmp_path_factory.mktemp("solved") / "out", []
+    solve("furnace", out, SETTINGS, tell=lines.append)
+    return out
+
+
+def test_the_radiance_in_a_furnace_is_found_within_one_percent(solved):
+    for side in ("lhs", "rhs"):
+        error = np.stack([read_exr(solved / f"train_00{i}-{side}.exr") for i in (0, 1)]) / TRUTH - 1
+        print(f"{side}: mean {error.mean():+.4f}, rms {np.sqrt(np.mean(error**2)):.4f}")
+        assert abs(error.mean()) < 0.01
+        # A pixel of RHS keeps the noise of its 64 bounces.
+        assert np.sqrt(np.mean(error**2)) < (0.01 if side == "lhs" else 0.03)
+
+
+def test_the_untrained_field_did_not_know_it(solved):
+    first, *_, last = read_object(solved / "solve.json")["measurements"]
+    assert (first["step"], last["step"]) == (0, SETTINGS.steps)
+    assert first["relmse"]["lhs"] > 10 * last["relmse"]["lhs"]
+
+
+def test_what_is_written_is_told_and_can_be_read_again(solved):
+    told = read_object(solved / "solve.json")
+    assert told["finished"] and told["reference_noise"] > 0
+    pictures = [read_exr(solved / f"train_00{i}-reference.exr") for i in (0, 1)]
+    left = [read_exr(solved / f"train_00{i}-lhs.exr") for i in (0, 1)]
+    stated = told["measurements"][-1]["relmse"]["lhs"]
+    assert stated == pytest.approx(relative_mse(left, pictures), rel=1e-4)
+    assert {"step", "residual", "seconds"} <= json.loads(
+        (solved / "progress.jsonl").read_text().splitlines()[-1]
+    ).keys()
+    for name in ("train_000-lhs.png", "train_001-rhs.png", "train_000-reference.png"):
+        assert (solved / name).stat().st_size > 0
+
+    radiance = load_radiance(solved)
+    p = mi.Point3f([0.3, -1.0], [1.0, 0.2], [-0.4, 0.1])
+    n = mi.Normal3f([0, 1.0], [-1.0, 0], [0, 0])
+    found = radiance.evaluate(p, mi.Vector3f(n), n, mi.Color3f(0.5), mi.Bool(True))
+    # Reflected light alone: emission is added analytically.
+    np.testing.assert_allclose(np.array(found), TRUTH - 1, rtol=0.05)
+
+
+def test_a_damaged_folder_is_refused(solved, tmp_path):
+    (tmp_path / "solve.json").write_text((solved / "solve.json").read_text())
+    with pytest.raises(UserError, match="does not exist"):
+        load_radiance(tmp_path)
+    (tmp_path / "radiance.safetensors").write_bytes(b"damaged")
+    with pytest.raises(UserError, match="no field"):
+        load_radiance(tmp_path)
+
+
+@pytest.mark.parametrize("attach", [False, True])
+def test_a_step_is_replayed_and_lowers_the_residual(built_in, attach):
+    scene = mi.load_file(str(built_in("furnace")))
+    settings = replace(SETTINGS, attach_rhs=attach, batch=512)
+    radiance = make_radiance("neural", TINY, Domain.of(scene.bbox()), scale=3.0, seed=1)
+    adam = mi.ad.Adam(0.01, radiance.parameters(), mask_updates=True)
+    points = SurfacePoints.of(scene)
+    step = SolverStep(SceneView.of(scene, None, 8), radiance, points, settings)
+    first = float(step(adam, 0, 0.01)["residual"][0])
+    assert_only_replayed(step, adam, lambda i: 0.01, steps=40)
+    last = float(step(adam, 99, 0.01)["residual"][0])
+    assert last < 0.5 * first
+
+
+def test_gradients_of_the_right_hand_side_pass_only_where_it_is_attached(built_in):
+    """Of a constant field in the furnace: L − ρ (E + L), by L, is 1, or 1 − ρ if attached."""
+    scene = mi.load_file(str(built_in("furnace")))
+    found = {}
+    for attach in (False, True):
+
+        class Constant:
+            value = mi.Float(3.0)
+
+            def evaluate(self, p, w, n, albedo, valid, engine=None):
+                return dr.select(valid, mi.Color3f(self.value), 0)
+
+        field = Constant()
+        dr.enable_grad(field.value)
+        settings = replace(SETTINGS, attach_rhs=attach, batch=1 << 14, samples=4)
+        step = SolverStep(SceneView.of(scene, None, 8), field, SurfacePoints.of(scene), settings)
+        inputs = step.inputs(0)
+        dr.backward(step.loss(inputs))
+        found[attach] = float(dr.sum(dr.grad(field.value))[0])
+    np.testing.assert_allclose(found[True] / found[False], 0.5, rtol=0.03)
+
+
+SHAPES = """<scene version="3.0.0">
+  <bsdf type="diffuse" id="grey"/>
+  <shape type="rectangle" id="both"><bsdf type="twosided"><ref id="grey"/></bsdf>
+    <transform name="to_world"><translate x="-4"/></transform></shape>
+  <shape type="rectangle" id="front"><ref id="grey"/></shape>
+  <shape type="sphere" id="ball"><ref id="grey"/><point name="center" x="4" y="0" z="0"/></shape>
+  <shape type="rectangle" id="black"><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
+    <transform name="to_world"><translate x="-8"/></transform></shape>
+  <shape type="shapegroup" id="group"><shape type="rectangle"><ref id="grey"/></shape></shape>
+  <shape type="instance"><ref id="group"/><transform name="to_world"><scale value="2"/>
+    <rotate y="1" angle="180"/><translate x="9"/></transform></shape>
+  <emitter type="constant"/>
+</scene>
+"""
+
+
+def test_points_lie_on_all_sides_that_scatter_by_their_area():
+    scene = mi.load_string(SHAPES)
+    points = SurfacePoints.of(scene)
+    lanes = 1 << 16
+    ray = points.rays(seeded(3, lanes))
+    vertex = find_vertex(SceneView.of(scene, None, 8), ray, mi.Bool(True), seeded(4, lanes))
+    valid, w = np.array(vertex.valid), np.array(vertex.w)
+    p, n = np.array(vertex.si.p), np.array(vertex.si.n)
+    assert valid.mean() > 0.999
+    cosine = (w * n).sum(0)
+    where = np.digitize(p[0], [-6, -2, 2, 6])  # black, both, front, ball, instance
+    areas = np.array([0, 8, 4, 4 * np.pi, 16])
+    np.testing.assert_allclose(
+        np.bincount(where, minlength=5) / lanes, areas / areas.sum(), atol=0.01
+    )
+    assert abs((cosine[where == 1] > 0).mean() - 0.5) < 0.02
+    assert all((cosine[where == i] > 0).mean() > 0.999 for i in (2, 3, 4))
+    # Uniform over the hemisphere: the cosine has a mean of a half; by cosine it would be 2/3.
+    assert abs(cosine[where == 4].mean() - 0.5) < 0.01
+    assert (n[2][where == 4] < 0).mean() > 0.999
+
+
+def test_a_scene_that_scatters_nothing_is_refused():
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": black}})
+    with pytest.raises(UserError, match="nothing in the scene scatters"):
+        SurfacePoints.of(scene)
+
+
+def test_the_command_writes_the_folder_and_fits_eighty_columns(unbake, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    words = ["--steps", 3, "--batch", 64, "--views", 1, "--resolution", 8, "--spp", 4]
+    done = unbake("solve", "furnace", "--out", tmp_path / "s", *words, "--reference-spp", 4)
+    assert done.status == 0, done.err
+    assert max(map(len, done.out.splitlines()[:-1])) <= 80
+    assert "relMSE of LHS" in done.out
+    assert (tmp_path / "s" / "train_000-rhs.exr").is_file()
+    again = unbake("solve", "furnace", "--out", tmp_path / "s", *words)
+    assert again.status == 2 and "not empty" in again.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--attach-rhs", "--samples", "3"], "even number of samples"),
+        (["--reference-spp", "5"], "even"),
+        (["--steps", "0"], "--steps"),
+        (["--batch", "4194304"], "too many"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(unbake, tmp_path, words, said):
+    done = unbake("solve", "furnace", "--out", tmp_path / "s", *words)
+    assert done.status == 2 and said in done.err
+    assert not (tmp_path / "s").exists()
