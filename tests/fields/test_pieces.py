@@ -92,15 +92,22 @@ def test_a_scene_with_other_shapes_has_the_same_pieces():
     assert {row[0] for row in unknown} == {99}
 
 
-def test_small_pieces_are_weak_and_share_the_last_number():
+def test_small_pieces_are_weak():
     made = scene(mesh("large", 10 * CORNERS, BOX), mesh("small", CORNERS + np.float32(9), BOX))
-    few = Pieces(made, 4)
-    large, small = (few.of(shape) for shape in met_shapes(made))
-    assert set(large[:, 0]) == {0, 1, 2, 3}
-    assert set(small[:, 0]) == {3}
-    assert few.count == 4
+    large, small = (Pieces(made, 100).of(shape) for shape in met_shapes(made))
+    assert set(large[:, 0]) == {0, 1, 2, 3, 4, 5}
     np.testing.assert_allclose(large[:, 1], 1)
     np.testing.assert_allclose(small[:, 1], np.sqrt(1 / 606 / FULL_SHARE), rtol=1e-5)
+
+
+def test_the_smallest_pieces_share_a_number_and_are_strong_together():
+    made = scene(mesh("large", 10 * CORNERS, BOX), mesh("small", CORNERS + np.float32(9), BOX))
+    few = Pieces(made, 7)
+    large, small = (few.of(shape) for shape in met_shapes(made))
+    assert few.count == 7
+    assert set(large[:, 0]) == {0, 1, 2, 3, 4, 5}
+    assert set(small[:, 0]) == {6}
+    np.testing.assert_allclose(small[:, 1], np.sqrt(6 / 606 / FULL_SHARE), rtol=1e-5)
 
 
 def test_triangles_without_area_do_no_harm():

@@ -14,9 +14,9 @@ from .shapes import met_shapes, registry_number
 CREASE = 40.0
 #: A piece of this share of all surface, or more, has the full strength.
 FULL_SHARE = 0.05
-_NONE = np.zeros((0, 3, 3), np.float32)
 #: The attribute of a mesh's faces by which a hit finds its piece: number, strength, 0.
 ATTRIBUTE = "face_piece"
+_NONE = np.zeros((0, 3, 3), np.float32)
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Pieces:
     piece. Pieces are numbered by area; where there are more than numbers, the smallest share the
     last number.
 
-    The strength of a piece is the root of its share of all surface, because so the signal to noise
+    The strength of a number is the root of its share of all surface, because so the signal to noise
     of what pixels tell of it grows; it is 1 from `FULL_SHARE` on.
 
     Args:
@@ -53,15 +53,16 @@ class Pieces:
         areas = np.concatenate([areas, [extent[0] for extent in others]])
         rank = np.empty(len(areas), np.int64)
         rank[np.argsort(-areas, kind="stable")] = np.arange(len(areas))
-        strengths = np.sqrt(np.minimum(1, areas / max(areas.sum(), 1e-30) / FULL_SHARE))
+        numbers = np.minimum(rank, most - 1)
+        shares = np.bincount(numbers, areas) / max(areas.sum(), 1e-30)
         rows = np.zeros((len(areas), 3), np.float32)
-        rows[:, 0], rows[:, 1] = np.minimum(rank, most - 1), strengths
+        rows[:, 0], rows[:, 1] = numbers, np.sqrt(np.minimum(1, shares / FULL_SHARE))[numbers]
         first = len(areas) - len(others)
         self.most = most
         self.count = min(len(areas), most)  #: of numbers in use
         self._keys, self._rows = keys, rows[label]
         self._others = dict(zip(others, rows[first:], strict=True))
-        #: Of surfaces that the scene does not have: an unknown piece without a part in any fit.
+        # Of surfaces that the scene does not have: nothing was learned of them.
         self._unknown = np.array((most - 1, 0, 0), np.float32)
         self._single: dict[int, np.ndarray] = {}
 
