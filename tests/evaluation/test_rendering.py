@@ -18,8 +18,10 @@ from unbake.dataset.camera import LookAt, read_cameras, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.rendering import relight, render
+from unbake.evaluation.renderings import render_camera
 from unbake.evaluation.settings import RenderSettings
 from unbake.evaluation.turntable import turntable, up_of
+from unbake.imaging.metrics import psnr
 from unbake.imaging.pictures import read_exr, tonemap, write_exr
 from unbake.scene import relight as relighting
 from unbake.scene.parse import parse
@@ -90,6 +92,25 @@ def test_untrained_grids_have_the_materials_of_the_scene(folder):
     found = materials.evaluate(si, dr.ones(mi.Bool, 4))
     np.testing.assert_allclose(np.array(found["albedo"]), 0.5, atol=1e-3)
     np.testing.assert_allclose(np.array(found["roughness"]), 0.5, atol=0.05)
+
+
+def test_mitsuba_renders_a_loaded_run_as_it_is(folder, tmp_path):
+    loaded = load_run(folder / "run")
+    scene, camera = loaded.problem.scene_view.scene, loaded.dataset.heldout[0].camera
+    sensor, integrator = mi.load_dict(camera.sensor(256)), mi.load_dict({"type": "path"})
+    stock = np.array(mi.render(scene, sensor=sensor, integrator=integrator, seed=3))[..., :3]
+    settings = RenderSettings(spp=256)
+    ours = render_camera(loaded.problem.scene_view, camera, settings, hide_emitters=False)
+    assert ours.mean() > 0.05
+    # Within noise, and far from what black materials would show
+    np.testing.assert_allclose(stock.mean((0, 1)), ours.mean((0, 1)), rtol=0.02)
+    assert psnr(np.minimum(stock, 1), np.minimum(ours, 1)) > 28
+    # A fit beside it is recorded and replayed as ever, and leaves the loaded run as it is.
+    config = replace(tiny_fields(), method="prb", steps=4, score_seconds=0.0)
+    beside = fit(folder / "data", tmp_path / "beside", config)
+    assert beside.step == 4 and not loaded.problem.materials.carried
+    again = np.array(mi.render(scene, sensor=sensor, integrator=integrator, seed=3))[..., :3]
+    np.testing.assert_allclose(again, stock, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,7 @@ def exported(data, tmp_path_factory) -> Exported:
     randomise(problem.materials)
     randomise(problem.environment, 0.4)
     problem.environment.prepare()
+    problem.materials.stand_alone()  # with the new parameters
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exporting, "load_run", lambda *_, **__: recovered)
         as_if_seen(patch)
@@ -309,10 +310,8 @@ def test_mitsuba_alone_renders_what_was_recovered(exported, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "'ground'" in done.stdout and "'block-2'" in done.stdout
     problem = exported.recovered.problem
-    problem.materials.stand_alone()
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
     reference = mi.render(problem.scene_view.scene, integrator=integrator, spp=2048, seed=0)
-    problem.materials.carried = True
     reference, found = (np.array(x)[..., :3] for x in (reference, np.load(picture)))
     scale = np.percentile(reference, 99)
     assert psnr(np.minimum(found / scale, 1), np.minimum(reference / scale, 1)) > 40

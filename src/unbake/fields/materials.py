@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 
 import drjit as dr
@@ -20,6 +22,7 @@ from .shapes import registry_number
 #: Values by the name of their quantity: linear RGB, or one number, within the quantity's bounds.
 #: Roughness is perceptual (α_GGX = roughness²).
 Material = dict[str, "mi.Color3f | mi.Float"]
+_CARRYING = ContextVar("carrying", default=False)
 
 
 class Materials(Mapping[str, Field]):
@@ -40,8 +43,9 @@ class Materials(Mapping[str, Field]):
         self.numbers: dict[int, int] = {}
         #: Of the scene; set together with the domain, where fields have values of pieces.
         self.pieces: Pieces | None = None
-        #: Whether textures read the values put on the surface interaction by `carry`. It must not
-        #: change between an evaluation and its differentiation, which calls the textures again.
+        #: Whether textures always read the values put on the surface interaction by `carry`, and
+        #: not within `carrying` alone. It must not change between an evaluation and its
+        #: differentiation, which calls the textures again.
         self.carried = True
         self._fields = {name: fields[name] for name in in_order(fields)}
 
@@ -67,8 +71,15 @@ class Materials(Mapping[str, Field]):
         for name, field in self.items():
             field.assign({k: parameters[f"{name}.{k}"] for k in field.parameters()})
 
+    @property
+    def can_stand_alone(self) -> bool:
+        """Whether all fields can be evaluated inside of loops."""
+        return all(field.symbolic for field in self.values())
+
     def stand_alone(self) -> None:
         """From now on, textures evaluate the fields themselves, as stock integrators need it.
+
+        They do so with the present parameters: call it again after `assign`.
 
         Raises:
             UserError: a field cannot be evaluated inside of loops.
@@ -206,6 +217,25 @@ def make_materials(
         )
         fields[name] = registry.representation(representation).field(settings[name], spec)
     return Materials(fields)
+
+
+@contextmanager
+def carrying() -> Iterator[None]:
+    """A context in which all textures of fields read what `carry` put on surface interactions.
+
+    For our own integrators, whose vertices carry it: a field is then asked once a vertex. What is
+    evaluated in it must not be differentiated after it, unless the textures are `carried` anyway.
+    """
+    token = _CARRYING.set(True)
+    try:
+        yield
+    finally:
+        _CARRYING.reset(token)
+
+
+def is_carrying() -> bool:
+    """Whether this is within `carrying`."""
+    return _CARRYING.get()
 
 
 def carry(si: mi.SurfaceInteraction3f, material: Material) -> None:

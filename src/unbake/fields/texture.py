@@ -7,7 +7,7 @@ import re
 import mitsuba as mi
 
 from ..quantities import QUANTITIES
-from .materials import Materials, read_carried
+from .materials import Materials, is_carrying, read_carried
 from .shapes import met_shapes, registry_number
 
 #: By which the BSDF's parameters tell the number of its material.
@@ -34,7 +34,7 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
             self.quantity = props["quantity"]
 
         def lookup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f | mi.Float:
-            if materials.carried:
+            if materials.carried or is_carrying():
                 material = read_carried(si, materials)
             else:
                 material = materials.evaluate(si, mi.Bool(active), engine="coopvec")

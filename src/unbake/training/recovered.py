@@ -40,7 +40,7 @@ class OpenedRun:
 
 
 def open_run(
-    run: Path,
+    run: str | Path,
     *,
     allow_outside: bool = False,
     change: Callable[[ParsedScene], object] | None = None,
@@ -55,6 +55,7 @@ def open_run(
     Raises:
         UserError: the folder holds no run, or its data set is gone.
     """
+    run = Path(run)
     folder = RunFolder(run)
     folder.require_fitted()
     config = folder.settings()
@@ -71,7 +72,7 @@ def open_run(
 
 
 def load_run(
-    run: Path,
+    run: str | Path,
     *,
     allow_outside: bool = False,
     change: Callable[[ParsedScene], object] | None = None,
@@ -79,8 +80,8 @@ def load_run(
     """Read a run's newest checkpoint.
 
     `problem.scene_view.scene` is a Mitsuba scene with the recovered fields in the place of its
-    unknown quantities, its environment or its lights' strengths. Where materials were recovered,
-    any integrator of Mitsuba renders it after `problem.materials.stand_alone()`, and else at once.
+    unknown quantities, its environment or its lights' strengths. Any integrator of Mitsuba renders
+    it, unless a field cannot be evaluated inside of loops (`problem.materials.can_stand_alone`).
 
     Args:
         run: folder of a fit.
@@ -95,4 +96,7 @@ def load_run(
     if progress is None:
         raise UserError("no readable checkpoint", where=run, remedy="Fit again, or wait for one")
     opened.state.publish(opened.problem)
+    materials = opened.problem.materials
+    if materials is not None and materials.can_stand_alone:
+        materials.stand_alone()
     return Recovered(opened.problem, opened.dataset, opened.config, progress, opened.clip_negative)

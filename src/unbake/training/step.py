@@ -19,6 +19,7 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
 from ..errors import UserError
+from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.path_sample import SampleSubset
@@ -73,6 +74,8 @@ class TrainingStep:
             pixels.require_crops(config.pixels)
         # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
+        if problem.materials is not None:
+            problem.materials.carried = True  # a run that was read back may stand alone
         self._problem = problem
         self._pixels = pixels
         self._config = config
@@ -114,6 +117,7 @@ class TrainingStep:
                 f"no memory for a step of {paths} paths", None, self._smaller()
             ) from None
 
+    @carrying()
     def plan(self, state: State) -> None:
         """Let the path sampler decide what it fixes for all steps, once.
 
@@ -191,6 +195,7 @@ class TrainingStep:
         reference = colours[:, 3:] if smoothed else target
         return float((target**2 / (reference**2 + self._config.loss_epsilon)).mean())
 
+    @carrying()
     def replay(self, state: State, number: int) -> Replay:
         """A step taken apart, for a diagnosis; the state stays as it is."""
         self.plan(state)
@@ -248,6 +253,7 @@ class TrainingStep:
             halves = probe(inputs, state)
         return np.array(halves).T.reshape(-1, 2, 3)
 
+    @carrying()
     def _probe(self, inputs: Inputs, state: State) -> mi.Color3f:
         config, pixels, sampler = self._config, inputs.pixels, inputs.sampler
         with dr.suspend_grad(), self._path_sampler.prepared():
@@ -328,6 +334,7 @@ class TrainingStep:
         dr.eval(state, terms)
         return terms
 
+    @carrying()
     def _gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         """The loss terms on random pixels; their gradients are accumulated in the state."""
         config, path_sampler = self._config, self._path_sampler

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..fields.materials import read_carried
+from ..fields.materials import carrying, read_carried
 from ..fields.shapes import met_shapes
 from .operator import attach_material
 from .path_tracer import path_traced
@@ -22,6 +22,7 @@ RayGenerator = Callable[["mi.UInt32", "mi.Point2f"], "mi.Ray3f"]
 WAVEFRONT = 1 << 20
 
 
+@carrying()
 def render_radiance(
     scene_view: SceneView,
     through: RayGenerator,
@@ -54,6 +55,7 @@ def render_radiance(
     return image
 
 
+@carrying()
 def render_materials(
     scene_view: SceneView, through: RayGenerator, pixels: int, spp: int, *, seed: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
