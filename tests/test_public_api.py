@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import pkgutil
 import re
 import subprocess
@@ -84,6 +85,63 @@ def test_importing_loads_no_mitsuba():
     assert not {"mitsuba", "drjit", "numpy", "rich", "tyro"} & loaded
 
 
+def functions_of_paths() -> dict[str, str]:
+    """Public functions and methods that take paths: name → how those arguments are annotated."""
+    found = {}
+    for name in unbake.__all__:
+        value = getattr(unbake, name)
+        functions = {name: value} if inspect.isfunction(value) else {}
+        if inspect.isclass(value):
+            functions = {f"{name}.{k}": getattr(value, k) for k in vars(value) if k[0] != "_"}
+        for called, function in functions.items():
+            if not inspect.isroutine(function):
+                continue
+            notes = [str(p.annotation) for p in inspect.signature(function).parameters.values()]
+            notes = [note for note in notes if re.search(r"\bPath\b", note)]
+            if notes:
+                found[called] = ", ".join(notes)
+    return found
+
+
+def test_paths_may_be_texts(tmp_path):
+    found = functions_of_paths()
+    assert {name: notes for name, notes in found.items() if "str" not in notes} == {}
+    here, none, cpu = str(tmp_path), str(tmp_path / "none"), unbake.preset("cpu")
+    light = unbake.LightConfig(envmap=none)  # pyright: ignore[reportArgumentType]
+    methods, settings = [unbake.MethodVariant("ours")], unbake.EvaluationSettings()
+    refused = {
+        "capture": lambda: unbake.capture(f"{none}.xml", none, unbake.CaptureSettings()),
+        "fit": lambda: unbake.fit(none, f"{none}-run", cpu),
+        "evaluate": lambda: unbake.evaluate(none),
+        "render": lambda: unbake.render(none, f"{none}-pictures"),
+        "relight": lambda: unbake.relight(none, f"{none}-pictures", light),
+        "export": lambda: unbake.export(none, f"{none}-exported"),
+        "compare": lambda: unbake.compare(none, methods, here, cpu, evaluation=settings),
+        "write_report": lambda: unbake.write_report([none], f"{none}.html"),
+        "load_run": lambda: unbake.load_run(none),
+        "make_problem": lambda: unbake.make_problem(f"{none}.xml", "visible", cpu, 1.0, here),
+        "read_toml": lambda: unbake.read_toml(none),
+        "Dataset.load": lambda: unbake.Dataset.load(none),
+    }
+    for call in refused.values():
+        with pytest.raises(unbake.UserError, match="none"):
+            call()
+    camera = unbake.Camera.look_at((0, 0, 1), (0, 0, 0), (0, 1, 0), 45, 8, 8)
+    view = unbake.View("a", "train", camera, f"{here}/a.exr", {"albedo": f"{here}/b.exr"})
+    data = unbake.Dataset(here, f"{here}/scene.xml", "visible", (view,), {}, None)
+    data.save(here)
+    folder, run = unbake.DataFolder(here), unbake.RunFolder(here)
+    assert folder.transforms_file.is_file() and folder.known(str(folder.transforms_file))
+    assert folder.relative(f"{here}/a.exr") == "a.exr"
+    checkpoint = run.checkpoint(3)
+    checkpoint.mkdir(parents=True)
+    run.checkpoint(4).mkdir()
+    run.tidy_checkpoints(str(checkpoint))
+    assert run.written_checkpoints() == [checkpoint]
+    tried = {"Dataset.save", "DataFolder.known", "DataFolder.relative"}
+    assert found.keys() == refused.keys() | tried | {"RunFolder.tidy_checkpoints"}
+
+
 def test_help_is_complete_and_chooses_a_variant():
     text = fresh("import unbake; help(unbake)")
     shown = re.findall(r"^    (?:class )?(\w+)(?:\(| =|$)", text, flags=re.MULTILINE)
@@ -103,3 +161,4 @@ help(unbake)
     text = fresh(code, **nowhere)
     assert text.startswith("DRJIT_LIBLLVM_PATH: there is no file")
     assert "class UserError" in text
+    assert [n for n in unbake.__all__ if not re.search(rf"    .*\b{n}\b", text)] == []

@@ -1,15 +1,16 @@
 """Recovers materials or lighting from photographs, with the global illumination taken out.
 
-    from pathlib import Path
     import unbake
 
     unbake.activate()
-    unbake.capture("demo", Path("data"), unbake.CaptureSettings())
-    unbake.fit(Path("data"), Path("run"), unbake.preset("cpu"))
-    unbake.evaluate(Path("run"))
-    unbake.write_report([Path("run")], Path("report.html"))
-    unbake.export(Path("run"), Path("exported"))
-    unbake.relight(Path("run"), Path("relit"), unbake.LightConfig(envmap=Path("sky.exr")))
+    unbake.capture("demo", "data", unbake.CaptureSettings())
+    unbake.fit("data", "run", unbake.preset("cpu"))
+    unbake.evaluate("run")
+    unbake.write_report(["run"], "report.html")
+    unbake.export("run", "exported")
+    unbake.relight("run", "relit", unbake.LightConfig(envmap="sky.exr"))
+
+Paths may be given as `str` or as `Path`.
 
 `import unbake` loads neither Mitsuba nor Dr.Jit. A public name is loaded when it is first used; if
 it needs Mitsuba and no variant has been chosen, `activate()` chooses one for this machine.
@@ -18,6 +19,7 @@ it needs Mitsuba and no variant has been chosen, `activate()` chooses one for th
 from __future__ import annotations
 
 import importlib
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import unbake.version as _version
@@ -119,69 +121,76 @@ if TYPE_CHECKING:
 
 __version__ = _version.VERSION
 
-# The public names by module. A new one goes here and, for type checkers, into the block above.
-_MODULES: dict[str, tuple[str, ...]] = {
-    # The commands.
-    "backend": ("activate",),
-    "errors": ("UserError",),
-    "config": ("FitConfig", "preset", "read_toml", "to_toml"),
-    "acquisition.settings": ("CaptureSettings",),
-    "acquisition.capture": ("capture",),
-    "training.loop": ("fit",),
-    "training.recovered": ("load_run",),
-    "evaluation.settings": ("EvaluationSettings", "RenderSettings"),
-    "evaluation.evaluate": ("evaluate",),
-    "config.light": ("LightConfig",),
-    "evaluation.rendering": ("relight", "render"),
-    "report.page": ("write_report",),
-    "exports.export": ("export",),
-    "solver.settings": ("SolveSettings",),
-    "solver.solve": ("load_radiance", "solve"),
-    "comparison.compare": ("compare",),
-    "comparison.method_variant": ("MethodVariant",),
-    # Data sets.
-    "dataset.camera": ("Camera",),
-    "dataset.data_folder": ("DataFolder",),
-    "dataset.photographs": ("Photographs",),
-    "dataset.pixels": ("CameraRays", "PixelBatch", "PixelSource", "RayBatch"),
-    "dataset.views": ("Dataset", "View"),
-    # Unknowns: fields on surfaces.
-    "fields.domain": ("SurfacePoint",),
-    "fields.field": ("Cost", "Field", "FieldSpec"),
-    "fields.materials": ("Material", "Materials"),
-    "fields.perceptron": ("Perceptron",),
-    "fields.radiance": ("RadianceField",),
-    "fields.registry": ("Representation", "register_representation"),
-    "fields.settings": (
-        "BitmapConfig",
-        "DenseGridConfig",
-        "GridConfig",
-        "NetworkConfig",
-        "TriPlaneConfig",
-    ),
-    "fields.torch": ("TorchField",),
-    "quantities": ("DEFAULT_QUANTITIES", "QUANTITIES", "Quantity"),
-    # Light transport and the objective.
-    "transport.loss": ("RelativeL2", "pixel_means", "squared_error"),
-    "transport.methods": ("METHODS", "Attached", "Method", "register_method"),
-    "transport.objective": ("objective", "requirements"),
-    "transport.path_sample": ("PathSample", "Requirements", "lhs", "rhs", "trace"),
-    "transport.path_tracer": ("path_traced",),
-    "transport.prior": ("residual", "residual_norm"),
-    "transport.render": ("render_radiance",),
-    "transport.samplers": ("PathSampler", "SamplerContext", "register_sampler"),
-    "transport.terms": ("TERMS", "Term", "TermInputs", "register_term"),
-    "transport.vertex": ("SceneView", "Vertex"),
-    # The parts of a training loop.
-    "training.checkpoint": ("Progress", "load_checkpoint", "save_checkpoint"),
-    "training.defaults": ("with_defaults",),
-    "training.path_depth": ("with_path_depth",),
-    "training.problem": ("Problem", "make_problem", "training_pixels"),
-    "training.run_folder": ("Origin", "RunFolder"),
-    "training.schedule": ("learning_rates",),
-    "training.state": ("State", "initial_state"),
-    "training.step": ("TrainingStep",),
+# The public names by task and module. A new one goes here and, for type checkers, into the block
+# above.
+_GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
+    "The commands": {
+        "backend": ("activate",),
+        "errors": ("UserError",),
+        "config": ("FitConfig", "preset", "read_toml", "to_toml"),
+        "acquisition.settings": ("CaptureSettings",),
+        "acquisition.capture": ("capture",),
+        "training.loop": ("fit",),
+        "training.recovered": ("load_run",),
+        "evaluation.settings": ("EvaluationSettings", "RenderSettings"),
+        "evaluation.evaluate": ("evaluate",),
+        "config.light": ("LightConfig",),
+        "evaluation.rendering": ("relight", "render"),
+        "report.page": ("write_report",),
+        "exports.export": ("export",),
+        "solver.settings": ("SolveSettings",),
+        "solver.solve": ("load_radiance", "solve"),
+        "comparison.compare": ("compare",),
+        "comparison.method_variant": ("MethodVariant",),
+    },
+    "Data sets": {
+        "dataset.camera": ("Camera",),
+        "dataset.data_folder": ("DataFolder",),
+        "dataset.photographs": ("Photographs",),
+        "dataset.pixels": ("CameraRays", "PixelBatch", "PixelSource", "RayBatch"),
+        "dataset.views": ("Dataset", "View"),
+    },
+    "Unknowns (fields on surfaces)": {
+        "fields.domain": ("SurfacePoint",),
+        "fields.field": ("Cost", "Field", "FieldSpec"),
+        "fields.materials": ("Material", "Materials"),
+        "fields.perceptron": ("Perceptron",),
+        "fields.radiance": ("RadianceField",),
+        "fields.registry": ("Representation", "register_representation"),
+        "fields.settings": (
+            "BitmapConfig",
+            "DenseGridConfig",
+            "GridConfig",
+            "NetworkConfig",
+            "TriPlaneConfig",
+        ),
+        "fields.torch": ("TorchField",),
+        "quantities": ("DEFAULT_QUANTITIES", "QUANTITIES", "Quantity"),
+    },
+    "Light transport and the objective": {
+        "transport.loss": ("RelativeL2", "pixel_means", "squared_error"),
+        "transport.methods": ("METHODS", "Attached", "Method", "register_method"),
+        "transport.objective": ("objective", "requirements"),
+        "transport.path_sample": ("PathSample", "Requirements", "lhs", "rhs", "trace"),
+        "transport.path_tracer": ("path_traced",),
+        "transport.prior": ("residual", "residual_norm"),
+        "transport.render": ("render_radiance",),
+        "transport.samplers": ("PathSampler", "SamplerContext", "register_sampler"),
+        "transport.terms": ("TERMS", "Term", "TermInputs", "register_term"),
+        "transport.vertex": ("SceneView", "Vertex"),
+    },
+    "The parts of a training loop": {
+        "training.checkpoint": ("Progress", "load_checkpoint", "save_checkpoint"),
+        "training.defaults": ("with_defaults",),
+        "training.path_depth": ("with_path_depth",),
+        "training.problem": ("Problem", "make_problem", "training_pixels"),
+        "training.run_folder": ("Origin", "RunFolder"),
+        "training.schedule": ("learning_rates",),
+        "training.state": ("State", "initial_state"),
+        "training.step": ("TrainingStep",),
+    },
 }
+_MODULES = {module: names for group in _GROUPS.values() for module, names in group.items()}
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 # Modules above that are imported without Mitsuba.
@@ -203,6 +212,18 @@ _PURE = frozenset(
 )
 
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def _listed() -> str:
+    """The public names by task, which `help` shows also where no variant can be chosen."""
+    lines = ["", "Public names:", ""]
+    for task, modules in _GROUPS.items():
+        names = ", ".join(sorted((n for group in modules.values() for n in group), key=str.lower))
+        lines += [f"  {task}:", *wrap(names, 92, initial_indent=" " * 4, subsequent_indent=" " * 4)]
+    return "\n".join(lines) + "\n"
+
+
+__doc__ = (__doc__ or "") + _listed()
 
 
 class _NoVariant(UserError, AttributeError):

@@ -130,7 +130,7 @@ def test_numbers_of_an_interrupted_evaluation_are_not_those_before(fit, run, unb
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("unbake.evaluation.evaluate._render", stopped)
+        patch.setattr("unbake.evaluation.evaluate.render_camera", stopped)
         assert unbake("evaluate", run.path, "--spp", 1).status == 130
     one_line(unbake("report", run.path, "--out", run.path / "page.html"), "Run `unbake evaluate")
 

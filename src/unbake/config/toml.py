@@ -113,6 +113,6 @@ def _require_registered(table: Mapping[str, Any]) -> None:
             raise UserError(what, key, "A name of your own must be registered first")
 
 
-def read_toml(path: Path) -> FitConfig:
+def read_toml(path: str | Path) -> FitConfig:
     """Settings from a TOML file; see `from_toml`."""
-    return from_toml(read_text(path), str(path))
+    return from_toml(read_text(Path(path)), str(path))

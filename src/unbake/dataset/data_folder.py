@@ -46,6 +46,9 @@ class DataFolder:
     path: Path
     allow_outside: bool = False
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+
     @property
     def transforms_file(self) -> Path:
         """Cameras and images."""
@@ -113,12 +116,13 @@ class DataFolder:
         """
         return inside(self.path, name, where, _KIND, allow_outside=self.allow_outside)
 
-    def known(self, file: Path) -> bool:
+    def known(self, file: str | Path) -> bool:
         """Whether there is such a file of the truth.
 
         Raises:
             UserError: it is a link that leads out of the folder.
         """
+        file = Path(file)
         if not file.is_file():
             return False
         self.inside(file.relative_to(self.path).as_posix(), str(self.path))
@@ -133,13 +137,13 @@ class DataFolder:
                 "Remove it, or pass --allow-outside",
             )
 
-    def relative(self, file: Path) -> str:
+    def relative(self, file: str | Path) -> str:
         """How `transforms.json` names a file of the folder.
 
         Raises:
             UserError: the file lies outside the folder.
         """
-        return relative(self.path, file, _KIND)
+        return relative(self.path, Path(file), _KIND)
 
     def read_transforms(self) -> dict[str, Any]:
         """The content of `transforms.json`, as it stands in the file.

@@ -53,6 +53,11 @@ class View:
     image: Path
     truth: Mapping[str, Path]
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "image", Path(self.image))
+        truth = {name: Path(file) for name, file in self.truth.items()}
+        object.__setattr__(self, "truth", truth)
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -80,6 +85,10 @@ class Dataset:
     coverage: float | None
     light_by_depth: tuple[float, ...] = ()
     allow_outside: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(self.folder))
+        object.__setattr__(self, "scene", Path(self.scene))
 
     def depth_of_light(self, share: float) -> int | None:
         """The smallest depth of paths that carry this share of the light; None if unknown."""
@@ -111,7 +120,7 @@ class Dataset:
         return tuple(view for view in self.views if view.split == "heldout")
 
     @classmethod
-    def load(cls, folder: Path, *, allow_outside: bool = False) -> Dataset:
+    def load(cls, folder: str | Path, *, allow_outside: bool = False) -> Dataset:
         """Read a data folder and check all of it but the pixels: those when they are read.
 
         Args:
@@ -136,7 +145,7 @@ class Dataset:
         background = _background(top, file)
         return cls(data.path, scene, background, views, render, seen, light, allow_outside)
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: str | Path) -> None:
         """Write `transforms.json` into a folder, atomically; images are not touched.
 
         Args:

@@ -83,8 +83,8 @@ class Scales:
 
 
 def write_report(
-    runs: Sequence[Path],
-    out: Path,
+    runs: Sequence[str | Path],
+    out: str | Path,
     failed: Mapping[str, str] | None = None,
     *,
     allow_outside: bool = False,
@@ -108,6 +108,7 @@ def write_report(
     Raises:
         UserError: a run was not evaluated, runs differ in data, or a file is gone or malformed.
     """
+    out = Path(out)
     if not runs:
         raise UserError("a report needs at least one run")
     loaded = [read_run(path, label) for path, label in labels(runs)]
@@ -164,7 +165,6 @@ def write_report(
             definitions=_definitions(loaded),
         )
     )
-    out = Path(out)
     write_text(out, page)
     return out
 

@@ -66,7 +66,7 @@ class View:
     truth: dict[str, Path]
 
 
-def labels(runs: Sequence[Path]) -> list[tuple[Path, str]]:
+def labels(runs: Sequence[str | Path]) -> list[tuple[Path, str]]:
     """Folder names, preceded by as many parent folders as make them unique."""
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < len(paths):

@@ -94,11 +94,11 @@ class Problem:
 
 
 def make_problem(
-    scene: Path,
+    scene: str | Path,
     background: str,
     config: FitConfig,
     scale: float,
-    root: Path | None = None,
+    root: str | Path | None = None,
     *,
     change: Callable[[ParsedScene], object] | None = None,
 ) -> Problem:
@@ -117,6 +117,7 @@ def make_problem(
         UserError: the scene cannot be loaded, has no emitter or nothing to fit, has meshes without
             the texture coordinates that bitmaps need, or the fields do not fit the memory.
     """
+    scene, root = Path(scene), None if root is None else Path(root)
     parsed = parse(scene, root)
     edit.to_principled(parsed)
     require_room(config, len(edit.material_names(parsed)))

@@ -70,6 +70,9 @@ class RunFolder:
 
     path: Path
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+
     @property
     def config_file(self) -> Path:
         """The settings."""
@@ -286,13 +289,13 @@ class RunFolder:
         numbered = [(int(match[1]), path) for match, path in found if match]
         return [path for _, path in sorted(numbered, reverse=True)]
 
-    def tidy_checkpoints(self, newest: Path) -> None:
+    def tidy_checkpoints(self, newest: str | Path) -> None:
         """Delete all checkpoints but this one, which is good, and the newest few before it.
 
         Those after it are damaged, or of steps that were taken again.
         """
         written = self.written_checkpoints()
-        at = written.index(newest)
+        at = written.index(Path(newest))
         _remove(*written[:at], *written[at + KEEP :])
 
     def sweep(self) -> None:
