@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from .quantities import QUANTITIES as QUANTITIES
     from .quantities import Quantity as Quantity
     from .report.page import write_report as write_report
+    from .run import Run as Run
     from .solver.settings import SolveSettings as SolveSettings
     from .solver.solve import load_radiance as load_radiance
     from .solver.solve import solve as solve
@@ -132,6 +133,7 @@ _GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "acquisition.capture": ("capture",),
         "training.loop": ("fit",),
         "training.recovered": ("load_run",),
+        "run": ("Run",),
         "evaluation.settings": ("EvaluationSettings", "RenderSettings"),
         "evaluation.evaluate": ("evaluate",),
         "config.light": ("LightConfig",),

@@ -237,7 +237,7 @@ def _shots(
     """The pictures to make, and how their cameras were chosen."""
     dataset = recovered.dataset
     first = dataset.train[0].camera
-    width, height = _size(first, settings)
+    width, height = picture_size(first, settings)
     if cameras.file is not None:
         found = read_cameras(cameras.file, first.width, first.height, keep_size=True)
         counts: dict[str, int] = {}
@@ -245,7 +245,7 @@ def _shots(
         for split, camera in found:
             counts[split] = counts.get(split, -1) + 1
             name = frame_name(split, counts[split])
-            shots.append(_Shot(name, camera.rescaled(*_size(camera, settings)), split))
+            shots.append(_Shot(name, camera.rescaled(*picture_size(camera, settings)), split))
         return shots, {"kind": "file", "file": os.fspath(cameras.file)}
     if cameras.turntable is not None:
         scene, count = recovered.problem.scene_view.scene, cameras.turntable
@@ -264,7 +264,7 @@ def _shots(
     shots = [
         _Shot(
             view.name,
-            view.camera.rescaled(*_size(view.camera, settings)),
+            view.camera.rescaled(*picture_size(view.camera, settings)),
             view.split,
             view if cameras.truth is not None else None,
         )
@@ -273,7 +273,7 @@ def _shots(
     return shots, {"kind": "views", "of": "truth" if cameras.truth else "data"}
 
 
-def _size(camera: Camera, settings: RenderSettings) -> tuple[int, int]:
+def picture_size(camera: Camera, settings: RenderSettings) -> tuple[int, int]:
     """Width and height in pixels: the camera's own, or as the settings say."""
     width, height = settings.width, settings.height
     if width is None and height is None:
