@@ -1,6 +1,7 @@
 """Poses that do not belong to the scene are told with what is wrong; good ones never are."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +35,9 @@ def seen(built_in):
 
 
 def warnings(scene, cameras, photographs):
-    views = [View(f"train_{i:03d}", "train", c, None, {}) for i, c in enumerate(cameras)]
+    views = [
+        View(f"train_{i:03d}", "train", c, Path("none.exr"), {}) for i, c in enumerate(cameras)
+    ]
     return pose_warnings(scene, views, photographs, "data")
 
 

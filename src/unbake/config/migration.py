@@ -56,7 +56,8 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
     written = version is not None or _OF_RUN <= table.keys()
     found = table if version == FORMAT else _moved(table, version)
     for key, value in _AS_BEFORE.items() if written else ():
-        if not _has(found, key):
+        outer = key.rpartition(".")[0].rpartition(".")[0]
+        if not _has(found, key) and (not outer or _has(found, outer)):
             _put(found, key, value, key)
     return found
 
