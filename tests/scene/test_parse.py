@@ -83,3 +83,18 @@ def test_a_scene_that_fails_does_not_disturb_the_next_one(parse):
             parse(light + '<shape type="nothing"/>').instantiate()
         kept.append(caught)
     assert np.isfinite(render(parse(light + BALL.format(DIFFUSE)).instantiate(), 2)).all()
+
+
+def test_a_mesh_without_triangles_does_not_disturb_the_next_one(parse, tmp_path):
+    """It stayed behind in the traceback, and a mesh of the next scene could not be traced."""
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1\n")
+    corners = "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "triangle.obj").write_text(corners)
+    flat, triangle = (
+        f'<shape type="obj"><string name="filename" value="{name}.obj"/>{DIFFUSE}</shape>'
+        for name in ("flat", "triangle")
+    )
+    with pytest.raises(UserError, match="has no triangles") as caught:
+        parse(flat + BALL.format(DIFFUSE)).instantiate()
+    assert caught.tb is not None  # it lives on, as in a notebook
+    assert np.isfinite(render(parse(triangle).instantiate(), 2)).all()

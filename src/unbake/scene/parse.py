@@ -66,16 +66,13 @@ class ParsedScene:
             self.state = mi.parser.ParserState()
             raise UserError(f"Mitsuba cannot make this scene: {reason(error)}", self.path) from None
         scene = scene[0] if isinstance(scene, list) else scene
-        box = np.ravel([scene.bbox().min, scene.bbox().max])
-        if not np.isfinite(box).all():
-            raise UserError("the scene has no shapes, or one without end", self.path)
-        if np.ptp(box.reshape(2, 3), axis=0).max() == 0:
-            what = "all shapes of the scene lie in one point"
-            raise UserError(what, self.path, "Correct their transforms")
-        for shape in met_shapes(scene):
-            # Dr.Jit 1.5 cannot look up the corners of what was hit where a mesh has none at all.
-            if isinstance(shape, mi.Mesh) and not shape.face_count():
-                raise UserError(f"the mesh {shape.id()!r} has no triangles", self.path, "Remove it")
+        fault = _fault(scene)
+        if fault is not None:
+            # Dr.Jit calls all shapes that live, and fails at a mesh without triangles in whatever
+            # scene is traced next. The traceback of this error keeps what it can reach.
+            del scene
+            self.state = mi.parser.ParserState()
+            raise UserError(fault[0], self.path, fault[1])
         return scene
 
     def _forget_queries(self) -> None:
@@ -198,6 +195,20 @@ def write(scene: ParsedScene, folder: Path) -> Path:
     except (RuntimeError, ValueError) as error:
         raise UserError(f"cannot be copied: {reason(error)}", scene.path) from None
     return folder / "scene.xml"
+
+
+def _fault(scene: mi.Scene) -> tuple[str, str | None] | None:
+    """What makes a scene that Mitsuba made useless, and the remedy."""
+    box = np.ravel([scene.bbox().min, scene.bbox().max])
+    if not np.isfinite(box).all():
+        return "the scene has no shapes, or one without end", None
+    if np.ptp(box.reshape(2, 3), axis=0).max() == 0:
+        return "all shapes of the scene lie in one point", "Correct their transforms"
+    for shape in met_shapes(scene):
+        # Dr.Jit 1.5 cannot look up the corners of what was hit where a mesh has none at all.
+        if isinstance(shape, mi.Mesh) and not shape.face_count():
+            return f"the mesh {shape.id()!r} has no triangles", "Remove it"
+    return None
 
 
 def _copy(source: Path, folder: Path, kind: str) -> str:
