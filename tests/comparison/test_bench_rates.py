@@ -205,7 +205,10 @@ def test_ties_keep_the_published_estimator_and_the_own_rates():
 
 @pytest.mark.parametrize(
     ("unknown", "key", "name"),
-    [("lighting", "relight_psnr", "environment"), ("emission", "emission_db", "emission")],
+    [
+        pytest.param("lighting", "relight_psnr", "environment", marks=pytest.mark.slow),
+        ("emission", "emission_db", "emission"),
+    ],
 )
 def test_light_is_judged_too(unknown, key, name, unbake, tiny, tmp_path):
     scene = {"lighting": "still", "emission": "cornell"}[unknown]

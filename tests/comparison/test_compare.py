@@ -183,6 +183,7 @@ def test_finished_runs_are_kept(compare, tmp_path):
     assert list(result(tmp_path)["methods"]) == ["direct", "ours"]
 
 
+@pytest.mark.slow
 def test_another_quality_of_evaluation_is_evaluated_anew(compare, tmp_path):
     assert compare("direct", steps=2).status == 0
     assert compare("direct", steps=2, extra=("--evaluate-spp", 3)).status == 0

@@ -144,7 +144,7 @@ def test_fig4_longer_paths_miss_less(rows, out, scenes_dir):
     ("figure", "methods"),
     [
         pytest.param(fig6, fig6.METHODS, marks=pytest.mark.slow, id="fig6"),
-        pytest.param(fig7, fig7.METHODS, id="fig7"),
+        pytest.param(fig7, fig7.METHODS, marks=pytest.mark.slow, id="fig7"),
         pytest.param(fig8, ABLATION, marks=pytest.mark.slow, id="fig8"),
     ],
 )

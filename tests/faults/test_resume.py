@@ -154,7 +154,7 @@ def test_a_killed_fit_goes_on(started, fit, tmp_path):
     ("method", "words"),
     [
         ("direct", ()),
-        ("ad-pt", ("--max-depth", "5")),
+        pytest.param("ad-pt", ("--max-depth", "5"), marks=pytest.mark.slow),
         ("ours", ()),
         ("ours", ("--representation", "triplane", "--radiance", "triplane")),
     ],

@@ -168,6 +168,7 @@ def benchmark(repository, monkeypatch):
     return lambda name: runpy.run_path(str(repository / "benchmarks" / name))
 
 
+@pytest.mark.slow
 def test_killed_fits_go_on(benchmark, tmp_path, monkeypatch):
     """`make kill` does so 200 times."""
     monkeypatch.setenv("PYTHONPATH", SOURCE)

@@ -131,7 +131,10 @@ def test_series_is_the_image_of_path(name):
     assert_same_expectation(series, truth, spp)
 
 
-@pytest.mark.parametrize("name", ["mirror", "cut-out", "half opaque", "half opaque gloss"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("mirror", marks=pytest.mark.slow), "cut-out", "half opaque", "half opaque gloss"],
+)
 def test_series_is_the_image_of_path_inside_instances(name):
     scene = box_of_instances(THINGS[name])
     scene_view = SceneView.of(scene, None, 40)
@@ -142,7 +145,9 @@ def test_series_is_the_image_of_path_inside_instances(name):
     assert_same_expectation(series, truth, SPP)
 
 
-@pytest.mark.parametrize("name", ["coloured mirror", "glass ball", "glass pane"])
+@pytest.mark.parametrize(
+    "name", ["coloured mirror", "glass ball", pytest.param("glass pane", marks=pytest.mark.slow)]
+)
 def test_both_sides_with_an_exact_cache_are_the_image_of_path(name):
     """The cache is asked at the first surface that scatters, seen along the chain's last ray."""
     scene = box(THINGS[name])

@@ -201,6 +201,7 @@ def test_gradients_through_cut_outs_are_finite_differences(tmp_path, instanced):
 # ----------------------------------------------------------------- split halves and two passes
 
 
+@pytest.mark.slow
 def test_split_halves_and_two_passes_have_one_expectation(built_in):
     materials = ConstantMaterials(0.6, 0.4)
     parsed = parse(built_in("cornell"))
