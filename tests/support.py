@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from unbake.acquisition import built_in
-from unbake.config import FitConfig, GridConfig, NetworkConfig, update
+from unbake.config import FitConfig, GridConfig, NetworkConfig, RegularizationConfig, update
 from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
@@ -33,7 +33,7 @@ TINY = NetworkConfig(
 _SIZES = {key: value for key, value in asdict(TINY).items() if key != "learning_rate"}
 #: A fit of a few dozen pixels with tiny networks, and the usual learning rates.
 TINY_FIT = update(
-    FitConfig(pixels=32, spp=4),
+    FitConfig(pixels=32, spp=4, regularization=RegularizationConfig(albedo_smoothness=0.0)),
     {
         "materials": {name: {"neural": _SIZES} for name in QUANTITIES},
         "radiance": {"neural": _SIZES},

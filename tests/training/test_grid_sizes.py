@@ -76,6 +76,7 @@ def test_sizes_follow_the_data_set_and_settings_come_first(cornell):
     assert albedo == (sized(FitConfig().materials["albedo"]["neural"], seen).grid.levels, 15)
     assert 3 <= albedo[0] <= 5 and radiance[0] == albedo[0] - 1 and roughness == (2, 15)
     assert with_grid_sizes(config, dataset) is config
+    assert config.regularization.albedo_radius == seen.footprint / seen.extent
     assert from_toml(to_toml(config)) == config
     # What is no unknown stays open.
     assert config.materials["metallic"] == FitConfig().materials["metallic"]

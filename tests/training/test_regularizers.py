@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 from support import TINY_FIT, built_in_cameras, grey_photographs, pixel_rays, seeded
 
-from unbake.config import LightingConfig, RegularizationConfig
+from unbake.config import LightingConfig, RegularizationConfig, preset
 from unbake.training.problem import make_problem
 from unbake.training.regularizers import is_anchored, regularization_terms
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
 from unbake.transport.regularizers import (
+    albedo_smoothness,
     albedo_ties_roughness,
     mean_albedo_deviation,
     roughness_smoothness,
 )
 
 SPP = TINY_FIT.spp
+#: The photometric loss of a batch.
+PHOTOMETRIC = 0.1
+SMOOTH = RegularizationConfig()
+NONE = {"albedo_smoothness": 0.0}
 
 
 def floats(values):
@@ -57,7 +62,21 @@ def test_smoothness_is_the_mean_difference_of_the_lanes_that_count():
     assert not np.array(dr.grad(here["albedo"])).any()
 
 
-@pytest.mark.parametrize("term", [roughness_smoothness, "ties", "mean"])
+def test_smoothness_of_albedo_is_the_mean_over_channels_and_lanes_that_count():
+    here, near = (
+        {"albedo": mi.Color3f(*map(floats, channels))}
+        for channels in (([0.1, 0.5], [0.2, 0.5], [0.3, 0.5]), ([0.4, 0], [0.2, 0], [0.0, 0]))
+    )
+    dr.enable_grad(here, near)
+    value = albedo_smoothness(here, near, mi.Bool([True, False]))
+    assert value[0] == pytest.approx((0.3 + 0 + 0.3) / 3)
+    dr.backward(value)
+    np.testing.assert_allclose(
+        dr.grad(near["albedo"]), [[1 / 3, 0], [0, 0], [-1 / 3, 0]], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("term", [albedo_smoothness, roughness_smoothness, "ties", "mean"])
 def test_no_lane_that_counts_is_no_division_by_zero(term):
     here, none = material([0.1, 0.9], [0.2, 0.5]), mi.Bool([False, False])
     if term == "ties":
@@ -123,7 +142,7 @@ def cornell_problem(built_in):
     return make_problem(built_in("cornell"), "visible", TINY_FIT, 0.2)
 
 
-def terms_of(problem, config, cameras):
+def terms_of(problem, config, cameras, photometric=PHOTOMETRIC):
     """The terms, and for each the parameters that its gradient reaches."""
     names, values = zip(*problem.parameters().items(), strict=True)
     found = {}
@@ -131,8 +150,9 @@ def terms_of(problem, config, cameras):
     dr.enable_grad(*values)
     problem.assign(dict(zip(names, values, strict=True)))
     scene = problem.scene_view.scene
-    for term in regularization_terms(problem, config, scene, rays, seeded(2, dr.width(rays))):
-        terms = regularization_terms(problem, config, scene, rays, seeded(2, dr.width(rays)))
+    lanes, error = dr.width(rays), mi.Float(photometric)
+    for term in regularization_terms(problem, config, scene, rays, seeded(2, lanes), error):
+        terms = regularization_terms(problem, config, scene, rays, seeded(2, lanes), error)
         dr.clear_grad(list(values))
         dr.backward(terms[term])
         reached = {n.partition(".")[0] for n, v in zip(names, values, strict=True)
@@ -142,8 +162,29 @@ def terms_of(problem, config, cameras):
     return found
 
 
-def test_no_regularizer_is_on_by_default(cornell_problem):
-    assert terms_of(cornell_problem, TINY_FIT, built_in_cameras("cornell", 4)) == {}
+def test_the_smoothness_of_albedo_is_on_by_default_and_nothing_in_the_papers_settings(
+    cornell_problem,
+):
+    cameras = built_in_cameras("cornell", 8)
+    found = terms_of(cornell_problem, settings(regularization=RegularizationConfig()), cameras)
+    ((term, (value, reached)),) = found.items()
+    assert term == "albedo_smoothness" and value > 0 and reached == {"albedo"}
+    for name in ("paper", "release"):
+        config = settings(regularization=preset(name).regularization)
+        assert terms_of(cornell_problem, config, cameras) == {}
+
+
+@pytest.mark.parametrize(("error", "counted"), [(0.2, 0.2), (3.0, 1.0), (-0.1, 0.0)])
+def test_albedo_is_as_smooth_as_photographs_are_left_unexplained(cornell_problem, error, counted):
+    rays = pixel_rays(built_in_cameras("cornell", 8), SPP, seed=1)
+    config, scene = settings(regularization=SMOOTH), cornell_problem.scene_view.scene
+
+    def value(error):
+        sampler = seeded(2, dr.width(rays))
+        terms = regularization_terms(cornell_problem, config, scene, rays, sampler, mi.Float(error))
+        return terms["albedo_smoothness"][0]
+
+    assert value(error) == pytest.approx(counted * value(1.0), rel=1e-5) and value(1.0) > 0
 
 
 def test_terms_have_their_weights_and_train_the_roughness_alone(cornell_problem):
@@ -152,7 +193,7 @@ def test_terms_have_their_weights_and_train_the_roughness_alone(cornell_problem)
     single, double = (
         terms_of(
             cornell_problem,
-            settings(regularization=RegularizationConfig(**dict.fromkeys(names, weight))),
+            settings(regularization=RegularizationConfig(**dict.fromkeys(names, weight), **NONE)),
             cameras,
         )
         for weight in (1.0, 2.0)
@@ -222,9 +263,9 @@ def test_known_materials_do_not_count(tmp_path):
     def smoothness(x):
         rays = mi.Ray3f(mi.Point3f(mi.Float(x), 0, 5), mi.Vector3f(0, 0, -1))
         sampler = seeded(2, len(x))
-        return regularization_terms(problem, config, problem.scene_view.scene, rays, sampler)[
-            "roughness_smoothness"
-        ]
+        scene = problem.scene_view.scene
+        terms = regularization_terms(problem, config, scene, rays, sampler, mi.Float(0.1))
+        return terms["roughness_smoothness"]
 
     assert smoothness([0, 0.5])[0] > 0
     assert smoothness([3, 3.5])[0] == 0
@@ -235,14 +276,14 @@ def test_known_materials_do_not_count(tmp_path):
 
 @pytest.mark.parametrize(
     ("method", "term", "weight"),
-    [("ours", "roughness_smoothness", 1.0), ("prb", "albedo_ties_roughness", 10.0)],
+    [("ours", "roughness_smoothness", 1.0), ("prb", "albedo_ties_roughness", 40.0)],
 )
 def test_a_fit_with_a_term_logs_it_and_is_smoother(built_in, method, term, weight):
     rates = {"albedo": 1e-2, "roughness": 1e-2, "radiance": 1e-2}
     cameras = built_in_cameras("cornell", 16, views=2)
 
     def fitted(weight):
-        chosen = RegularizationConfig(radius=0.1, **{term: weight})
+        chosen = RegularizationConfig(**NONE | {"radius": 0.1, term: weight})
         config = settings(method=method, regularization=chosen)
         problem = make_problem(built_in("cornell"), "visible", config, 0.2)
         step = TrainingStep(problem, grey_photographs(cameras), config)

@@ -112,12 +112,18 @@ class LightingConfig:
 
 @dataclass(frozen=True)
 class RegularizationConfig:
-    """Regularizers of materials, for few or noisy photographs; all off by default (ours)."""
+    """Regularizers of materials, for few or noisy photographs (ours).
+
+    Those of roughness are off by default. That of albedo weighs as much as photographs are noisy:
+    next to nothing where they are clean.
+    """
 
     roughness_smoothness: float = 0.0  #: weight of differences between near points
     radius: float = 0.02  #: how near, as a fraction of the scene's (or the bitmap's) edge
     albedo_ties_roughness: float = 0.0  #: weight of roughness differences at similar albedo
     similarity: float = 0.1  #: distance of albedos (linear RGB) that still count as similar
+    albedo_smoothness: float = 3.5  #: weight of albedo differences, times the photometric loss
+    albedo_radius: float = 0.0  #: how near, like `radius`; 0: a pixel of the training views
 
     def __post_init__(self) -> None:
         weight, distance = (0, 1e6), (POSITIVE, 1e3)
@@ -128,6 +134,8 @@ class RegularizationConfig:
                 "albedo_ties_roughness": weight,
                 "radius": distance,
                 "similarity": distance,
+                "albedo_smoothness": weight,
+                "albedo_radius": (0, 1e3),
             },
         )
 

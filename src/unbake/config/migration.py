@@ -34,7 +34,11 @@ _MOVED = {
 }
 _GROUPS = ("grid", "bitmap")
 #: Settings that came later, at their value before: a run of an earlier version goes on as it began.
-_AS_BEFORE = {"held_aside": 0.0, "materials.roughness.neural.pieces.most": 0}
+_AS_BEFORE = {
+    "held_aside": 0.0,
+    "materials.roughness.neural.pieces.most": 0,
+    "regularization.albedo_smoothness": 0.0,
+}
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
 _OF_RUN = {"preset", "unknown", "method", "seed", "steps", "seconds", "pixels", "spp"}
 

@@ -12,7 +12,7 @@ from ..errors import UserError, require_name
 from ..fields.settings import GridConfig, NetworkConfig
 from ..quantities import QUANTITIES
 from ..transport.methods import method_named
-from .fit import FitConfig, LightingConfig, PresetName
+from .fit import FitConfig, LightingConfig, PresetName, RegularizationConfig
 
 
 def _paper() -> FitConfig:
@@ -36,6 +36,7 @@ def _paper() -> FitConfig:
         loss_reference="photograph",
         loss_epsilon=0.01,
         lighting=LightingConfig(resolution=128, learning_rate=5e-4, initial_radiance=1.0),
+        regularization=RegularizationConfig(albedo_smoothness=0.0),
         **_networks(grid),
     )
 

@@ -35,13 +35,17 @@ def with_grid_sizes(config: FitConfig, dataset: Dataset) -> FitConfig:
 
     The finest cells of albedo are about as wide as a pixel of the training views on the surfaces,
     those of other quantities and of L_θ a multiple of that (`GridConfig.footprints`). A table has
-    room for those cells that the seen surface meets. Other presets than `cpu` leave nothing open.
+    room for those cells that the seen surface meets. The albedo's smoothness is that between points
+    a pixel apart, where its radius is open. Other presets than `cpu` leave nothing open.
 
     Raises:
         UserError: the scene cannot be loaded.
     """
     materials = [config.materials[name][config.representation] for name in config.quantities]
-    if not any(map(is_open, [*materials, config.radiance[config.radiance_representation]])):
+    fields = [*materials, config.radiance[config.radiance_representation]]
+    smoothed = config.regularization
+    near = smoothed.albedo_smoothness > 0 and smoothed.albedo_radius == 0
+    if not near and not any(map(is_open, fields)):
         return config
     if dataset not in _SEEN:
         scene = parse(dataset.scene, dataset.root).instantiate()
@@ -57,6 +61,9 @@ def with_grid_sizes(config: FitConfig, dataset: Dataset) -> FitConfig:
             for name, forms in config.materials.items()
         },
         radiance={**config.radiance, of_radiance: sized(config.radiance[of_radiance], seen)},
+        regularization=replace(smoothed, albedo_radius=seen.footprint / seen.extent)
+        if near
+        else smoothed,
     )
 
 

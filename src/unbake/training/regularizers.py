@@ -6,7 +6,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..config import FitConfig
+from ..fields.grid_sizes import USUAL
 from ..transport.regularizers import (
+    albedo_smoothness,
     albedo_ties_roughness,
     mean_albedo_deviation,
     roughness_smoothness,
@@ -14,19 +16,48 @@ from ..transport.regularizers import (
 from ..transport.vertex import find_vertex
 from .problem import Problem
 
+#: The largest photometric loss that differences of albedo are weighed by: that of black pictures.
+_LARGEST_LOSS = 1.0
+
+
+def has_terms(problem: Problem, config: FitConfig) -> bool:
+    """Whether any regularizer has a weight."""
+    r = config.regularization
+    weights = (r.roughness_smoothness, r.albedo_ties_roughness, smooths_albedo(problem, config))
+    return problem.materials is not None and (any(weights) or is_anchored(problem, config))
+
+
+def smooths_albedo(problem: Problem, config: FitConfig) -> bool:
+    """Whether differences of albedo between near points have a weight."""
+    return "albedo" in (problem.materials or ()) and config.regularization.albedo_smoothness > 0
+
 
 def regularization_terms(
-    problem: Problem, config: FitConfig, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler
+    problem: Problem,
+    config: FitConfig,
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    photometric: mi.Float,
 ) -> dict[str, mi.Float]:
     """Weighted terms, at the points of optimized material that camera rays hit.
 
     No term where none has a weight. They are the same for all methods, and cost one more ray a
-    sample.
+    pixel.
+
+    Differences of albedo weigh as much as photographs are left unexplained. What the noise of
+    photographs is cannot be told from a photograph alone, where texture looks like it. A fit can
+    tell: texture is the same in all views and is learned, noise is not. So the weight is a multiple
+    of the photometric loss, whose expectation has no noise of the fit's own samples in it.
+
+    Args:
+        ray: a camera ray for each pixel of the batch.
+        sampler: of as many lanes.
+        photometric: the photometric loss of the batch.
     """
-    materials, r = problem.materials, config.regularization
-    anchored = is_anchored(problem, config)
-    if materials is None or not (r.roughness_smoothness or r.albedo_ties_roughness or anchored):
+    if not has_terms(problem, config):
         return {}
+    materials, r = problem.materials, config.regularization
     scene_view, everywhere = problem.scene_view.with_scene(scene), mi.Bool(True)
     vertex = find_vertex(scene_view, ray, everywhere, sampler, hide_emitters=problem.hide_emitters)
     valid = vertex.valid & scene_view.is_optimized(vertex.si.shape)
@@ -37,10 +68,16 @@ def regularization_terms(
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), r.radius)
         value = roughness_smoothness(here, near, valid)
         terms["roughness_smoothness"] = r.roughness_smoothness * value
+    if smooths_albedo(problem, config):
+        radius = r.albedo_radius or USUAL.footprint
+        near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), radius)
+        unexplained = dr.clip(dr.detach(photometric), 0, _LARGEST_LOSS)
+        value = albedo_smoothness(here, near, valid)
+        terms["albedo_smoothness"] = r.albedo_smoothness * unexplained * value
     if r.albedo_ties_roughness:
-        value = albedo_ties_roughness(here, valid, r.similarity, shift=config.spp)
+        value = albedo_ties_roughness(here, valid, r.similarity, shift=1)
         terms["albedo_ties_roughness"] = r.albedo_ties_roughness * value
-    if anchored:
+    if is_anchored(problem, config):
         value = mean_albedo_deviation(here, valid, config.lighting.mean_albedo)
         terms["mean_albedo"] = config.lighting.anchor * value
     return terms

@@ -22,12 +22,13 @@ from ..errors import UserError
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..transport.loss import RelativeL2, pixel_means
+from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
 from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
 from .problem import Problem
-from .regularizers import regularization_terms
+from .regularizers import has_terms, regularization_terms
 from .state import State
 
 #: Camera samples, at most, of the batch that a path sampler plans with.
@@ -45,6 +46,7 @@ class Inputs:
     pixels: PixelBatch
     sampler: mi.Sampler  # of all camera samples
     second: mi.Sampler  # of those that L_θ learns from, if these are fewer
+    single: mi.Sampler  # of one camera sample a pixel, for regularizers
     seed: mi.UInt32
 
 
@@ -82,6 +84,7 @@ class TrainingStep:
         self._path_sampler = make_sampler(_context(problem, config))
         self._sampler = mi.load_dict({"type": "independent"})
         self._second = mi.load_dict({"type": "independent"})
+        self._single = mi.load_dict({"type": "independent"})
         recordable = self._path_sampler.can_be_recorded and all(
             field.recordable for field in problem.fields()
         )
@@ -246,6 +249,7 @@ class TrainingStep:
             pixels=pixels,
             sampler=self._probed,
             second=self._second,
+            single=self._single,
             seed=dr.opaque(mi.UInt32, seed),
         )
         probe = self._probe if self._frozen_probe is None else self._frozen_probe
@@ -311,6 +315,7 @@ class TrainingStep:
             pixels=self._drawn(int(seeds[0]), probe),
             sampler=self._sampler,
             second=self._second,
+            single=self._single,
             seed=dr.opaque(mi.UInt32, int(seeds[1])),
         )
 
@@ -355,10 +360,22 @@ class TrainingStep:
             terms = path_sampler.terms(
                 scene, batch.ray, batch.target, sampler, subset, loss, primal
             )
-            terms |= regularization_terms(self._problem, config, scene, batch.ray, sampler)
+            terms |= self._regularization(inputs, batch.ray, terms[PHOTOMETRIC])
             total = sum(terms.values())
             dr.backward(total if state.scale is None else total * state.scale)
         return terms
+
+    def _regularization(
+        self, inputs: Inputs, ray: mi.Ray3f, photometric: mi.Float
+    ) -> dict[str, mi.Float]:
+        """The regularizers, at the first camera sample of each pixel."""
+        problem, config = self._problem, self._config
+        if not has_terms(problem, config):
+            return {}
+        chosen = _first_samples(inputs.pixels.count, config.spp, 1)
+        inputs.single.seed(inputs.seed + 2, inputs.pixels.count)
+        ray = dr.gather(mi.Ray3f, ray, chosen)
+        return regularization_terms(problem, config, inputs.scene, ray, inputs.single, photometric)
 
 
 def _context(problem: Problem, config: FitConfig) -> SamplerContext:
@@ -381,13 +398,17 @@ def _subset(config: FitConfig, inputs: Inputs) -> SampleSubset | None:
     each = config.radiance_samples
     if each == config.spp:
         return None
-    lanes = inputs.pixels.count * each
-    inputs.second.seed(inputs.seed + 1, lanes)
-    lane = dr.arange(mi.UInt32, lanes)
-    chosen = lane // each * config.spp + lane % each
+    inputs.second.seed(inputs.seed + 1, inputs.pixels.count * each)
+    return SampleSubset(_first_samples(inputs.pixels.count, config.spp, each), inputs.second)
+
+
+def _first_samples(pixels: int, spp: int, each: int) -> mi.UInt32:
+    """The lanes of the first `each` of `spp` camera samples of pixels."""
+    lane = dr.arange(mi.UInt32, pixels * each)
+    chosen = lane // each * spp + lane % each
     # Evaluated, because a replayed kernel takes its size from arrays in memory that it reads.
     dr.eval(chosen)
-    return SampleSubset(chosen, inputs.second)
+    return chosen
 
 
 @contextmanager

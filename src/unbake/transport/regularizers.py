@@ -1,4 +1,4 @@
-"""Regularizers of materials. They are not in the paper, and off by default."""
+"""Regularizers of materials. They are not in the paper."""
 
 from __future__ import annotations
 
@@ -17,6 +17,12 @@ def roughness_smoothness(here: Material, near: Material, valid: mi.Bool) -> mi.F
     return _mean(dr.select(valid, difference, 0), valid)
 
 
+def albedo_smoothness(here: Material, near: Material, valid: mi.Bool) -> mi.Float:
+    """Mean absolute difference of the albedo of points and of others near them, over channels."""
+    difference = dr.mean(dr.abs(here["albedo"] - near["albedo"]))
+    return _mean(dr.select(valid, difference, 0), valid)
+
+
 def albedo_ties_roughness(
     here: Material, valid: mi.Bool, similarity: float, shift: int
 ) -> mi.Float:
@@ -26,7 +32,7 @@ def albedo_ties_roughness(
 
     Args:
         similarity: σ, distance of linear RGB albedos.
-        shift: lanes between the two of a pair; as many as a pixel has samples, or more.
+        shift: lanes between the two of a pair.
     """
     lane = dr.arange(mi.UInt32, dr.width(valid))
     other = dr.select(lane + shift < dr.width(valid), lane + shift, lane + shift - dr.width(valid))
