@@ -73,7 +73,10 @@ class Pieces:
         wanted, _ = _keys(_corners(shape))
         if not len(self._keys):
             return np.broadcast_to(self._unknown, (len(wanted), 3)).copy()
-        at = np.minimum(np.searchsorted(self._keys, wanted), len(self._keys) - 1)
+        order = np.argsort(wanted)  # in order, places are near to each other in memory
+        at = np.empty(len(wanted), np.int64)
+        at[order] = np.searchsorted(self._keys, wanted[order])
+        at = np.minimum(at, len(self._keys) - 1)
         known = self._keys[at] == wanted
         return np.where(known[:, None], self._rows[at], self._unknown)
 
@@ -119,10 +122,10 @@ def _corners(mesh: mi.Mesh) -> np.ndarray:
     return positions[np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)] + np.float32(0)
 
 
-def _mixed(columns: np.ndarray) -> np.ndarray:
-    """A number of 64 bits for each row of integers (n, k), by all of its bits."""
-    keys = np.zeros(len(columns), np.uint64)
-    for column in columns.T:
+def _mixed(*columns: np.ndarray) -> np.ndarray:
+    """A number of 64 bits for each row of columns of integers (n,), by all of its bits."""
+    keys = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
         keys = (keys ^ column) * np.uint64(0x9E3779B97F4A7C15)
         keys ^= keys >> np.uint64(29)
     return keys
@@ -131,8 +134,8 @@ def _mixed(columns: np.ndarray) -> np.ndarray:
 def _keys(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keys of triangles (m, 3, 3) and of their corners (m, 3), by where they are."""
     bits = np.ascontiguousarray(corners).reshape(-1, 3).view(np.uint32)
-    of_corners = _mixed(bits).reshape(-1, 3)
-    return _mixed(np.sort(of_corners, axis=1)), of_corners
+    of_corners = _mixed(*bits.T).reshape(-1, 3)
+    return _mixed(*np.sort(of_corners, axis=1).T), of_corners
 
 
 def _pieces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,32 +143,58 @@ def _pieces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns:
         Sorted keys of triangles, the piece of each, and the areas of the pieces. Everything is
-        computed in the order of keys, which does not depend on how the triangles are stored.
+        numbered in the order of keys, which does not depend on how the triangles are stored.
     """
     keys, of_corners = _keys(corners)
-    keys, first = np.unique(keys, return_index=True)
-    corners, of_corners = corners[first], of_corners[first]
-    order = np.argsort(of_corners, axis=1)
-    a, b, c = np.moveaxis(np.take_along_axis(corners, order[..., None], 1).astype(float), 1, 0)
-    normals = np.cross(b - a, c - a)
+    order = np.argsort(keys)
+    keys = keys[order]
+    new = np.ones(len(keys), bool)
+    new[1:] = keys[1:] != keys[:-1]
+    keys, first = keys[new], order[new]
+    if len(keys) < len(corners):  # some are there twice
+        kept = np.sort(first)
+        corners, of_corners = corners[kept], of_corners[kept]
+        first = np.searchsorted(kept, first)
+    rank = np.empty(len(keys), np.int64)
+    rank[first] = np.arange(len(keys))
+    # From here on triangles are as they are stored: neighbours are near to each other in memory.
+    within = np.argsort(of_corners, axis=1) + 3 * np.arange(len(keys))[:, None]
+    a, b, c = (corners.reshape(-1, 3).take(corner, 0).astype(float).T for corner in within.T)
+    x, y = b - a, c - a
+    normals = np.stack(
+        [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]], -1
+    )
     double = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(double, 1e-300)[:, None]
-    # Meshes have several vertices at a place where normals or texture coordinates differ.
-    _, places = np.unique(np.take_along_axis(of_corners, order, 1), return_inverse=True)
-    one, other = _neighbours(places.reshape(-1, 3))
+    # By places, not by vertices: those differ where normals or texture coordinates do.
+    one, other = _neighbours([of_corners.ravel().take(corner) for corner in within.T], rank)
     # Neighbouring triangles may be turned to opposite sides.
-    smooth = np.abs((normals[one] * normals[other]).sum(1)) > np.cos(np.radians(CREASE))
-    label = connected(len(keys), one[smooth], other[smooth])
-    return keys, label, np.bincount(label, double / 2)
+    cosine = np.abs((normals.take(one, 0) * normals.take(other, 0)).sum(1))
+    smooth = cosine > np.cos(np.radians(CREASE))
+    label = connected(len(keys), rank[one[smooth]], rank[other[smooth]])
+    return keys, label, np.bincount(label, double[first] / 2)
 
 
-def _neighbours(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of triangles, of sorted corners (n, 3), that share an edge."""
-    edges = triangles[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2)
-    edge = edges[:, 0] * (int(edges.max(initial=0)) + 1) + edges[:, 1]
-    order = np.argsort(edge, kind="stable")
-    same = edge[order][1:] == edge[order][:-1]
-    return order[:-1][same] // 3, order[1:][same] // 3
+def _neighbours(corners: list[np.ndarray], rank: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of triangles that share an edge.
+
+    Args:
+        corners: the sorted keys of the three corners, (n,) each.
+        rank: of each triangle, (n,). Where more than two share an edge, those are pairs that follow
+            each other by it.
+    """
+    a, b, c = corners
+    edge = np.concatenate([_mixed(a, b), _mixed(b, c), _mixed(a, c)])
+    order = np.argsort(edge)
+    edge = edge[order]
+    same = edge[1:] == edge[:-1]
+    triangle = order % max(len(a), 1)
+    crowded = np.zeros(len(edge), bool)
+    for shift in range(3) if len(edge) > 2 else ():
+        crowded[shift : len(edge) - 2 + shift] |= same[1:] & same[:-1]
+    several = triangle[crowded]
+    triangle[crowded] = several[np.lexsort((rank[several], edge[crowded]))]
+    return triangle[:-1][same], triangle[1:][same]
 
 
 def connected(count: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -173,13 +202,16 @@ def connected(count: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
     Components are numbered from 0, in the order of their first nodes.
     """
-    label = np.arange(count)
-    while True:
-        a, b = label[one], label[other]
-        apart = a != b
-        if not apart.any():
-            return np.unique(label, return_inverse=True)[1]
-        low, high = np.minimum(a, b)[apart], np.maximum(a, b)[apart]
-        np.minimum.at(label, high, low)
-        while (label != label[label]).any():
-            label = label[label]
+    kind = np.int32 if count < 1 << 31 else np.int64
+    label = np.arange(count, dtype=kind)
+    one, other = one.astype(kind), other.astype(kind)
+    while len(one):
+        a, b = label.take(one), label.take(other)
+        apart = np.flatnonzero(a != b)  # edges within what is connected already are done with
+        a, b = a.take(apart), b.take(apart)
+        one, other = np.minimum(a, b), np.maximum(a, b)
+        np.minimum.at(label, other, one)
+        while ((further := label.take(label)) != label).any():
+            label = further
+    first = label == np.arange(count, dtype=kind)
+    return (np.cumsum(first) - 1)[label]
