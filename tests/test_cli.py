@@ -57,6 +57,7 @@ def test_from_a_scene_to_a_page(walked, tmp_path):
     assert "next: unbake fit data --out RUN" in walked["capture"].out
     assert "next: unbake evaluate run" in walked["fit"].out
     assert "next: unbake report run --out report.html" in walked["evaluate"].out
+    assert re.search(r"render_ssim 0\.\d{3}, render_flip 0\.\d{3}, albedo", walked["evaluate"].out)
     assert not list(tmp_path.rglob("*.partial")) and not list(tmp_path.rglob("*.tmp"))
     check_data(tmp_path / "data")
     check_run(tmp_path / "run")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -243,9 +243,17 @@ class Run:
             tell=tell,
         )
 
-    def report(self, out: str | Path) -> Path:
+    def report(
+        self,
+        out: str | Path,
+        *,
+        exported: Sequence[str | Path] = (),
+        relit: Sequence[str | Path] = (),
+    ) -> Path:
         """Write the page of an evaluated run; see `unbake.write_report`."""
-        return write_report([self.path], out, allow_outside=self._allow_outside)
+        return write_report(
+            [self.path], out, exported=exported, relit=relit, allow_outside=self._allow_outside
+        )
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"

@@ -137,6 +137,7 @@ def test_true_materials_relit_are_a_capture_under_that_light(options, folder, tm
     assert [frame["name"] for frame in made["frames"]] == ["train_000", "heldout_000", "train_001"]
     assert all(frame["render_psnr"] > 38 for frame in made["frames"])
     assert made["mean"]["views"] == 3 and made["mean"]["render_psnr"] > 38
+    assert made["mean"]["render_ssim"] > 0.9 and made["mean"]["render_flip"] < 0.1
     assert any("turned off 3 lights" in line for line in lines) is not light.keep_lights
     before, after = (Dataset.load(folder / d).train[0].image for d in ("data", truth))
     assert np.abs(read_exr(before) - read_exr(after))[..., :3].mean() > 0.02
@@ -151,7 +152,7 @@ def test_another_light_than_that_of_the_truth_scores_less(folder, tmp_path):
     made = relight(
         folder / "run", tmp_path / "out", light, settings, truth=folder / "data", tell=lines.append
     )
-    assert made["mean"]["render_psnr"] < 25
+    assert made["mean"]["render_psnr"] < 25 and made["mean"]["render_flip"] > 0.1
     assert any("--envmap-up +z turns it" in line for line in lines)
 
 

@@ -491,6 +491,143 @@ def test_a_ceiling_has_its_row_and_the_distance_to_it(made, tmp_path: Path):
         write_report(made[1], tmp_path / "wrong.html")
 
 
+def _liken(run: Path, ssim: float, flip: float) -> None:
+    """Give an evaluation SSIM and FLIP."""
+    found = {"render_ssim": ssim, "render_flip": flip}
+
+    def change(metrics: dict) -> None:
+        metrics["display_exposure"] = -0.5
+        metrics["definitions"].update(render_ssim="windows", render_flip="flipping")
+        for row in (*metrics["per_view"], metrics["heldout"], metrics["train"]):
+            row.update(found)
+
+    _edit(run, change)
+
+
+def test_ssim_and_flip_stand_beside_psnr(made, tmp_path: Path):
+    without = write_report(made[1], tmp_path / "old.html").read_text()
+    assert "SSIM" not in _words(without) and "FLIP" not in _words(without)
+    _liken(made[1][0], 0.9514, 0.1)
+    text = write_report(made[1], tmp_path / "one.html").read_text()
+    numbers = _section(text, "numbers")
+    assert "(FLIP: lower)" in numbers and "windows" in numbers and "-0.5 stops" in numbers
+    _liken(made[1][1], 0.5, 0.2)
+    text = write_report(made[1], tmp_path / "both.html").read_text()
+    table = _section(text, "numbers").split('<table class="light">')[1]
+    best = [("n best first", "0.951"), ("n best", "0.100")]
+    assert _cells(table) == [best * 2, [("n first", "0.500"), ("n", "0.200")] * 2]
+    views = HELDOUT + 4
+    assert text.count("<small>SSIM 0.951, FLIP 0.100</small>") == views
+
+
+def _relit(folder: Path, run: Path, truth: Path | None = None, name: str = "sky.exr") -> Path:
+    """Pictures of a run, as `unbake relight` leaves them."""
+    frames = [{"name": f"train_{i:03d}", "render_psnr": 30.0 + i} for i in range(TRAINING)]
+    for number, frame in enumerate(frames):
+        _save(folder / f"{frame['name']}.exr", 0.9 * _truth(number)["render"])
+    found = {
+        "format": 1, "run": {"folder": str(run.resolve())}, "settings": {"exposure": 1.0},
+        "light": {"envmap": f"lights/{name}", "lights": None}, "frames": frames,
+        "truth": None if truth is None else str(truth),
+        "mean": {"views": TRAINING, "render_psnr": 32.5, "render_ssim": 0.9, "render_flip": 0.05},
+    }  # fmt: skip
+    (folder / "render.json").write_text(json.dumps(found))
+    return folder
+
+
+def test_pictures_under_another_light_are_strips(made, tmp_path: Path):
+    data, runs = made
+    text = write_report(runs, tmp_path / "without.html").read_text()
+    assert "New pictures" not in text and 'class="strip"' not in text
+    folders = [_relit(tmp_path / run.name, run, data) for run in runs]
+    folders.append(_relit(tmp_path / "evening", runs[1], name=EVIL))
+    page = write_report(runs, tmp_path / "report.html", relit=folders).read_text()
+    section = _section(page, "relit")
+    assert 'href="#relit"' in page and section.count('class="strip"') == 2
+    assert "<h3>Environment map: sky.exr</h3>" in section and EVIL not in section
+    sky = section.split("sky.exr</h3>")[1].split("</div>")[0]
+    names = _Page(sky).images()
+    assert len(names) == 6 + 2 * 6 and names[0] == "Relit, ground truth, view train_000"
+    assert names[7] == "Relit, ours, 31.00 dB, view train_001"
+    mean = "32.50 dB, mean of 6 views; SSIM 0.900, FLIP 0.050"
+    assert sky.count(mean) == 2 and "At +1.0 stops" in section
+    truth = pictures.png_data_uri(pictures.tonemap(_truth(0)["render"].astype(np.float32), 1.0))
+    assert truth in sky
+    other = section.replace(sky, "")
+    assert len(_Page(other).images()) == 6 and "ground truth, view" not in other
+
+
+def _exported(folder: Path, run: Path, count: int = 2, formats: tuple[str, ...] = ("textures",)):
+    """An export of a run with this many materials; the last one is the largest."""
+    sheet = np.stack([np.mgrid[0:8, 0:8][1] / 7] * 3, -1)
+    rows = []
+    for number in range(count):
+        names = [f"stone{number}_albedo.exr", f"stone{number}_unobserved.png"]
+        _save(folder / "textures" / names[0], sheet)
+        pictures.write_png(folder / "textures" / names[1], np.eye(8, dtype=np.uint8) * 255)
+        rows.append({
+            "name": f"stone{number}{EVIL}", "textures": names, "resolution": 512,
+            "unobserved_share": 0.125, "area": number,
+        })  # fmt: skip
+    found = {
+        "format": 1, "run": {"folder": str(run.resolve())}, "formats": formats, "materials": rows,
+        "texels_per_unit": 64.0, "unobserved_share": 0.25,
+    }  # fmt: skip
+    (folder / "export.json").write_text(json.dumps(found))
+    return folder
+
+
+def test_exported_textures_are_sheets(made, tmp_path: Path):
+    folder = _exported(tmp_path / "exported", made[1][1], count=13)
+    page = write_report(made[1], tmp_path / "report.html", exported=[folder]).read_text()
+    section = _section(page, "textures")
+    assert 'href="#textures"' in page and EVIL not in section
+    assert "direct: 64 texels along a scene unit, 25.0 % of the surface unobserved" in section
+    assert section.count("512 × 512 texels, 12.5 % unobserved") == 12
+    assert "1 smaller materials are not shown" in section and "stone0" not in section
+    assert section.index("stone12") < section.index("stone1&lt;")
+    shown = re.findall(r'src="(.*?)"', section)
+    assert len(shown) == 24
+    sheet = np.stack([np.mgrid[0:8, 0:8][1] / 7] * 3, -1)
+    assert shown[0] == pictures.png_data_uri(pictures.tonemap(sheet))
+    assert shown[1] == pictures.png_data_uri(np.eye(8, dtype=np.uint8) * 255)
+
+
+def test_folders_of_runs_that_were_moved_are_known_by_name(made, tmp_path: Path):
+    folder = _relit(tmp_path / "relit", tmp_path / "elsewhere" / "ours")
+    text = write_report(made[1], tmp_path / "report.html", relit=[folder]).read_text()
+    assert "Relit, ours" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda folder: (folder / "render.json").unlink(), r"render\.json.*unbake relight"),
+        (lambda folder: _edit_json(folder / "render.json", run={}), r"render\.json: names no run"),
+        (
+            lambda folder: _edit_json(folder / "render.json", run={"folder": str(folder)}),
+            "made of another run",
+        ),
+        (lambda folder: _edit_json(folder / "render.json", frames=3), r"render\.json: cannot be"),
+        (
+            lambda folder: _edit_json(folder / "render.json", frames=[{"name": "../x"}]),
+            r"render\.json: cannot be read",
+        ),
+        (lambda folder: (folder / "train_000.exr").unlink(), r"train_000\.exr.*does not exist"),
+        (lambda folder: (folder / "export.json").unlink(), r"export\.json.*--format textures"),
+        (lambda folder: _edit_json(folder / "export.json", formats=["gltf"]), "holds no textures"),
+        (lambda folder: _edit_json(folder / "export.json", materials=[1]), "cannot be read"),
+        (lambda folder: _edit_json(folder / "export.json", format=99), "newer unbake"),
+    ],
+)
+def test_folders_that_cannot_be_shown_are_named(made, tmp_path: Path, change, said: str):
+    folder = _exported(_relit(tmp_path / "made", made[1][0]), made[1][0])
+    change(folder)
+    with pytest.raises(UserError, match=said):
+        write_report(made[1], tmp_path / "report.html", exported=[folder], relit=[folder])
+    assert not list(tmp_path.glob("*.html*"))
+
+
 def test_what_failed_is_told_and_cannot_inject_markup(made, tmp_path: Path):
     page = tmp_path / "report.html"
     text = write_report(made[1], page, {"ad-pt": f"out of memory {EVIL}"}).read_text()
@@ -543,9 +680,12 @@ def _edit(run: Path, change: Callable[[dict], object]) -> None:
     path.write_text(json.dumps(metrics))
 
 
+def _edit_json(file: Path, **changes: object) -> None:
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
 def _edit_data(data: Path, **changes: object) -> None:
-    path = data / "transforms.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    _edit_json(data / "transforms.json", **changes)
 
 
 def _remove(path: str) -> Callable[[Path, list[Path]], None]:

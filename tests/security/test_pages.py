@@ -7,8 +7,10 @@ import subprocess
 from functools import cache
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
+from unbake.imaging import pictures
 from unbake.report.page import write_report
 
 #: Each would change the title of a page in which it counts as markup; none has a slash, which no
@@ -68,9 +70,28 @@ def page(repository, tmp_path_factory):
             log.append(log[-1] | {"validation": {"split": text, "albedo_psnr": 20.0}})
             (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log))
             runs.append(run)
-        return write_report(runs, tmp_path / "page.html", failed={text: text})
+        sheets, relit = exported(tmp_path / "exported", runs[0], text), tmp_path / "relit"
+        shutil.copytree(sheets / "textures", relit)
+        frame = {"name": f"a{name}", "render_psnr": 1.0}
+        made = {"frames": [frame], "light": {"envmap": name}, "settings": {"exposure": 0}}
+        made["run"] = {"folder": str(runs[0].resolve())}
+        made["mean"] = {"views": text, "render_psnr": 1}
+        (relit / "a_albedo.exr").rename(relit / f"a{name}.exr")
+        (relit / "render.json").write_text(json.dumps(made))
+        shown = {"exported": [sheets], "relit": [relit]}
+        return write_report(runs, tmp_path / "page.html", failed={text: text}, **shown)
 
     return write
+
+
+def exported(folder, run, name):
+    """An export with one texture, of a material of this name."""
+    pictures.write_exr(folder / "textures" / "a_albedo.exr", np.ones((4, 4, 3), np.float32))
+    row = {"name": name, "textures": ["a_albedo.exr"], "resolution": 4}
+    row |= {"unobserved_share": 0.5, "area": 1.0}
+    made = {"formats": ["textures"], "materials": [row], "run": {"folder": str(run.resolve())}}
+    (folder / "export.json").write_text(json.dumps(made))
+    return folder
 
 
 class Markup(HTMLParser):

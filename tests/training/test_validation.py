@@ -169,6 +169,10 @@ def test_known_materials_are_not_evaluated(scored, tmp_path, monkeypatch):
     heldout = metrics["heldout"]
     assert heldout["albedo_psnr"] is heldout["roughness_psnr"] is None
     assert np.isfinite(heldout["render_psnr"])
+    (row,) = (row for row in metrics["per_view"] if row["split"] == "heldout")
+    for key in ("render_ssim", "render_flip"):
+        assert 0 < heldout[key] == row[key] < 1
+    assert 2 * metrics["display_exposure"] % 1 == 0
     written = {p.name for p in (run / "evaluation" / "heldout").iterdir()}
     assert written == {"heldout_000_render.exr", "heldout_000_render.png"}
 

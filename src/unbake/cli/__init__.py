@@ -268,7 +268,7 @@ def evaluate(
         values = {k: v for k, v in metrics[split].items() if k != "views"}
         if not metrics["quantities"]:  # of known materials there are no scores
             values = {k: v for k, v in values.items() if v is not None}
-        shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in values.items())
+        shown = _scores(values)
         _say(f"{split} ({metrics[split]['views']} views): {shown}")
         if split == "heldout":
             for line in told:
@@ -281,12 +281,21 @@ def evaluate(
     _say(f"{wrote}; next: unbake report {_word(run)} --out report.html")
 
 
-def report(runs: Positional[Runs], /, out: Out, allow_outside: Flag = False) -> None:
+def report(
+    runs: Positional[Runs],
+    /,
+    out: Out,
+    exported: Folders = (),
+    relit: Folders = (),
+    allow_outside: Flag = False,
+) -> None:
     """Write one HTML page that shows evaluated runs of a data set side by side.
 
     Args:
         runs: Folders of runs, each after `unbake evaluate`.
         out: The page to write, such as report.html. It needs no other file.
+        exported: Folders of `unbake export`, with textures: the page shows their sheets.
+        relit: Folders of `unbake relight` or `unbake render`: the page shows their pictures.
         allow_outside: Read files that the data set names outside of its folder.
     """
     if not runs:
@@ -294,7 +303,8 @@ def report(runs: Positional[Runs], /, out: Out, allow_outside: Flag = False) -> 
     backend.activate()
     from ..report.page import write_report
 
-    _say(f"wrote {write_report(runs, out, allow_outside=allow_outside)}")
+    shown: dict[str, Any] = {"exported": exported, "relit": relit}
+    _say(f"wrote {write_report(runs, out, **shown, allow_outside=allow_outside)}")
 
 
 def export(
@@ -412,9 +422,17 @@ def relight(
     made = go(run, out, chosen, settings, **places, allow_outside=allow_outside, tell=_say)
     if made["mean"] is not None:
         scores = {k: v for k, v in made["mean"].items() if k != "views"}
-        shown = ", ".join(f"{k} {'—' if v is None else f'{v:.2f} dB'}" for k, v in scores.items())
+        shown = _scores(scores)
         _say(f"mean over {made['mean']['views']} views: {shown}")
     _say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
+
+
+def _scores(values: Mapping[str, float | None]) -> str:
+    """Scores by their keys in a line; all but SSIM and FLIP are in dB."""
+    plain = ("render_ssim", "render_flip")
+    told = {k: None if v is None else f"{v:.3f}" if k in plain else f"{v:.2f} dB"
+            for k, v in values.items()}  # fmt: skip
+    return ", ".join(f"{key} {value or '—'}" for key, value in told.items())
 
 
 def _render_settings(

@@ -26,8 +26,8 @@ from ..training.run_lock import RunLock
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
-from . import lighting, yardsticks
-from .renderings import METRICS, counted_pixels, render_camera, render_psnr
+from . import lighting, renderings, yardsticks
+from .renderings import METRICS, counted_pixels, exposure_of, render_camera, render_scores
 from .settings import EvaluationSettings
 from .yardsticks import find_yardsticks, seen_materials
 
@@ -101,10 +101,12 @@ def _evaluate(
     views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
     # First, as the true lighting may be damaged, and views take long
     recovered_lighting = _evaluate_lighting(recovered, folder, tell)
+    clip = settings.clip_negative or recovered.clip_negative
+    exposure = exposure_of(read_view(view.image, view, clip) for view in views)
     rows, materials = [], []
     for view in views:
         lock.require_held()
-        row, seen, truth = _evaluate_view(recovered, view, folder, settings, true_scene)
+        row, seen, truth = _evaluate_view(recovered, view, folder, settings, true_scene, exposure)
         rows.append(row)
         materials.append((seen, truth))
         told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
@@ -128,8 +130,10 @@ def _evaluate(
         "train": _summary(rows, "train"),
         **measures,
         **recovered_lighting,
+        "display_exposure": exposure,
         "per_view": rows,
         "definitions": DEFINITIONS
+        | renderings.DEFINITIONS
         | (yardsticks.DEFINITIONS if measures else {})
         | (lighting.DEFINITIONS if recovered_lighting else {}),
         "data": origin.data,
@@ -191,6 +195,7 @@ def _evaluate_view(
     folder: RunFolder,
     settings: EvaluationSettings,
     true_scene: SceneView | None,
+    exposure: float,
 ) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
     problem = recovered.problem
     radiance = render_camera(problem.scene_view, view.camera, settings, problem.hide_emitters)
@@ -214,10 +219,11 @@ def _evaluate_view(
     limits = () if true_scene is None else ("true_render_psnr",)
     row = {"name": view.name, "split": view.split} | dict.fromkeys((*keys, *limits))
     if mask.any():
-        row |= render_psnr(radiance, photograph[..., :3], mask)
+        row |= render_scores(radiance, photograph[..., :3], mask, exposure)
         if true_scene is not None:
             limit = render_camera(true_scene, view.camera, settings, problem.hide_emitters)
-            row["true_render_psnr"] = render_psnr(limit, photograph[..., :3], mask)["render_psnr"]
+            found = render_scores(limit, photograph[..., :3], mask, exposure)
+            row["true_render_psnr"] = found["render_psnr"]
     if seen is not None and truth is not None:
         row |= seen.psnr(truth)
     return row, seen, truth

@@ -31,15 +31,14 @@ from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..training.validation import GroundTruth, read_view
 from ..version import VERSION
+from . import renderings
 from .evaluate import DEFINITIONS, description
-from .renderings import METRICS, counted_pixels, render_camera, render_psnr
-from .settings import MOST_PICTURES, RenderSettings
+from .renderings import METRICS, counted_pixels, render_camera, render_scores
+from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
 from .turntable import turntable as make_turntable
 from .turntable import up_of
 from .yardsticks import seen_materials
 
-#: Of `render.json`.
-RENDER_FORMAT = 1
 #: Memory in bytes that a pixel of a picture takes, its copies included.
 _PIXEL_BYTES = 64
 #: Cosine below which an environment map that stands beside the cameras' upward direction is told.
@@ -219,6 +218,8 @@ def _render(
             "definitions": {
                 key: DEFINITIONS[key] for key in ("psnr", "colour_space", "mask")
             }
+            | renderings.DEFINITIONS
+            | {"display_exposure": "stops, as the settings say"}
             | {"files": "OpenEXR: linear RGB radiance; PNG: the same times 2^exposure as sRGB"},
             "notes": notes,
         }  # fmt: skip
@@ -298,7 +299,7 @@ def _picture(
 def _scores(
     recovered: Recovered, shot: _Shot, radiance: np.ndarray, settings: RenderSettings
 ) -> dict[str, float | None]:
-    """PSNR of a picture against the truth, counted as in an evaluation; empty without truth."""
+    """Scores of a picture against the truth, counted as in an evaluation; empty without truth."""
     if shot.truth is None:
         return {}
     photograph = read_view(shot.truth.image, shot.truth, recovered.clip_negative)
@@ -309,7 +310,7 @@ def _scores(
     mask = counted_pixels(photograph, seen, truth)
     if not mask.any():
         return dict.fromkeys(METRICS)
-    return render_psnr(radiance, photograph[..., :3], mask)
+    return render_scores(radiance, photograph[..., :3], mask, settings.exposure)
 
 
 def _frame(shot: _Shot) -> dict[str, Any]:

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
+from ..imaging import perceptual
 from ..imaging.metrics import psnr
+from ..imaging.pictures import encoded, fitting_exposure, sample
 from ..training.validation import GroundTruth, MaterialBuffers, finite
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
 from .settings import EvaluationSettings, RenderSettings
 
 #: Scores of a rendering; those of materials come after them.
-METRICS = ("render_psnr", "render_psnr_unclamped")
+METRICS = ("render_psnr", "render_psnr_unclamped", "render_ssim", "render_flip")
+#: What they are; `display_exposure` stands beside them.
+DEFINITIONS = {
+    "render_ssim": "structural similarity of rendering and photograph as sRGB, clipped, at "
+    "`display_exposure` stops; 1: equal. Gaussian window of 11 x 11 pixels with sigma 1.5, K1 "
+    "0.01, K2 0.03, mirrored borders; mean over channels and unmasked pixels, then over views",
+    "render_flip": "LDR-FLIP of the same pictures at 67 pixels a degree: how visible the "
+    "difference is, from 0, not at all, to 1; mean over unmasked pixels, then over views",
+    "display_exposure": "stops: the 95th percentile of the photographs' radiance becomes about 0.8",
+}
 
 
 def render_camera(
@@ -56,11 +69,31 @@ def counted_pixels(
     return truth.known if seen is None else seen.mask(truth)
 
 
-def render_psnr(
-    radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray
+def render_scores(
+    radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray, exposure: float
 ) -> dict[str, float | None]:
-    """The scores of `METRICS`, in dB, of a rendering (H, W, 3); `mask` must not be empty."""
-    return {
+    """The scores of `METRICS` of a rendering (H, W, 3); see `DEFINITIONS`.
+
+    Args:
+        radiance: linear RGB.
+        photograph: linear RGB, the same size.
+        mask: (H, W) bool, the pixels that count; one at least. SSIM and FLIP look at those around
+            them, too.
+        exposure: stops, of SSIM and FLIP alone.
+    """
+    found = {
         "render_psnr": finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)),
         "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
     }
+    image, reference = (encoded(x, exposure) for x in (radiance, photograph))
+    return found | {
+        "render_ssim": float(perceptual.ssim(image, reference)[mask].mean()),
+        "render_flip": float(perceptual.flip(image, reference)[mask].mean()),
+    }
+
+
+def exposure_of(photographs: Iterable[np.ndarray]) -> float:
+    """The exposure in stops that suits photographs (H, W, 4), linear RGB and alpha."""
+    return fitting_exposure(
+        [sample(x[..., :3].mean(axis=2)[x[..., 3] >= 0.5]) for x in photographs]
+    )

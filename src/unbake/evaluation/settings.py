@@ -9,6 +9,8 @@ from ..config.fit import DEEPEST
 from ..config.flag import Flag
 from ..errors import require_ranges
 
+#: Of `render.json`.
+RENDER_FORMAT = 1
 #: Samples of a pixel are all in flight at once; see `transport/render.py`.
 MOST_SAMPLES = 1 << 20
 #: Pixels along an edge of a picture, and pictures of a turntable.

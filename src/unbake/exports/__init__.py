@@ -2,6 +2,9 @@
 
 from typing import Literal, get_args
 
+#: Of `export.json`.
+EXPORT_FORMAT = 1
+
 Format = Literal["gltf", "textures", "mitsuba"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_FORMATS: tuple[Format, ...] = ("gltf", "textures")

@@ -26,7 +26,7 @@ from ..training.grid_sizes import surface_seen
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..version import VERSION
-from . import DEFAULT_FORMATS, FORMATS, Format
+from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
 from .bake import Baked, Baker, own_textures
 from .gltf import write_glb
 from .lights import Light, environment_picture, read_lights
@@ -36,8 +36,6 @@ from .parts import Part, Parts, parsed_principled, read_parts
 from .textures import COLOUR_SPACES, file_names, write_textures
 from .unwrap import LARGEST, UNIQUE, make_atlases
 
-#: Of `export.json`.
-EXPORT_FORMAT = 1
 #: The recovered environment, beside `export.json`.
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 #: Texels along the diagonal of a scene that no camera sees.

@@ -31,11 +31,7 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     Source: PSNR as reported in Paper: Sec. 6, Fig. 6.
     """
     image, reference = np.asarray(image), np.asarray(reference)
-    if image.shape != reference.shape or image.ndim not in (2, 3):
-        raise ValueError(
-            f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}: "
-            "both must be (H, W) or (H, W, C) of equal size"
-        )
+    require_alike(image, reference)
     if mask is not None:
         image, reference = _select(image, mask), _select(reference, mask)
     if image.size == 0:
@@ -46,6 +42,19 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
         raise UserError(f"{bad} of {finite.size} compared values are not finite")
     mse = float(np.mean(np.square(image.astype(np.float64) - reference.astype(np.float64))))
     return math.inf if mse == 0 else -10 * math.log10(mse)
+
+
+def require_alike(image: np.ndarray, reference: np.ndarray) -> None:
+    """Check that two arrays are pictures of equal size, (H, W) or (H, W, C).
+
+    Raises:
+        ValueError: they are not.
+    """
+    if image.shape != reference.shape or image.ndim not in (2, 3):
+        raise ValueError(
+            f"a picture of shape {image.shape} cannot be compared with one of {reference.shape}: "
+            "both must be (H, W) or (H, W, C) of equal size"
+        )
 
 
 def mean_psnr(values: Iterable[float | None]) -> float | None:

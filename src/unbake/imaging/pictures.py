@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -50,6 +51,27 @@ def read_exr(path: Path) -> np.ndarray:
     return pixels[..., None] if pixels.ndim == 2 else pixels
 
 
+def read_png(path: Path) -> np.ndarray:
+    """Read a PNG picture of 8 bits.
+
+    Returns:
+        (H, W) or (H, W, C) uint8, as stored.
+
+    Raises:
+        UserError: the file is missing or no such PNG.
+    """
+    path = Path(path)
+    require_file(path, "picture")
+    try:
+        pixels = np.array(mi.Bitmap(str(path), mi.Bitmap.FileFormat.PNG))
+    except (RuntimeError, MemoryError, ValueError) as error:
+        what = "the picture cannot be read as PNG"
+        raise UserError(what, path, "Write it again, or copy it again") from error
+    if pixels.dtype != np.uint8:
+        raise UserError("the picture has more than 8 bits a channel", path, "Write it again")
+    return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
+
+
 def write_exr(path: Path, array: np.ndarray) -> None:
     """Write (H, W) or (H, W, C) linear values as float32 OpenEXR; C is 1, 3 or 4 (RGB + alpha).
 
@@ -93,10 +115,35 @@ def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
 
     Source: IEC 61966-2-1.
     """
+    return to_bytes(encoded(linear, exposure))
+
+
+def encoded(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
+    """Linear RGB to sRGB values in [0, 1], float32, not rounded; else as `tonemap`."""
     value = _unit(np.asarray(linear, dtype=np.float32) * np.float32(2.0**exposure))
-    return to_bytes(
-        np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
-    )
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
+
+
+def fitting_exposure(radiance: Sequence[np.ndarray]) -> float:
+    """The exposure in half stops that maps the 95th percentile of radiance to about 0.8.
+
+    Args:
+        radiance: means of channels; see `sample`.
+    """
+    bright = percentile(radiance, 95)
+    return round(2 * math.log2(0.8 / bright)) / 2 if bright > 0 else 0.0
+
+
+def sample(values: np.ndarray, limit: int = 4096) -> np.ndarray:
+    """About `limit` of the finite values, evenly spaced."""
+    values = values[np.isfinite(values)]
+    return values[:: max(1, len(values) // limit)]
+
+
+def percentile(parts: Sequence[np.ndarray], percent: float) -> float:
+    """A percentile of all values; 0 where there are none."""
+    values = np.concatenate([np.zeros(0), *parts])
+    return float(np.percentile(values, percent)) if len(values) else 0.0
 
 
 def shown(values: np.ndarray, display: Display) -> np.ndarray:

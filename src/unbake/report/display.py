@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from unbake.errors import UserError
 from unbake.imaging import pictures
+from unbake.imaging.pictures import percentile
 from unbake.report.runs import Run
 
 LONGEST_SIDE = 640  # pixels of an embedded picture: keeps a page of 24 views near 50 MB
@@ -34,6 +35,18 @@ def decibels(value: float | None) -> str:
         return DASH
     text = "∞" if math.isinf(value) else f"{abs(value):.2f}"
     return f"−{text}" if value < 0 else text
+
+
+def similar(scores: Mapping[str, Any]) -> str:
+    """SSIM and FLIP in a few words; empty where there are none."""
+    names = {"SSIM": "render_ssim", "FLIP": "render_flip"}
+    found = {name: number(scores.get(key)) for name, key in names.items()}
+    return ", ".join(f"{name} {value:.3f}" for name, value in found.items() if value is not None)
+
+
+def fraction(value: float | None) -> str:
+    """A score in [0, 1] with three digits; a dash for None."""
+    return DASH if value is None else f"{value:.3f}"
 
 
 def percent(value: float | None) -> str:
@@ -109,32 +122,15 @@ def painted(values: np.ndarray, scale: float, mask: np.ndarray) -> str:
     return pictures.png_data_uri(pictures.false_colour(small, scale, inside))
 
 
-def exposure(radiance: list[np.ndarray]) -> float:
-    """The exposure in half stops that maps the 95th percentile of radiance to about 0.8."""
-    bright = _percentile(radiance, 95)
-    return round(2 * math.log2(0.8 / bright)) / 2 if bright > 0 else 0.0
-
-
 def error_scale(errors: list[list[np.ndarray]]) -> float:
     """The upper end of the error scale of all runs.
 
     It is the 97th percentile of the best run, rounded up to 1, 2 or 5 times 10^n: with that of the
     worst run, errors of all others would be black.
     """
-    high = np.array([_percentile(parts, 97) for parts in errors])
+    high = np.array([percentile(parts, 97) for parts in errors])
     high = high[high > 1e-6]  # not of a run without errors
     return _round_up(float(high.min())) if len(high) else 0.01
-
-
-def sample(values: np.ndarray, limit: int = 4096) -> np.ndarray:
-    """About `limit` of the finite values, evenly spaced."""
-    values = values[np.isfinite(values)]
-    return values[:: max(1, len(values) // limit)]
-
-
-def _percentile(parts: list[np.ndarray], percent: float) -> float:
-    values = np.concatenate([np.zeros(0), *parts])
-    return float(np.percentile(values, percent)) if len(values) else 0.0
 
 
 def _round_up(value: float) -> float:

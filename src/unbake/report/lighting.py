@@ -9,6 +9,7 @@ import numpy as np
 
 from unbake.dataset.lighting import true_environment
 from unbake.dataset.views import Dataset
+from unbake.imaging import pictures
 from unbake.report import display
 from unbake.report.runs import Run
 
@@ -50,8 +51,8 @@ def _maps(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
         found.append(map_)
         errors.append(None if truth is None else display.error(map_, truth, path))
     lit = [map_ for map_ in found if map_ is not None] if truth is None else [truth]
-    exposure = display.exposure([display.sample(map_.mean(axis=2)) for map_ in lit])
-    scale = display.error_scale([[display.sample(e)] for e in errors if e is not None])
+    exposure = pictures.fitting_exposure([pictures.sample(map_.mean(axis=2)) for map_ in lit])
+    scale = display.error_scale([[pictures.sample(e)] for e in errors if e is not None])
 
     numbers = _numbers(runs)
     cells = [
@@ -61,6 +62,7 @@ def _maps(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
             "empty": "known, not optimized",
             "number": f"SH error {low['text']} %" if low["text"] != display.DASH else display.DASH,
             "best": low["best"],
+            "more": "",
         }
         for map_, off, low in zip(found, errors, numbers["sh_error"], strict=True)
     ]

@@ -20,7 +20,9 @@ from unbake.io import write_text
 from unbake.quantities import QUANTITIES
 from unbake.report import charts, display
 from unbake.report.lighting import lighting_section
+from unbake.report.relit import relit_sections
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
+from unbake.report.sheets import texture_sections
 from unbake.training.monitor import loss_terms
 from unbake.transport.terms import TERMS
 
@@ -34,6 +36,11 @@ for _name, _row in QUANTITIES.items():
     PSNRS.append((f"{_name}_psnr", _name, _row.title))
     if _name == "albedo":
         PSNRS.append(("albedo_psnr_aligned", _name, "Aligned albedo"))
+#: Scores of renderings beside PSNR: key, heading, and which is best.
+SIMILAR: tuple[tuple[str, str, display.Choice], ...] = (
+    ("render_ssim", "SSIM", max),
+    ("render_flip", "FLIP", min),
+)
 #: What results are measured by, in the order of their rows, and what it is called.
 YARDSTICKS = {
     "ceiling": "Ceiling",
@@ -52,6 +59,8 @@ DEFINED = {
     "yardsticks": "Ceiling, constant, untrained",
     "colour_space": "Colour space",
     "mask": "Mask",
+    "render_ssim": "SSIM",
+    "render_flip": "FLIP",
 }
 LIGHT_DEFINED = {
     "environment": {
@@ -87,6 +96,8 @@ def write_report(
     out: str | Path,
     failed: Mapping[str, str] | None = None,
     *,
+    exported: Sequence[str | Path] = (),
+    relit: Sequence[str | Path] = (),
     allow_outside: bool = False,
 ) -> Path:
     """Write one HTML page that compares evaluated runs with the ground truth and each other.
@@ -100,13 +111,16 @@ def write_report(
         runs: run folders, all evaluated on the same data.
         out: the page's file; it appears complete or not at all.
         failed: further runs that failed: name to reason.
+        exported: folders of `export`, with textures, whose sheets are shown.
+        relit: folders of `relight` or `render`, whose pictures are shown.
         allow_outside: read files of the data set that lie outside of its folder.
 
     Returns:
         `out`.
 
     Raises:
-        UserError: a run was not evaluated, runs differ in data, or a file is gone or malformed.
+        UserError: a run was not evaluated, runs differ in data, a file is gone or malformed, or a
+            folder was made of another run.
     """
     out = Path(out)
     if not runs:
@@ -125,6 +139,8 @@ def write_report(
         for split in SPLITS
     ]
     lighting, materials = lighting_section(loaded, dataset), _materials(loaded)
+    textures = texture_sections([Path(folder) for folder in exported], loaded)
+    strips = relit_sections([Path(folder) for folder in relit], loaded, allow_outside)
     page = (
         _environment()
         .from_string(TEMPLATE.read_text(encoding="utf-8"))
@@ -135,7 +151,10 @@ def write_report(
             psnrs=_psnrs(loaded).values(),
             rows=_table(loaded),
             yardsticks=_yardsticks(loaded),
+            similar=_similar(loaded),
             light=lighting,
+            textures=textures,
+            strips=strips,
             optimized=_optimized(loaded),
             materials=bool(materials),
             known=any(name in view.truth for view in views for name in QUANTITIES),
@@ -187,14 +206,14 @@ def _scales(runs: list[Run], views: list[View]) -> Scales:
         for quantity, path in view.truth.items():
             reference, mask = display.rgb(path)
             if quantity == "render":
-                radiance.append(display.sample(reference.mean(axis=2)[mask]))
+                radiance.append(pictures.sample(reference.mean(axis=2)[mask]))
             for run, parts in zip(runs, errors[quantity], strict=True):
                 recovered = _recovered(run, view, quantity)
                 if recovered is not None:
                     error = display.error(display.rgb(recovered)[0], reference, recovered)
-                    parts.append(display.sample(error[mask]))
+                    parts.append(pictures.sample(error[mask]))
     error_scales = {q: display.error_scale(errors[q]) for q in NAMES}
-    return Scales(display.exposure(radiance), error_scales)
+    return Scales(pictures.fitting_exposure(radiance), error_scales)
 
 
 def _view_block(view: View, runs: list[Run], scales: Scales) -> dict[str, Any]:
@@ -226,7 +245,8 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
             if reference is not None and mask is not None:
                 cell["error"] = display.painted(display.error(image, reference, path), scale, mask)
         unit = "" if psnr["text"] == display.DASH else " dB"
-        cells.append(cell | {"number": psnr["text"] + unit, "best": psnr["best"]})
+        more = display.similar(run.view(view.name)) if quantity == "render" else ""
+        cells.append(cell | {"number": psnr["text"] + unit, "best": psnr["best"], "more": more})
     truth = None if reference is None else paint(reference)
     return {"quantity": quantity, "truth": truth, "scale": scale, "cells": cells}
 
@@ -276,6 +296,20 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
         }
         for run, row in zip(runs, zip(*columns, strict=True), strict=True)
     ]
+
+
+def _similar(runs: list[Run]) -> list[tuple[Run, list[dict[str, Any]]]]:
+    """One row a run: SSIM and FLIP of each split, the best of each column marked.
+
+    Empty where no run has them, as after an evaluation by an earlier version.
+    """
+    columns = []
+    for split, (key, _, choose) in product(SPLITS, SIMILAR):
+        values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+        columns.append(display.marked(values, display.fraction, choose))
+    if all(cell["text"] == display.DASH for column in columns for cell in column):
+        return []
+    return [(run, list(row)) for run, row in zip(runs, zip(*columns, strict=True), strict=True)]
 
 
 def _ceiling(run: Run, key: str) -> float | None:
@@ -434,7 +468,9 @@ def _told(run: Run, names: dict[str, str]) -> dict[str, str]:
 def _rendering(run: Run) -> dict[str, str]:
     said = run.metrics.get("render") or {}
     spp, depth = said.get("spp", display.DASH), said.get("max_depth", display.DASH)
-    return {"Rendered with": f"{spp} samples a pixel, path depth {depth}"} if said else {}
+    told = {"Rendered with": f"{spp} samples a pixel, path depth {depth}"} if said else {}
+    exposure = display.number(run.metrics.get("display_exposure"))
+    return told if exposure is None else told | {"Display exposure": f"{exposure:+.1f} stops"}
 
 
 def _grouped(runs: list[Run], said: list[dict[str, str]]) -> list[dict[str, Any]]:

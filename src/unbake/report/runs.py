@@ -11,7 +11,7 @@ import numpy as np
 
 from unbake.dataset import views
 from unbake.dataset.views import Dataset
-from unbake.errors import UserError
+from unbake.errors import UserError, printable
 from unbake.quantities import DEFAULT_QUANTITIES
 from unbake.training.run_folder import RunFolder
 
@@ -104,6 +104,30 @@ def read_run(path: Path, label: str) -> Run:
     settings = dict(_flatten(folder.settings_table()))
     log = [] if metrics.get("steps") == 0 else folder.log()
     return Run(folder, label, metrics, settings, log)
+
+
+def made_of(manifest: dict[str, Any], where: Path, runs: list[Run]) -> int:
+    """The number of the run that a folder of an export or of pictures was made of.
+
+    Args:
+        manifest: of the folder; it names the run.
+        where: its file.
+        runs: those of the page.
+
+    Raises:
+        UserError: it is none of them.
+    """
+    told = manifest.get("run")
+    named = told.get("folder") if isinstance(told, dict) else None
+    if not isinstance(named, str):
+        raise UserError("names no run", where, "Make it again")
+    resolved = [run.folder.path.resolve() for run in runs]
+    if Path(named) in resolved:
+        return resolved.index(Path(named))
+    same = [i for i, path in enumerate(resolved) if path.name == Path(named).name]
+    if len(same) == 1 and not Path(named).exists():  # the run was moved
+        return same[0]
+    raise UserError(f"was made of another run ({printable(named)})", where, "Name that run as well")
 
 
 def data_folder(runs: list[Run]) -> Path:

@@ -1,0 +1,105 @@
+"""The page's section on relighting: pictures that `unbake relight` or `unbake render` made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.evaluation.settings import RENDER_FORMAT
+from unbake.formats import check_format
+from unbake.imaging import pictures
+from unbake.io import read_object
+from unbake.report import display
+from unbake.report.runs import Run, made_of
+
+#: Pictures of a folder that are shown, evenly spaced, and pixels along their longer side.
+MOST, LONGEST = 6, 320
+
+
+def relit_sections(
+    folders: Sequence[Path], runs: list[Run], allow_outside: bool
+) -> list[dict[str, Any]]:
+    """A strip of pictures for each light: the truth, if it is there, and each run under it.
+
+    Args:
+        folders: of `unbake relight` or `unbake render`.
+        runs: those of the page.
+        allow_outside: read files of the truth that lie outside of its folder.
+
+    Raises:
+        UserError: a folder holds no pictures, or those of another run.
+    """
+    strips: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for folder in folders:
+        file = folder / "render.json"
+        manifest = read_object(file, "Make one with `unbake relight RUN --out DIR …`")
+        check_format(manifest, RENDER_FORMAT, file)
+        number = made_of(manifest, file, runs)
+        try:
+            names = [str(frame["name"]) for frame in manifest["frames"]]
+            exposure = float(manifest["settings"]["exposure"])
+            light, truth = _light(manifest.get("light")), manifest.get("truth")
+            if not names or any(Path(name).name != name for name in names):
+                raise ValueError
+            key = (light, truth, exposure, *names)
+            if key not in strips:
+                strips[key] = _strip(light, truth, exposure, names, allow_outside)
+            strips[key]["rows"].append(_row(folder, manifest, number, strips[key]))
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise UserError("cannot be read", file, "Make the pictures again") from None
+    return [strip for _, strip in sorted(strips.items(), key=lambda item: item[0][0])]
+
+
+def _light(told: dict[str, Any] | None) -> str:
+    """What a light is called."""
+    if told is None:
+        return "The scene's own light, as it was recovered"
+    file = Path(str(told.get("envmap") or told.get("lights") or "another light")).name
+    kind = "Environment map" if told.get("envmap") else "Lights"
+    return f"{kind}: {file}" + (", with its own" if told.get("keep_lights") else "")
+
+
+def _strip(
+    light: str, truth: str | None, exposure: float, names: list[str], allow_outside: bool
+) -> dict[str, Any]:
+    at = np.unique(np.linspace(0, len(names) - 1, min(MOST, len(names))).round().astype(int))
+    shown = [names[i] for i in at]
+    true = None
+    if truth is not None and Path(truth).is_dir():
+        views = {v.name: v for v in Dataset.load(Path(truth), allow_outside=allow_outside).views}
+        if all(name in views for name in shown):
+            images = [display.rgb(views[name].image)[0] for name in shown]
+            true = [_picture(image, exposure) for image in images]
+    return {
+        "light": light,
+        "exposure": exposure,
+        "names": shown,
+        "more": len(names) - len(shown),
+        "truth": true,
+        "rows": [],
+    }
+
+
+def _row(folder: Path, manifest: dict[str, Any], run: int, strip: dict[str, Any]) -> dict[str, Any]:
+    """A run's pictures and scores; sets the shape of the strip's pictures."""
+    frames = {str(frame["name"]): frame for frame in manifest["frames"]}
+    cells = []
+    for name in strip["names"]:
+        image = display.rgb(folder / f"{name}.exr")[0]
+        strip["height"], strip["width"] = image.shape[:2]
+        psnr = display.number(frames[name].get("render_psnr"))
+        number = "" if psnr is None else f"{display.decibels(psnr)} dB"
+        cells.append({"picture": _picture(image, strip["exposure"]), "number": number})
+    mean = manifest.get("mean") or {}
+    psnr = display.number(mean.get("render_psnr"))
+    told = "" if psnr is None else f"{display.decibels(psnr)} dB, mean of {mean.get('views')} views"
+    return {"run": run, "cells": cells, "mean": told, "similar": display.similar(mean)}
+
+
+def _picture(image: np.ndarray, exposure: float) -> str:
+    return pictures.png_data_uri(pictures.tonemap(pictures.shrink(image, LONGEST), exposure))
