@@ -72,7 +72,7 @@ def test_materials_are_those_of_the_surfaces_that_rays_meet(run):
     camera = run.cameras("train")[0]
     x, y = (axis.ravel() + 0.5 for axis in np.meshgrid(np.arange(16), np.arange(16)))
     origins, directions = camera.rays(x, y)
-    found = run.material(origins, 3 * directions)
+    found = run.material_along(origins, 3 * directions)
     problem = run.recovered.problem
     ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
     si = run.scene.ray_intersect(ray)
@@ -85,7 +85,7 @@ def test_materials_are_those_of_the_surfaces_that_rays_meet(run):
     np.testing.assert_allclose(found["albedo"][seen], albedo[seen], atol=1e-4)
     np.testing.assert_allclose(found["roughness"][seen], roughness[seen], atol=1e-4)
     assert (found["albedo"][~seen] == 0).all()
-    one = run.material(origins[0], directions[0])
+    one = run.material_along(origins[0], directions[0])
     np.testing.assert_allclose(one["albedo"], found["albedo"][:1], atol=1e-5)
 
 
@@ -101,7 +101,51 @@ def test_materials_are_those_of_the_surfaces_that_rays_meet(run):
 )
 def test_bad_rays_are_refused(run, origins, directions, what):
     with pytest.raises(unbake.UserError, match=what):
-        run.material(origins, directions)
+        run.material_along(origins, directions)
+
+
+def test_materials_are_those_of_texture_coordinates(run):
+    (file,) = run.dataset.scene.parent.rglob("left.ply")
+    mesh = mi.load_dict({"type": "ply", "filename": str(file)})
+    uv = np.random.default_rng(2).uniform(-0.1, 1.1, (300, 2)).astype(np.float32)
+    found = run.material("left", uv)
+    si = mesh.eval_parameterization(mi.Point2f(uv.T.copy()))
+    valid = np.array(si.is_valid())
+    assert found.keys() == {"albedo", "roughness", "on_mesh", "observed"}
+    np.testing.assert_array_equal(found["on_mesh"], valid)
+    assert 0.3 < valid.mean() < 1
+    expected = run.recovered.problem.materials.evaluate(si, si.is_valid())
+    albedo, roughness = np.array(expected["albedo"]).T, np.array(expected["roughness"])
+    assert albedo[valid].std() > 0.02 and found["albedo"].dtype == np.float32
+    np.testing.assert_allclose(found["albedo"][valid], albedo[valid], atol=1e-4)
+    np.testing.assert_allclose(found["roughness"][valid], roughness[valid], atol=1e-4)
+    assert (found["albedo"][~valid] == 0).all()
+    assert 0 < found["observed"].sum() <= valid.sum()
+    one = run.material("left", uv[0])
+    np.testing.assert_allclose(one["albedo"], found["albedo"][:1], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "uv", "what"),
+    [
+        ("nothing", [[0, 0]], "no mesh named 'nothing'.*There are room, left"),
+        ("light", [[0, 0]], "'light' was known"),
+        ("left", [[0, 0, 0]], "have shape"),
+        ("left", [["a", "b"]], "no array of numbers"),
+        ("left", [[0, np.inf]], "not finite"),
+    ],
+)
+def test_texture_coordinates_that_cannot_be_asked_are_refused(run, mesh, uv, what):
+    with pytest.raises(unbake.UserError, match=what):
+        run.material(mesh, uv)
+
+
+def test_a_mesh_without_texture_coordinates_is_refused(run, monkeypatch):
+    part = run._parts["left"]
+    bare = replace(part, triangles=replace(part.triangles, uv=None))
+    monkeypatch.setitem(run._parts, "left", bare)
+    with pytest.raises(unbake.UserError, match=r"no texture coordinates.*material_along"):
+        run.material("left", [[0, 0]])
 
 
 @pytest.mark.slow

@@ -19,7 +19,12 @@ from .dataset.views import Dataset, View
 from .errors import UserError, printable
 from .evaluation import evaluate, rendering, renderings
 from .evaluation.settings import EvaluationSettings, RenderSettings
+from .exports.bake import Baker
 from .exports.export import DEFAULT_FORMATS, export
+from .exports.observed import Views
+from .exports.parts import Part, read_parts
+from .exports.unwrap import Placed
+from .fields.materials import Materials
 from .quantities import QUANTITIES
 from .report.page import write_report
 from .training.recovered import Recovered, load_run
@@ -146,7 +151,50 @@ class Run:
             problem.scene_view, found, settings, problem.hide_emitters, seed
         )
 
-    def material(
+    def material(self, mesh: str, uv: np.ndarray) -> dict[str, np.ndarray]:
+        """What was recovered at texture coordinates of a mesh.
+
+        Meshes have the names that `export` gives them: those of the scene file, or of their files.
+        Coordinates are the mesh's own, as Mitsuba reads them: (0, 0) is the corner of the first
+        texel of the first row of an image. Where several triangles share coordinates, one counts.
+
+        Args:
+            mesh: its name.
+            uv: (n, 2) or (2,).
+
+        Returns:
+            By quantity, float32: albedo (n, 3), linear RGB in [0, 1]; others (n,), without units:
+            roughness is perceptual (GGX α = roughness²). `on_mesh`, (n,) bool: whether there is
+            surface; values are zeros where there is none. `observed`, (n,) bool: whether a training
+            view saw it; where none did, the value is a guess of the field.
+
+        Raises:
+            UserError: the run recovered no materials, there is no such mesh, it has no texture
+                coordinates, its material was known, or the coordinates are not finite or have
+                another shape.
+        """
+        materials = self._materials
+        at = _coordinates(uv)
+        parts = self._parts
+        if mesh not in parts:
+            names = ", ".join(list(parts)[:6]) + (", …" if len(parts) > 6 else "")
+            what = f"no mesh named {printable(mesh)!r}"
+            raise UserError(what, self.dataset.scene, f"There are {names}")
+        part = parts[mesh]
+        if not part.is_optimized:
+            what = f"the material of {printable(mesh)!r} was known, and is not recovered"
+            raise UserError(what, self.dataset.scene, "Give another mesh")
+        if part.triangles.uv is None:
+            what = f"the mesh {printable(mesh)!r} has no texture coordinates"
+            remedy = "`export` unwraps it; `material_along` takes rays"
+            raise UserError(what, self.dataset.scene, remedy)
+        problem = self.recovered.problem
+        cameras = [view.camera for view in self.dataset.train]
+        baker = Baker(materials, {}, Views(problem.scene_view.scene, cameras))
+        values, hit, seen = baker.at(Placed(part, part.triangles, part.triangles.uv), at)
+        return values | {"on_mesh": hit, "observed": seen}
+
+    def material_along(
         self, origins: np.ndarray, directions: np.ndarray, *, seed: int = 1
     ) -> dict[str, np.ndarray]:
         """The recovered materials where rays meet surfaces.
@@ -169,9 +217,7 @@ class Run:
             UserError: the run recovered no materials, or the rays are not finite or have other
                 shapes.
         """
-        if self.recovered.problem.materials is None:
-            what = f"the run recovered {self.settings.unknown}, and no materials"
-            raise UserError(what, self.path, "Give a run of `unbake fit` with --unknown materials")
+        known = self._materials
         o, d = _rays(origins, directions)
         count = len(o)
         start, towards = (mi.Point3f(o.T), mi.Vector3f(d.T))
@@ -183,7 +229,6 @@ class Run:
         scene_view = self.recovered.problem.scene_view
         values, coverage = render_materials(scene_view, through, count, 1, seed=seed)
         found = {k: x if QUANTITIES[k].channels == 3 else x[:, 0] for k, x in values.items()}
-        known = self.recovered.problem.materials
         return {k: x for k, x in found.items() if k in known} | {"seen": coverage > 0}
 
     def evaluate(
@@ -280,6 +325,25 @@ class Run:
         steps = f"{metrics.get('steps', 0):,} steps"
         return f"<p>{told}, {steps}</p><table><tr>{head}</tr>{body}</table>"
 
+    @cached_property
+    def _parts(self) -> dict[str, Part]:
+        """The parts of the scene as its author gave them, by their names."""
+        dataset, pieces = self.dataset, self.recovered.problem.pieces
+        return {part.name: part for part in read_parts(dataset.scene, dataset.root, pieces).parts}
+
+    @property
+    def _materials(self) -> Materials:
+        """What was recovered of the materials.
+
+        Raises:
+            UserError: the run recovered none.
+        """
+        found = self.recovered.problem.materials
+        if found is None:
+            what = f"the run recovered {self.settings.unknown}, and no materials"
+            raise UserError(what, self.path, "Give a run of `unbake fit` with --unknown materials")
+        return found
+
     def _camera(self, camera: Camera | View | str) -> Camera:
         if isinstance(camera, Camera):
             return camera
@@ -291,6 +355,24 @@ class Run:
             what = f"no view named {printable(camera)!r}"
             raise UserError(what, self.dataset.folder, f"There are {names}")
         return by_name[camera].camera
+
+
+def _coordinates(uv: np.ndarray) -> np.ndarray:
+    """Texture coordinates, (n, 2) float32.
+
+    Raises:
+        UserError: they have another shape, or are not finite.
+    """
+    remedy = "Give texture coordinates of shape (n, 2)"
+    try:
+        found = np.atleast_2d(np.asarray(uv, np.float32))
+    except (ValueError, TypeError):
+        raise UserError("texture coordinates are no array of numbers", None, remedy) from None
+    if found.ndim != 2 or found.shape[1] != 2 or not len(found):
+        raise UserError(f"texture coordinates have shape {found.shape}", None, remedy)
+    if not np.isfinite(found).all():
+        raise UserError("a texture coordinate is not finite", None, "Leave such ones out")
+    return found
 
 
 def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

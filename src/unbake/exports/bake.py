@@ -17,7 +17,7 @@ from ..memory import require_memory
 from ..quantities import QUANTITIES
 from ..scene.parse import ParsedScene, is_reference, reason
 from .observed import Views, filled
-from .unwrap import Atlas, joined, parameterized
+from .unwrap import Atlas, Placed, joined, parameterized
 
 #: Texels that are looked up at once; bounds the memory.
 CHUNK = 1 << 17
@@ -92,6 +92,41 @@ class Baker:
             baked[name] = filled(square, known.reshape(n, n), default)
         return Baked(atlas, baked, covered.reshape(n, n), observed.reshape(n, n), self._learned)
 
+    def at(
+        self, placed: Placed, uv: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """What was recovered at texture coordinates of a part, in linear space.
+
+        Args:
+            placed: the part; its triangles have the coordinates that are meant.
+            uv: (n, 2) float32.
+
+        Returns:
+            By quantity, (n, 3) or (n,) float32; whether there is surface, (n,) bool; whether a
+            training view saw it, (n,) bool. Where there is no surface, values are zeros.
+        """
+        mesh = _lookup(Atlas(placed.part.name, (), [placed], "own", 1.0, 1, 1))
+        values = {
+            name: np.zeros((len(uv), QUANTITIES[name].channels), np.float32)
+            for name in self._learned
+        }
+        hit, seen = np.zeros(len(uv), bool), np.zeros(len(uv), bool)
+        for start in range(0, len(uv), CHUNK):
+            part = slice(start, start + CHUNK)
+            si = mesh.eval_parameterization(mi.Point2f(np.ascontiguousarray(uv[part].T)))
+            valid = si.is_valid()
+            info = mesh.eval_attribute_3("face_info", si, valid)
+            found = self._values(mesh, (), si, info, valid)
+            dr.eval(found, valid, info)
+            for name, value in values.items():
+                each = [np.array(dr.select(valid, channel, 0)) for channel in found[name]]
+                value[part] = np.stack(each, -1)
+            hit[part] = np.array(valid)
+            two_sided = info.y > 0.5
+            seen[part] = np.array(self._views.see(mi.Point3f(si.p), si.n, two_sided, valid))
+        flat = {k: x if x.shape[1] == 3 else x[:, 0] for k, x in values.items()}
+        return flat, hit, seen
+
     def _chunk(
         self, mesh: mi.Mesh, atlas: Atlas, start: int, width: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
@@ -110,7 +145,7 @@ class Baker:
             valid = si.is_valid()
             # The number of the material and whether it has two sides.
             info = mesh.eval_attribute_3("face_info", si, valid)
-            for name, value in self._values(mesh, atlas, si, info, valid).items():
+            for name, value in self._values(mesh, atlas.materials, si, info, valid).items():
                 sums[name] = [
                     s + dr.select(valid, v, 0) for s, v in zip(sums[name], value, strict=True)
                 ]
@@ -130,7 +165,7 @@ class Baker:
     def _values(
         self,
         mesh: mi.Mesh,
-        atlas: Atlas,
+        numbers: Collection[int],
         si: mi.SurfaceInteraction3f,
         info: mi.Color3f,
         valid: mi.Bool,
@@ -143,7 +178,7 @@ class Baker:
         piece = None
         if self._materials is not None and self._materials.pieces is not None:
             piece = decoded(mesh.eval_attribute_3(ATTRIBUTE, si, valid), valid)
-        return look_up(self._materials, self._own, atlas.materials, si, number, piece, valid)
+        return look_up(self._materials, self._own, numbers, si, number, piece, valid)
 
 
 def look_up(
