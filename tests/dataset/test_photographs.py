@@ -209,8 +209,8 @@ def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_bot
     dataset, on_disk, monkeypatch
 ):
     made, read = dataset(), []
-    decode = module.read_image
-    monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))
+    decode = module.read_masked
+    monkeypatch.setattr(module, "read_masked", lambda *a: read.append(a) or decode(*a))
     decoded = []
     for smoothed in (False, False, True, True, False):
         found = Photographs.load(made, False, smoothed=smoothed)
@@ -228,7 +228,7 @@ def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
     def never(*arguments):
         raise AssertionError("an image was read again")
 
-    monkeypatch.setattr(module, "read_image", never)
+    monkeypatch.setattr(module, "read_masked", never)
     again = Photographs.load(made, False)
     np.testing.assert_array_equal(first.table, again.table)
     assert again.mean == first.mean
@@ -280,8 +280,8 @@ def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch,
         (made.folder / ".cache" / "photographs.npy").unlink()
         os.mkfifo(made.folder / ".cache" / "photographs.npy")
     read = []
-    decode = module.read_image
-    monkeypatch.setattr(module, "read_image", lambda *a: read.append(a) or decode(*a))
+    decode = module.read_masked
+    monkeypatch.setattr(module, "read_masked", lambda *a: read.append(a) or decode(*a))
     found = Photographs.load(made, clip)
     assert len(read) == len(made.train)
     np.testing.assert_array_equal(found.table[:, :3], rgba(made)[:, :3])
@@ -343,14 +343,14 @@ def test_a_file_that_a_fit_has_mapped_stays_as_it_is(dataset, on_disk):
 
 
 def test_two_fits_at_once_decode_once(dataset, on_disk, monkeypatch):
-    made, read, decode = dataset(), [], module.read_image
+    made, read, decode = dataset(), [], module.read_masked
 
     def slowly(*arguments):
         read.append(arguments)
         time.sleep(0.1)
         return decode(*arguments)
 
-    monkeypatch.setattr(module, "read_image", slowly)
+    monkeypatch.setattr(module, "read_masked", slowly)
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: Photographs.load(made, False), range(4)))
     assert len(read) == len(made.train)
@@ -416,7 +416,7 @@ def test_photographs_that_do_not_fit_the_memory_are_refused_before_they_are_read
 ):
     made = dataset()
     monkeypatch.setattr(memory, "free_bytes", lambda: 4000)
-    monkeypatch.setattr(module, "read_image", None)
+    monkeypatch.setattr(module, "read_masked", None)
     with pytest.raises(UserError, match="the photographs need about 0 MB of memory, 0 MB are free"):
         Photographs.load(made, False)
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+from unittest.mock import patch
 
 import mitsuba as mi
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from unbake import memory
 from unbake.dataset.camera import Camera
-from unbake.dataset.views import Dataset, View, check_cameras, read_image
+from unbake.dataset.fingerprint import fingerprint
+from unbake.dataset.views import Dataset, View, check_cameras, read_image, read_photograph
 from unbake.errors import UserError
 
 WIDTH, HEIGHT = 6, 4
@@ -298,6 +300,84 @@ def test_low_dynamic_range_is_refused(folder, name):
     (folder / "images" / name).write_bytes(b"anything")
     change(folder, set_frame("file_path", f"images/{name}"))
     assert "OpenEXR" in refused(folder, "low dynamic range").remedy
+
+
+def coded(folder, name, codes, **keys):
+    """Put a photograph of code values into the place of the second view's."""
+    mi.Bitmap(np.ascontiguousarray(codes)).write(str(folder / "images" / name))
+    for key, value in {"file_path": f"images/{name}", "encoding": "srgb", **keys}.items():
+        change(folder, set_frame(key, value))
+    return Dataset.load(folder).views[1]
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_code_values_are_decoded_by_the_srgb_curve(folder, kind):
+    most = np.iinfo(kind).max
+    codes = np.linspace(0, most, HEIGHT * WIDTH * 3).astype(kind).reshape(HEIGHT, WIDTH, 3)
+    view = coded(folder, "photo.png", codes)
+    pixels = read_photograph(view)
+    value = codes.astype(np.float64) / most
+    wanted = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    assert np.abs(pixels[..., :3] - wanted).max() < 1e-6 and (pixels[..., 3] == 1).all()
+    assert np.array_equal(
+        pixels_of(Dataset.load(folder).views[0])[:, 0], picture(0)[..., 0].ravel()
+    )
+
+
+def test_alpha_of_code_values_is_premultiplied(folder):
+    codes = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    codes[:2, :, 3] = 51
+    pixels = read_photograph(coded(folder, "photo.png", codes))
+    assert np.allclose(pixels[:2], 0.2) and np.allclose(pixels[2:], 1)
+
+
+def test_a_data_set_of_code_values_and_masks_is_saved_and_loaded(folder):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[1:3, 2] = 0
+    mi.Bitmap(mask).write(str(folder / "mask.png"))
+    view = coded(folder, "photo.png", np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    change(folder, set_frame("mask_path", "mask.png"))
+    data = Dataset.load(folder)
+    data.save(folder)
+    again = Dataset.load(folder).views[1]
+    assert (again.encoding, again.mask) == ("srgb", folder / "mask.png") and view.mask is None
+    assert np.array_equal(read_photograph(again)[..., 3], mask / 255)
+    assert Dataset.load(folder).views[0].mask is None
+
+
+def test_the_fingerprint_knows_masks(folder):
+    def of_photographs():
+        dataset = Dataset.load(folder)
+        files = [view.image for view in dataset.views]
+        with patch("unbake.dataset.fingerprint._of_geometry", return_value={}):
+            return files and fingerprint(dataset)["photographs"]
+
+    before = of_photographs()
+    mi.Bitmap(np.full((HEIGHT, WIDTH), 255, np.uint8)).write(str(folder / "mask.png"))
+    change(folder, set_frame("mask_path", "mask.png"))
+    masked = of_photographs()
+    mi.Bitmap(np.zeros((HEIGHT, WIDTH), np.uint8)).write(str(folder / "mask.png"))
+    assert len({before, masked, of_photographs()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"encoding": "gamma"}, "unknown encoding 'gamma'"),
+        ({"encoding": 3}, "unknown encoding 3"),
+        ({"file_path": "images/train_001.exr"}, "the image holds no code values: it is .exr"),
+        ({"mask_path": "none.png"}, "none.png: the image does not exist"),
+        ({"mask_path": "images/train_001.exr"}, "holds no code values"),
+        ({"mask_path": "../a.png"}, "'../a.png' lies outside"),
+        ({"mask_path": 1}, "'mask_path' is not a text"),
+        ({"w": WIDTH + 1}, "photo.png: the image has 6 x 4 pixels"),
+    ],
+)
+def test_a_wrong_key_of_a_coded_photograph_is_refused(folder, keys, message):
+    codes = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    with pytest.raises(UserError, match=message) as caught:
+        coded(folder, "photo.png", codes, **keys)
+    assert caught.value.where and caught.value.remedy
 
 
 def test_an_unknown_format_is_refused(folder):

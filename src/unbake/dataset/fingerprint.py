@@ -20,15 +20,21 @@ _CHUNK = 1 << 20  # bytes
 def fingerprint(dataset: Dataset) -> dict[str, str]:
     """SHA-256 of the parts of a data set: `photographs`, `poses`, `views` and `scene`.
 
-    `photographs` are the image files, `poses` the cameras with their intrinsics, `views` the names
-    and splits, and `scene` the scene with its meshes, textures and included files. Where the folder
-    lies does not count. Files are read, not decoded: about a second for a gigabyte on each core.
+    `photographs` are the image files and their masks, `poses` the cameras with their intrinsics,
+    `views` the names and splits, and `scene` the scene with its meshes, textures and included
+    files. Where the folder lies does not count. Files are read, not decoded: about a second for a
+    gigabyte on each core.
 
     Raises:
         UserError: a file cannot be read, or the scene is none.
     """
-    photographs = _of_values(_of_files(view.image for view in dataset.views))
-    return {"photographs": photographs} | _of_geometry(dataset)
+    views = dataset.views
+    photographs: list[Any] = _of_files(view.image for view in views)
+    masks = [view.name for view in views if view.mask is not None]
+    if masks:
+        files = _of_files(view.mask for view in views if view.mask is not None)
+        photographs = [photographs, masks, files]
+    return {"photographs": _of_values(photographs)} | _of_geometry(dataset)
 
 
 def truth_fingerprint(dataset: Dataset, quantities: Iterable[str]) -> dict[str, str]:

@@ -21,7 +21,7 @@ from ..memory import require_memory
 from .camera import Camera
 from .data_folder import DataFolder
 from .outliers import Outliers, without_outliers
-from .views import PIXEL_BYTES, Dataset, View, read_image
+from .views import PIXEL_BYTES, Dataset, View, read_masked
 
 #: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
 #: set's folder, of which the system keeps in memory what it has room for.
@@ -35,6 +35,8 @@ _RADIUS = 2
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
 #: Pixels are numbered in 32 bits.
 MOST_PIXELS = (1 << 32) - 1
+#: An image with its camera: linear RGBA, shape (pixels, 4), and whether pixels count, (pixels,).
+_Image = tuple[Camera, np.ndarray, np.ndarray]
 
 
 @final
@@ -47,7 +49,7 @@ class Photographs:
             errors are relative to, which is blurred over 5 x 5 pixels and knows the noise.
         chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
             background pixels say nothing about the scene and only those with alpha > 0 are taken
-            (the paper: at least half of them).
+            (the paper: at least half of them). Pixels that are masked are never taken.
         mean: mean radiance of the pixels to train on.
         outliers: pixels that were too bright and are not as in the images, by view.
 
@@ -94,7 +96,10 @@ class Photographs:
             smoothed: keep a blurred copy, too.
         """
         table = np.empty((len(rgb), _WITH_BLURRED if smoothed else _COLUMNS), np.float32)
-        images = zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
+        images = [
+            (camera, pixels, (pixels[:, 3] > 0) | (not foreground_only))
+            for camera, pixels in zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
+        ]
         return _fill(table, images, foreground_only)
 
     @staticmethod
@@ -111,6 +116,7 @@ class Photographs:
         """
         views = dataset.train
         hidden = dataset.background == "hidden"
+        some = hidden or any(view.mask is not None for view in views)
         count = sum(view.camera.width * view.camera.height for view in views)
         remedy = "Use fewer views, or smaller images"
         if count > MOST_PIXELS:
@@ -119,7 +125,7 @@ class Photographs:
         columns = _WITH_BLURRED if smoothed else _COLUMNS
         # Views are decoded one after the other
         largest = PIXEL_BYTES * max(view.camera.width * view.camera.height for view in views)
-        need = largest + min(4 * columns * count, IN_MEMORY) + 8 * count * hidden
+        need = largest + min(4 * columns * count, IN_MEMORY) + 8 * count * some
         require_memory(need, "the photographs need", remedy, dataset.folder)
         if 4 * columns * count <= IN_MEMORY:
             table = np.empty((count, columns), np.float32)
@@ -137,39 +143,42 @@ def _decode_into(
     """Put the images of views into a table, but for what is too bright in them."""
     outliers: list[Outliers] = []
 
-    def images() -> Iterator[tuple[Camera, np.ndarray]]:
+    def images() -> Iterator[_Image]:
         for view in views:
-            camera = view.camera
-            pixels = read_image(view.image, camera.width, camera.height, clip_negative)
-            counted = pixels[:, 3] > 0 if foreground_only else np.ones(len(pixels), bool)
+            pixels, mask = read_masked(view, clip_negative)
+            pixels, camera = pixels.reshape(-1, 4), view.camera
+            counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
+            if foreground_only:
+                counted &= pixels[:, 3] > 0
             pixels, found = without_outliers(pixels, counted, view.name, camera.width)
             if found is not None:
                 outliers.append(found)
-            yield camera, pixels
+            yield camera, pixels, counted
 
-    return replace(_fill(table, images(), foreground_only), outliers=tuple(outliers))
+    some = foreground_only or any(view.mask is not None for view in views)
+    return replace(_fill(table, images(), some), outliers=tuple(outliers))
 
 
-def _fill(
-    table: np.ndarray, images: Iterable[tuple[Camera, np.ndarray]], foreground_only: bool
-) -> Photographs:
-    """Put images, RGBA, into a table one after the other; blurred, too, if it has room for that."""
+def _fill(table: np.ndarray, images: Iterable[_Image], some: bool) -> Photographs:
+    """Put images into a table one after the other; blurred, too, if it has room for that.
+
+    Args:
+        some: whether there are pixels that do not count.
+    """
     start, total, seen = 0, 0.0, []
-    for camera, pixels in images:
+    for camera, pixels, counted in images:
         stop = start + len(pixels)
-        rgb, foreground = pixels[:, :3], pixels[:, 3] > 0
+        rgb = pixels[:, :3]
         table[start:stop, :3] = rgb
         if table.shape[1] == _WITH_BLURRED:
-            counts = foreground if foreground_only else np.ones_like(foreground)
             # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
             with np.errstate(over="ignore", invalid="ignore"):
-                table[start:stop, 3:] = _reference(rgb, counts, camera)
-        counted = rgb[foreground] if foreground_only else rgb
-        total += float(counted.sum(dtype=np.float64))
-        if foreground_only:
-            seen.append(start + np.flatnonzero(foreground))
+                table[start:stop, 3:] = _reference(rgb, counted, camera)
+        total += float((rgb[counted] if some else rgb).sum(dtype=np.float64))
+        if some:
+            seen.append(start + np.flatnonzero(counted))
         start = stop
-    chosen = np.concatenate(seen).astype(np.uint32) if foreground_only else None
+    chosen = np.concatenate(seen).astype(np.uint32) if some else None
     count = len(table) if chosen is None else len(chosen)
     return Photographs(table, chosen, total / max(3 * count, 1))
 
@@ -248,12 +257,14 @@ def _cached(
 ) -> Photographs:
     """Photographs in a file that is made where it is missing, or made from other images."""
     data = DataFolder(dataset.folder, dataset.allow_outside)
+    masks = [view.mask for view in views if view.mask is not None]
     key = {
-        "images": [[str(v.image), v.image.stat().st_mtime_ns] for v in views if v.image.is_file()],
+        "images": _stamps([view.image for view in views]),
         "pixels": count,
         "columns": columns,
         "clip_negative": clip_negative,
         "foreground_only": hidden,
+        **({"masks": _stamps(masks)} if masks else {}),
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": _RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
@@ -271,6 +282,16 @@ def _cached(
             data.cache,
             f"They take {_size(key) / 1e9:.1f} GB. Make room, or the folder writable",
         ) from None
+
+
+def _stamps(files: Sequence[Path]) -> list[list[Any]]:
+    """The names of files and when they were written."""
+    return [[str(file), file.stat().st_mtime_ns] for file in files if file.is_file()]
+
+
+def _chooses(key: dict[str, Any]) -> bool:
+    """Whether there are pixels that are not trained on."""
+    return key["foreground_only"] or "masks" in key
 
 
 def _find_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
@@ -294,7 +315,7 @@ def _open_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
             return None
         shape = (key["pixels"], key["columns"])
         table, chosen = _mapped(data.cached_photographs, stored["table"], np.float32, shape), None
-        if key["foreground_only"]:
+        if _chooses(key):
             shape = (stored["foreground_pixels"],)
             chosen = _mapped(data.cached_foreground, stored["foreground"], np.uint32, shape)
             if chosen.max(initial=0) >= len(table):
@@ -375,7 +396,7 @@ def _write_cache(
 
 def _size(key: dict[str, Any]) -> int:
     """Bytes that the files take at most."""
-    return 4 * key["pixels"] * (key["columns"] + key["foreground_only"])
+    return 4 * key["pixels"] * (key["columns"] + _chooses(key))
 
 
 def _require_disk(folder: Path, need: int) -> None:

@@ -1,4 +1,4 @@
-"""The views of a data folder: posed HDR images, each read once and checked when it is."""
+"""The views of a data folder: posed photographs, each read once and checked when it is."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from unbake.dataset.camera import Camera, camera_from_frame, read_split
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError
-from unbake.imaging.headers import SUFFIXES, HeaderError, read_header
+from unbake.imaging.coded import decode, read_codes
+from unbake.imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, read_header
 from unbake.io import number, require_file, text
 from unbake.memory import require_memory
 from unbake.quantities import QUANTITIES
@@ -22,15 +23,21 @@ from unbake.scene import free_space
 from unbake.transport.light_by_depth import depth_of_light, light_of_depth
 
 BACKGROUNDS = ("visible", "hidden")
+#: How photographs hold radiance: as it is, or as code values of the sRGB curve.
+ENCODINGS = ("linear", "srgb")
 
-_LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".webp", ".gif", ".tif", ".tiff", ".ppm")
+_LDR_SUFFIXES = (*CODED_SUFFIXES, ".bmp", ".tga", ".webp", ".gif", ".ppm")
 _MOST_CHANNELS = 4
 _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 #: Memory in bytes that takes part in decoding a pixel, blurring it included.
 PIXEL_BYTES = 100
 #: Bytes of the name of a view, which files of results are named after.
 _LONGEST_NAME = 200
-_NEED_HDR = "Give linear HDR images (OpenEXR); tone-mapped 8-bit images hold no radiance"
+_NEED_HDR = (
+    "Give linear HDR images (OpenEXR); PNG, JPEG and TIFF files of a camera are read where "
+    f'{TRANSFORMS} has "encoding": "srgb", as `unbake import` writes it'
+)
+_CODED = "Code values of the sRGB curve are read from PNG, JPEG and TIFF files"
 _REPLACE = f"Write the image again, or remove its frame from {TRANSFORMS}"
 
 
@@ -43,8 +50,12 @@ class View:
         name: the image's file name without its suffix, unique in the data set.
         split: "train" or "heldout".
         camera: pose and intrinsics, in the image's pixels.
-        image: linear RGB radiance, alpha 1 where a surface is seen; inside the data folder.
+        image: RGB radiance, alpha 1 where a surface is seen; inside the data folder.
         truth: true pictures by quantity, of those that the data set has.
+        encoding: "linear" where the image holds radiance; "srgb" where it holds code values of 8 or
+            16 bits, which the sRGB curve decodes to [0, 1].
+        mask: an image of the same size, zero where a pixel counts neither in a fit nor in scores;
+            None: all count.
     """
 
     name: str
@@ -52,9 +63,13 @@ class View:
     camera: Camera
     image: Path
     truth: Mapping[str, Path]
+    encoding: str = "linear"
+    mask: Path | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image", Path(self.image))
+        if self.mask is not None:
+            object.__setattr__(self, "mask", Path(self.mask))
         truth = {name: Path(file) for name, file in self.truth.items()}
         object.__setattr__(self, "truth", truth)
 
@@ -129,8 +144,8 @@ class Dataset:
 
         Raises:
             UserError: anything is missing, malformed, outside the folder, or not a valid camera,
-                or an image is not HDR or of another size than its frame says. It names the file
-                and the remedy.
+                or an image cannot hold radiance or has another size than its frame says. It names
+                the file and the remedy.
         """
         data = DataFolder(Path(folder), allow_outside)
         top, file = data.read_transforms(), data.transforms_file
@@ -138,8 +153,12 @@ class Dataset:
         require_file(scene, "scene file", f"Set 'scene' in {file}")
         views = _read_views(data, file, top)
         for view in views:
-            for image in (view.image, *view.truth.values()):
-                _check_header(image, view.camera.width, view.camera.height)
+            size = view.camera.width, view.camera.height
+            _check_header(view.image, *size, view.encoding)
+            for image in view.truth.values():
+                _check_header(image, *size)
+            if view.mask is not None:
+                _check_header(view.mask, *size, "srgb")
         render, seen = _provenance(top, file)
         light = _light_by_depth(top, file)
         background = _background(top, file)
@@ -166,16 +185,26 @@ class Dataset:
         data.write_transforms(content)
 
 
-def read_image(path: Path, width: int, height: int, clip_negative: bool = False) -> np.ndarray:
-    """One HDR image, row by row: (width * height, 4) float32, linear RGB and alpha (1 if absent).
+def read_image(
+    path: Path, width: int, height: int, clip_negative: bool = False, encoding: str = "linear"
+) -> np.ndarray:
+    """One image, row by row: (width * height, 4) float32, linear RGB and alpha (1 if absent).
+
+    Args:
+        path: the image.
+        width, height: in pixels, as they must be.
+        clip_negative: take negative pixels as zero.
+        encoding: "srgb": it holds code values, and is decoded to [0, 1].
 
     Raises:
-        UserError: it is missing, unreadable, no HDR image, of another size, or has pixels that
-            are NaN, infinite, or (without `clip_negative`) negative.
+        UserError: it is missing, unreadable, of another kind or size, or has pixels that are NaN,
+            infinite, or (without `clip_negative`) negative.
     """
     # The header first: a damaged one may ask for more memory than there is
-    _check_header(path, width, height)
+    _check_header(path, width, height, encoding)
     require_memory(PIXEL_BYTES * width * height, "the image needs", "Use a smaller image", path)
+    if encoding == "srgb":
+        return decode(read_codes(path, _REPLACE)).reshape(-1, 4)
     try:
         bitmap = mi.Bitmap(str(path))
         size = tuple(bitmap.size())
@@ -188,6 +217,38 @@ def read_image(path: Path, width: int, height: int, clip_negative: bool = False)
         reason = " ".join(str(error).split())[:160]
         raise UserError(f"the image cannot be read ({reason})", path, _REPLACE) from None
     return _valid_pixels(np.array(bitmap).reshape(-1, 4), path, clip_negative)
+
+
+def read_photograph(view: View, clip_negative: bool = False) -> np.ndarray:
+    """The photograph of a view, (H, W, 4) float32: linear RGB, and alpha, 0 where it is masked.
+
+    Raises:
+        UserError: as in `read_image`, for the photograph or its mask.
+    """
+    pixels, counted = read_masked(view, clip_negative)
+    if counted is not None:
+        pixels[..., 3] *= counted
+    return pixels
+
+
+def read_masked(view: View, clip_negative: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+    """The photograph of a view, (H, W, 4) float32, and whether pixels count, (H, W) bool.
+
+    The second is None where the view has no mask. Errors are as in `read_photograph`.
+    """
+    width, height = view.camera.width, view.camera.height
+    pixels = read_image(view.image, width, height, clip_negative, view.encoding)
+    pixels = pixels.reshape(height, width, 4)
+    if view.mask is None:
+        return pixels, None
+    _check_header(view.mask, width, height, "srgb")
+    codes = read_codes(view.mask, _REPLACE)
+    return pixels, counted_by(codes)
+
+
+def counted_by(codes: np.ndarray) -> np.ndarray:
+    """Whether pixels count by the code values of a mask, (H, W, C): (H, W) bool."""
+    return codes[..., : 1 if codes.shape[2] < 3 else 3].max(axis=2) > 0
 
 
 def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
@@ -247,12 +308,20 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
     split = read_split(frame, where)
     camera = camera_from_frame(frame, top, where)
     known = {name: data.truth(name, image.stem) for name in QUANTITIES}
+    encoding = frame.get("encoding", top.get("encoding", "linear"))
+    if encoding not in ENCODINGS:
+        raise UserError(f"unknown encoding {encoding!r}", where, "It is 'linear' or 'srgb'")
+    mask = None
+    if "mask_path" in frame:
+        mask = data.inside(text(frame, "mask_path", where), f"{where}: 'mask_path'")
     return View(
         image.stem,
         split,
         camera,
         image,
         {name: file for name, file in known.items() if data.known(file)},
+        encoding=encoding,
+        mask=mask,
     )
 
 
@@ -274,13 +343,17 @@ def _valid_pixels(pixels: np.ndarray, path: Path, clip_negative: bool) -> np.nda
     return np.maximum(pixels, 0)
 
 
-def _check_header(path: Path, width: int, height: int) -> None:
-    """Refuse what cannot be an HDR image of that size, without reading its pixels."""
-    if path.suffix.lower() in _LDR_SUFFIXES:
+def _check_header(path: Path, width: int, height: int, encoding: str = "linear") -> None:
+    """Refuse what cannot be an image of that size and encoding, without reading its pixels."""
+    suffix, coded = path.suffix.lower(), encoding == "srgb"
+    if suffix in _LDR_SUFFIXES and not coded:
         raise UserError("the image is low dynamic range", path, _NEED_HDR)
     require_file(path, "image", _REPLACE)
-    if path.suffix.lower() not in SUFFIXES:
-        raise UserError(f"unknown image format {path.suffix!r}", path, _NEED_HDR)
+    if coded and suffix in SUFFIXES:
+        raise UserError(f"the image holds no code values: it is {suffix}", path, _CODED)
+    if suffix not in (CODED_SUFFIXES if coded else SUFFIXES):
+        remedy = _CODED if coded else _NEED_HDR
+        raise UserError(f"unknown image format {path.suffix!r}", path, remedy)
     try:
         header = read_header(path)
     except HeaderError as error:
@@ -313,6 +386,8 @@ def _frame(data: DataFolder, view: View) -> dict[str, Any]:
         "cx": camera.cx,
         "cy": camera.cy,
         "transform_matrix": camera.to_world.tolist(),
+        **({} if view.encoding == "linear" else {"encoding": view.encoding}),
+        **({} if view.mask is None else {"mask_path": data.relative(view.mask)}),
     }
 
 

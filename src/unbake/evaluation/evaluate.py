@@ -12,7 +12,7 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.lighting import ROWS, true_environment
-from ..dataset.views import Dataset, View
+from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
@@ -23,7 +23,7 @@ from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.run_lock import RunLock
-from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys, read_view
+from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from . import lighting, renderings, yardsticks
@@ -102,7 +102,7 @@ def _evaluate(
     # First, as the true lighting may be damaged, and views take long
     recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     clip = settings.clip_negative or recovered.clip_negative
-    exposure = exposure_of(read_view(view.image, view, clip) for view in views)
+    exposure = exposure_of(read_photograph(view, clip) for view in views)
     rows, materials = [], []
     for view in views:
         lock.require_held()
@@ -199,7 +199,7 @@ def _evaluate_view(
 ) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
     problem = recovered.problem
     radiance = render_camera(problem.scene_view, view.camera, settings, problem.hide_emitters)
-    photograph = read_view(view.image, view, settings.clip_negative or recovered.clip_negative)
+    photograph = read_photograph(view, settings.clip_negative or recovered.clip_negative)
     truth, seen = GroundTruth.of(view, recovered.config.quantities), None
     if recovered.config.learns_materials:
         seen = seen_materials(problem, view, settings.material_spp)

@@ -21,7 +21,7 @@ from ..acquisition.new_light import change_light
 from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
 from ..dataset.camera import Camera, frame_name, read_cameras
-from ..dataset.views import Dataset, View
+from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr
 from ..imaging.pictures import tonemap, write_exr, write_png
@@ -29,7 +29,7 @@ from ..io import filled_folder, require_new_folder, write_json
 from ..memory import require_memory
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
-from ..training.validation import GroundTruth, read_view
+from ..training.validation import GroundTruth
 from ..version import VERSION
 from . import renderings
 from .evaluate import DEFINITIONS, description
@@ -302,7 +302,7 @@ def _scores(
     """Scores of a picture against the truth, counted as in an evaluation; empty without truth."""
     if shot.truth is None:
         return {}
-    photograph = read_view(shot.truth.image, shot.truth, recovered.clip_negative)
+    photograph = read_photograph(shot.truth, recovered.clip_negative)
     truth = GroundTruth.of(shot.truth, recovered.config.quantities)
     seen = None
     if recovered.config.learns_materials:

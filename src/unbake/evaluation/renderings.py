@@ -60,13 +60,14 @@ def counted_pixels(
     """The pixels of a view that scores of its rendering count, (H, W) bool.
 
     Args:
-        photograph: (H, W, 4), with alpha.
+        photograph: (H, W, 4), with alpha, which is 0 where it is masked.
         seen: the recovered materials; None where they are known.
         truth: the true ones; None where they are not known: every foreground pixel counts.
     """
     if truth is None:
         return photograph[..., 3] >= 1
-    return truth.known if seen is None else seen.mask(truth)
+    known = truth.known if seen is None else seen.mask(truth)
+    return known & (photograph[..., 3] > 0)
 
 
 def render_scores(

@@ -1,4 +1,4 @@
-"""What the header of an HDR image says, read without its pixels.
+"""What the header of an image says, read without its pixels.
 
 A file of a kilobyte may claim a picture of terabytes. Decoders take the memory before they find
 that the rest is missing.
@@ -23,15 +23,26 @@ _CHANNELS = 1 << 16
 _BLOCK_LINES, _BLOCK_BYTES = 256, 16
 #: Bytes of the text at the beginning of Radiance HDR and PFM files.
 _TEXT = 1 << 14
+#: Bytes in which a JPEG file must tell its size, behind profiles of colours and small pictures.
+_JPEG = 1 << 22
+#: Pixels that a byte of a PNG, JPEG or TIFF file holds at most: black ones, packed by zlib.
+_DENSEST = 1 << 14
+#: Tags of a TIFF directory, and bytes of a number by its type.
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES, _TIFF_KIND = 256, 257, 258, 277, 339
+_TIFF_NUMBERS = {1: "B", 3: "H", 4: "I"}
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size of a picture in pixels, and number of its channels."""
+    """Size of a picture in pixels, number of its channels, and bits of a code value.
+
+    `bits` is None where values are floating point, as they are in HDR images.
+    """
 
     width: int
     height: int
     channels: int
+    bits: int | None = None
 
 
 class HeaderError(ValueError):
@@ -39,7 +50,7 @@ class HeaderError(ValueError):
 
 
 def read_header(path: Path) -> ImageHeader:
-    """The header of an OpenEXR, Radiance HDR or PFM file, by the suffix of its name.
+    """The header of a file of `SUFFIXES` or `CODED_SUFFIXES`, by the suffix of its name.
 
     Raises:
         HeaderError: the file is of another format, damaged, or too short for its size.
@@ -129,11 +140,87 @@ def _read_pfm(file: BinaryIO, size: int) -> ImageHeader:
     return ImageHeader(width, height, channels)
 
 
+def _read_png(file: BinaryIO, size: int) -> ImageHeader:
+    head = file.read(33)
+    if not head.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise HeaderError("it is not PNG" if head else "it is empty")
+    if len(head) < 33 or head[12:16] != b"IHDR":
+        raise HeaderError("it is cut off")
+    width, height, bits, kind = struct.unpack_from(">2I2B", head, 16)
+    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(kind)
+    if channels is None or bits not in (1, 2, 4, 8, 16):
+        raise HeaderError("its header is damaged")
+    return _coded(width, height, channels, max(bits, 8), size)
+
+
+def _read_jpeg(file: BinaryIO, size: int) -> ImageHeader:
+    head = file.read(_JPEG)
+    if not head.startswith(b"\xff\xd8"):
+        raise HeaderError("it is not JPEG" if head else "it is empty")
+    at = 2
+    while at + 10 <= len(head) and head[at] == 0xFF:
+        kind = head[at + 1]
+        if kind == 0xFF:  # a byte that only fills up
+            at += 1
+            continue
+        length = int.from_bytes(head[at + 2 : at + 4], "big")
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            bits, height, width, channels = struct.unpack_from(">B2HB", head, at + 4)
+            return _coded(width, height, channels, bits, size)
+        at += 2 + length
+    raise HeaderError("its header lacks a size")
+
+
+def _read_tiff(file: BinaryIO, size: int) -> ImageHeader:
+    head = file.read(8)
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
+    if order is None or len(head) < 8:
+        raise HeaderError("it is not TIFF (or a BigTIFF)" if head else "it is empty")
+    found: dict[int, int] = {}
+    try:
+        file.seek(struct.unpack_from(f"{order}I", head, 4)[0])
+        (count,) = struct.unpack(f"{order}H", file.read(2))
+        entries = file.read(12 * count)
+        for at in range(0, 12 * count, 12):
+            tag, kind, length = struct.unpack_from(f"{order}2HI", entries, at)
+            number = _TIFF_NUMBERS.get(kind)
+            if number is None or not length:
+                continue
+            field = entries[at + 8 : at + 12]
+            if length * struct.calcsize(number) > 4:  # of each channel; the first one tells
+                file.seek(struct.unpack(f"{order}I", field)[0])
+                field = file.read(4)
+            found[tag] = struct.unpack_from(f"{order}{number}", field)[0]
+    except struct.error:
+        raise HeaderError("it is cut off") from None
+    if _TIFF_WIDTH not in found or _TIFF_HEIGHT not in found:
+        raise HeaderError("its header lacks a size")
+    if found.get(_TIFF_KIND, 1) != 1:
+        raise HeaderError("its values are no code values: write OpenEXR")
+    channels, bits = found.get(_TIFF_SAMPLES, 1), max(found.get(_TIFF_BITS, 1), 8)
+    return _coded(found[_TIFF_WIDTH], found[_TIFF_HEIGHT], channels, bits, size)
+
+
+def _coded(width: int, height: int, channels: int, bits: int, size: int) -> ImageHeader:
+    if width < 1 or height < 1 or width * height > size * _DENSEST:
+        raise HeaderError(f"{size} bytes cannot hold {width} x {height} pixels")
+    if bits not in (8, 16):
+        raise HeaderError(f"it has {bits} bits a channel, not 8 or 16")
+    return ImageHeader(width, height, channels, bits)
+
+
 _READERS: dict[str, Callable[[BinaryIO, int], ImageHeader]] = {
     ".exr": _read_exr,
     ".hdr": _read_hdr,
     ".rgbe": _read_hdr,
     ".pfm": _read_pfm,
+    ".png": _read_png,
+    ".jpg": _read_jpeg,
+    ".jpeg": _read_jpeg,
+    ".tif": _read_tiff,
+    ".tiff": _read_tiff,
 }
-#: Suffixes of the files whose headers can be read.
-SUFFIXES = tuple(_READERS)
+#: Suffixes of HDR images, which hold linear radiance.
+SUFFIXES = (".exr", ".hdr", ".rgbe", ".pfm")
+#: Suffixes of images of code values, of 8 or 16 bits a channel.
+CODED_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")

@@ -11,6 +11,8 @@ import numpy as np
 
 from unbake.errors import UserError
 from unbake.imaging import pictures
+from unbake.imaging.coded import read_picture
+from unbake.imaging.headers import CODED_SUFFIXES
 from unbake.imaging.pictures import percentile
 from unbake.report.runs import Run
 
@@ -80,8 +82,12 @@ def evaluated(run: Run, picture: Path) -> Path:
 
 
 def rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) linear RGB and (H, W) bool, True where alpha (if any) is at least one half."""
-    pixels = pictures.read_exr(path)
+    """(H, W, 3) linear RGB and (H, W) bool, True where alpha (if any) is at least one half.
+
+    Photographs may hold code values of the sRGB curve; all other pictures are OpenEXR.
+    """
+    coded = path.suffix.lower() in CODED_SUFFIXES
+    pixels = read_picture(path) if coded else pictures.read_exr(path)
     if pixels.shape[2] < 3:
         pixels = pixels[..., :1].repeat(3, axis=2)
     mask = pixels[..., 3] >= 0.5 if pixels.shape[2] > 3 else np.ones(pixels.shape[:2], bool)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..config import FitConfig
 from ..dataset.pixels import HELD_GROUPS, MOST_HELD, CameraRays, PixelBatch
-from ..dataset.views import Dataset, read_image
+from ..dataset.views import Dataset, read_photograph
 from .checkpoint import Progress
 from .state import State
 from .step import TrainingStep
@@ -194,8 +194,7 @@ class HeldOutPhotographs:
         each = max(MOST_HELD // len(dataset.heldout), 1)
         rng, numbers, colours = np.random.default_rng(config.seed), [], []
         for view in dataset.heldout:
-            camera = view.camera
-            pixels = read_image(view.image, camera.width, camera.height, clip_negative)
+            pixels = read_photograph(view, clip_negative).reshape(-1, 4)
             seen = np.flatnonzero(pixels[:, 3] >= 1)
             chosen = seen[rng.permutation(len(seen))[:each]]
             numbers.append(start + chosen)

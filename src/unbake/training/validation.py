@@ -123,10 +123,10 @@ class Score:
         return {"views": len(rows)} | means
 
 
-def read_view(image: Path, view: View, clip_negative: bool = False) -> np.ndarray:
-    """An image of a view, (H, W, 4) float32, linear RGB and alpha; errors as in `read_image`."""
+def read_view(image: Path, view: View) -> np.ndarray:
+    """A true picture of a view, (H, W, 4) float32, with alpha; errors as in `read_image`."""
     width, height = view.camera.width, view.camera.height
-    return read_image(image, width, height, clip_negative).reshape(height, width, 4)
+    return read_image(image, width, height).reshape(height, width, 4)
 
 
 def finite(value: float) -> float | None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
-from ..dataset.views import Dataset, View
+from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
 from ..exports.bake import OwnTextures, look_up, own_textures
 from ..exports.observed import Views
@@ -430,7 +430,7 @@ def _error_to(what: str) -> str:
 
 
 def _photograph(view: View) -> np.ndarray:
-    return read_view(view.image, view, clip_negative=True)[..., :3]
+    return read_photograph(view, clip_negative=True)[..., :3]
 
 
 def _truth(view: View, name: str) -> np.ndarray:

@@ -1,0 +1,145 @@
+"""Images of code values, 8 or 16 bits a channel: read, and decoded by the sRGB curve."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from PIL import Image
+
+from ..errors import UserError
+from ..io import require_file
+from .headers import HeaderError, read_header
+
+#: Formats that Pillow may try, by its names: it knows some that start other programs.
+_FORMATS = ("PNG", "JPEG", "TIFF")
+#: Pillow's names of colours that become RGB without a profile.
+_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+
+
+class _Unreadable(ValueError):
+    """Why an image of code values cannot be decoded, as the end of a sentence."""
+
+
+def read_picture(path: Path) -> np.ndarray:
+    """A picture of code values, decoded: (H, W, 4) as from `decode`; errors as in `read_codes`."""
+    return decode(read_codes(path))
+
+
+def read_codes(path: Path, remedy: str = "Write it again, or copy it again") -> np.ndarray:
+    """The code values of a PNG, JPEG or TIFF file as they are stored, not turned by its EXIF.
+
+    Args:
+        path: the file.
+        remedy: what the user can do where it cannot be read.
+
+    Returns:
+        (H, W, C) uint8 or uint16; C is 1 (grey), 2 (grey and alpha), 3 or 4.
+
+    Raises:
+        UserError: it is missing or damaged, has other colours than these, or needs a package that
+            is not installed.
+    """
+    require_file(path, "image", remedy)
+    try:
+        return _codes(path)
+    except OSError as error:
+        said = error.strerror or error
+    except MemoryError:
+        said = "it does not fit into memory"
+    except (_Unreadable, HeaderError) as error:
+        said = error
+    raise UserError(f"the image cannot be read ({said})", path, remedy)
+
+
+def decode(codes: np.ndarray) -> np.ndarray:
+    """Code values to linear RGB and alpha, premultiplied as in OpenEXR.
+
+    Args:
+        codes: (H, W, C) uint8 or uint16, C from 1 to 4, alpha last where C is 2 or 4.
+
+    Returns:
+        (H, W, 4) float32: values in [0, 1], the largest code being 1; alpha is 1 where there is
+        none, and is not decoded by the curve.
+
+    Source: IEC 61966-2-1.
+    """
+    table = _table(np.iinfo(codes.dtype).max)
+    colours = codes.shape[2] - (codes.shape[2] in (2, 4))
+    pixels = np.ones((*codes.shape[:2], 4), np.float32)
+    pixels[..., :3] = table[codes[..., :colours]]
+    if colours < codes.shape[2]:
+        pixels[..., 3] = codes[..., -1] / np.float32(np.iinfo(codes.dtype).max)
+        pixels[..., :3] *= pixels[..., 3:]
+    return pixels
+
+
+def encode(linear: np.ndarray) -> np.ndarray:
+    """Linear values to 16-bit codes of the sRGB curve, clamped to [0, 1]; the inverse of `decode`.
+
+    Args:
+        linear: of any shape, not premultiplied.
+
+    Source: IEC 61966-2-1.
+    """
+    value = np.clip(np.asarray(linear, np.float64), 0, 1)
+    curve = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.round(65535 * curve).astype(np.uint16)
+
+
+@cache
+def _table(most: int) -> np.ndarray:
+    """Linear values of all codes up to `most`, float32."""
+    value = np.arange(most + 1) / most
+    curve = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return curve.astype(np.float32)
+
+
+def _codes(path: Path) -> np.ndarray:
+    header = read_header(path)
+    if header.bits == 16 and path.suffix.lower() == ".png":
+        read = _read_png
+    else:
+        read = _read_by_pillow if header.bits == 8 else _read_tiff
+    try:
+        codes = read(path)
+    except (_Unreadable, MemoryError):
+        raise
+    except Exception as error:  # decoders of damaged files raise whatever they meet
+        told = " ".join(str(error).split())[:160] or type(error).__name__
+        raise _Unreadable(told) from None
+    codes = codes[..., None] if codes.ndim == 2 else codes
+    if codes.ndim != 3 or codes.shape[:2] != (header.height, header.width):
+        raise _Unreadable("it does not have the size that its header tells")
+    if not 1 <= codes.shape[2] <= 4 or codes.dtype not in (np.uint8, np.uint16):
+        raise _Unreadable("it has other channels than grey or RGB, and alpha")
+    return codes
+
+
+def _read_png(path: Path) -> np.ndarray:
+    return np.array(mi.Bitmap(str(path), mi.Bitmap.FileFormat.PNG))
+
+
+def _read_by_pillow(path: Path) -> np.ndarray:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of odd tags, and of sizes that were checked
+        with Image.open(path, formats=_FORMATS) as image:
+            if image.mode not in _MODES:
+                raise _Unreadable(f"its colours are {image.mode}, not RGB or grey")
+            alpha = "A" in image.mode or "transparency" in image.info
+            return np.array(image.convert("RGBA" if alpha else "RGB"))
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    try:
+        from tifffile import TiffFile
+    except ImportError:
+        raise _Unreadable("16 bits of TIFF need tifffile: pip install 'unbake[import]'") from None
+    with TiffFile(path) as file:
+        page = file.pages[0]
+        if page.planarconfig != 1 and page.samplesperpixel > 1:
+            raise _Unreadable("its channels lie one after the other")
+        return np.asarray(page.asarray())

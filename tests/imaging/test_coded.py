@@ -1,0 +1,103 @@
+"""Images of code values: decoded as they were encoded, and damaged ones refused in one line."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from unbake.errors import UserError
+from unbake.imaging.coded import decode, encode, read_codes, read_picture
+from unbake.imaging.headers import CODED_SUFFIXES, HeaderError, ImageHeader, read_header
+from unbake.imaging.pictures import tonemap
+
+CODES = np.random.default_rng(3).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+
+
+def save(file, codes, **options):
+    Image.fromarray(codes).save(file, **options)
+    return file
+
+
+@pytest.mark.parametrize("suffix", CODED_SUFFIXES)
+def test_eight_bits_are_read(tmp_path, suffix):
+    options = {"quality": 100, "subsampling": 0} if "jp" in suffix else {}
+    file = save(tmp_path / f"a{suffix}", CODES, **options)
+    assert read_header(file) == ImageHeader(7, 5, 3, 8)
+    assert np.abs(read_codes(file).astype(int) - CODES).max() <= (4 if options else 0)
+
+
+@pytest.mark.parametrize(("mode", "channels"), [("L", 3), ("LA", 4), ("P", 3), ("RGBA", 4)])
+def test_grey_palettes_and_alpha_are_read(tmp_path, mode, channels):
+    image = Image.fromarray(CODES).convert(mode)
+    image.save(tmp_path / "a.png")
+    codes = read_codes(tmp_path / "a.png")
+    assert np.array_equal(codes, np.array(image.convert("RGBA" if channels == 4 else "RGB")))
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_sixteen_bits_of_png_are_read_whole(tmp_path, channels):
+    codes = np.random.default_rng(1).integers(0, 65536, (5, 7, channels)).astype(np.uint16)
+    mi.Bitmap(codes).write(str(tmp_path / "a.png"))
+    assert read_header(tmp_path / "a.png") == ImageHeader(7, 5, channels, 16)
+    assert np.array_equal(read_codes(tmp_path / "a.png"), codes)
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_sixteen_bits_of_tiff_are_read_whole(tmp_path, compression):
+    tifffile = pytest.importorskip("tifffile", reason="16 bits of TIFF need tifffile")
+    codes = np.random.default_rng(1).integers(0, 65536, (5, 7, 3)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", codes, photometric="rgb", compression=compression)
+    assert read_header(tmp_path / "a.tif") == ImageHeader(7, 5, 3, 16)
+    assert np.array_equal(read_codes(tmp_path / "a.tif"), codes)
+
+
+def test_decoding_is_the_inverse_of_tone_mapping():
+    every = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, 2)
+    linear = decode(every)
+    assert np.array_equal(tonemap(linear[..., :3]), every)
+    fine = np.arange(65536, dtype=np.uint16).reshape(256, 256, 1)
+    assert np.array_equal(encode(decode(fine)[..., :1]), fine)
+
+
+def test_pictures_are_not_turned_by_their_exif(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    file = save(tmp_path / "a.jpg", CODES, exif=exif)
+    assert read_picture(file).shape == (5, 7, 4)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_what_is_cut_off_is_refused_in_one_line(tmp_path, suffix):
+    whole = save(tmp_path / f"whole{suffix}", CODES).read_bytes()
+    file = tmp_path / f"a{suffix}"
+    for length in (0, 3, 20, 40, 80, len(whole) // 2):
+        file.write_bytes(whole[:length])
+        with pytest.raises(UserError, match="the image cannot be read") as caught:
+            read_codes(file)
+        assert "\n" not in str(caught.value) and caught.value.remedy
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_a_header_that_claims_gigapixels_is_refused(tmp_path, suffix):
+    file = save(tmp_path / f"a{suffix}", CODES)
+    data = bytearray(file.read_bytes())
+    if suffix == ".png":
+        data[16:24] = b"\0\0\xff\xff" * 2
+    elif suffix == ".jpg":
+        at = data.index(b"\xff\xc0")
+        data[at + 5 : at + 9] = b"\xff\xff\xff\xff"
+    else:
+        at = data.index((256).to_bytes(2, "little") + b"\4\0")
+        data[at + 8 : at + 12] = (1 << 30).to_bytes(4, "little")
+    file.write_bytes(data)
+    with pytest.raises(HeaderError, match="bytes cannot hold"):
+        read_header(file)
+
+
+def test_other_colours_and_values_are_refused(tmp_path):
+    Image.fromarray(CODES).convert("CMYK").save(tmp_path / "a.jpg")
+    with pytest.raises(UserError, match="its colours are CMYK"):
+        read_codes(tmp_path / "a.jpg")
+    Image.fromarray(CODES[..., 0].astype(np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match="its values are no code values"):
+        read_codes(tmp_path / "a.tif")
