@@ -111,6 +111,7 @@ def test_paths_may_be_texts(tmp_path):
     methods, settings = [unbake.MethodVariant("ours")], unbake.EvaluationSettings()
     refused = {
         "capture": lambda: unbake.capture(f"{none}.xml", none, unbake.CaptureSettings()),
+        "import_data": lambda: unbake.import_data(none, f"{none}-data", [f"{none}.ply"]),
         "fit": lambda: unbake.fit(none, f"{none}-run", cpu),
         "evaluate": lambda: unbake.evaluate(none),
         "render": lambda: unbake.render(none, f"{none}-pictures"),

@@ -68,6 +68,8 @@ if TYPE_CHECKING:
     from .fields.settings import NetworkConfig as NetworkConfig
     from .fields.settings import TriPlaneConfig as TriPlaneConfig
     from .fields.torch import TorchField as TorchField
+    from .importing.import_data import import_data as import_data
+    from .importing.settings import ImportSettings as ImportSettings
     from .quantities import DEFAULT_QUANTITIES as DEFAULT_QUANTITIES
     from .quantities import QUANTITIES as QUANTITIES
     from .quantities import Quantity as Quantity
@@ -131,6 +133,8 @@ _GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "config": ("FitConfig", "preset", "read_toml", "to_toml"),
         "acquisition.settings": ("CaptureSettings",),
         "acquisition.capture": ("capture",),
+        "importing.settings": ("ImportSettings",),
+        "importing.import_data": ("import_data",),
         "training.loop": ("fit",),
         "training.recovered": ("load_run",),
         "run": ("Run",),
@@ -207,6 +211,7 @@ _PURE = frozenset(
         "fields.field",
         "fields.registry",
         "fields.settings",
+        "importing.settings",
         "quantities",
         "solver.settings",
         "transport.methods",

@@ -72,6 +72,61 @@ def _data_set_with(suffix: str) -> Callable[[Path], None]:
     return prepare
 
 
+def _coded_data_set(suffix: str) -> Callable[[Path], None]:
+    """A data set one of whose photographs holds code values."""
+
+    def prepare(folder: Path) -> None:
+        _data_set(folder)
+        file = folder / "transforms.json"
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            if frame["file_path"].endswith("train_001.exr"):
+                frame |= {"file_path": f"images/train_001.{suffix}", "encoding": "srgb"}
+        file.write_text(json.dumps(content))
+
+    return prepare
+
+
+def _coded(suffix: str) -> Callable[[], Sequence[bytes]]:
+    """Photographs of 16 x 16 code values: of 8 bits, and of 16 where PNG has them."""
+
+    def make() -> Sequence[bytes]:
+        from io import BytesIO
+
+        import mitsuba as mi
+        import numpy as np
+        from PIL import Image
+
+        codes = np.random.default_rng(0).integers(0, 256, (16, 16, 3)).astype(np.uint8)
+        stream = BytesIO()
+        Image.fromarray(codes).save(stream, {"jpg": "JPEG", "tif": "TIFF", "png": "PNG"}[suffix])
+        found = [stream.getvalue()]
+        if suffix == "png":
+            fine = mi.MemoryStream()
+            mi.Bitmap(codes.astype(np.uint16) * 257).write(fine, mi.Bitmap.FileFormat.PNG)
+            found.append(fine.raw_buffer())
+        return found
+
+    return make
+
+
+def _read_foreign(folder: Path) -> None:
+    from unbake.importing.faults import Faults
+    from unbake.importing.frames import read_one_file
+
+    faults = Faults()
+    read_one_file(folder / "transforms.json", None, False, False, faults)
+    faults.require_none(folder)
+
+
+def _nerfstudio() -> Sequence[bytes]:
+    content = json.loads((FIRST / "data" / "transforms.json").read_text())
+    del content["scene"]
+    content |= {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]}
+    content |= {"camera_model": "OPENCV", "k1": 0.1, "test_filenames": ["images/heldout_000.exr"]}
+    return [json.dumps(content).encode()]
+
+
 def _load_data(folder: Path) -> None:
     from unbake.dataset.views import Dataset
 
@@ -422,6 +477,21 @@ FORMATS: dict[str, Format] = {
     ),
     "photograph rgbe": Format(
         "images/train_001.hdr", _rgbe, mutations.IMAGE, _load_photographs, _data_set_with("hdr")
+    ),
+    "photograph png": Format(
+        "images/train_001.png", _coded("png"), mutations.IMAGE, _load_photographs,
+        _coded_data_set("png"),
+    ),
+    "photograph jpeg": Format(
+        "images/train_001.jpg", _coded("jpg"), mutations.IMAGE, _load_photographs,
+        _coded_data_set("jpg"),
+    ),
+    "photograph tiff": Format(
+        "images/train_001.tif", _coded("tif"), mutations.IMAGE, _load_photographs,
+        _coded_data_set("tif"),
+    ),
+    "nerfstudio": Format(
+        "transforms.json", _nerfstudio, mutations.JSON, _read_foreign, _data_set
     ),
     "picture": Format(
         "picture.exr", _files("data/images/train_001.exr"), mutations.IMAGE, _read_picture, weight=2

@@ -26,6 +26,8 @@ from ..config import FitConfig, with_quality
 from ..config.light import LightConfig
 from ..errors import UserError, printable
 from ..evaluation.settings import EvaluationSettings, RenderSettings
+from ..importing.faults import ImportFaults
+from ..importing.settings import ImportSettings
 from ..memory import lacks_memory
 from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
@@ -37,8 +39,10 @@ from .options import (
     Experiment,
     File,
     Flag,
+    Folder,
     Folders,
     Formats,
+    Meshes,
     Methods,
     OtherData,
     Out,
@@ -50,6 +54,7 @@ from .options import (
     Runs,
     Scale,
     Scene,
+    Source,
     any_light,
     chosen_light,
     chosen_settings,
@@ -81,13 +86,15 @@ _STATUS = (
 
 if TYPE_CHECKING:
     CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = RenderFlags = LightFlags = Any
-    SolveFlags = Any
+    ImportFlags = ImportLightFlags = SolveFlags = Any
 else:
     CaptureFlags = flags(CaptureSettings)
+    ImportFlags = flags(ImportSettings)
     FitFlags = flags(FitConfig, presets=True)
     EvaluationFlags = flags(EvaluationSettings)
     RenderFlags = flags(RenderSettings)
     LightFlags = flags(LightConfig)
+    ImportLightFlags = flags(LightConfig, without=("keep-lights",))
     SolveFlags = flags(SolveSettings)
     CompareFlags = flags(FitConfig, presets=True, without=("method",))
 
@@ -163,6 +170,59 @@ def capture(
     run(scene, out, settings, cameras=cameras, light=other, **options)
     took = f"{time.perf_counter() - start:.0f} s"
     _say(f"wrote {out} in {took}; next: unbake fit {_word(out)} --out RUN")
+
+
+def import_(
+    source: Positional[Source],
+    /,
+    mesh: Meshes,
+    out: Out,
+    images: Folder = None,
+    exposures: File = None,
+    envmap: File = None,
+    lights: File = None,
+    allow_outside: Flag = False,
+    *,
+    settings: OmitArgPrefixes[ImportFlags],
+    light: OmitArgPrefixes[ImportLightFlags],
+) -> None:
+    """Make a data set of photographs, cameras and meshes of other programs.
+
+    Photographs may be PNG, JPEG, TIFF or OpenEXR. The mesh must be in the frame and unit of the
+    cameras. Lens distortion is taken out. Exposures come from EXIF. It needs more packages:
+    pip install 'unbake[import]'
+
+    Without --envmap or --lights the light is unknown, and is fitted with the materials.
+
+    Args:
+        source: Folder or transforms.json of nerfstudio, Blender-NeRF or a synthetic NeRF scene, or
+            folder of a COLMAP project or model.
+        mesh: Mesh (PLY, OBJ, GLB); may be given several times.
+        out: Folder to write to, new or empty.
+        images: Folder of the photographs, where it is not the one that the source names.
+        exposures: Table (CSV) with the columns name and exposure, instead of EXIF.
+        envmap: Environment map (OpenEXR, HDR) that is the known light.
+        lights: Mitsuba XML file with the known lights: emitters, and shapes that emit light.
+        allow_outside: Read files that the source and --lights name outside of their folders.
+        settings: How the source is read.
+        light: How the known light is put into the scene.
+    """
+    chosen = with_options(ImportSettings(), given(settings))
+    known = any_light(envmap, lights, given(light))
+    backend.activate()
+    from ..importing.import_data import import_data
+
+    start = time.perf_counter()
+    files: dict[str, Any] = {"images": images, "exposures": exposures, "light": known}
+    try:
+        import_data(source, out, mesh, chosen, **files, allow_outside=allow_outside, tell=_say)
+    except ImportFaults as error:
+        for fault in error.faults:
+            print(f"  {printable(fault, _LONGEST)}", file=sys.stderr)
+        raise UserError(f"{error.count}, listed above", source, error.remedy) from None
+    took = f"{time.perf_counter() - start:.0f} s"
+    unknown = " --unknown materials+lighting" if known is None else ""
+    _say(f"wrote {out} in {took}; next: unbake fit {_word(out)}{unknown} --out RUN")
 
 
 def fit(
@@ -796,6 +856,7 @@ def doctor() -> int:
 GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
     "Start": {
         "capture": capture,
+        "import": import_,
         "fit": fit,
     },
     "Results": {

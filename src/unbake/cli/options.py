@@ -7,7 +7,7 @@ import typing
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from .. import config, experiments, exports
 from ..config.light import LightConfig
@@ -32,6 +32,11 @@ Out = Annotated[Path, arg(aliases=("-o",))]
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 OtherData = Annotated[Path | None, arg(metavar="DATA", help_behavior_hint="")]
 OutFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="", aliases=("-o",))]
+Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
+Source = Annotated[Path, arg(metavar="SOURCE")]
+Meshes = UseAppendAction[
+    Annotated[tuple[Path, ...], arg(metavar="MESH", help_behavior_hint="(required)")]
+]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
 Preset = Annotated[

@@ -3,7 +3,8 @@
     DATA/
       transforms.json                  cameras and images, in the layout of nerfstudio
       scene/                           the Mitsuba scene and its files
-      images/VIEW.exr                  photographs
+      images/VIEW.exr                  photographs; of cameras as .jpg, .png or .tif
+      masks/VIEW.png                   zero where pixels do not count; only where there are masks
       truth/QUANTITY/VIEW.exr          true materials; a quantity that is not known has no folder
       truth/environment.exr            the true environment map
       truth/emission.json              the true strengths of lights
@@ -30,6 +31,15 @@ TRANSFORMS = "transforms.json"
 FORMAT = 1
 
 _MAKE_DATA = "Render a data set from a scene with `unbake capture SCENE --out DATA`"
+#: What turns the folder of another program into a data set.
+IMPORT = "`unbake import SOURCE --mesh MESH --out DATA` makes a data set of it"
+#: What is found in the folders of other programs.
+_FOREIGN = {
+    "transforms_train.json": "Blender",
+    "sparse": "COLMAP",
+    "cameras.bin": "COLMAP",
+    "cameras.txt": "COLMAP",
+}
 _KIND = "data folder"
 
 
@@ -59,9 +69,13 @@ class DataFolder:
         """The folder of the scene, where the data set was captured."""
         return self.path / "scene"
 
-    def image(self, view: str) -> Path:
-        """The photograph of a view, where the data set was captured."""
-        return self.path / "images" / f"{view}.exr"
+    def image(self, view: str, suffix: str = ".exr") -> Path:
+        """The photograph of a view, where the data set was captured or imported."""
+        return self.path / "images" / f"{view}{suffix}"
+
+    def mask(self, view: str) -> Path:
+        """The mask of a view, where the data set was imported."""
+        return self.path / "masks" / f"{view}.png"
 
     def truth(self, quantity: str, view: str) -> Path:
         """The true picture of a quantity, such as "albedo", in a view."""
@@ -158,9 +172,15 @@ class DataFolder:
             raise UserError("the data folder does not exist", self.path, "Check the path")
         file = self.transforms_file
         if not file.exists():
-            raise UserError(f"no {TRANSFORMS} in the folder", self.path, "Is this a data folder?")
+            programs = [_FOREIGN[name] for name in _FOREIGN if (self.path / name).exists()]
+            told = f"It looks like one of {programs[0]}: {IMPORT}" if programs else None
+            what = f"no {TRANSFORMS} in the folder"
+            raise UserError(what, self.path, told or "Is this a data folder?")
         content = read_object(self.inside(TRANSFORMS, str(self.path)))
         check_format(content, FORMAT, file)
+        if "scene" not in content and "frames" in content:
+            what = "the key 'scene' is missing, as in files of nerfstudio and Blender"
+            raise UserError(what, file, f"{IMPORT[0].upper()}{IMPORT[1:]}")
         return content
 
     def write_transforms(self, content: Mapping[str, Any]) -> None:

@@ -1,0 +1,1 @@
+"""Turns photographs, cameras and meshes of other programs into data sets."""

@@ -1,0 +1,228 @@
+"""Cameras in JSON: the layouts of nerfstudio, of Blender-NeRF and of the synthetic NeRF scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..dataset.camera import Camera, camera_from_frame
+from ..dataset.data_folder import TRANSFORMS
+from ..errors import UserError
+from ..io import array, inside, number, read_object, text
+from .faults import Faults
+from .lens import Lens, fisheye, opencv
+from .source import Shot, Source, image_header, with_suffix
+
+#: The files of a folder with one file a split, and our names of the splits.
+SPLIT_FILES = {
+    "transforms_train.json": "train",
+    "transforms_test.json": "heldout",
+    "transforms_val.json": "heldout",
+}
+#: Lists of file names at the top of a nerfstudio file, by what they become.
+_SPLIT_LISTS = {"train_filenames": "train", "val_filenames": "heldout", "test_filenames": "heldout"}
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+_LENSES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+def read_one_file(
+    file: Path, images: Path | None, keep_frame: bool, allow_outside: bool, faults: Faults
+) -> Source:
+    """A folder with one `transforms.json`, as nerfstudio, instant-ngp and others write it.
+
+    Args:
+        file: the JSON file.
+        images: folder of the images instead of that of the file; None: that of the file.
+        keep_frame: leave cameras in the frame of the file, where it has an `applied_transform`.
+        allow_outside: read images that lie outside of the folder.
+        faults: all that is wrong is added to it.
+    """
+    top = read_object(file)
+    if "scene" in top:
+        faults.add(f"the folder is a data set already: {file.name} names a 'scene'")
+        return Source("data set", ())
+    back, notes = _taken_back(top, file, keep_frame, faults)
+    splits = _listed_splits(top)
+    shots = _read_frames(file, top, images, None, allow_outside, faults)
+    placed = [
+        Shot(
+            shot.name,
+            splits.get(Path(shot.name).name, shot.split),
+            shot.image,
+            shot.lens,
+            back(shot.to_world),
+            shot.mask,
+        )
+        for shot in shots
+    ]
+    return Source("nerfstudio", tuple(placed), notes)
+
+
+def read_split_files(
+    folder: Path, images: Path | None, allow_outside: bool, faults: Faults
+) -> Source:
+    """A folder with `transforms_train.json` and its like; arguments as in `read_one_file`.
+
+    The views of `transforms_test.json` are held out; those of `transforms_val.json` where there is
+    no other file, and are left out where there is.
+    """
+    found = {name: folder / name for name in SPLIT_FILES if (folder / name).is_file()}
+    notes = []
+    if {"transforms_test.json", "transforms_val.json"} <= found.keys():
+        del found["transforms_val.json"]
+        notes.append("transforms_val.json is left out: transforms_test.json has held-out views")
+    shots = []
+    for name, file in found.items():
+        with faults.collected():
+            shots += _read_frames(
+                file, read_object(file), images, SPLIT_FILES[name], allow_outside, faults
+            )
+    if "transforms_train.json" not in found:
+        faults.add("there is no transforms_train.json")
+    return Source("Blender", tuple(shots), tuple(notes))
+
+
+def _read_frames(
+    file: Path,
+    top: dict[str, Any],
+    images: Path | None,
+    split: str | None,
+    allow_outside: bool,
+    faults: Faults,
+) -> list[Shot]:
+    frames, shots = top.get("frames"), []
+    if not isinstance(frames, list) or not frames:
+        faults.add("'frames' is not a list of frames", file.name)
+        return []
+    for index, frame in enumerate(frames):
+        place = f"{file.name}: frame {index}"
+        if not isinstance(frame, dict):
+            faults.add("the frame is not an object", place)
+            continue
+        with faults.collected(place):
+            shots.append(_shot(file, top, frame, images, split, allow_outside, faults))
+    return [shot for shot in shots if shot is not None]
+
+
+def _shot(
+    file: Path,
+    top: dict[str, Any],
+    frame: dict[str, Any],
+    images: Path | None,
+    split: str | None,
+    allow_outside: bool,
+    faults: Faults,
+) -> Shot | None:
+    """A frame; None where its image, pose or lens is faulty, each of which is told."""
+    name = text(frame, "file_path", file.name)
+    root = file.parent if images is None else images
+    image = mask = pose = lens = None
+    with faults.collected(name):
+        image = with_suffix(_inside(root, name, allow_outside))
+        header = image_header(image)
+        lens = _lens({**top, **frame}, header.width, header.height, name)
+    with faults.collected(f"{file.name}: {name}"):
+        pose = _pose(frame, name)
+    if "mask_path" in frame:
+        with faults.collected(frame["mask_path"]):
+            said = text(frame, "mask_path", name)
+            mask = with_suffix(_inside(file.parent, said, allow_outside))
+            image_header(mask)
+    if image is None or lens is None or pose is None:
+        return None
+    if split is None and frame.get("split") in ("train", "heldout"):
+        split = frame["split"]
+    short = Path(name).with_suffix(image.suffix).as_posix() if not Path(name).suffix else name
+    return Shot(short.removeprefix("./"), split, image, lens, pose, mask)
+
+
+def _inside(folder: Path, name: str, allow_outside: bool) -> Path:
+    return inside(folder, name, name, "source", allow_outside=allow_outside)
+
+
+def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
+    """Camera to world, (4, 4); some programs leave out the last row."""
+    rows = frame.get("transform_matrix")
+    if isinstance(rows, list) and len(rows) == 3:
+        frame = {"transform_matrix": [*rows, [0, 0, 0, 1]]}
+    pose = array(frame, "transform_matrix", (4, 4), where)
+    return np.array(Camera(pose, 1, 1, 0, 0, 1, 1).to_world)
+
+
+def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
+    """The lens of a frame; `width` and `height` are those of its image."""
+    model = keys.get("camera_model", "OPENCV")
+    if model not in (*_PINHOLES, *_LENSES, _FISHEYE):
+        raise UserError(f"unknown camera_model {model!r}", where)
+    plain = {k: v for k, v in keys.items() if k not in (*_DISTORTION, "camera_model")}
+    plain["transform_matrix"] = np.eye(4).tolist()
+    if "w" not in plain or "h" not in plain:
+        plain |= {"w": width, "h": height}
+    camera = camera_from_frame(plain, {}, where)
+    if (camera.width, camera.height) != (width, height):
+        told = f"{camera.width} x {camera.height}, the image has {width} x {height} pixels"
+        raise UserError(f"the camera is for {told}", where)
+    values = {k: number(dict(keys), k, where) for k in _DISTORTION if k in keys}
+    k1, k2, k3, k4, k5, k6, p1, p2 = (values.get(k, 0.0) for k in _DISTORTION)
+    focal, centre = (camera.fl_x, camera.fl_y), (camera.cx, camera.cy)
+    project = None
+    if model == _FISHEYE:
+        project = fisheye(focal, centre, np.array([k1, k2, k3, k4]))
+    elif any(values.values()) and model not in _PINHOLES:
+        if k4 or k5 or k6:
+            raise UserError("the lens has k4, k5 or k6, which programs use differently", where)
+        project = opencv(focal, centre, np.array([k1, k2, k3]), p1, p2)
+    return Lens(width, height, *focal, *centre, project)
+
+
+def _taken_back(
+    top: dict[str, Any], file: Path, keep: bool, faults: Faults
+) -> tuple[Callable[[np.ndarray], np.ndarray], tuple[str, ...]]:
+    """What puts poses back into the frame before `applied_transform`, and a note of it."""
+
+    def same(pose: np.ndarray) -> np.ndarray:
+        return pose
+
+    if keep or ("applied_transform" not in top and "applied_scale" not in top):
+        return same, ()
+    try:
+        applied = np.eye(4)
+        if "applied_transform" in top:
+            rows = top["applied_transform"]
+            shape = (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 4)
+            applied[:3] = array(top, "applied_transform", shape, str(file))[:3]
+        scale = number(top, "applied_scale", file.name) if "applied_scale" in top else 1.0
+        rotation = applied[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
+            raise UserError("'applied_transform' is no rotation with a translation")
+        if scale <= 0:
+            raise UserError("'applied_scale' is not positive")
+    except UserError as error:
+        faults.add(error.what, file.name)
+        return same, ()
+    undo = np.linalg.inv(applied)
+
+    def back(pose: np.ndarray) -> np.ndarray:
+        pose = pose.copy()
+        pose[:3, 3] /= scale
+        return undo @ pose
+
+    moved = not np.allclose(applied, np.eye(4)) or scale != 1
+    note = f"cameras are in the frame before 'applied_transform' of {TRANSFORMS}"
+    return back, (note,) if moved else ()
+
+
+def _listed_splits(top: dict[str, Any]) -> dict[str, str]:
+    """Splits by the file names of images, where the file has lists of them."""
+    return {
+        Path(name).name: split
+        for key, split in _SPLIT_LISTS.items()
+        if isinstance(top.get(key), list)
+        for name in top[key]
+        if isinstance(name, str)
+    }

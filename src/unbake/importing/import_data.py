@@ -1,0 +1,345 @@
+"""Make a data set of the photographs, cameras and meshes of other programs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..config.light import LightConfig
+from ..dataset.camera import LONGEST_SIDE, Camera
+from ..dataset.data_folder import TRANSFORMS, DataFolder
+from ..dataset.views import PIXEL_BYTES, counted_by, read_image
+from ..errors import UserError
+from ..imaging.coded import decode, encode, read_codes
+from ..imaging.pictures import write_exr
+from ..io import filled_folder, require_new_folder, require_utf8, write_atomically
+from ..memory import require_memory
+from ..scene import free_space, relight
+from ..scene.parse import parse, write
+from .colmap import find_model, read_colmap
+from .exposures import exposures_of, read_table
+from .faults import Faults
+from .frames import SPLIT_FILES, read_one_file, read_split_files
+from .meshes import Part, read_parts, write_scene
+from .settings import ImportSettings
+from .source import Shot, Source, image_header
+
+#: Codes at and above this share of the largest one are taken for clipped: 250 of 255.
+CLIPPED_CODE = 250 / 255
+#: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
+_RAYS = 64
+_KNOWN = (
+    f"It has a {TRANSFORMS} (nerfstudio), transforms_train.json (Blender), or cameras.bin or "
+    "cameras.txt (COLMAP), maybe in sparse/0"
+)
+
+
+def import_data(
+    source: str | Path,
+    out: str | Path,
+    meshes: Sequence[str | Path],
+    settings: ImportSettings | None = None,
+    *,
+    images: str | Path | None = None,
+    exposures: str | Path | None = None,
+    light: LightConfig | None = None,
+    allow_outside: bool = False,
+    tell: Callable[[str], None] = print,
+) -> DataFolder:
+    """Make a data set of photographs and cameras of another program and of meshes in their frame.
+
+    World units and axes stay those of the source. Photographs stay as they are where their lens is
+    a pinhole with square pixels; others are resampled to one.
+
+    Args:
+        source: a folder or file of nerfstudio, Blender-NeRF, a synthetic NeRF scene, or COLMAP.
+        out: folder to write, new or empty; it appears only when it is complete.
+        meshes: PLY, OBJ or GLB files.
+        settings: None: the defaults.
+        images: folder of the images, where it is not the source's own.
+        exposures: table of `name,exposure`; None: EXIF tells.
+        light: the known light; None: the light is unknown, and a constant environment stands for
+            it.
+        allow_outside: read files that lie outside of the source.
+        tell: called with what was found.
+
+    Raises:
+        UserError: the input has faults, all of which are told, or no photograph sees the mesh.
+    """
+    source, out, settings = Path(source), Path(out), settings or ImportSettings()
+    require_new_folder(out)
+    require_utf8(source, "source")
+    faults = Faults()
+    if not meshes:
+        faults.add("no mesh was given (--mesh FILE)")
+    found = _read_source(
+        source, None if images is None else Path(images), settings, allow_outside, faults
+    )
+    parts = read_parts([Path(mesh) for mesh in meshes], faults)
+    known, told = exposures_of(found.shots)
+    if exposures is not None:
+        with faults.collected():
+            known, told = read_table(Path(exposures), found.shots, faults)
+    names = _names(found.shots, faults)
+    _check_pictures(found.shots, faults)
+    faults.require_none(source)
+    splits = _splits(found.shots, settings.holdout)
+    with filled_folder(out) as folder:
+        data = DataFolder(folder)
+        seen = _write_scene(data, parts, light, allow_outside, found.shots, tell)
+        background = settings.background
+        if background == "auto":
+            background = _background(found.shots)
+        frames = [
+            _write_view(data, shot, names[shot.name], splits[shot.name], known)
+            for shot in found.shots
+        ]
+        data.write_transforms(
+            {"scene": data.relative(data.scene / "scene.xml"), "background": background}
+            | _clipped(found.shots)
+            | {"frames": frames}
+        )
+    for line in _summary(found, splits, seen, parts, told):
+        tell(line)
+    return DataFolder(out)
+
+
+# ------------------------------------------------------------------------------------------ reading
+
+
+def _read_source(
+    source: Path,
+    images: Path | None,
+    settings: ImportSettings,
+    allow_outside: bool,
+    faults: Faults,
+) -> Source:
+    folder = source if source.is_dir() else source.parent
+    if not source.exists():
+        raise UserError("the source does not exist", source, "Check the path")
+    if source.suffix == ".json" and source.name not in SPLIT_FILES:
+        return read_one_file(source, images, settings.keep_applied_transform, allow_outside, faults)
+    if any((folder / name).is_file() for name in SPLIT_FILES):
+        return read_split_files(folder, images, allow_outside, faults)
+    if (folder / TRANSFORMS).is_file():
+        file = folder / TRANSFORMS
+        return read_one_file(file, images, settings.keep_applied_transform, allow_outside, faults)
+    model = find_model(folder)
+    if model is not None:
+        return read_colmap(model, images, allow_outside, faults)
+    raise UserError("no cameras were found in the source", source, _KNOWN)
+
+
+def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
+    """Names of views by those of photographs: stems, and folders where stems are not unique."""
+    stems = [PurePosixPath(shot.name).stem for shot in shots]
+    names = dict(zip((shot.name for shot in shots), stems, strict=True))
+    if len(set(stems)) < len(stems):
+        names = {name: "_".join(_plain(PurePosixPath(name).with_suffix(""))) for name in names}
+    taken: dict[str, str] = {}
+    for shot in shots:
+        other = taken.setdefault(names[shot.name], shot.name)
+        if other != shot.name:
+            faults.add("two photographs have one name but for their suffix", shot.name)
+    if len({shot.name for shot in shots}) < len(shots):
+        faults.add("a photograph has two poses")
+    return names
+
+
+def _plain(path: PurePosixPath) -> list[str]:
+    return [part for part in path.parts if part not in ("/", ".", "..")]
+
+
+def _check_pictures(shots: Sequence[Shot], faults: Faults) -> None:
+    """Decode all photographs and masks once, and add those that cannot be read to the faults."""
+    for shot in shots:
+        size = shot.lens.width, shot.lens.height
+        if max(size) > LONGEST_SIDE:
+            faults.add(f"the image has over {LONGEST_SIDE} pixels along an edge", shot.name)
+            continue
+        with faults.collected(shot.name):
+            _pixels(shot)
+        if shot.mask is None:
+            continue
+        with faults.collected(shot.mask):
+            header = image_header(shot.mask)
+            if (header.width, header.height) != size:
+                raise UserError("the mask has another size than its image")
+            _mask(shot)
+        with faults.collected(shot.name):
+            shot.lens.camera(shot.to_world)
+
+
+def _pixels(shot: Shot) -> np.ndarray:
+    """The photograph, (H, W, 4) float32: linear, alpha premultiplied."""
+    need = PIXEL_BYTES * shot.lens.width * shot.lens.height
+    require_memory(need, "the image needs", "Use a smaller image", shot.name)
+    if shot.coded:
+        return decode(read_codes(shot.image))
+    pixels = read_image(shot.image, shot.lens.width, shot.lens.height)
+    return pixels.reshape(shot.lens.height, shot.lens.width, 4)
+
+
+def _mask(shot: Shot) -> np.ndarray:
+    """Which pixels count, (H, W) bool."""
+    assert shot.mask is not None
+    return counted_by(read_codes(shot.mask))
+
+
+def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:
+    """Splits by name: the source's own, else every n-th photograph by name is held out."""
+    own = {shot.name: shot.split for shot in shots if shot.split is not None}
+    if own:
+        return {shot.name: own.get(shot.name, "train") for shot in shots}
+    ordered = sorted(shot.name for shot in shots)
+    held = set(ordered[::holdout] if holdout and len(ordered) > 1 else ())
+    if len(held) == len(ordered):
+        held = set(ordered[:1])
+    return {name: "heldout" if name in held else "train" for name in ordered}
+
+
+# ------------------------------------------------------------------------------------------ writing
+
+
+def _write_scene(
+    data: DataFolder,
+    parts: Sequence[Part],
+    light: LightConfig | None,
+    allow_outside: bool,
+    shots: Sequence[Shot],
+    tell: Callable[[str], None],
+) -> np.ndarray:
+    """Write the scene; returns the share of each photograph's pixels that see the mesh."""
+    file = write_scene(parts, data.scene, environment=light is None)
+    if light is not None:
+        parsed = parse(file)
+        if light.envmap is not None:
+            relight.put_environment(parsed, light.envmap, light.envmap_scale, light.up, light.turn)
+        if light.lights is not None:
+            root = Path(light.lights.resolve().anchor) if allow_outside else None
+            for line in relight.put_lights(parsed, light.lights, root):
+                tell(line)
+        file = write(parsed, data.scene)
+    scene = parse(file).instantiate()
+    seen = np.array([_share_seen(scene, shot.lens.camera(shot.to_world)) for shot in shots])
+    if not seen.any():
+        raise UserError(
+            "no photograph sees the mesh",
+            None,
+            "Mesh and cameras must be in one frame and unit; --keep-applied-transform leaves "
+            "nerfstudio's cameras in the frame of their file",
+        )
+    return seen
+
+
+def _share_seen(scene: mi.Scene, camera: Camera) -> float:
+    x, y = (axis.ravel() for axis in np.meshgrid(*[(np.arange(_RAYS) + 0.5) / _RAYS] * 2))
+    origins, directions = camera.rays(x * camera.width, y * camera.height)
+    return float(np.isfinite(free_space.trace(scene, origins, directions).distance).mean())
+
+
+def _write_view(
+    data: DataFolder, shot: Shot, name: str, split: str, exposures: Mapping[str, float]
+) -> dict[str, Any]:
+    """Write the photograph and the mask of a view; returns its frame."""
+    camera = shot.lens.camera(shot.to_world)
+    if shot.lens.straight:
+        image = data.image(name, shot.image.suffix.lower())
+        image.parent.mkdir(exist_ok=True)
+        shutil.copyfile(shot.image, image)
+    else:
+        image = data.image(name, ".png" if shot.coded else ".exr")
+        pixels = shot.lens.straightened(_pixels(shot), camera.fl_x)
+        _write_picture(image, pixels)
+    frame: dict[str, Any] = {
+        "file_path": data.relative(image),
+        "split": split,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "transform_matrix": camera.to_world.tolist(),
+    }
+    if shot.coded:
+        frame["encoding"] = "srgb"
+    if shot.name in exposures:
+        frame["exposure"] = exposures[shot.name]
+    if shot.mask is not None:
+        counted = _mask(shot)[..., None].astype(np.float32)
+        if not shot.lens.straight:
+            counted = shot.lens.straightened(counted, camera.fl_x)
+        mask = data.mask(name)
+        _write_codes(mask, np.where(counted >= 1, 255, 0).astype(np.uint8))
+        frame["mask_path"] = data.relative(mask)
+    return frame
+
+
+def _write_picture(file: Path, pixels: np.ndarray) -> None:
+    """Write linear RGBA, premultiplied, as 16-bit codes or OpenEXR by the suffix of the file."""
+    opaque = bool((pixels[..., 3] >= 1).all())
+    if file.suffix == ".exr":
+        write_exr(file, pixels[..., :3] if opaque else pixels)
+        return
+    alpha = pixels[..., 3:]
+    codes = encode(pixels[..., :3] / np.where(alpha > 0, alpha, 1))
+    if not opaque:
+        codes = np.concatenate([codes, np.round(65535 * alpha).astype(np.uint16)], 2)
+    _write_codes(file, codes)
+
+
+def _write_codes(file: Path, codes: np.ndarray) -> None:
+    bitmap = mi.Bitmap(np.ascontiguousarray(codes))
+    write_atomically(file, lambda p: bitmap.write(str(p), mi.Bitmap.FileFormat.PNG))
+
+
+def _background(shots: Sequence[Shot]) -> str:
+    """Hidden where every photograph has alpha, as pictures of objects rendered by themselves."""
+    return "hidden" if all(image_header(s.image).channels in (2, 4) for s in shots) else "visible"
+
+
+def _clipped(shots: Sequence[Shot]) -> dict[str, float]:
+    """The decoded value from which code values are taken for clipped; none of radiance."""
+    if not any(shot.coded for shot in shots):
+        return {}
+    code = np.full((1, 1, 1), round(CLIPPED_CODE * 255), np.uint8)
+    return {"clipped": round(float(decode(code)[0, 0, 0]), 6)}
+
+
+# ------------------------------------------------------------------------------------------ telling
+
+
+def _summary(
+    source: Source,
+    splits: Mapping[str, str],
+    seen: np.ndarray,
+    parts: Sequence[Part],
+    exposures: str,
+) -> list[str]:
+    """What was found, in a few lines."""
+    shots = source.shots
+    sizes = sorted({(shot.lens.width, shot.lens.height) for shot in shots})
+    size = " to ".join(f"{w} x {h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
+    held = sum(split == "heldout" for split in splits.values())
+    bent = sum(not shot.lens.straight for shot in shots)
+    masked = sum(shot.mask is not None for shot in shots)
+    more = [f"{bent} undistorted"] if bent else []
+    more += [f"{masked} with masks"] if masked else []
+    views = f"{len(shots) - held} training and {held} held-out views of {size} pixels"
+    triangles = sum(len(part.faces) for part in parts)
+    count = "one part" if len(parts) == 1 else f"{len(parts)} parts"
+    low, high = (f"{100 * value:.0f}" for value in (seen.min(), seen.max()))
+    share = f"{100 * seen.mean():.0f} % of the pixels see it"
+    share += "" if low == high else f" ({low} to {high} % by view)"
+    lines = [f"{source.kind}: {', '.join([views, *more])}", *source.notes, exposures]
+    lines += [f"mesh: {count}, {triangles:,} triangles; {share}"]
+    blind = [shot.name for shot, value in zip(shots, seen, strict=True) if value == 0]
+    if blind:
+        lines += [f"{len(blind)} photographs do not see the mesh: {', '.join(blind[:3])}"]
+    return lines

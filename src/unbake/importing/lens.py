@@ -1,0 +1,156 @@
+"""Lenses of other programs, and photographs as a pinhole camera would have taken them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from ..dataset.camera import Camera
+
+#: Maps points of the plane in front of a camera to pixels: (n, 2) to (n, 2), both x to the right
+#: and y down; the plane lies at distance 1, pixels count from the upper left corner.
+Projection = Callable[[np.ndarray], np.ndarray]
+
+#: Focal lengths that differ by no more than this, relative, make square pixels.
+_SQUARE = 1e-4
+#: Points of an edge of the image that must come from inside of the photograph.
+_EDGE = 128
+#: How far the focal length may change: from the longest to the shortest, relative, in equal steps.
+_LONGEST, _SHORTEST, _STEPS = 4.0, 0.25, 1200
+#: Rows that are resampled at a time.
+_ROWS = 128
+
+
+@final
+@dataclass(frozen=True)
+class Lens:
+    """What maps directions to pixels of a photograph.
+
+    Args:
+        width, height: of the photograph, in pixels.
+        fl_x, fl_y: focal lengths in pixels; of a distorted lens those in its middle.
+        cx, cy: principal point in pixels from the upper left corner.
+        project: of a distorted lens; None: a pinhole.
+    """
+
+    width: int
+    height: int
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    project: Projection | None = None
+
+    @property
+    def straight(self) -> bool:
+        """Whether photographs can stay as they are: a pinhole with square pixels."""
+        return self.project is None and abs(self.fl_x / self.fl_y - 1) <= _SQUARE
+
+    def pixels(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 2) of the plane at distance 1 are seen, (n, 2); see `Projection`."""
+        if self.project is not None:
+            return self.project(points)
+        return points * (self.fl_x, self.fl_y) + (self.cx, self.cy)
+
+    def camera(self, to_world: np.ndarray) -> Camera:
+        """The pinhole camera that photographs belong to after `straightened`.
+
+        It has as many pixels and the same principal point. Its focal length is the shortest with
+        which all of its image lies inside the photograph.
+
+        Args:
+            to_world: (4, 4), OpenGL axes.
+
+        Raises:
+            UserError: the pose or the lens is none.
+        """
+        fl_x, fl_y = (self.fl_x, self.fl_y) if self.straight else (self._focal, self._focal)
+        return Camera(to_world, fl_x, fl_y, self.cx, self.cy, self.width, self.height)
+
+    def straightened(self, image: np.ndarray, focal: float) -> np.ndarray:
+        """The image (H, W, C) of the pinhole camera with this focal length, sampled bilinearly."""
+        straight = np.empty(image.shape, np.float32)
+        for top in range(0, self.height, _ROWS):
+            rows = np.arange(top, min(top + _ROWS, self.height))
+            x, y = np.meshgrid(np.arange(self.width) + 0.5 - self.cx, rows + 0.5 - self.cy)
+            at = self.pixels(np.stack([x.ravel(), y.ravel()], 1) / focal) - 0.5
+            straight[rows] = _bilinear(image, at).reshape(len(rows), self.width, -1)
+        return straight
+
+    @cached_property
+    def _focal(self) -> float:
+        """The shortest focal length with which no pixel looks beyond the photograph's edge.
+
+        It comes from long ones, as distortions of high order turn back outside of the photograph.
+        """
+        w, h = self.width, self.height
+        along = np.linspace(0, 1, _EDGE)
+        sides = [(along * w, 0 * along + v) for v in (0.0, h)]
+        sides += [(0 * along + u, along * h) for u in (0.0, w)]
+        edge = np.concatenate([np.stack(side, 1) for side in sides]) - (self.cx, self.cy)
+        middle = self.pixels(np.zeros((1, 2)))
+        found = start = max(self.fl_x, self.fl_y)
+        reach = np.zeros(len(edge))
+        for factor in np.geomspace(_LONGEST, _SHORTEST, _STEPS):
+            seen = self.pixels(edge / (start * factor))
+            further = np.linalg.norm(seen - middle, axis=1)
+            inside = (seen >= -1e-6).all() and (seen <= (w + 1e-6, h + 1e-6)).all()
+            if not (inside and (further >= reach).all()):
+                break
+            found, reach = start * factor, further
+        return float(found)
+
+
+def opencv(
+    focal: tuple[float, float], centre: tuple[float, float], radial: np.ndarray, *tangential: float
+) -> Projection:
+    """OpenCV's lens with k1, k2, k3 (`radial`) and p1, p2 (`tangential`).
+
+    Args:
+        focal: fx, fy in pixels.
+        centre: cx, cy in pixels.
+    """
+    p1, p2 = tangential
+
+    def project(points: np.ndarray) -> np.ndarray:
+        x, y = points.T
+        r2 = x * x + y * y
+        scale = 1 + r2 * (radial[0] + r2 * (radial[1] + r2 * radial[2]))
+        u = x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        v = y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+        return np.stack([u, v], 1) * focal + centre
+
+    return project
+
+
+def fisheye(
+    focal: tuple[float, float], centre: tuple[float, float], radial: np.ndarray
+) -> Projection:
+    """OpenCV's fisheye lens with k1, k2, k3, k4 (`radial`); arguments as in `opencv`."""
+
+    def project(points: np.ndarray) -> np.ndarray:
+        r = np.linalg.norm(points, axis=1, keepdims=True)
+        angle = np.arctan(r)
+        t = angle * angle
+        bent = angle * (1 + t * (radial[0] + t * (radial[1] + t * (radial[2] + t * radial[3]))))
+        return points * np.where(r > 0, bent / np.where(r > 0, r, 1), 1) * focal + centre
+
+    return project
+
+
+def _bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (n, C) of an image (H, W, C) at (n, 2), pixel centres at whole numbers."""
+    height, width = image.shape[:2]
+    x = np.clip(at[:, 0], 0, width - 1)
+    y = np.clip(at[:, 1], 0, height - 1)
+    left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    left, top = np.maximum(left, 0), np.maximum(top, 0)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    u, v = (x - left)[:, None].astype(np.float32), (y - top)[:, None].astype(np.float32)
+    above = image[top, left] * (1 - u) + image[top, right] * u
+    below = image[bottom, left] * (1 - u) + image[bottom, right] * u
+    return above * (1 - v) + below * v

@@ -1,0 +1,228 @@
+"""Meshes of other programs, written as a Mitsuba scene of grey parts."""
+
+from __future__ import annotations
+
+import logging
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from ..io import require_file
+from ..scene.meshes import HEADER, check_mesh
+from .faults import Faults
+
+#: Suffixes of the meshes that are read.
+SUFFIXES = (".ply", ".obj", ".glb", ".gltf")
+#: Albedo and roughness of all parts: a fit does not read them.
+_ALBEDO, _ROUGHNESS = 0.5, 0.5
+_VERSION = "3.0.0"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of the geometry.
+
+    Args:
+        name: unique, of letters, digits, dashes and underscores.
+        positions: (n, 3) float64, in the frame of the file.
+        faces: (m, 3) indices.
+        normals: (n, 3) of unit length as the file has them; None: facets.
+        uv: (n, 2), v upwards; None where the file has none.
+    """
+
+    name: str
+    positions: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None
+    uv: np.ndarray | None
+
+    def write(self, file: Path) -> None:
+        """Write it as binary PLY."""
+        smooth, painted = self.normals is not None, self.uv is not None
+        mesh = mi.Mesh(
+            self.name,
+            len(self.positions),
+            len(self.faces),
+            has_vertex_normals=smooth,
+            has_vertex_texcoords=painted,
+        )
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = np.ravel(self.positions).astype(np.float32)
+        params["faces"] = np.ravel(self.faces).astype(np.uint32)
+        if self.normals is not None:
+            params["vertex_normals"] = np.ravel(self.normals).astype(np.float32)
+        if self.uv is not None:
+            params["vertex_texcoords"] = np.ravel(self.uv).astype(np.float32)
+        params.update()
+        mesh.write_ply(str(file))
+
+
+def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
+    """The parts of meshes: objects and groups of an OBJ file, nodes of a glTF file, all of a PLY.
+
+    Positions stay as they are, with the transforms of a glTF file's nodes. Faces with more than
+    three corners become triangles. Materials are not read.
+
+    Args:
+        files: PLY, OBJ, GLB or glTF.
+        faults: all that is wrong is added to it.
+    """
+    parts: list[Part] = []
+    for file in files:
+        with faults.collected(file):
+            own = _read_ply(file)
+            if own is not None:
+                parts.append(replace(own, name=_unique(file.stem, {part.name for part in parts})))
+                continue
+            for name, mesh, to_file in _loaded(file):
+                taken = {part.name for part in parts}
+                parts.append(_part(_unique(name or file.stem, taken), mesh, to_file, file))
+    return parts
+
+
+def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Path:
+    """Write `scene.xml` and a PLY file for each part; returns its path.
+
+    Every part has a material of its own, grey on both sides.
+
+    Args:
+        folder: made here.
+        environment: add a constant one, of radiance 1.
+    """
+    (folder / "meshes").mkdir(parents=True)
+    root = ElementTree.Element("scene", version=_VERSION)
+    if environment:
+        emitter = _add(root, "emitter", type="constant", id="environment")
+        _add(emitter, "rgb", name="radiance", value="1")
+    for part in parts:
+        sides = _add(root, "bsdf", type="twosided", id=f"{part.name}_sides")
+        bsdf = _add(sides, "bsdf", type="principled", id=part.name)
+        _add(bsdf, "rgb", name="base_color", value=f"{_ALBEDO:g}")
+        _add(bsdf, "float", name="roughness", value=f"{_ROUGHNESS:g}")
+        part.write(folder / "meshes" / f"{part.name}.ply")
+        shape = _add(root, "shape", type="ply", id=f"{part.name}_shape")
+        _add(shape, "string", name="filename", value=f"meshes/{part.name}.ply")
+        if part.normals is None:
+            _add(shape, "boolean", name="face_normals", value="true")
+        _add(shape, "ref", name="bsdf", id=f"{part.name}_sides")
+    ElementTree.indent(root, space="    ")
+    file = folder / "scene.xml"
+    ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
+    return file
+
+
+def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
+    return ElementTree.SubElement(parent, tag, attributes)
+
+
+def _read_ply(file: Path) -> Part | None:
+    """A PLY file of triangles as Mitsuba reads it; None where it cannot.
+
+    trimesh 5.2 joins vertices of such files that have the same texture coordinates, and forgets
+    normals then.
+    """
+    if file.suffix.lower() != ".ply" or not file.is_file():
+        return None
+    try:
+        check_mesh("ply", file)
+        mesh: Any = mi.load_dict({"type": "ply", "filename": str(file)})
+    except (UserError, RuntimeError):
+        return None
+    params = mi.traverse(mesh)
+
+    def table(name: str, columns: int) -> np.ndarray:
+        return np.array(params[name], np.float64).reshape(-1, columns)
+
+    with file.open("rb") as opened:
+        smooth = re.search(rb"\n\s*property \w+ nx\s", opened.read(HEADER)) is not None
+    return Part(
+        file.stem,
+        table("vertex_positions", 3),
+        np.array(params["faces"], np.int64).reshape(-1, 3),
+        table("vertex_normals", 3) if smooth else None,
+        table("vertex_texcoords", 2) if mesh.has_vertex_texcoords() else None,
+    )
+
+
+def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
+    """The triangle meshes of a file: names, meshes, and what takes these to its frame, (4, 4)."""
+    try:
+        import trimesh
+    except ImportError:
+        remedy = "pip install 'unbake[import]'"
+        raise UserError("meshes need trimesh", file, remedy) from None
+    require_file(file, "mesh")
+    suffix = file.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError("the mesh is of a format that is not read (PLY, OBJ, GLB)", file)
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
+    of_nodes = suffix in (".glb", ".gltf")
+    options: dict[str, Any] = {"process": False}
+    if suffix == ".obj":
+        options |= {"split_objects": True, "split_groups": True, "maintain_order": True}
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")  # of textures that are not there
+            scene = trimesh.load_scene(file, **options)
+        found = []
+        for node in sorted(scene.graph.nodes_geometry):
+            transform, name = scene.graph[node]
+            mesh = scene.geometry[name]
+            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                found.append((str(node if of_nodes else name), mesh, np.array(transform)))
+    except Exception as error:  # readers of damaged files raise whatever they meet
+        told = " ".join(str(error).split())[:160] or type(error).__name__
+        raise UserError(f"the mesh cannot be read ({told})", file) from None
+    if not found:
+        raise UserError("the mesh has no triangles", file)
+    if len(found) == 1 and not of_nodes:
+        return [("", *found[0][1:])]
+    return found
+
+
+def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
+    linear = to_file[:3, :3]
+    positions = np.array(mesh.vertices, np.float64) @ linear.T + to_file[:3, 3]
+    faces = np.array(mesh.faces, np.int64)
+    if np.linalg.det(linear) < 0:
+        faces = faces[:, ::-1]
+    if not np.isfinite(positions).all():
+        raise UserError("the mesh has vertices that are not finite", file)
+    if faces.min() < 0 or faces.max() >= len(positions):
+        raise UserError("the mesh has triangles of vertices that it does not have", file)
+    normals = None
+    # Where the file has none, trimesh 5.2 makes them up at this very access, and keeps them there.
+    if "vertex_normals" in mesh._cache and np.shape(mesh.vertex_normals) == positions.shape:
+        normals = np.array(mesh.vertex_normals, np.float64) @ np.linalg.inv(linear)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.maximum(length, 1e-12) if (length > 0).all() else None
+    uv = getattr(mesh.visual, "uv", None)
+    known = uv is not None and np.shape(uv) == (len(positions), 2) and np.isfinite(uv).all()
+    # Parts of an OBJ file share its vertices
+    used, places = np.unique(faces, return_inverse=True)
+    return Part(
+        name,
+        positions[used],
+        places.reshape(faces.shape),
+        None if normals is None else normals[used],
+        np.array(uv, np.float64)[used] if known else None,
+    )
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    """A name for files and for Mitsuba that is not taken."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "part"
+    found, number = plain, 1
+    while found in taken:
+        number += 1
+        found = f"{plain}_{number}"
+    return found

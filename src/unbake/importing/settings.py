@@ -1,0 +1,38 @@
+"""How a source becomes a data set. Needs neither Mitsuba nor Dr.Jit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from ..config.flag import Flag
+from ..errors import require_ranges
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """How a source becomes a data set.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    #: By the order of names, from the first.
+    holdout: Annotated[
+        int,
+        Flag("Hold out every so many views, where the source does not say which; 0 holds out none"),
+    ] = 8
+    background: Annotated[
+        Literal["auto", "visible", "hidden"],
+        Flag(
+            "What photographs show behind the mesh: visible, the environment, which lights it; "
+            "hidden, nothing of it, where alpha is 0; auto, hidden if all photographs have alpha"
+        ),
+    ] = "auto"
+    keep_applied_transform: Annotated[
+        bool,
+        Flag("Leave nerfstudio's cameras in the frame of their file, instead of that of COLMAP"),
+    ] = False
+
+    def __post_init__(self) -> None:
+        require_ranges(self, {"holdout": (0, 10**6)})

@@ -1,0 +1,91 @@
+"""What is found in the folder of another program, before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from ..errors import UserError
+from ..imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, ImageHeader, read_header
+from ..io import require_file
+from .lens import Lens
+
+#: Suffixes that are tried where the name of an image has none.
+_TRIED = tuple(s for suffix in (*CODED_SUFFIXES, ".exr") for s in (suffix, suffix.upper()))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One photograph of a source.
+
+    Args:
+        name: as the source has it: a path from the folder of its images, with slashes.
+        split: "train" or "heldout"; None: the source does not say.
+        image: the file.
+        lens: of the photograph.
+        to_world: camera to world, (4, 4) float64, OpenGL axes, in the frame of the mesh.
+        mask: a file, zero where pixels do not count; None: all count.
+    """
+
+    name: str
+    split: str | None
+    image: Path
+    lens: Lens
+    to_world: np.ndarray
+    mask: Path | None = None
+
+    @property
+    def coded(self) -> bool:
+        """Whether the image holds code values and not radiance."""
+        return self.image.suffix.lower() in CODED_SUFFIXES
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What a folder of another program holds.
+
+    Args:
+        kind: the program or layout, for people.
+        shots: the photographs.
+        notes: what the user should know of how it was read.
+    """
+
+    kind: str
+    shots: tuple[Shot, ...]
+    notes: tuple[str, ...] = ()
+
+
+def image_header(path: Path) -> ImageHeader:
+    """The header of a photograph or mask.
+
+    Raises:
+        UserError: it does not exist, is damaged, or of a format that is not read.
+    """
+    require_file(path, "image")
+    if path.suffix.lower() not in (*CODED_SUFFIXES, *SUFFIXES):
+        raise UserError("the image is of a format that is not read (PNG, JPEG, TIFF, EXR)", path)
+    try:
+        return read_header(path)
+    except HeaderError as error:
+        raise UserError(f"the image cannot be read ({error})", path) from None
+    except OSError as error:
+        raise UserError(f"the image cannot be read ({error.strerror})", path) from None
+
+
+def with_suffix(path: Path) -> Path:
+    """A file by its name, which may lack its suffix; the path as it is where there is none."""
+    if path.is_file():
+        return path
+    others = (path.with_name(path.name + suffix) for suffix in _TRIED)
+    return next((other for other in others if other.is_file()), path)
+
+
+def first_folder(folders: Sequence[Path]) -> Path | None:
+    """The first of these folders that there is."""
+    return next((folder for folder in folders if folder.is_dir()), None)

@@ -1,0 +1,493 @@
+"""Imports: a captured data set written in the layout of another program comes back as it was."""
+
+import json
+import math
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from layouts import (
+    APERTURE,
+    APPLIED,
+    ISO,
+    SECONDS,
+    codes,
+    intrinsics,
+    quiet,
+    same_as_captured,
+    save,
+    write_json,
+)
+
+from unbake.config.light import LightConfig
+from unbake.dataset.photographs import Photographs
+from unbake.dataset.views import Dataset, read_photograph
+from unbake.errors import UserError
+from unbake.imaging.coded import encode
+from unbake.importing.faults import ImportFaults
+from unbake.importing.import_data import import_data
+from unbake.importing.settings import ImportSettings
+from unbake.scene.edit import material_names
+from unbake.scene.parse import parse
+
+
+@pytest.fixture
+def nerfstudio(captured, tmp_path):
+    """A folder with one `transforms.json`, whose cameras have been moved."""
+    folder = tmp_path / "nerfstudio"
+    frames = []
+    for view in captured.views:
+        save(codes(view), folder / "images" / f"{view.name}.png")
+        pose = (APPLIED @ view.camera.to_world).tolist()
+        frames.append({"file_path": f"./images/{view.name}.png", "transform_matrix": pose})
+    top = intrinsics(captured.views[0].camera) | {"camera_model": "OPENCV", "k1": 0.0, "p2": 0}
+    lists = {"train_filenames": [], "test_filenames": []}
+    for view in captured.views:
+        key = "train_filenames" if view.split == "train" else "test_filenames"
+        lists[key].append(f"./images/{view.name}.png")
+    applied = {"applied_transform": APPLIED[:3].tolist(), "ply_file_path": "sparse_pc.ply"}
+    write_json(folder / "transforms.json", top | applied | lists | {"frames": frames})
+    return folder
+
+
+def change(folder, edit, name="transforms.json"):
+    content = json.loads((folder / name).read_text())
+    edit(content)
+    (folder / name).write_text(json.dumps(content))
+
+
+def test_nerfstudio_comes_back(captured, nerfstudio, meshes, tmp_path):
+    out, told = tmp_path / "data", []
+    import_data(nerfstudio, out, meshes, tell=told.append)
+    found = same_as_captured(captured, out)
+    assert found.background == "visible"
+    assert told[0].endswith("2 training and 1 held-out views of 16 x 16 pixels")
+    assert "before 'applied_transform'" in told[1]
+    assert "100 % of the pixels see it" in told[-1]
+    # Photographs are copies, and geometry is that of the meshes, part by part
+    name = captured.views[0].name
+    image = nerfstudio / "images" / f"{name}.png"
+    assert (out / "images" / f"{name}.png").read_bytes() == image.read_bytes()
+    parts = sorted(file.name for file in (out / "scene" / "meshes").iterdir())
+    assert parts == [mesh.name for mesh in meshes]
+    mine, theirs = (parse(file).instantiate() for file in (found.scene, captured.scene))
+    assert np.allclose(np.ravel(mine.bbox().min), np.ravel(theirs.bbox().min), atol=1e-6)
+    assert np.allclose(np.ravel(mine.bbox().max), np.ravel(theirs.bbox().max), atol=1e-6)
+    assert mine.environment() is not None
+
+
+def test_an_applied_transform_may_stay(captured, nerfstudio, meshes, tmp_path):
+    settings = ImportSettings(keep_applied_transform=True, holdout=0)
+    with pytest.raises(UserError, match="no photograph sees the mesh") as caught:
+        import_data(nerfstudio, tmp_path / "data", meshes, settings, tell=quiet)
+    assert "--keep-applied-transform" in caught.value.remedy
+    assert not (tmp_path / "data").exists()
+    poses = [view.camera.to_world.tolist()[:3] for view in captured.views]
+
+    def put_back(content):
+        for frame, pose in zip(content["frames"], poses, strict=True):
+            frame["transform_matrix"] = pose
+
+    change(nerfstudio, put_back)
+    import_data(nerfstudio, tmp_path / "data", meshes, settings, tell=quiet)
+    same_as_captured(captured, tmp_path / "data")
+
+
+def test_a_scale_that_was_applied_is_taken_back(captured, nerfstudio, meshes, tmp_path):
+    def scale(content):
+        content["applied_scale"] = 0.25
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 0.25
+
+    change(nerfstudio, scale)
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    same_as_captured(captured, tmp_path / "data")
+
+
+def write_blender(captured, source):
+    """A folder with a file for each split, names without suffix, and alpha."""
+    angle = 2 * math.atan(0.5 * captured.views[0].camera.width / captured.views[0].camera.fl_x)
+    for split, short in (("train", "train"), ("heldout", "test"), ("heldout", "val")):
+        frames = []
+        for view in captured.views:
+            if view.split != split:
+                continue
+            alpha = np.full((*codes(view).shape[:2], 1), 255, np.uint8)
+            save(np.concatenate([codes(view), alpha], 2), source / short / f"{view.name}.png")
+            pose = view.camera.to_world.tolist()
+            frames.append({"file_path": f"./{short}/{view.name}", "transform_matrix": pose})
+        write_json(source / f"transforms_{short}.json", {"camera_angle_x": angle, "frames": frames})
+
+
+def test_blender_comes_back(captured, meshes, tmp_path):
+    source = tmp_path / "blender"
+    write_blender(captured, source)
+    told = []
+    import_data(source, tmp_path / "data", meshes, tell=told.append)
+    found = same_as_captured(captured, tmp_path / "data")
+    assert found.background == "hidden"
+    assert any("transforms_val.json is left out" in line for line in told)
+
+
+def test_names_in_two_folders_are_kept_apart(captured, meshes, tmp_path):
+    source = tmp_path / "blender"
+    for short in ("train", "test"):
+        view = captured.views[0]
+        save(codes(view), source / short / "r_0.png")
+        frame = {"file_path": f"{short}/r_0", "transform_matrix": view.camera.to_world.tolist()}
+        content = intrinsics(view.camera) | {"frames": [frame]}
+        write_json(source / f"transforms_{short}.json", content)
+    import_data(source, tmp_path / "data", meshes, tell=quiet)
+    names = {(view.name, view.split) for view in Dataset.load(tmp_path / "data").views}
+    assert names == {("train_r_0", "train"), ("test_r_0", "heldout")}
+
+
+def test_every_eighth_view_is_held_out(captured, nerfstudio, meshes, tmp_path):
+    def without_lists(content):
+        del content["train_filenames"], content["test_filenames"]
+
+    change(nerfstudio, without_lists)
+    import_data(nerfstudio, tmp_path / "a", meshes, ImportSettings(holdout=2), tell=quiet)
+    import_data(nerfstudio, tmp_path / "b", meshes, ImportSettings(holdout=0), tell=quiet)
+    names = sorted(view.name for view in captured.views)
+    held = {view.name for view in Dataset.load(tmp_path / "a").heldout}
+    assert held == set(names[::2])
+    assert Dataset.load(tmp_path / "b").heldout == ()
+
+
+# ------------------------------------------------------------------------------------- photographs
+
+
+def test_masked_pixels_are_neither_drawn_nor_scored(captured, nerfstudio, meshes, tmp_path):
+    def add_masks(content):
+        for number, frame in enumerate(content["frames"][:2]):
+            frame["mask_path"] = f"masks/{number}.png"
+
+    first = np.zeros((16, 16), np.uint8)
+    first[:, 4:] = 255
+    second = np.full((16, 16, 3), 255, np.uint8)
+    second[:3] = 0
+    save(first, nerfstudio / "masks" / "0.png")
+    save(second, nerfstudio / "masks" / "1.png")
+    change(nerfstudio, add_masks)
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    assert "2 with masks" in told[0]
+    found = Dataset.load(tmp_path / "data")
+    kept = [first > 0, second[..., 0] > 0, np.ones((16, 16), bool)]
+    for view, counted in zip(found.views, kept, strict=True):
+        assert np.array_equal(read_photograph(view)[..., 3] > 0, counted)
+    photographs = Photographs.load(found, False)
+    train = [mask for view, mask in zip(found.views, kept, strict=True) if view.split == "train"]
+    assert np.array_equal(photographs.chosen, np.flatnonzero(np.concatenate(train)))
+    assert photographs.mean == pytest.approx(photographs.table[photographs.chosen, :3].mean())
+
+
+def with_exif(folder, captured, tags):
+    """Write the photographs as JPEG, with EXIF each."""
+    for view, exif in zip(captured.views, tags, strict=True):
+        (folder / "images" / f"{view.name}.png").unlink()
+        save(codes(view), folder / "images" / f"{view.name}.jpg", exif)
+
+    def rename(content):
+        for frame in content["frames"]:
+            frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
+
+    change(folder, rename)
+
+
+def frames_of(out):
+    return json.loads((out / "transforms.json").read_text())["frames"]
+
+
+def test_exposures_come_from_exif(captured, nerfstudio, meshes, tmp_path):
+    values = ((0.01, 100, 2), (0.04, 50, 2), (0.01, 400, 4))
+    tags = [dict(zip((SECONDS, ISO, APERTURE), row, strict=True)) for row in values]
+    with_exif(nerfstudio, captured, tags)
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    found = np.array([frame["exposure"] for frame in frames_of(tmp_path / "data")])
+    absolute = np.array([t[SECONDS] * t[ISO] / 100 / t[APERTURE] ** 2 for t in tags])
+    assert np.allclose(found / found[0], absolute / absolute[0], rtol=1e-4)
+    assert np.prod(found) == pytest.approx(1)
+    assert any("1.0 stops apart), by EXIF" in line for line in told)
+    content = json.loads((tmp_path / "data" / "transforms.json").read_text())
+    assert content["clipped"] == pytest.approx(((250 / 255 + 0.055) / 1.055) ** 2.4, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("tags", "line"),
+    [
+        ([{SECONDS: 0.01, ISO: 100}] * 2 + [{}], "2 of 3 tell time and ISO in EXIF"),
+        (
+            [{SECONDS: 0.01, ISO: 100, APERTURE: 2.0}] * 2 + [{SECONDS: 0.02, ISO: 100}],
+            "2 of 3 tell an f-number in EXIF",
+        ),
+        ([{SECONDS: 0.01, ISO: 100}] * 3, "the same in all photographs, by EXIF"),
+    ],
+)
+def test_exif_that_some_lack_is_told_and_not_used(
+    tags, line, captured, nerfstudio, meshes, tmp_path
+):
+    with_exif(nerfstudio, captured, tags)
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    assert any(line in text for text in told)
+    assert not any("exposure" in frame for frame in frames_of(tmp_path / "data"))
+
+
+def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
+    table = tmp_path / "exposures.csv"
+    names = [view.name for view in captured.views]
+    table.write_text("name,exposure\n" + "".join(f"{n},{i + 1}\n" for i, n in enumerate(names)))
+    import_data(nerfstudio, tmp_path / "data", meshes, exposures=table, tell=quiet)
+    assert [frame["exposure"] for frame in frames_of(tmp_path / "data")] == [1, 2, 3]
+    table.write_text(f"name,exposure\n{names[0]},-1\n{names[1]},2\n")
+    with pytest.raises(ImportFaults) as caught:
+        import_data(nerfstudio, tmp_path / "other", meshes, exposures=table, tell=quiet)
+    assert caught.value.faults == (
+        "a line of the table is no name and positive number: line 2",
+        "the table of exposures has no line for a photograph: "
+        f"images/{names[0]}.png, images/{names[2]}.png",
+    )
+
+
+def picture_of(points):
+    """A smooth picture of directions (n, 2), linear in [0, 1]: (n, 3)."""
+    x, y = points.T
+    return np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * y), 0.4 + 0.2 * x * y], 1)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"camera_model": "OPENCV", "k1": -0.2, "k2": 0.05, "p1": 0.003, "p2": -0.002},
+        {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.0, "k4": 0.0},
+        {"camera_model": "PINHOLE", "fl_y": 90.0},
+    ],
+    ids=["opencv", "fisheye", "oblong pixels"],
+)
+@pytest.mark.parametrize("suffix", [".png", ".exr"])
+def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
+    from unbake.imaging.pictures import write_exr
+    from unbake.importing.frames import _lens
+
+    top = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 81.0, "cx": 45.0, "cy": 33.0} | keys
+    lens = _lens(top, 96, 64, "here")
+    # What each pixel of the distorted photograph sees, found by fixed point iteration
+    y, x = np.divmod(np.arange(96 * 64), 96)
+    at = np.stack([x + 0.5, y + 0.5], 1)
+    points = np.zeros((len(at), 2))
+    for _ in range(50):
+        points += (at - lens.pixels(points)) / (lens.fl_x, lens.fl_y)
+    assert np.abs(lens.pixels(points) - at).max() < 1e-6
+    photograph = picture_of(points).reshape(64, 96, 3)
+    source = tmp_path / "source"
+    file = source / "images" / f"a{suffix}"
+    file.parent.mkdir(parents=True)
+    if suffix == ".exr":
+        write_exr(file, photograph)
+    else:
+        save(np.round(encode(photograph) / 257).astype(np.uint8), file)
+    pose = captured.views[0].camera.to_world.tolist()
+    frame = {"file_path": f"images/a{suffix}", "transform_matrix": pose}
+    write_json(source / "transforms.json", top | {"frames": [frame]})
+    told = []
+    import_data(source, tmp_path / "data", meshes, tell=told.append)
+    assert "1 undistorted" in told[0]
+    (view,) = Dataset.load(tmp_path / "data").views
+    assert view.camera.fl_x == view.camera.fl_y
+    # Its corners show the photograph, and one of its edges touches that of the photograph
+    corners = np.array([[0, 0], [96, 0], [0, 64], [96, 64.0]]) - (view.camera.cx, view.camera.cy)
+    seen = lens.pixels(corners / view.camera.fl_x)
+    assert (seen > -0.5).all() and (seen < (96.5, 64.5)).all()
+    pixels = read_photograph(view)[..., :3].reshape(-1, 3)
+    wanted = picture_of((at - (view.camera.cx, view.camera.cy)) / view.camera.fl_x)
+    assert np.abs(pixels - wanted).max() < (0.002 if suffix == ".exr" else 0.006)
+
+
+# -------------------------------------------------------------------------------------------- light
+
+
+def test_known_lights_take_the_place_of_the_unknown_environment(nerfstudio, meshes, tmp_path):
+    lights = tmp_path / "lights.xml"
+    lights.write_text(
+        "<scene version='3.0.0'><emitter type='point'><point name='position' value='0, 0, 0.5'/>"
+        "<rgb name='intensity' value='3'/></emitter></scene>"
+    )
+    light = LightConfig(lights=lights)
+    import_data(nerfstudio, tmp_path / "data", meshes, light=light, tell=quiet)
+    scene = parse(Dataset.load(tmp_path / "data").scene).instantiate()
+    assert scene.environment() is None and len(scene.emitters()) == 1
+    assert len(list((tmp_path / "data" / "scene" / "meshes").iterdir())) == len(meshes)
+
+
+# ------------------------------------------------------------------------------------------- faults
+
+
+def test_all_faults_are_told_at_once(nerfstudio, meshes, tmp_path, unbake):
+    names = sorted(file.name for file in (nerfstudio / "images").iterdir())
+    (nerfstudio / "images" / names[0]).unlink()
+    (nerfstudio / "images" / names[1]).write_bytes(
+        (nerfstudio / "images" / names[1]).read_bytes()[:90]
+    )
+
+    def damage(content):
+        del content["frames"][2]["transform_matrix"]
+        content["frames"][2]["mask_path"] = "masks/none.png"
+
+    change(nerfstudio, damage)
+    broken = tmp_path / "broken.glb"
+    broken.write_bytes(b"glTF")
+    out = tmp_path / "data"
+    outcome = unbake(
+        "import", nerfstudio, "--mesh", meshes[0], "--mesh", broken, "--out", out,
+        "--exposures", tmp_path / "none.csv",
+    )  # fmt: skip
+    assert outcome.status == 2 and not out.exists()
+    *faults, last = outcome.err.splitlines()
+    assert last.endswith("5 faults, listed above. Correct them and import again")
+    told = "\n".join(faults)
+    for part in ("the image does not exist", "the image cannot be read (", "truncated",
+                 "the key 'transform_matrix' is missing", "none.csv", "broken.glb",
+                 "masks/none.png"):  # fmt: skip
+        assert part in told, told
+
+
+def test_equal_faults_are_one_line(nerfstudio, meshes, tmp_path):
+    shutil.rmtree(nerfstudio / "images")
+    with pytest.raises(ImportFaults) as caught:
+        import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    (fault,) = caught.value.faults
+    assert fault.startswith("the image does not exist: ./images/") and fault.count(".png") == 3
+
+
+def set_top(key, value):
+    return lambda content: content.__setitem__(key, value)
+
+
+def set_frame(key, value):
+    return lambda content: content["frames"][1].__setitem__(key, value)
+
+
+@pytest.mark.parametrize(
+    ("edit", "fault"),
+    [
+        (set_top("frames", 3), "'frames' is not a list of frames"),
+        (set_top("camera_model", "EQUIRECTANGULAR"), "unknown camera_model 'EQUIRECTANGULAR'"),
+        (set_top("k4", 0.1), "the lens has k4, k5 or k6"),
+        (set_top("w", 32), "the camera is for 32 x 16, the image has 16 x 16 pixels"),
+        (set_top("applied_transform", [1]), "'applied_transform' is not an array of 3 x 4"),
+        (set_top("applied_transform", (2 * np.eye(4)).tolist()), "'applied_transform' is no rota"),
+        (set_top("scene", "scene.xml"), "the folder is a data set already"),
+        (set_frame("transform_matrix", np.diag([-1.0, 1, 1, 1]).tolist()), "left-handed"),
+        (set_frame("file_path", "../secret.png"), "lies outside the source"),
+        (set_frame("file_path", "images/train_000.png"), "a photograph has two poses"),
+        (lambda c: c["frames"].__setitem__(0, 7), "the frame is not an object"),
+        (lambda c: c.pop("fl_x"), "the key 'fl_x' is missing"),
+    ],
+)
+def test_a_wrong_entry_is_a_fault(edit, fault, nerfstudio, meshes, tmp_path):
+    change(nerfstudio, edit)
+    with pytest.raises(ImportFaults, match=fault):
+        import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_source_that_is_none_is_told_what_there_could_be(meshes, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no cameras were found") as caught:
+        import_data(tmp_path / "empty", tmp_path / "data", meshes)
+    assert "COLMAP" in caught.value.remedy
+    with pytest.raises(UserError, match="the source does not exist"):
+        import_data(tmp_path / "none", tmp_path / "data", meshes)
+
+
+def test_a_foreign_folder_given_to_a_fit_is_told_to_import(nerfstudio, tmp_path):
+    with pytest.raises(UserError, match="'scene' is missing") as caught:
+        Dataset.load(nerfstudio)
+    assert "unbake import" in caught.value.remedy
+    (tmp_path / "project" / "sparse").mkdir(parents=True)
+    with pytest.raises(UserError, match="looks like one of COLMAP: `unbake import"):
+        Dataset.load(tmp_path / "project")
+
+
+def test_the_command_leads_to_a_fit(nerfstudio, meshes, tmp_path, unbake):
+    words = [word for mesh in meshes for word in ("--mesh", mesh)]
+    outcome = unbake("import", nerfstudio, *words, "-o", tmp_path / "data")
+    assert outcome.status == 0 and outcome.err == ""
+    assert outcome.out.rstrip().endswith("--unknown materials+lighting --out RUN")
+    assert Path(tmp_path / "data").is_dir()
+
+
+# -------------------------------------------------------------------------------------------- docs
+
+DOCS = Path(__file__).parents[2] / "docs" / "import.md"
+BLOCKS = dict(
+    re.findall(r"<!-- run by the tests: (\w+) -->\n```\w+\n(.*?)```", DOCS.read_text("utf-8"), re.S)
+)
+
+
+def write_colmap(captured, project):
+    """A project with a text model, written without pycolmap."""
+    (project / "sparse" / "0").mkdir(parents=True)
+    lens = captured.views[0].camera
+    size, focal = f"{lens.width} {lens.height}", f"{lens.fl_x!r} {lens.cx!r} {lens.cy!r}"
+    model = {"cameras": f"1 SIMPLE_PINHOLE {size} {focal}\n", "points3D": "", "images": ""}
+    for number, view in enumerate(captured.views, 1):
+        save(codes(view), project / "images" / f"{view.name}.png")
+        matrix = np.linalg.inv(view.camera.to_world @ np.diag([1.0, -1, -1, 1]))
+        x, y, z, w = quaternion(matrix[:3, :3])
+        numbers = " ".join(repr(float(v)) for v in (w, x, y, z, *matrix[:3, 3]))
+        model["images"] += f"{number} {numbers} 1 {view.name}.png\n\n"
+    for name, content in model.items():
+        (project / "sparse" / "0" / f"{name}.txt").write_text(content)
+
+
+def quaternion(rotation):
+    """(x, y, z, w) of a rotation, by its axis and angle."""
+    values, vectors = np.linalg.eig(rotation)
+    axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
+    cos = np.clip((np.trace(rotation) - 1) / 2, -1, 1)
+    skew = rotation - rotation.T
+    angle = np.arccos(cos) * (1 if axis @ (skew[2, 1], skew[0, 2], skew[1, 0]) >= 0 else -1)
+    return (*(axis * np.sin(angle / 2)), np.cos(angle / 2))
+
+
+def as_one(meshes, file):
+    """All meshes as one file of a format that the suffix of its name tells."""
+    trimesh.util.concatenate([trimesh.load_mesh(mesh) for mesh in meshes]).export(file)
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "blender", "colmap"])
+def test_the_commands_of_the_guide_run(
+    name, captured, nerfstudio, meshes, tmp_path, unbake, monkeypatch
+):
+    program, command, source, *words = shlex.split(BLOCKS[name])
+    monkeypatch.chdir(tmp_path)
+    as_one(meshes, Path(words[words.index("--mesh") + 1]))
+    if name == "nerfstudio":
+        nerfstudio.rename(source)
+    elif name == "blender":
+        write_blender(captured, Path(source))
+    else:
+        pytest.importorskip("pycolmap", reason="COLMAP models need pycolmap")
+        write_colmap(captured, Path(source))
+    outcome = unbake(command, source, *words)
+    assert (program, outcome.status, outcome.err) == ("unbake", 0, "")
+    assert "one part" in outcome.out and "100 % of the pixels see it" in outcome.out
+    assert len(Dataset.load("data").views) == len(captured.views)
+
+
+def test_the_smallest_scene_of_the_guide_is_one(meshes, tmp_path):
+    (tmp_path / "scene.xml").write_text(BLOCKS["scene"])
+    (tmp_path / "meshes").mkdir()
+    shutil.copy(meshes[0], tmp_path / "meshes" / "vase.ply")
+    parsed = parse(tmp_path / "scene.xml")
+    assert material_names(parsed) == ["clay"]
+    assert parsed.instantiate().environment() is not None
