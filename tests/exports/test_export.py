@@ -162,7 +162,7 @@ def exported(data, tmp_path_factory) -> Exported:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exporting, "load_run", lambda *_, **__: recovered)
         as_if_seen(patch)
-        formats = ("gltf", "textures", "mitsuba")
+        formats = ("gltf", "textures", "mitsuba", "usd")
         out, silent = folder / "out", {"tell": lambda line: None}
         manifest = exporting.export(run, out, formats, texels=60.0, **silent)
     return Exported(run, recovered, out, manifest)
@@ -286,6 +286,84 @@ def test_gltf_has_the_lights(exported):
     (lamp,) = (m for m in document["materials"] if "emissiveFactor" in m)
     assert lamp["emissiveFactor"] == pytest.approx([1, 4 / 6, 2 / 6])
     assert lamp["extensions"]["KHR_materials_emissive_strength"]["emissiveStrength"] == 6
+
+
+def test_usd_has_the_parts_and_the_recovered_materials(exported):
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(exported.folder / "usd" / "scene.usdc"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and stage.GetDefaultPrim().GetName() == "scene"
+    told = {part["name"]: part["material"] for part in exported.manifest["parts"]}
+    meshes = {p.GetDisplayName(): p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)}
+    assert meshes.keys() == told.keys()
+    rng = np.random.default_rng(1)
+    for name, prim in meshes.items():
+        mesh = UsdGeom.Mesh(prim)
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+        surface = material.ComputeSurfaceSource()[0]
+        assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+        if told[name] is None:
+            assert not surface.GetInput("diffuseColor").HasConnectedSource()
+            continue
+        assert material.GetPrim().GetDisplayName() == told[name]
+        points = np.array(mesh.GetPointsAttr().Get())
+        corners = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+        areas = np.linalg.norm(np.cross(*(points[corners[:, i]] - points[corners[:, 0]]
+                                          for i in (1, 2))), axis=1)  # fmt: skip
+        chosen = corners[rng.choice(len(corners), 500, p=areas / areas.sum())]
+        weights = rng.dirichlet([1, 1, 1], 500)
+        at = np.einsum("nk,nkd->nd", weights, points[chosen])
+        uv = np.einsum("nk,nkd->nd", weights, st[chosen]) * [1, -1] + [0, 1]
+        truth = material_at(exported.recovered, at)
+        truth["albedo"] = srgb(truth["albedo"])
+        read = {"diffuseColor": ("albedo", "sRGB"), "roughness": ("roughness", "raw")}
+        for target, (quantity, space) in read.items():
+            (source,) = surface.GetInput(target).GetConnectedSources()[0]
+            texture = UsdShade.Shader(source.source.GetPrim())
+            assert texture.GetInput("sourceColorSpace").Get() == space
+            file = texture.GetInput("file").Get().resolvedPath
+            assert Path(file).parent == exported.folder / "usd" / "textures"
+            found = looked_up(as_pixels(file), uv)
+            error = np.abs(found - 255 * np.atleast_2d(truth[quantity].T).T)
+            assert (error.max(1) <= 2).mean() > 0.98, (name, target)
+        assert mesh.GetDoubleSidedAttr().Get() == (name == "ground")
+
+
+def as_pixels(file):
+    """A PNG file as (H, W, channels)."""
+    pixels = np.array(mi.Bitmap(file))
+    return pixels.reshape(*pixels.shape[:2], -1)
+
+
+def test_usd_has_the_lights(exported):
+    from pxr import Usd, UsdGeom, UsdLux, UsdShade
+
+    stage = Usd.Stage.Open(str(exported.folder / "usd" / "scene.usdc"))
+    (torch,) = (p for p in stage.Traverse() if p.IsA(UsdLux.SphereLight))
+    light = UsdLux.SphereLight(torch)
+    assert torch.GetDisplayName() == "torch" and light.GetNormalizeAttr().Get()
+    # The radiance of a sphere, times what is seen of it, is the radiant intensity.
+    assert light.GetIntensityAttr().Get() / 4 == 4
+    np.testing.assert_allclose(light.GetColorAttr().Get(), [0.25, 0.5, 1])
+    assert UsdLux.ShapingAPI(torch).GetShapingConeAngleAttr().Get() == pytest.approx(20)
+    matrix = np.array(UsdGeom.Xformable(torch).ComputeLocalToWorldTransform(0)).T
+    np.testing.assert_allclose(matrix[:3, 3], [1, -1, 1.5], atol=1e-5)
+    ahead = np.array([-1, 1, -1.5]) / np.linalg.norm([-1, 1, -1.5])
+    np.testing.assert_allclose(-matrix[:3, 2], ahead, atol=1e-5)
+    (dome,) = (p for p in stage.Traverse() if p.IsA(UsdLux.DomeLight))
+    found = UsdLux.DomeLight(dome).GetTextureFileAttr().Get().resolvedPath
+    assert Path(found).resolve().parent == exported.folder
+    (lamp,) = (p for p in stage.Traverse() if p.GetDisplayName() == "lamp" and p.IsA(UsdGeom.Mesh))
+    surface = UsdShade.MaterialBindingAPI(lamp).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+    np.testing.assert_allclose(surface.GetInput("emissiveColor").Get(), [6, 4, 2], rtol=1e-5)
+
+
+def test_usd_without_its_package_is_refused_at_once(exported, tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *_: None)
+    with pytest.raises(UserError, match=r"--format.*usd-core.*pip install 'unbake\[usd\]'"):
+        exporting.export(exported.run, tmp_path / "out", ["usd"])
+    assert not (tmp_path / "out").exists()
 
 
 RENDER = """

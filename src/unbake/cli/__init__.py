@@ -375,7 +375,7 @@ def export(
     texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
     allow_outside: Flag = False,
 ) -> None:
-    """Write what a run recovered for other programs: textures, glTF, or a scene for Mitsuba.
+    """Write what a run recovered for other programs: textures, glTF, OpenUSD, or for Mitsuba.
 
     The scene keeps its parts and their names. Each material gets textures of albedo, roughness and
     metallic, in the texture coordinates of its parts if these are unique, else unwrapped. What no
@@ -386,7 +386,8 @@ def export(
         run: Folder that `unbake fit` wrote.
         out: Folder to write to, new or empty.
         format: One or more of gltf (one file, scene.glb, with parts, textures and lights), textures
-            (OpenEXR and PNG) and mitsuba (a scene that Mitsuba renders without unbake).
+            (OpenEXR and PNG), mitsuba (a scene that Mitsuba renders without unbake) and usd
+            (OpenUSD; it needs pip install 'unbake[usd]').
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
             surfaces). A texture has from 64 to 8192 along an edge.
         allow_outside: Read files that the data set or its scene names outside of its folder.
@@ -398,6 +399,7 @@ def export(
     options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
     run_export(run, out, format, texels=texels, **options)
     files = {"gltf": "scene.glb", "textures": "textures", "mitsuba": "mitsuba/scene.xml"}
+    files |= {"usd": "usd/scene.usdc"}
     _say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")
 
 

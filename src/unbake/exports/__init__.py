@@ -1,10 +1,10 @@
-"""Results for other programs: textures, glTF, and scenes for Mitsuba without unbake."""
+"""Results for other programs: textures, glTF, OpenUSD, and scenes for Mitsuba without unbake."""
 
 from typing import Literal, get_args
 
 #: Of `export.json`.
 EXPORT_FORMAT = 1
 
-Format = Literal["gltf", "textures", "mitsuba"]
+Format = Literal["gltf", "textures", "mitsuba", "usd"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_FORMATS: tuple[Format, ...] = ("gltf", "textures")

@@ -1,10 +1,11 @@
-"""`unbake export`: what a run recovered, as textures, glTF or a scene for Mitsuba.
+"""`unbake export`: what a run recovered, as textures, glTF, OpenUSD or a scene for Mitsuba.
 
 DIR/
   export.json             what is there, how it was made, and its conventions
   textures/               of each material: OpenEXR, PNG, and a mask of what no view saw
   scene.glb               the scene as binary glTF
   mitsuba/scene.xml       the scene for Mitsuba, with its own meshes and textures
+  usd/scene.usdc          the scene as OpenUSD, with its own textures
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ..dataset.views import Dataset
 from ..errors import UserError
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
@@ -35,6 +38,7 @@ from .observed import Views
 from .parts import Part, Parts, parsed_principled, read_parts
 from .textures import COLOUR_SPACES, file_names, write_textures
 from .unwrap import LARGEST, UNIQUE, make_atlases
+from .usd import require_usd, write_usd
 
 #: The recovered environment, beside `export.json`.
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
@@ -48,6 +52,12 @@ _CONVENTIONS = {
     "texture coordinates": "(0, 0) is the corner of the first texel of the first row of an image, "
     "in Mitsuba and in glTF",
     "roughness": "perceptual: GGX alpha = roughness squared",
+    "axes of usd": "those of the scene; the stage calls up what is nearest to the cameras' up, y "
+    "or z",
+    "texture coordinates of usd": "(u, 1 - v): (0, 0) is the corner of the first texel of the last "
+    "row",
+    "light of usd": "a point or spot light of radiant intensity I has intensity 4 I and is "
+    "normalized: its radiance does not depend on the radius",
     "metallic and roughness of glTF": "blue and green of one texture",
     "light": "radiance and intensity in the scene's own units; glTF takes them as candela",
     "environment": "latitude and longitude as Mitsuba's envmap reads them without to_world: +y is "
@@ -109,6 +119,9 @@ def _require_sound(
     if unknown or not formats:
         what = f"no format named {', '.join(map(repr, unknown))}" if unknown else "no format given"
         wrong.append(str(UserError(what, "--format", f"There are {', '.join(FORMATS)}")))
+    if "usd" in formats:
+        with _collected(wrong):
+            require_usd()
     if texels is not None and not 0 < texels < 1e9:
         wrong.append(str(UserError(f"must be a positive number, not {texels:g}", "--texels")))
     if wrong:
@@ -217,6 +230,10 @@ def _write(
         write_exr(out / _ENVIRONMENT, environment)
     if "gltf" in formats:
         write_glb(out / "scene.glb", found.scene, found.parts, shown, lights)
+    if "usd" in formats:
+        (out / "usd").mkdir()
+        beside = None if environment is None else f"../{_ENVIRONMENT}"
+        write_usd(out / "usd", found.scene, found.parts, shown, lights, beside, _up(dataset))
     if "mitsuba" in formats:
         (out / "mitsuba").mkdir()
         written = write_scene(
@@ -231,6 +248,12 @@ def _write(
         )
         notes += written.notes
     return files, notes
+
+
+def _up(dataset: Dataset) -> str:
+    """Which axis is up by the cameras, as OpenUSD calls it."""
+    up = np.sum([view.camera.to_world[:3, 1] for view in dataset.train], axis=0)
+    return "Z" if abs(up[2]) > abs(up[1]) else "Y"
 
 
 # ------------------------------------------------------------------------------------- the manifest
@@ -283,7 +306,7 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light]) -> lis
             notes.append(f"{atlas.name}: no training view saw it, its textures are the defaults")
     varying = [light.name for light in lights if light.strength is None]
     if varying:
-        notes.append(f"lights of varying strength are dark in glTF: {', '.join(varying)}")
+        notes.append(f"lights of varying strength are dark in glTF and usd: {', '.join(varying)}")
     if not any(one.learned for one in baked):
         notes.append("the run learned no materials: all textures are the scene's own")
     return notes

@@ -159,7 +159,7 @@ def write_glb(
         else:
             triangles = part.triangles
             strength = None if part.emitter is None else glow.get(part.emitter)
-            material = _plain(document, scene, part, strength)
+            material = plain_material(document, scene, part, strength)
         material["doubleSided"] = part.two_sided
         key = json.dumps(material, sort_keys=True)
         if key not in materials:
@@ -199,13 +199,20 @@ def _textured(document: Document, baked: Baked) -> dict[str, Any]:
     }
 
 
-def _plain(
+def plain_material(
     document: Document,
     scene: ParsedScene,
     part: Part,
     strength: tuple[float, float, float] | None,
 ) -> dict[str, Any]:
-    """A material of numbers for what no fit optimizes: lights, glass, mirrors and the like."""
+    """A material of numbers for what no fit optimizes: lights, glass, mirrors and the like.
+
+    Args:
+        document: declares the extensions that the material uses.
+        scene: the nodes that the part is of.
+        part: the part.
+        strength: linear RGB radiance of its emitter; None: it has none, or it varies.
+    """
     nodes = scene.state.nodes
     found = [] if part.bsdf is None else scene.reachable(part.bsdf)
     props = {nodes[i].props.plugin_name(): nodes[i].props for i in reversed(found)}

@@ -1,0 +1,4 @@
+# OpenUSD as an untyped library: usd-core comes without stubs.
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
