@@ -61,3 +61,33 @@ def same_as_captured(captured, out, *, tolerance=1e-6):
         assert view.encoding == "srgb"
         assert np.abs(codes(view).astype(int) - codes(known)).max() <= 1
     return found
+
+
+def picture_of(points):
+    """A smooth picture of directions (n, 2), linear in [0, 1]: (n, 3)."""
+    x, y = points.T
+    return np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * y), 0.4 + 0.2 * x * y], 1)
+
+
+def photograph_through(lens):
+    """What a lens sees of it, (H, W, 3): each pixel's direction is found by iteration."""
+    y, x = np.divmod(np.arange(lens.width * lens.height), lens.width)
+    at, points = np.stack([x + 0.5, y + 0.5], 1), np.zeros((len(x), 2))
+    for _ in range(50):
+        points += (at - lens.pixels(points)) / (lens.fl_x, lens.fl_y)
+    assert np.abs(lens.pixels(points) - at).max() < 1e-6
+    return picture_of(points).reshape(lens.height, lens.width, 3)
+
+
+def straightened_as_seen(view, lens, tolerance):
+    """Check a view that was made of `photograph_through`: its pixels, and that it is not beyond."""
+    camera = view.camera
+    assert camera.fl_x == camera.fl_y
+    centre, size = (camera.cx, camera.cy), np.array([camera.width, camera.height])
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - centre
+    seen = lens.pixels(corners / camera.fl_x)
+    assert (seen > -0.5).all() and (seen < size + 0.5).all()
+    y, x = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    wanted = picture_of((np.stack([x + 0.5, y + 0.5], 1) - centre) / camera.fl_x)
+    pixels = read_photograph(view)[..., :3].reshape(-1, 3)
+    assert np.abs(pixels - wanted).max() < tolerance

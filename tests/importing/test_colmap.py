@@ -4,10 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import codes, quiet, same_as_captured, save
+from layouts import (
+    codes,
+    photograph_through,
+    quiet,
+    same_as_captured,
+    save,
+    straightened_as_seen,
+)
 
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
+from unbake.imaging.coded import encode
+from unbake.importing import colmap
 from unbake.importing.colmap import find_model, read_colmap
 from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.frames import _lens
@@ -125,6 +134,33 @@ def test_our_lenses_are_those_of_colmap():
         )
         theirs = camera.img_from_cam(np.c_[points, np.ones(50)])
         assert np.abs(lens.pixels(points) - theirs).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [80, 45, 33, -0.1]),
+        ("OPENCV", [80, 81, 45, 33, -0.2, 0.05, 0.003, -0.002]),
+        ("OPENCV_FISHEYE", [80, 81, 45, 33, 0.02, -0.01, 0, 0]),
+    ],
+)
+def test_distortion_is_taken_out(model, params, captured, meshes, tmp_path):
+    camera = pycolmap.Camera(model=model, width=96, height=64, params=params)
+    camera.camera_id = 1
+    found = pycolmap.Reconstruction()
+    found.add_camera_with_trivial_rig(camera)
+    pose = np.linalg.inv(captured.views[0].camera.to_world @ TURN)
+    image = pycolmap.Image(name="a.png", camera_id=1, image_id=1)
+    found.add_image_with_trivial_frame(image, rigid(pose))
+    (tmp_path / "sparse").mkdir()
+    found.write_binary(str(tmp_path / "sparse"))
+    lens = colmap._lens(camera)
+    photograph = photograph_through(lens)
+    save(np.round(encode(photograph) / 257).astype(np.uint8), tmp_path / "images" / "a.png")
+    told = []
+    import_data(tmp_path, tmp_path / "data", meshes, tell=told.append)
+    assert "1 undistorted" in told[0]
+    straightened_as_seen(Dataset.load(tmp_path / "data").views[0], lens, 0.006)
 
 
 def test_faults_of_a_model_are_told(captured, meshes, tmp_path):

@@ -17,9 +17,11 @@ from layouts import (
     SECONDS,
     codes,
     intrinsics,
+    photograph_through,
     quiet,
     same_as_captured,
     save,
+    straightened_as_seen,
     write_json,
 )
 
@@ -257,12 +259,6 @@ def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
     )
 
 
-def picture_of(points):
-    """A smooth picture of directions (n, 2), linear in [0, 1]: (n, 3)."""
-    x, y = points.T
-    return np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * y), 0.4 + 0.2 * x * y], 1)
-
-
 @pytest.mark.parametrize(
     "keys",
     [
@@ -279,14 +275,7 @@ def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
 
     top = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 81.0, "cx": 45.0, "cy": 33.0} | keys
     lens = _lens(top, 96, 64, "here")
-    # What each pixel of the distorted photograph sees, found by fixed point iteration
-    y, x = np.divmod(np.arange(96 * 64), 96)
-    at = np.stack([x + 0.5, y + 0.5], 1)
-    points = np.zeros((len(at), 2))
-    for _ in range(50):
-        points += (at - lens.pixels(points)) / (lens.fl_x, lens.fl_y)
-    assert np.abs(lens.pixels(points) - at).max() < 1e-6
-    photograph = picture_of(points).reshape(64, 96, 3)
+    photograph = photograph_through(lens)
     source = tmp_path / "source"
     file = source / "images" / f"a{suffix}"
     file.parent.mkdir(parents=True)
@@ -302,29 +291,29 @@ def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
     assert "1 undistorted" in told[0]
     (view,) = Dataset.load(tmp_path / "data").views
     assert view.camera.fl_x == view.camera.fl_y
-    # Its corners show the photograph, and one of its edges touches that of the photograph
-    corners = np.array([[0, 0], [96, 0], [0, 64], [96, 64.0]]) - (view.camera.cx, view.camera.cy)
-    seen = lens.pixels(corners / view.camera.fl_x)
-    assert (seen > -0.5).all() and (seen < (96.5, 64.5)).all()
-    pixels = read_photograph(view)[..., :3].reshape(-1, 3)
-    wanted = picture_of((at - (view.camera.cx, view.camera.cy)) / view.camera.fl_x)
-    assert np.abs(pixels - wanted).max() < (0.002 if suffix == ".exr" else 0.006)
+    straightened_as_seen(view, lens, 0.002 if suffix == ".exr" else 0.006)
 
 
 # -------------------------------------------------------------------------------------------- light
 
 
-def test_known_lights_take_the_place_of_the_unknown_environment(nerfstudio, meshes, tmp_path):
+def test_known_lights_take_the_place_of_the_unknown_environment(
+    nerfstudio, meshes, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     lights = tmp_path / "lights.xml"
     lights.write_text(
         "<scene version='3.0.0'><emitter type='point'><point name='position' value='0, 0, 0.5'/>"
         "<rgb name='intensity' value='3'/></emitter></scene>"
     )
     light = LightConfig(lights=lights)
-    import_data(nerfstudio, tmp_path / "data", meshes, light=light, tell=quiet)
-    scene = parse(Dataset.load(tmp_path / "data").scene).instantiate()
+    import_data(nerfstudio, "data", meshes, light=light, tell=quiet)
+    scene = parse(Dataset.load("data").scene).instantiate()
     assert scene.environment() is None and len(scene.emitters()) == 1
-    assert len(list((tmp_path / "data" / "scene" / "meshes").iterdir())) == len(meshes)
+    assert len(list(Path("data/scene/meshes").iterdir())) == len(meshes)
+    lights.write_text("<scene version='3.0.0'>")
+    with pytest.raises(ImportFaults, match="not a scene that Mitsuba can read"):
+        import_data(nerfstudio, "other", [tmp_path / "none.ply"], light=light, tell=quiet)
 
 
 # ------------------------------------------------------------------------------------------- faults

@@ -85,13 +85,14 @@ def import_data(
     if exposures is not None:
         with faults.collected():
             known, told = read_table(Path(exposures), found.shots, faults)
+    _check_light(light, allow_outside, faults)
     names = _names(found.shots, faults)
     _check_pictures(found.shots, faults)
     faults.require_none(source)
     splits = _splits(found.shots, settings.holdout)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
-        seen = _write_scene(data, parts, light, allow_outside, found.shots, tell)
+        scene, seen = _write_scene(data, parts, light, allow_outside, found.shots, tell)
         background = settings.background
         if background == "auto":
             background = _background(found.shots)
@@ -100,7 +101,7 @@ def import_data(
             for shot in found.shots
         ]
         data.write_transforms(
-            {"scene": data.relative(data.scene / "scene.xml"), "background": background}
+            {"scene": data.relative(scene), "background": background}
             | _clipped(found.shots)
             | {"frames": frames}
         )
@@ -133,6 +134,18 @@ def _read_source(
     if model is not None:
         return read_colmap(model, images, allow_outside, faults)
     raise UserError("no cameras were found in the source", source, _KNOWN)
+
+
+def _check_light(light: LightConfig | None, allow_outside: bool, faults: Faults) -> None:
+    """Read the files of a light, and add what is wrong with them to the faults."""
+    if light is None:
+        return
+    if light.envmap is not None:
+        with faults.collected():
+            relight.check_environment(light.envmap)
+    if light.lights is not None:
+        with faults.collected():
+            parse(light.lights, Path(light.lights.resolve().anchor) if allow_outside else None)
 
 
 def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
@@ -213,8 +226,8 @@ def _write_scene(
     allow_outside: bool,
     shots: Sequence[Shot],
     tell: Callable[[str], None],
-) -> np.ndarray:
-    """Write the scene; returns the share of each photograph's pixels that see the mesh."""
+) -> tuple[Path, np.ndarray]:
+    """Write the scene; returns its file, and the share of each view's pixels that see the mesh."""
     file = write_scene(parts, data.scene, environment=light is None)
     if light is not None:
         parsed = parse(file)
@@ -224,7 +237,7 @@ def _write_scene(
             root = Path(light.lights.resolve().anchor) if allow_outside else None
             for line in relight.put_lights(parsed, light.lights, root):
                 tell(line)
-        file = write(parsed, data.scene)
+        file = write(parsed, data.scene.resolve())
     scene = parse(file).instantiate()
     seen = np.array([_share_seen(scene, shot.lens.camera(shot.to_world)) for shot in shots])
     if not seen.any():
@@ -234,7 +247,7 @@ def _write_scene(
             "Mesh and cameras must be in one frame and unit; --keep-applied-transform leaves "
             "nerfstudio's cameras in the frame of their file",
         )
-    return seen
+    return file, seen
 
 
 def _share_seen(scene: mi.Scene, camera: Camera) -> float:
