@@ -28,6 +28,8 @@ ROOM_ENCLOSURE = 0.75
 
 _DIRECTIONS = 64
 _CHUNK = 1 << 20
+# Segments whose visibility is tested at once: few are slow, and many take memory.
+_SEGMENTS = 1 << 16
 
 
 @final
@@ -108,11 +110,16 @@ def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) ->
     """Visibility of surface points (m) from positions (n), from either side: (n, m) bool."""
     offset = _RAY_OFFSET * bounds(scene)[2]
     result = np.empty((len(positions), len(points.position)), dtype=bool)
-    for row, position in enumerate(positions):
-        to_position = position - points.position
-        side = np.sign(np.einsum("ij,ij->i", to_position, points.normal))
-        start = points.position + (offset * side)[:, None] * points.normal
-        result[row] = unoccluded(scene, start, np.broadcast_to(position, start.shape))
+    if not result.size:
+        return result
+    rows = max(1, _SEGMENTS // len(points.position))
+    for row in range(0, len(positions), rows):
+        ends = np.repeat(positions[row : row + rows], len(points.position), axis=0)
+        count = len(ends) // len(points.position)
+        position, normal = (np.tile(a, (count, 1)) for a in (points.position, points.normal))
+        side = np.sign(np.einsum("ij,ij->i", ends - position, normal))
+        start = position + (offset * side)[:, None] * normal
+        result[row : row + rows] = unoccluded(scene, start, ends).reshape(count, -1)
     return result
 
 
