@@ -33,6 +33,8 @@ _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 PIXEL_BYTES = 100
 #: Bytes of the name of a view, which files of results are named after.
 _LONGEST_NAME = 200
+#: Faults of frames that an error tells.
+_TOLD = 3
 _NEED_HDR = (
     "Give linear HDR images (OpenEXR); PNG, JPEG and TIFF files of a camera are read where "
     f'{TRANSFORMS} has "encoding": "srgb", as `unbake import` writes it'
@@ -135,30 +137,38 @@ class Dataset:
         return tuple(view for view in self.views if view.split == "heldout")
 
     @classmethod
-    def load(cls, folder: str | Path, *, allow_outside: bool = False) -> Dataset:
+    def load(
+        cls,
+        folder: str | Path,
+        *,
+        allow_outside: bool = False,
+        faults: list[UserError] | None = None,
+    ) -> Dataset:
         """Read a data folder and check all of it but the pixels: those when they are read.
 
         Args:
             folder: has a nerfstudio `transforms.json`; frames without "split" are for training.
             allow_outside: read files that lie outside the folder, by their path or through links.
+            faults: takes what is wrong with single frames, which are then left out; None: that is
+                an error.
 
         Raises:
             UserError: anything is missing, malformed, outside the folder, or not a valid camera,
                 or an image cannot hold radiance or has another size than its frame says. It names
-                the file and the remedy.
+                the file and the remedy, of all frames that cannot be used.
         """
+        found: list[UserError] = []
         data = DataFolder(Path(folder), allow_outside)
         top, file = data.read_transforms(), data.transforms_file
         scene = data.inside(text(top, "scene", str(file)), f"{file}: 'scene'")
         require_file(scene, "scene file", f"Set 'scene' in {file}")
-        views = _read_views(data, file, top)
-        for view in views:
-            size = view.camera.width, view.camera.height
-            _check_header(view.image, *size, view.encoding)
-            for image in view.truth.values():
-                _check_header(image, *size)
-            if view.mask is not None:
-                _check_header(view.mask, *size, "srgb")
+        views = _read_views(data, file, top, found)
+        if faults is not None:
+            faults += found
+        else:
+            _raise_together(found)
+        if not any(view.split == "train" for view in views):
+            raise UserError("no view has the split 'train'", file, "There is nothing to learn from")
         render, seen = _provenance(top, file)
         light = _light_by_depth(top, file)
         background = _background(top, file)
@@ -268,32 +278,63 @@ def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
     near = free_space.CONTACT * free_space.bounds(scene)[2]
     film = (np.arange(16) + 0.5) / 16
     x, y = (axis.ravel() for axis in np.meshgrid(film, film))
-    named = []
-    for (name, camera), trapped in zip(cameras.items(), inside, strict=True):
-        origins, directions = camera.rays(x * camera.width, y * camera.height)
-        touching = free_space.trace(scene, origins, directions).distance < near
-        if trapped or touching.mean() > 0.5:
-            named.append(name)
-    return named
+    rays = [camera.rays(x * camera.width, y * camera.height) for camera in cameras.values()]
+    origins, directions = (np.concatenate(part) for part in zip(*rays, strict=True))
+    touching = free_space.trace(scene, origins, directions).distance < near
+    nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
+    return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]
 
 
-def _read_views(data: DataFolder, file: Path, top: dict[str, Any]) -> tuple[View, ...]:
+def _raise_together(faults: list[UserError]) -> None:
+    """Raise one error for what is wrong with frames; it tells some of it where that is much."""
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        told = "; ".join(map(str, faults[:_TOLD]))
+        more = len(faults) - _TOLD
+        rest = f"; and {more} more, all of which `unbake data check` tells" if more > 0 else ""
+        raise UserError(f"{told}{rest}")
+
+
+def _read_views(
+    data: DataFolder, file: Path, top: dict[str, Any], faults: list[UserError]
+) -> tuple[View, ...]:
+    """The views that can be used; what is wrong with the others goes to `faults`."""
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError("'frames' is not a list of frames", file, "Each view is one frame")
     views, names = [], set()
     for index, frame in enumerate(frames):
         where = f"{file}: frame {index}"
-        if not isinstance(frame, dict):
-            raise UserError("the frame is not an object", where, "Each view is one frame")
-        view = _read_view(data, frame, top, where)
-        if view.name in names:
-            raise UserError(f"two frames are named {view.name!r}", where, "Rename one image")
-        names.add(view.name)
-        views.append(view)
-    if not any(view.split == "train" for view in views):
-        raise UserError("no view has the split 'train'", file, "There is nothing to learn from")
+        try:
+            if not isinstance(frame, dict):
+                raise UserError("the frame is not an object", where, "Each view is one frame")
+            view = _read_view(data, frame, top, where)
+            if view.name in names:
+                raise UserError(f"two frames are named {view.name!r}", where, "Rename one image")
+            names.add(view.name)
+        except UserError as error:
+            faults.append(error)
+            continue
+        found = _file_faults(view)
+        faults += found
+        if not found:
+            views.append(view)
     return tuple(views)
+
+
+def _file_faults(view: View) -> list[UserError]:
+    """What is wrong with the files of a view, without reading their pixels."""
+    found = []
+    files = [(view.image, view.encoding), *((image, "linear") for image in view.truth.values())]
+    if view.mask is not None:
+        files.append((view.mask, "srgb"))
+    for image, encoding in files:
+        try:
+            _check_header(image, view.camera.width, view.camera.height, encoding)
+        except UserError as error:
+            found.append(error)
+    return found
 
 
 def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
