@@ -8,6 +8,7 @@
       truth/QUANTITY/VIEW.exr          true materials; a quantity that is not known has no folder
       truth/environment.exr            the true environment map
       truth/emission.json              the true strengths of lights
+      degraded.json                    what `unbake degrade` did to photographs and poses
       .cache/                          decoded photographs, measured ceilings; can be deleted
 
 `transforms.json` says where photographs and scene lie, so that those of another program may lie
@@ -90,6 +91,11 @@ class DataFolder:
     def emission_file(self) -> Path:
         """The true strengths of lights."""
         return self.path / "truth" / "emission.json"
+
+    @property
+    def degraded_file(self) -> Path:
+        """The truth of what photographs and poses were degraded by."""
+        return self.path / "degraded.json"
 
     @property
     def cache(self) -> Path:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,6 +11,7 @@ import numpy as np
 from ..errors import UserError, printable
 from ..scene import free_space
 from .camera import Camera
+from .mistakes import usual_mistakes
 from .photographs import Photographs
 from .views import View
 
@@ -26,46 +25,32 @@ _BLIND = 16
 #: A mistake is named if as large a share of the pixels that see nothing would see surfaces.
 _CONVINCING = 0.5
 
-# From OpenCV's cameras, which look along z with y down, to OpenGL's.
-_OPENCV = np.diag([1.0, -1.0, -1.0])
-# A quarter turn about x, either way: between worlds whose z and whose y points up.
-_TURNS = {
-    "": np.eye(3),
-    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-}
-
-
-@dataclass(frozen=True)
-class _Mistake:
-    """What poses may have been written with, and how they are without it."""
-
-    told: str
-    scale: float
-    turn: np.ndarray  # (3, 3), of the world
-    flip: np.ndarray  # (3, 3), of the camera's axes
-
-    def corrected(self, camera: Camera) -> Camera:
-        pose = np.eye(4)
-        pose[:3, :3] = self.turn @ camera.to_world[:3, :3] @ self.flip
-        pose[:3, 3] = self.scale * (self.turn @ camera.origin)
-        return replace(camera, to_world=pose)
-
 
 def pose_warnings(
     scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path
 ) -> list[str]:
-    """One line for each sign that poses do not belong to the scene.
+    """One line for each sign that poses do not belong to the scene; arguments as below.
+
+    Raises:
+        UserError: no pixel sees a surface of the scene. It names the mistake that explains that, if
+            there is one.
+    """
+    problems = pose_problems(scene, views, photographs, where)
+    if any(problem.where == str(where) for problem in problems):
+        raise problems[0]
+    return [str(problem) for problem in problems]
+
+
+def pose_problems(
+    scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path
+) -> list[UserError]:
+    """What is wrong where poses do not belong to the scene, with the likely mistake.
 
     Args:
         scene: that the photographs show.
         views: to train on.
         photographs: of these views.
-        where: the data set's folder, for the error.
-
-    Raises:
-        UserError: no pixel sees a surface of the scene. It names the mistake that explains that, if
-            there is one.
+        where: the data set's folder, which is named where no pixel sees a surface of the scene.
     """
     cameras = [view.camera for view in views]
     numbers = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
@@ -79,9 +64,9 @@ def pose_warnings(
     if share < (_DOUBTFUL_WITH_SKY if sky else _DOUBTFUL):
         remedy = _likely(scene, cameras, numbers, share)
         if share == 0:
-            raise UserError("no training view sees a surface of the scene", where, remedy)
+            return [UserError("no training view sees a surface of the scene", where, remedy)]
         what = f"only {100 * share:.2g} % of the pixels to train on see a surface of the scene"
-        return [f"{what}. {remedy}"]
+        return [UserError(what, None, remedy)]
     view = _views_of(cameras, numbers)
     count = np.bincount(view, minlength=len(views))
     hits = np.bincount(view, seen, len(views))
@@ -92,38 +77,21 @@ def pose_warnings(
         return []
     more = f" and {len(blind) - 3} more" if len(blind) > 3 else ""
     remedy = _likely(scene, cameras, numbers, share)
-    return [f"{', '.join(blind[:3])}{more}: the view sees no surface of the scene. {remedy}"]
+    what = "the view sees no surface of the scene"
+    return [UserError(what, f"{', '.join(blind[:3])}{more}", remedy)]
 
 
 def _likely(scene: mi.Scene, cameras: Sequence[Camera], numbers: np.ndarray, share: float) -> str:
     """What to correct, as a sentence: the simplest of the mistakes that explain what is seen."""
     found = [
         (mistake, float(_seen(scene, [mistake.corrected(c) for c in cameras], numbers).mean()))
-        for mistake in _mistakes(_scales(scene, cameras))
+        for mistake in usual_mistakes(_scales(scene, cameras))
     ]
     best = max(value for _, value in found)
     if best < share + _CONVINCING * (1 - share):
         return "Check the axes and the units of the poses, and that they are of this scene"
     mistake, value = next((m, v) for m, v in found if v >= 0.97 * best)
     return f"Are poses {mistake.told}? Without that {100 * value:.0f} % would"
-
-
-def _mistakes(scales: Sequence[float]) -> Iterator[_Mistake]:
-    """All mistakes with these scales: single ones first, and of these the most common."""
-    parts = itertools.product(_TURNS.items(), scales, (False, True))
-    named = []
-    for (up, turn), scale, opencv in parts:
-        told = []
-        if opencv:
-            told.append("in OpenCV's axes (negate columns 2 and 3 of the matrix)")
-        if scale != 1:
-            told.append(f"in other units (multiply positions by {scale:g})")
-        if up:
-            told.append(f"of a world with {up} up (turn them by 90° about x)")
-        named.append((told, scale, turn, _OPENCV if opencv else np.eye(3)))
-    for told, scale, turn, flip in sorted(named, key=lambda entry: len(entry[0])):
-        if told:
-            yield _Mistake(" and ".join(told), scale, turn, flip)
 
 
 def _scales(scene: mi.Scene, cameras: Sequence[Camera]) -> list[float]:

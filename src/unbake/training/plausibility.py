@@ -9,6 +9,7 @@ import numpy as np
 from ..dataset.outliers import told_outliers
 from ..dataset.pixels import PixelSource
 from ..dataset.poses import pose_warnings
+from ..dataset.quick_check import quick_findings
 from ..dataset.views import Dataset, check_cameras
 from ..fields.arrays import from_numpy
 from ..transport.render import RayGenerator, render_radiance
@@ -38,6 +39,8 @@ def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> li
         inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
         found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
         found += pose_warnings(scene, dataset.train, pixels.photographs, dataset.folder)
+        quick = [] if found else quick_findings(scene, dataset.train, pixels.photographs)
+        found += map(str, quick)
         units = None if found else _other_units(pixels, problem)
     return [line for line in (*found, units, told_outliers(pixels.photographs.outliers)) if line]
 

@@ -1,0 +1,187 @@
+"""Whether edges of the geometry lie where photographs have edges, and which poses are better."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from .camera import Camera
+from .mistakes import Mistake, all_mistakes
+from .small_views import SmallView, pixel_rays, seen_by, small_view
+
+#: Views that are compared, at most, and how many are needed to tell that others are better.
+MOST_VIEWS, FEWEST_VIEWS = 8, 3
+#: Pixels along the shorter side of a view, below which edges cannot be told from noise.
+SHORTEST_SIDE = 24
+#: Other poses are better if their score is larger by so much, and in as many of the views.
+MARGIN, AGREEING = 0.1, 0.75
+#: Of other poses, the simplest mistake counts whose score is nearly the best.
+_NEARLY = 0.03
+#: All mistakes are tried on so many views, of at most 36 pixels, and so many of them on all views.
+_FEW_VIEWS, _LIKELY = 4, 20
+#: Relative jump of inverse depth, and jump of normals, that are a whole edge.
+_JUMP, _CREASE = 0.1, 0.5
+#: Photographs may be mirrored: what is told, and the axis of the picture that is turned round.
+_MIRRORED = {
+    "mirrored top to bottom": 0,
+    "mirrored left to right": 1,
+}
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How well edges of the geometry and of photographs agree.
+
+    The score is the correlation of both over the pixels of a view, in [-1, 1], averaged over views.
+
+    Args:
+        views: number of views that have edges.
+        score: with the poses as they are.
+        share: of these views' pixels that see a surface, in [0, 1].
+        mistake: what the poses were written with, if they are clearly better without.
+        mirrored: how photographs are mirrored, if they clearly are.
+        best: the score without the mistake; None where there is none.
+        best_share: of pixels that see a surface without the mistake.
+    """
+
+    views: int
+    score: float
+    share: float
+    mistake: Mistake | None = None
+    mirrored: str | None = None
+    best: float | None = None
+    best_share: float | None = None
+
+
+def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
+    """Compare the poses with those that common mistakes would have made of the right ones.
+
+    Args:
+        scene: that the photographs show.
+        views: at low resolution; some of them are looked at, spread evenly.
+
+    Returns:
+        None where it cannot be told: too few views, too small, or without edges.
+    """
+    usable = [v for v in views if min(v.rgb.shape[:2]) >= SHORTEST_SIDE]
+    usable = [v for v in usable if photograph_edges(v).std() > 1e-6]
+    if len(usable) < FEWEST_VIEWS:
+        return None
+    chosen = np.linspace(0, len(usable) - 1, min(len(usable), MOST_VIEWS)).round().astype(int)
+    views = [usable[i] for i in chosen]
+    edges = [photograph_edges(view) for view in views]
+    cameras = [view.camera for view in views]
+    mistakes = _likely(scene, views)
+    (drawn, share), *others = _drawn(scene, cameras, [Mistake(()), *mistakes])
+    given = _scores(edges, drawn)
+    result = Alignment(len(views), float(given.mean()), share)
+    tried: list[tuple[np.ndarray, Mistake | None, str | None, float]] = []
+    for told, axis in _MIRRORED.items():
+        tried.append((_scores([np.flip(e, axis) for e in edges], drawn), None, told, share))
+    for mistake, (found, hit) in zip(mistakes, others, strict=True):
+        tried.append((_scores(edges, found), mistake, None, hit))
+    better = [entry for entry in tried if _clearly_better(entry[0], given)]
+    if not better:
+        return result
+    top = max(entry[0].mean() for entry in better)
+    scores, mistake, mirrored, hit = next(e for e in better if e[0].mean() >= top - _NEARLY)
+    best = float(scores.mean())
+    return Alignment(len(views), result.score, share, mistake, mirrored, best, hit)
+
+
+def _likely(scene: mi.Scene, views: Sequence[SmallView]) -> list[Mistake]:
+    """The mistakes that are worth a closer look, simple ones first: by few views of few pixels."""
+    few = [_smaller(view) for view in views[:: max(1, len(views) // _FEW_VIEWS)][:_FEW_VIEWS]]
+    edges = [photograph_edges(view) for view in few]
+    mistakes = all_mistakes()
+    found = _drawn(scene, [view.camera for view in few], mistakes)
+    scores = [float(_scores(edges, drawn).mean()) for drawn, _ in found]
+    kept = np.sort(np.argsort(scores)[::-1][:_LIKELY])
+    return [mistakes[i] for i in kept]
+
+
+def _smaller(view: SmallView) -> SmallView:
+    rgb, alpha = view.rgb.reshape(-1, 3), view.alpha.ravel()
+    return small_view(view.name, view.camera, rgb, alpha, SHORTEST_SIDE * 3 // 2)
+
+
+def _clearly_better(scores: np.ndarray, given: np.ndarray) -> bool:
+    gain = scores - given
+    return bool(gain.mean() > MARGIN and (gain > 0).mean() >= AGREEING)
+
+
+def _drawn(
+    scene: mi.Scene, cameras: Sequence[Camera], mistakes: Sequence[Mistake]
+) -> list[tuple[list[np.ndarray], float]]:
+    """Edges that cameras see without each mistake, and the share of pixels that see a surface."""
+    corrected = [m.corrected(camera) for m in mistakes for camera in cameras]
+    seen = seen_by(scene, corrected)
+    found = []
+    for i in range(0, len(corrected), len(cameras)):
+        pairs = list(zip(corrected, seen, strict=True))[i : i + len(cameras)]
+        share = float(np.mean([np.isfinite(s.distance).mean() for _, s in pairs]))
+        found.append(([geometry_edges(c, s.distance, s.normal) for c, s in pairs], share))
+    return found
+
+
+def _scores(photographed: list[np.ndarray], drawn: list[np.ndarray]) -> np.ndarray:
+    """The correlation of edges, one number a view; 0 where the geometry has none."""
+    found = []
+    for picture, edges in zip(photographed, drawn, strict=True):
+        a, b = picture - picture.mean(), edges - edges.mean()
+        norm = np.sqrt((a * a).sum() * (b * b).sum())
+        found.append(float((a * b).sum() / norm) if norm > 1e-9 else 0.0)
+    return np.array(found)
+
+
+def photograph_edges(view: SmallView) -> np.ndarray:
+    """Slope of the logarithm of brightness, blurred: (height, width), in [0, 1]."""
+    luminance = view.rgb.mean(axis=-1)
+    positive = luminance[luminance > 0]
+    floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
+    logarithm = np.log(luminance + floor)
+    slope = np.hypot(*np.gradient(logarithm)) + np.hypot(*np.gradient(view.alpha))
+    top = float(np.quantile(slope, 0.98))
+    return _blurred(np.minimum(slope / top, 1)) if top > 1e-9 else np.zeros_like(slope)
+
+
+def geometry_edges(camera: Camera, distance: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Edges of what is seen: jumps and folds of depth, creases of normals; (height, width).
+
+    On a plane the inverse of depth is a linear function of the pixel, so that its second
+    differences vanish also where the plane is seen from its edge.
+
+    Args:
+        camera: of the picture.
+        distance: along the rays through the pixels, (pixels,), infinite where nothing is seen.
+        normal: (pixels, 3), zero there.
+    """
+    shape = (camera.height, camera.width)
+    _, directions = pixel_rays([camera])
+    cosine = -(directions @ camera.to_world[:3, 2])
+    inverse = (1 / (distance * np.maximum(cosine, 1e-6))).reshape(shape)
+    facing = normal.reshape(*shape, 3)
+    strength = np.zeros(shape)
+    for axis in (0, 1):
+        line = np.moveaxis(inverse, axis, 0)
+        along = np.moveaxis(facing, axis, 0)
+        out = np.moveaxis(strength, axis, 0)
+        middle = np.abs(line[2:] - 2 * line[1:-1] + line[:-2])
+        largest = np.maximum(np.maximum(line[2:], line[:-2]), line[1:-1])
+        jump = middle / np.maximum(_JUMP * largest, 1e-30)
+        crease = np.linalg.norm(along[2:] - along[:-2], axis=-1) / _CREASE
+        out[1:-1] = np.maximum(out[1:-1], np.minimum(np.maximum(jump, crease), 1))
+    return _blurred(strength)
+
+
+def _blurred(picture: np.ndarray) -> np.ndarray:
+    """The mean of 3 x 3 pixels with weights 1, 2, 1; edges repeated."""
+    for axis in (0, 1):
+        padded = np.pad(picture, [(1, 1) if i == axis else (0, 0) for i in range(2)], "edge")
+        first, last = (slice(None, -2), slice(2, None))
+        parts = [padded[s] if axis == 0 else padded[:, s] for s in (first, slice(1, -1), last)]
+        picture = 0.25 * parts[0] + 0.5 * parts[1] + 0.25 * parts[2]
+    return picture

@@ -1,0 +1,104 @@
+"""What is wrong with a data set, in words: what, where and the remedy.
+
+A fit tells these before its first step, and `unbake data check` with more beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..errors import UserError, printable
+from .agreement import Exposures, TurningLight
+from .alignment import Alignment
+
+#: An error: a fit makes no sense. A warning: it will be worse than it could be. A hint: something
+#: to know.
+Level = Literal["error", "warning", "hint"]
+#: Stops between the darkest and the brightest exposure from which on it matters.
+SPREAD = 0.5
+#: Light turns with the cameras if it explains such a share of what differs between views, and so
+#: many stops of it.
+TURNING, TURNING_STOPS = 0.35, 0.15
+#: Names that are told; of more there is the number.
+_TOLD = 3
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong, or worth knowing.
+
+    Args:
+        level: how bad it is.
+        check: the check that found it, a word.
+        what: what is wrong, as a sentence without full stop.
+        where: views or files; None: the data set as a whole.
+        remedy: what to do about it, without full stop.
+    """
+
+    level: Level
+    check: str
+    what: str
+    where: str | None = None
+    remedy: str | None = None
+
+    def __str__(self) -> str:
+        return str(UserError(self.what, self.where, self.remedy))
+
+
+def named(names: Sequence[str]) -> str:
+    """Names of views, of which the first are told."""
+    more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+    return ", ".join(printable(name) for name in names[:_TOLD]) + more
+
+
+def misaligned(found: Alignment | None) -> Finding | None:
+    """Whether other poses than those that are given put edges where photographs have them."""
+    if found is None or found.best is None:
+        return None
+    much = f"their edges agree with the photographs' by {max(found.score, 0):.2f}, without that by"
+    if found.mirrored is not None:
+        what = f"photographs seem to be {found.mirrored}: {much} {found.best:.2f}"
+        return Finding("error", "alignment", what, None, "Flip them, or write them again")
+    assert found.mistake is not None
+    what = f"poses seem to be {found.mistake.parts[0].partition(' (')[0]}"
+    for part in found.mistake.parts[1:]:
+        what += f" and {part.partition(' (')[0]}"
+    remedies = [part.partition(" (")[2].removesuffix(")") for part in found.mistake.parts]
+    remedy = ", and ".join(remedies)
+    return Finding(
+        "error",
+        "alignment",
+        f"{what}: {much} {found.best:.2f}",
+        None,
+        f"{remedy[0].upper()}{remedy[1:]}",
+    )
+
+
+def unequal_exposures(found: Exposures, names: Sequence[str]) -> Finding | None:
+    """Whether views that see the same surfaces are exposed in different ways."""
+    if found.spread < SPREAD:
+        return None
+    darkest, brightest = int(np.nanargmin(found.stops)), int(np.nanargmax(found.stops))
+    what = (
+        f"surfaces that views share are up to {found.spread:.1f} stops brighter in one than in "
+        f"another ({printable(names[darkest])} the darkest, {printable(names[brightest])} the "
+        "brightest)"
+    )
+    remedy = "Give each frame its 'exposure', or take all photographs with the same one"
+    return Finding("warning", "exposure", what, None, remedy)
+
+
+def light_that_turns(found: TurningLight | None) -> Finding | None:
+    """Whether light turned with the cameras, as on a turntable."""
+    if found is None or found.explained < TURNING or found.stops < TURNING_STOPS:
+        return None
+    what = (
+        "light and shadow turn with the cameras, as where an object stands on a turntable: that "
+        f"explains {100 * found.explained:.0f} % of how surfaces differ between views"
+    )
+    remedy = "Take the photographs by moving the camera around: the light must stand still"
+    return Finding("error", "light", what, None, remedy)

@@ -1,0 +1,142 @@
+"""Views at low resolution, with the surfaces that their pixels see: what checks of data look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..imaging.pictures import block_means
+from .camera import Camera
+
+#: Pixels along the longer side of a small view, at most.
+LONGEST_SIDE = 64
+#: Rays that are traced at once: few calls, for each takes long where a scene has many shapes.
+_RAYS = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class SmallView:
+    """A view at low resolution.
+
+    Args:
+        name: of the view.
+        camera: of the small picture.
+        rgb: mean linear radiance of blocks of pixels, (height, width, 3).
+        alpha: mean coverage of the same blocks, (height, width); 1 where the background is visible.
+    """
+
+    name: str
+    camera: Camera
+    rgb: np.ndarray
+    alpha: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What pixels see, (n,) each: the first surface through their centres.
+
+    Args:
+        position: (n, 3) in world space; NaN where nothing is seen.
+        normal: (n, 3) unit shading normals, turned towards the camera.
+        distance: from the camera, world units; infinite where nothing is seen.
+        emits: whether the surface emits light.
+    """
+
+    position: np.ndarray
+    normal: np.ndarray
+    distance: np.ndarray
+    emits: np.ndarray
+
+    def of(self, part: slice) -> Seen:
+        """The same of some pixels."""
+        fields = (self.position, self.normal, self.distance, self.emits)
+        return Seen(*(values[part] for values in fields))
+
+
+def small_view(
+    name: str,
+    camera: Camera,
+    rgb: np.ndarray,
+    alpha: np.ndarray | None,
+    longest: int = LONGEST_SIDE,
+) -> SmallView:
+    """A view averaged over the smallest square blocks that make it fit; a remainder is cut.
+
+    Args:
+        camera: of the whole picture.
+        rgb: linear, row by row, (pixels, 3).
+        alpha: coverage, (pixels,); None where the background is visible.
+        longest: pixels along the longer side, at most.
+    """
+    small = small_camera(camera, longest)
+    height, width = small.height, small.width
+    shape = (camera.height, camera.width)
+    block = min(shape[0] // height, shape[1] // width)
+    means = block_means(rgb.reshape(*shape, -1)[..., :3], block)
+    covered = np.ones((height, width))
+    if alpha is not None:
+        covered = block_means(alpha.reshape(shape), block)
+    return SmallView(name, small, means, covered)
+
+
+def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
+    """The camera of the small view."""
+    block = -(-max(camera.height, camera.width) // longest)
+    block = min(block, camera.height, camera.width)  # a picture of one line keeps it
+    return replace(
+        camera,
+        fl_x=camera.fl_x / block,
+        fl_y=camera.fl_y / block,
+        cx=camera.cx / block,
+        cy=camera.cy / block,
+        width=camera.width // block,
+        height=camera.height // block,
+    )
+
+
+def pixel_rays(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions through the centres of all pixels, row by row, camera by camera."""
+    rays = []
+    for camera in cameras:
+        row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
+        rays.append(camera.rays(column + 0.5, row + 0.5))
+    origins, directions = zip(*rays, strict=True)
+    return np.concatenate(origins), np.concatenate(directions)
+
+
+def seen_by(scene: mi.Scene, cameras: Sequence[Camera]) -> list[Seen]:
+    """The surfaces that the pixels of cameras see, row by row."""
+    every = seen_along(scene, *pixel_rays(cameras))
+    first = np.cumsum([0, *(c.width * c.height for c in cameras)])
+    return [every.of(slice(a, b)) for a, b in pairwise(first.tolist())]
+
+
+def seen_along(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> Seen:
+    """The first surfaces along rays, (n, 3) each, with unit directions."""
+    parts = [
+        _seen(scene, origins[i : i + _RAYS], directions[i : i + _RAYS])
+        for i in range(0, len(origins), _RAYS)
+    ]
+    return Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _seen(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    o, d = (np.ascontiguousarray(a.T, dtype=np.float32) for a in (origins, directions))
+    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+    hit = scene.ray_intersect(ray)
+    valid = hit.is_valid()
+    normal = hit.sh_frame.n
+    emits = valid & hit.shape.is_emitter()
+    dr.eval(hit.t, normal, valid, emits)
+    found = np.array(valid)
+    distance = np.where(found, np.array(hit.t, dtype=np.float64), np.inf)
+    towards = np.array(normal, dtype=np.float64).reshape(3, -1).T
+    towards = np.where(((towards * directions).sum(1) > 0)[:, None], -towards, towards)
+    reach = np.where(found, distance, 0)[:, None]
+    position = np.where(found[:, None], origins + reach * directions, np.nan)
+    return position, np.where(found[:, None], towards, 0.0), distance, np.array(emits)
