@@ -189,11 +189,39 @@ def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -
     for camera in cameras:
         framed = np.flatnonzero(~seen & _in_frame(camera, points.position))
         seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
+    return float(seen.sum() / max(_reachable(scene, points, seen).sum(), 1))
+
+
+def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000) -> np.ndarray:
+    """The number of cameras that see points of the reachable surface, (points,).
+
+    Args:
+        scene: the scene.
+        cameras: the training views.
+        samples: number of surface points tested, uniform by area; those that are reachable, as in
+            `coverage`, are counted.
+    """
+    points = free_space.sample_surface(scene, samples, 1)
+    counts = np.zeros(len(points.position), dtype=int)
+    for camera in cameras:
+        framed = np.flatnonzero(_in_frame(camera, points.position))
+        shown = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
+        counts[framed] += shown
+    return counts[_reachable(scene, points, counts > 0)]
+
+
+def _reachable(scene: mi.Scene, points: free_space.SurfacePoints, seen: np.ndarray) -> np.ndarray:
+    """Points that were seen, or that one of the standpoints sees."""
     reachable = seen.copy()
-    for position in _standpoints(scene):
+    positions = _standpoints(scene)
+    # Most points are seen from the first few positions: the others are tested from ever more.
+    first, count = 0, 1
+    while first < len(positions) and not reachable.all():
         hidden = np.flatnonzero(~reachable)
-        reachable[hidden] = free_space.visibility(scene, position[None], _subset(points, hidden))[0]
-    return float(seen.sum() / max(reachable.sum(), 1))
+        block = positions[first : first + count]
+        reachable[hidden] = free_space.visibility(scene, block, _subset(points, hidden)).any(axis=0)
+        first, count = first + len(block), min(2 * count, 32)
+    return reachable
 
 
 def _candidates(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from ..config.fit import DEEPEST
 from ..config.flag import Flag
-from ..errors import require_ranges
+from ..errors import UserError, require_ranges
 
 #: Pixels of the training views, chosen at random, and samples of each, that measure how much light
 #: paths carry by their depth.
@@ -54,3 +54,79 @@ class CaptureSettings:
                 "seed": (0, (1 << 31) - 1),  # of Mitsuba's samplers
             },
         )
+
+
+#: Names of responses; see `acquisition/degrade.py`.
+Response = Literal["srgb", "gamma", "contrast"]
+
+
+@dataclass(frozen=True)
+class DegradeSettings:
+    """What a camera does to photographs. The defaults leave everything as it is.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    exposure: Annotated[
+        float, Flag("Exposures differ by up to so many stops either way; the first view's does not")
+    ] = 0.0
+    white_balance: Annotated[
+        float, Flag("Red differs from blue by up to so many stops either way")
+    ] = 0.0
+    #: Cameras give code values, which programs decode by the sRGB curve.
+    response: Annotated[
+        Response,
+        Flag(
+            "Response of the camera: srgb, which is decoded without an error; gamma, a power of "
+            "1/2.2; contrast, an S-shaped curve as of telephones"
+        ),
+    ] = "srgb"
+    vignetting: Annotated[float, Flag("Share of the light that is lost in the corners")] = 0.0
+    electrons: Annotated[
+        float, Flag("Electrons that white counts, which makes shot noise; 0: none")
+    ] = 0.0
+    read_noise: Annotated[float, Flag("Read noise in electrons, for --electrons")] = 0.0
+    clip: Annotated[
+        float | None,
+        Flag(
+            "Share of the pixels of an exposure without jitter that is brighter than white and "
+            "clipped (default: 0.01 where a response or noise needs a white, else nothing is "
+            "clipped)",
+            metavar="NUMBER",
+            tell_default=False,
+        ),
+    ] = None
+    pose_jitter: Annotated[float, Flag("Poses are off by so many pixels, root mean square")] = 0.0
+    displace: Annotated[
+        float, Flag("Meshes are off by so much, as a share of the scene's diagonal")
+    ] = 0.0
+    tell_exposures: Annotated[
+        bool, Flag("Write the true exposures to the frames, as EXIF would tell them")
+    ] = False
+    seed: Annotated[int, Flag("Seed of all random numbers")] = 0
+
+    def __post_init__(self) -> None:
+        require_ranges(
+            self,
+            {
+                "exposure": (0, 8),
+                "white_balance": (0, 4),
+                "vignetting": (0, 0.99),
+                "electrons": (0, 1e9),
+                "read_noise": (0, 1e6),
+                "clip": (0, 0.9),
+                "pose_jitter": (0, 100),
+                "displace": (0, 0.1),
+                "seed": (0, (1 << 31) - 1),
+            },
+        )
+        if self.read_noise and not self.electrons:
+            raise UserError("needs electrons", "read_noise", "Give --electrons, such as 10000")
+
+    @property
+    def white(self) -> float | None:
+        """Share of the pixels that is clipped; None where there is no white."""
+        if self.clip is None and (self.electrons or self.response != "srgb"):
+            return 0.01
+        return self.clip

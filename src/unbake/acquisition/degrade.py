@@ -1,0 +1,367 @@
+"""Turn a rendered data set into what cameras deliver, and keep the truth of every fault beside it.
+
+A photograph is, channel by channel,
+
+    decode(response(clip(gain · exposure · balance · vignetting · radiance + noise)))
+
+where `gain` is common to all views and puts white at 1, and `decode` is the inverse of the sRGB
+curve, by which programs read photographs. Each fault has random numbers of its own: it is the same
+alone and together with others.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..dataset.data_folder import DataFolder
+from ..dataset.small_views import seen_by, small_camera
+from ..dataset.views import Dataset, View, read_image
+from ..imaging.pictures import write_exr
+from ..io import filled_folder, require_new_folder, write_json
+from ..scene import free_space
+from ..scene.parse import ParsedScene, parse, write
+from .settings import DegradeSettings
+
+#: Entries of the table of a response.
+_TABLE = 257
+#: Values of each kind of random numbers.
+_EXPOSURE, _BALANCE, _NOISE, _POSE, _MESH = range(5)
+#: Plugins of meshes in files, which can be displaced.
+_MESHES = ("ply", "obj", "serialized")
+#: Of the displacement: waves, and their shortest and longest length in diagonals of the scene.
+_WAVES, _LENGTHS = 24, (0.05, 0.5)
+#: How much an S-shaped response differs from the sRGB curve.
+_CONTRAST = 0.5
+
+
+@final
+@dataclass(frozen=True)
+class CameraTruth:
+    """What a camera did to one photograph.
+
+    Args:
+        exposure: photograph over radiance, before the response: gain and jitter.
+        white_balance: factors of red, green and blue.
+    """
+
+    exposure: float
+    white_balance: tuple[float, float, float]
+
+
+def degrade(
+    data: str | Path,
+    out: str | Path,
+    settings: DegradeSettings,
+    *,
+    allow_outside: bool = False,
+    tell: Callable[[str], None] = print,
+) -> Dataset:
+    """Write a degraded copy of a data set, with scene and true materials.
+
+    Args:
+        data: folder of the data set.
+        out: folder to write, new or empty; it appears only when it is complete.
+        settings: what is done to photographs, poses and meshes.
+        allow_outside: read files of the data set that lie outside of its folder.
+        tell: called with lines of progress.
+
+    Raises:
+        UserError: the data set cannot be read, or `out` is not empty.
+    """
+    out = Path(out)
+    require_new_folder(out)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
+    parsed = parse(dataset.scene, dataset.root)
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    diagonal = free_space.bounds(scene)[2]
+    gain = _gain(dataset, settings)
+    cameras = _moved(scene, dataset.views, settings)
+    truths = _camera_truths(dataset.views, gain, settings)
+    with filled_folder(out) as partial:
+        folder = DataFolder(partial)
+        folder.scene.mkdir()
+        displaced = _displace(parsed, folder, settings, diagonal) if settings.displace else []
+        path = write(parsed, folder.scene)
+        for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
+            pixels = _photograph(view, number, truth, settings)
+            write_exr(folder.image(view.name), pixels)
+            _copy_truth(view, folder)
+        _copy_lighting(DataFolder(dataset.folder, allow_outside), folder)
+        content = DataFolder(dataset.folder, allow_outside).read_transforms()
+        _write_transforms(folder, content, path, dataset, cameras, truths, gain, settings)
+        write_json(
+            folder.degraded_file,
+            _truth(dataset, truths, gain, settings, displaced, diagonal),
+            allow_nan=False,
+        )
+    tell(f"degraded {len(truths)} photographs; the truth of it is in degraded.json")
+    return Dataset.load(out)
+
+
+def response(values: np.ndarray, kind: str) -> np.ndarray:
+    """What a program reads of linear values in [0, 1]: decoded by sRGB, encoded by the camera.
+
+    Args:
+        kind: see `DegradeSettings.response`.
+    """
+    if kind == "gamma":
+        return _decoded(np.power(values, 1 / 2.2))
+    if kind == "contrast":
+        code = _encoded(values)
+        return _decoded(code + _CONTRAST * (code * code * (3 - 2 * code) - code))
+    return values
+
+
+def vignetting(camera: Camera, lost: float) -> np.ndarray:
+    """The share of the light that arrives at pixels, (height, width): 1 − lost · (r / corner)²."""
+    x = (np.arange(camera.width) + 0.5) / camera.width - 0.5
+    y = (np.arange(camera.height) + 0.5) / camera.height - 0.5
+    scale = camera.width**2 + camera.height**2
+    square = ((x * camera.width) ** 2 + ((y * camera.height) ** 2)[:, None]) / (scale / 4)
+    return 1 - lost * square
+
+
+def _encoded(linear: np.ndarray) -> np.ndarray:
+    """The sRGB curve. Source: IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
+
+
+def _decoded(code: np.ndarray) -> np.ndarray:
+    """Its inverse."""
+    return np.where(code <= 0.04045, code / 12.92, np.power((code + 0.055) / 1.055, 2.4))
+
+
+def _random(settings: DegradeSettings, *which: int) -> np.random.Generator:
+    return np.random.default_rng([settings.seed, *which])
+
+
+# -------------------------------------------------------------------------------------- photographs
+
+
+def _gain(dataset: Dataset, settings: DegradeSettings) -> float:
+    """The factor that puts white at 1; 1 where nothing is clipped."""
+    if settings.white is None:
+        return 1.0
+    hidden = dataset.background == "hidden"
+    brightest = []
+    for view in dataset.train:
+        pixels = read_image(view.image, view.camera.width, view.camera.height)
+        kept = pixels[pixels[:, 3] > 0] if hidden else pixels
+        brightest.append(kept[:, :3].max(axis=1))
+    white = float(np.quantile(np.concatenate(brightest), 1 - settings.white))
+    return 1 / white if white > 0 else 1.0
+
+
+def _camera_truths(
+    views: tuple[View, ...], gain: float, settings: DegradeSettings
+) -> list[CameraTruth]:
+    """Exposures and white balances; those of the first training view are without jitter."""
+    anchor = next(i for i, view in enumerate(views) if view.split == "train")
+    stops = _random(settings, _EXPOSURE).uniform(-1, 1, len(views)) * settings.exposure
+    tint = _random(settings, _BALANCE).uniform(-1, 1, len(views)) * settings.white_balance
+    stops[anchor] = tint[anchor] = 0
+    return [
+        CameraTruth(gain * 2.0 ** float(s), (2.0 ** (0.5 * t), 1.0, 2.0 ** (-0.5 * t)))
+        for s, t in zip(stops.tolist(), tint.tolist(), strict=True)
+    ]
+
+
+def _photograph(
+    view: View, number: int, truth: CameraTruth, settings: DegradeSettings
+) -> np.ndarray:
+    """The degraded photograph, (height, width, 4)."""
+    camera = view.camera
+    shape = (camera.height, camera.width)
+    pixels = read_image(view.image, camera.width, camera.height).reshape(*shape, 4)
+    rgb = pixels[..., :3].astype(np.float64) * truth.exposure * np.array(truth.white_balance)
+    rgb *= vignetting(camera, settings.vignetting)[..., None]
+    if settings.electrons:
+        rng = _random(settings, _NOISE, number)
+        counted = rng.poisson(np.minimum(rgb, 1e3) * settings.electrons)
+        counted = counted + rng.normal(0, settings.read_noise, rgb.shape)
+        covered = pixels[..., 3:] > 0  # what is hidden behind the scene stays black
+        rgb = np.where(covered, counted / settings.electrons, rgb)
+    rgb = np.maximum(rgb, 0)
+    if settings.white is not None:
+        rgb = response(np.minimum(rgb, 1), settings.response)
+    return np.dstack([rgb, pixels[..., 3]])
+
+
+# --------------------------------------------------------------------------------- poses and meshes
+
+
+def _moved(scene: mi.Scene, views: tuple[View, ...], settings: DegradeSettings) -> list[Camera]:
+    """Cameras that are turned and moved at random, half of the error each."""
+    if not settings.pose_jitter:
+        return [view.camera for view in views]
+    diagonal = free_space.bounds(scene)[2]
+    moved, every = [], seen_by(scene, [small_camera(view.camera) for view in views])
+    for number, (view, seen) in enumerate(zip(views, every, strict=True)):
+        camera = view.camera
+        rng = _random(settings, _POSE, number)
+        # Two causes, which move a pixel along two axes each.
+        part = settings.pose_jitter / 2
+        known = seen.distance[np.isfinite(seen.distance)]
+        depth = float(np.median(known)) if len(known) else diagonal
+        turn = _rotation(rng.normal(0, part / camera.fl_x, 3))
+        shift = rng.normal(0, part * depth / camera.fl_x, 3)
+        pose = camera.to_world.copy()
+        pose[:3, 3] += pose[:3, :3] @ shift
+        pose[:3, :3] = pose[:3, :3] @ turn
+        moved.append(
+            Camera(
+                pose,
+                camera.fl_x,
+                camera.fl_y,
+                camera.cx,
+                camera.cy,
+                camera.width,
+                camera.height,
+            )
+        )
+    return moved
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """The rotation about a vector by its length (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-15:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _displace(
+    parsed: ParsedScene, folder: DataFolder, settings: DegradeSettings, diagonal: float
+) -> list[str]:
+    """Move the vertices of all meshes by smooth noise; the files that it wrote."""
+    files = []
+    for number, node in enumerate(parsed.state.nodes):
+        plugin = node.props.plugin_name()
+        if node.type != mi.ObjectType.Shape or plugin not in _MESHES:
+            continue
+        kept = ("filename", "shape_index", "face_normals", "flip_tex_coords", "to_world")
+        made = {key: node.props[key] for key in kept if key in node.props}
+        mesh = mi.load_dict({"type": plugin, **made})
+        params = mi.traverse(mesh)
+        positions = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        positions += displacement(positions, settings, diagonal)
+        params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+        params.update()
+        dr.eval(params["vertex_positions"])
+        file = folder.scene / "meshes" / f"displaced-{number}.ply"
+        file.parent.mkdir(exist_ok=True)
+        mesh.write_ply(str(file))
+        for key in ("shape_index", "flip_tex_coords", "to_world"):
+            if key in node.props:
+                del node.props[key]
+        node.props.set_plugin_name("ply")
+        node.props["filename"] = str(file.resolve())
+        files.append(file.name)
+    return files
+
+
+def displacement(positions: np.ndarray, settings: DegradeSettings, diagonal: float) -> np.ndarray:
+    """How vertices are moved, (n, 3) in world units: a sum of waves, equal at equal positions.
+
+    Args:
+        positions: (n, 3).
+        settings: their root mean square is `displace` diagonals.
+        diagonal: of the scene, world units.
+    """
+    rng = _random(settings, _MESH)
+    direction = rng.normal(size=(_WAVES, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    length = diagonal * np.exp(rng.uniform(math.log(_LENGTHS[0]), math.log(_LENGTHS[1]), _WAVES))
+    wave = 2 * np.pi * direction / length[:, None]
+    amplitude = rng.normal(size=(_WAVES, 3))
+    phase = rng.uniform(0, 2 * np.pi, _WAVES)
+    size = math.sqrt(float((amplitude**2).sum()) / 2)
+    moved = np.sin(positions @ wave.T + phase) @ amplitude
+    return settings.displace * diagonal / size * moved
+
+
+# -------------------------------------------------------------------------------------------- files
+
+
+def _copy_truth(view: View, folder: DataFolder) -> None:
+    for quantity, file in view.truth.items():
+        target = folder.truth(quantity, view.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target)
+
+
+def _copy_lighting(source: DataFolder, folder: DataFolder) -> None:
+    pairs = {
+        source.environment_file: folder.environment_file,
+        source.emission_file: folder.emission_file,
+    }
+    for file, target in pairs.items():
+        if source.known(file):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, target)
+
+
+def _write_transforms(
+    folder: DataFolder,
+    content: dict[str, Any],
+    scene: Path,
+    dataset: Dataset,
+    cameras: list[Camera],
+    truths: list[CameraTruth],
+    gain: float,
+    settings: DegradeSettings,
+) -> None:
+    """The frames with other poses, and with what a camera tells of its exposures."""
+    frames = []
+    for frame, view, camera, truth in zip(
+        content["frames"], dataset.views, cameras, truths, strict=True
+    ):
+        new = dict(frame)
+        new["file_path"] = folder.relative(folder.image(view.name))
+        new["transform_matrix"] = camera.to_world.tolist()
+        exposure = truth.exposure if settings.tell_exposures else gain
+        if exposure != 1:
+            new["exposure"] = exposure
+        frames.append(new)
+    content |= {"scene": folder.relative(scene), "frames": frames}
+    if settings.white is not None:
+        content["clipped"] = 1.0
+    folder.write_transforms(content)
+
+
+def _truth(
+    dataset: Dataset,
+    truths: list[CameraTruth],
+    gain: float,
+    settings: DegradeSettings,
+    displaced: list[str],
+    diagonal: float,
+) -> dict[str, Any]:
+    linear = np.linspace(0, 1, _TABLE)
+    return {
+        "settings": asdict(settings),
+        "gain": gain,
+        "clipped": None if settings.white is None else 1.0,
+        "response": {
+            "linear": linear.tolist(),
+            "read": response(linear, settings.response).tolist(),
+        },
+        "vignetting": {"corner": 1 - settings.vignetting, "falls with": "square of the distance"},
+        "displaced": {"meshes": displaced, "world_units": settings.displace * diagonal},
+        "views": {
+            view.name: asdict(truth) | {"transform_matrix": view.camera.to_world.tolist()}
+            for view, truth in zip(dataset.views, truths, strict=True)
+        },
+    }

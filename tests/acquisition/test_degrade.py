@@ -1,0 +1,155 @@
+"""What cameras do to photographs is done as told, the same for the same seed, with its truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from unbake.acquisition.degrade import degrade, displacement, response
+from unbake.acquisition.settings import DegradeSettings
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.imaging.pictures import read_exr
+from unbake.io import read_json
+
+
+@pytest.fixture
+def degraded(cornell, tmp_path):
+    """`degraded(**faults)`: a degraded copy of the room, its data set and the truth beside it."""
+    number = iter(range(100))
+
+    def make(**faults):
+        out = tmp_path / f"degraded-{next(number)}"
+        dataset = degrade(cornell, out, DegradeSettings(**faults), tell=lambda line: None)
+        return dataset, read_json(out / "degraded.json")
+
+    return make
+
+
+def pictures(dataset):
+    return {view.name: read_exr(view.image) for view in dataset.views}
+
+
+def test_without_faults_a_copy_is_the_same(cornell, degraded):
+    dataset, truth = degraded()
+    before = Dataset.load(cornell)
+    assert truth["gain"] == 1 and truth["clipped"] is None
+    for old, new in zip(before.views, dataset.views, strict=True):
+        assert np.array_equal(read_exr(old.image), read_exr(new.image))
+        assert np.array_equal(old.camera.to_world, new.camera.to_world)
+        assert {k: read_exr(f).tolist() for k, f in old.truth.items()} == {
+            k: read_exr(f).tolist() for k, f in new.truth.items()
+        }
+    assert dataset.kind == before.kind and dataset.light_by_depth == before.light_by_depth
+
+
+def test_exposure_balance_and_vignetting_are_those_of_the_truth(cornell, degraded):
+    dataset, truth = degraded(exposure=1.5, white_balance=0.5, vignetting=0.4, seed=3)
+    clean = pictures(Dataset.load(cornell))
+    for name, pixels in pictures(dataset).items():
+        told = truth["views"][name]
+        y, x = (np.indices((16, 16)) + 0.5) / 16 - 0.5
+        falls = 1 - 0.4 * (x**2 + y**2) / 0.5
+        factor = told["exposure"] * np.array(told["white_balance"]) * falls[..., None]
+        np.testing.assert_allclose(pixels[..., :3], clean[name][..., :3] * factor, rtol=1e-5)
+    assert truth["views"]["train_000"]["exposure"] == 1
+    stops = np.log2([view["exposure"] for view in truth["views"].values()])
+    assert np.abs(stops).max() <= 1.5 and np.ptp(stops) > 0.1
+
+
+def test_the_same_seed_gives_the_same_and_each_fault_its_own_numbers(degraded):
+    faults = {"exposure": 1.0, "electrons": 500.0, "read_noise": 5.0, "pose_jitter": 1.0}
+    (one, first), (two, second) = degraded(**faults), degraded(**faults)
+    assert first == second
+    for a, b in zip(pictures(one).values(), pictures(two).values(), strict=True):
+        assert np.array_equal(a, b)
+    _, other = degraded(**faults, seed=1)
+    assert other["views"] != first["views"]
+    _, alone = degraded(exposure=1.0)
+    ratio = [
+        first["views"][name]["exposure"] / alone["views"][name]["exposure"]
+        for name in first["views"]
+    ]
+    np.testing.assert_allclose(ratio, first["gain"])
+
+
+def test_a_response_is_kept_as_a_table_and_ends_at_white(cornell, degraded):
+    dataset, truth = degraded(response="contrast", clip=0.1)
+    clean = pictures(Dataset.load(cornell))
+    table = truth["response"]
+    values = np.concatenate([p[..., :3].ravel() for p in pictures(dataset).values()])
+    assert values.max() == 1
+    for name, pixels in pictures(dataset).items():
+        linear = np.minimum(clean[name][..., :3] * truth["gain"], 1)
+        read = np.interp(linear, table["linear"], table["read"])
+        np.testing.assert_allclose(pixels[..., :3], read, atol=2e-4)
+    content = json.loads((dataset.folder / "transforms.json").read_text())
+    assert content["clipped"] == 1
+    assert {frame["exposure"] for frame in content["frames"]} == {truth["gain"]}
+
+
+@pytest.mark.parametrize("kind", ["srgb", "gamma", "contrast"])
+def test_responses_rise_from_black_to_white(kind):
+    values = response(np.linspace(0, 1, 101), kind)
+    assert values[0] == 0 and abs(values[-1] - 1) < 1e-12 and (np.diff(values) > 0).all()
+
+
+def test_noise_has_the_variance_of_its_electrons(cornell, degraded):
+    dataset, truth = degraded(electrons=200.0, read_noise=4.0, clip=0.0)
+    clean = pictures(Dataset.load(cornell))
+    error, variance = [], []
+    for name, pixels in pictures(dataset).items():
+        linear = clean[name][..., :3].astype(float) * truth["gain"]
+        inside = (linear > 0.2) & (linear < 0.7)
+        error.append((pixels[..., :3] - linear)[inside])
+        variance.append(linear[inside] / 200 + (4 / 200) ** 2)
+    error, variance = np.concatenate(error), np.concatenate(variance)
+    assert len(error) > 300
+    assert abs((error**2 / variance).mean() - 1) < 4 * np.sqrt(2 / len(error))
+
+
+def test_poses_are_off_by_pixels_and_the_true_ones_are_kept(cornell, degraded):
+    dataset, truth = degraded(pose_jitter=1.0)
+    before = {view.name: view.camera for view in Dataset.load(cornell).views}
+    for view in dataset.views:
+        kept = np.array(truth["views"][view.name]["transform_matrix"])
+        assert np.array_equal(kept, before[view.name].to_world)
+        turned = view.camera.to_world[:3, :3].T @ kept[:3, :3]
+        angle = np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)) * view.camera.fl_x
+        assert 0 < angle < 4
+
+
+def test_meshes_are_displaced_by_smooth_noise(cornell, degraded):
+    from unbake.scene.parse import parse
+
+    dataset, truth = degraded(displace=0.01)
+    assert truth["displaced"]["meshes"]
+    old = parse(Dataset.load(cornell).scene).instantiate()
+    new = parse(dataset.scene).instantiate()
+    assert len(old.shapes()) == len(new.shapes())
+    assert not np.allclose(np.array(old.bbox().max), np.array(new.bbox().max))
+    points = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    moved = displacement(points, DegradeSettings(displace=0.01), 2.0)
+    assert 0.5 < np.sqrt((moved**2).sum(1).mean()) / 0.02 < 2
+    near = displacement(points + 1e-4, DegradeSettings(displace=0.01), 2.0)
+    assert np.abs(near - moved).max() < 2e-3
+
+
+def test_the_command_says_where_it_wrote(cornell, unbake, tmp_path):
+    out = tmp_path / "out"
+    outcome = unbake("degrade", cornell, "-o", out, "--exposure", 1, "--tell-exposures")
+    assert outcome.status == 0, outcome
+    assert f"wrote {out}; next: unbake data check {out}" in outcome.out
+    content, truth = (
+        json.loads((out / f"{n}.json").read_text()) for n in ("transforms", "degraded")
+    )
+    told = [frame.get("exposure", 1) for frame in content["frames"]]
+    assert told == [view["exposure"] for view in truth["views"].values()]
+    again = unbake("degrade", cornell, "--out", out)
+    assert again.status == 2 and "the folder is not empty" in again.err
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_read_noise_needs_electrons():
+    with pytest.raises(UserError, match="needs electrons"):
+        DegradeSettings(read_noise=3.0)
