@@ -28,8 +28,11 @@ from .errors import UserError as UserError
 
 if TYPE_CHECKING:
     from .acquisition.capture import capture as capture
+    from .acquisition.degrade import degrade as degrade
     from .acquisition.settings import CaptureSettings as CaptureSettings
+    from .acquisition.settings import DegradeSettings as DegradeSettings
     from .backend import activate as activate
+    from .checks.check import check_data as check_data
     from .comparison.compare import compare as compare
     from .comparison.method_variant import MethodVariant as MethodVariant
     from .config import FitConfig as FitConfig
@@ -131,10 +134,12 @@ _GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "backend": ("activate",),
         "errors": ("UserError",),
         "config": ("FitConfig", "preset", "read_toml", "to_toml"),
-        "acquisition.settings": ("CaptureSettings",),
+        "acquisition.settings": ("CaptureSettings", "DegradeSettings"),
         "acquisition.capture": ("capture",),
         "importing.settings": ("ImportSettings",),
         "importing.import_data": ("import_data",),
+        "acquisition.degrade": ("degrade",),
+        "checks.check": ("check_data",),
         "training.loop": ("fit",),
         "training.recovered": ("load_run",),
         "run": ("Run",),

@@ -25,7 +25,7 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
-from ..dataset.views import Dataset, View, read_image
+from ..dataset.views import Dataset, View, read_masked
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
@@ -95,7 +95,7 @@ def degrade(
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
             pixels = _photograph(view, number, truth, settings)
             write_exr(folder.image(view.name), pixels)
-            _copy_truth(view, folder)
+            _copy_files(view, DataFolder(dataset.folder), folder)
         _copy_lighting(DataFolder(dataset.folder, allow_outside), folder)
         content = DataFolder(dataset.folder, allow_outside).read_transforms()
         _write_transforms(folder, content, path, dataset, cameras, truths, gain, settings)
@@ -155,7 +155,7 @@ def _gain(dataset: Dataset, settings: DegradeSettings) -> float:
     hidden = dataset.background == "hidden"
     brightest = []
     for view in dataset.train:
-        pixels = read_image(view.image, view.camera.width, view.camera.height)
+        pixels = read_masked(view)[0].reshape(-1, 4)
         kept = pixels[pixels[:, 3] > 0] if hidden else pixels
         brightest.append(kept[:, :3].max(axis=1))
     white = float(np.quantile(np.concatenate(brightest), 1 - settings.white))
@@ -181,8 +181,7 @@ def _photograph(
 ) -> np.ndarray:
     """The degraded photograph, (height, width, 4)."""
     camera = view.camera
-    shape = (camera.height, camera.width)
-    pixels = read_image(view.image, camera.width, camera.height).reshape(*shape, 4)
+    pixels, _ = read_masked(view)
     rgb = pixels[..., :3].astype(np.float64) * truth.exposure * np.array(truth.white_balance)
     rgb *= vignetting(camera, settings.vignetting)[..., None]
     if settings.electrons:
@@ -295,7 +294,12 @@ def displacement(positions: np.ndarray, settings: DegradeSettings, diagonal: flo
 # -------------------------------------------------------------------------------------------- files
 
 
-def _copy_truth(view: View, folder: DataFolder) -> None:
+def _copy_files(view: View, source: DataFolder, folder: DataFolder) -> None:
+    """Copy the true pictures of a view, and its mask."""
+    if view.mask is not None:
+        target = folder.path / source.relative(view.mask)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(view.mask, target)
     for quantity, file in view.truth.items():
         target = folder.truth(quantity, view.name)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -328,13 +332,14 @@ def _write_transforms(
     for frame, view, camera, truth in zip(
         content["frames"], dataset.views, cameras, truths, strict=True
     ):
-        new = dict(frame)
+        new = {key: value for key, value in frame.items() if key != "encoding"}
         new["file_path"] = folder.relative(folder.image(view.name))
         new["transform_matrix"] = camera.to_world.tolist()
         exposure = truth.exposure if settings.tell_exposures else gain
         if exposure != 1:
             new["exposure"] = exposure
         frames.append(new)
+    content.pop("encoding", None)
     content |= {"scene": folder.relative(scene), "frames": frames}
     if settings.white is not None:
         content["clipped"] = 1.0

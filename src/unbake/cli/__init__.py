@@ -21,7 +21,7 @@ from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from .. import backend, experiments, exports, signals
-from ..acquisition.settings import CaptureSettings
+from ..acquisition.settings import CaptureSettings, DegradeSettings
 from ..config import FitConfig, with_quality
 from ..config.light import LightConfig
 from ..errors import UserError, printable
@@ -86,9 +86,10 @@ _STATUS = (
 
 if TYPE_CHECKING:
     CaptureFlags = FitFlags = EvaluationFlags = CompareFlags = RenderFlags = LightFlags = Any
-    ImportFlags = ImportLightFlags = SolveFlags = Any
+    ImportFlags = ImportLightFlags = SolveFlags = DegradeFlags = Any
 else:
     CaptureFlags = flags(CaptureSettings)
+    DegradeFlags = flags(DegradeSettings)
     ImportFlags = flags(ImportSettings)
     FitFlags = flags(FitConfig, presets=True)
     EvaluationFlags = flags(EvaluationSettings)
@@ -223,6 +224,83 @@ def import_(
     took = f"{time.perf_counter() - start:.0f} s"
     unknown = " --unknown materials+lighting" if known is None else ""
     _say(f"wrote {out} in {took}; next: unbake fit {_word(out)}{unknown} --out RUN")
+
+
+def data(
+    what: Positional[Literal["check"]],
+    folder: Positional[Data],
+    /,
+    out: OutFile = None,
+    clip_negative: Flag = False,
+    allow_outside: Flag = False,
+) -> int:
+    """Check a data set before a fit: what is wrong with it, where, and what to do about it.
+
+    It tells of files, cameras that see nothing, axes and units of poses that are not those of the
+    scene, exposures that differ, light that turns with the cameras, clipped, black and blurred
+    photographs, surfaces that no view sees, and duplicates: of all of it at once. The exit status
+    is 2 where a fit makes no sense.
+
+    Args:
+        what: What to do with it: check.
+        folder: Folder of the data set, with its transforms.json.
+        out: Page to write, such as check.html, with edges of the geometry on photographs. It needs
+            no other file.
+        clip_negative: Take negative pixels as zero instead of refusing them.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
+    """
+    backend.activate()
+    from ..checks.check import check_data
+    from ..checks.told import told_rows
+
+    options = {"allow_outside": allow_outside, "clip_negative": clip_negative}
+    result = check_data(folder, **options)
+    marks = {"ok": "green", "warning": "yellow", "error": "bold red", "hint": "cyan", "—": "dim"}
+    console = Console(highlight=False)
+    for check, verdict, told in told_rows(result):
+        line = Text.assemble(f"{check:11}", (f"{verdict:8}", marks[verdict]), printable(told, 200))
+        console.print(line)
+    for finding in result.findings:
+        _say("")
+        console.print(Text.assemble((f"{finding.level}: ", marks[finding.level]), str(finding)))
+    _say("")
+    if out is not None:
+        from ..report.check_page import write_check
+
+        _say(f"wrote {write_check(result, out, clip_negative=clip_negative)}")
+    kinds = {kind: result.count(kind) for kind in ("error", "warning", "hint")}
+    told = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in kinds.items() if n)
+    ready = f"next: unbake fit {_word(folder)} --out RUN"
+    _say(f"{told or 'nothing is wrong'}; {ready if result.usable else 'a fit makes no sense yet'}")
+    return 0 if result.usable else 2
+
+
+def degrade(
+    data: Positional[Data],
+    /,
+    out: Out,
+    allow_outside: Flag = False,
+    *,
+    degrade: OmitArgPrefixes[DegradeFlags],
+) -> None:
+    """Turn a rendered data set into what cameras deliver, to know what a fit can bear.
+
+    Faults are drawn at random, the same for the same --seed. Their truth is kept in
+    OUT/degraded.json: exposures, white balances and poses by view, the response as a table.
+    Without an option nothing is changed.
+
+    Args:
+        data: Folder of the data set, with its transforms.json.
+        out: Folder to write, new or empty.
+        allow_outside: Read files that the data set or its scene names outside of its folder.
+        degrade: What is done to photographs, poses and meshes.
+    """
+    settings = with_options(DegradeSettings(), given(degrade))
+    backend.activate()
+    from ..acquisition.degrade import degrade as run
+
+    run(data, out, settings, allow_outside=allow_outside, tell=_say)
+    _say(f"wrote {out}; next: unbake data check {_word(out)}")
 
 
 def fit(
@@ -859,6 +937,7 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
     "Start": {
         "capture": capture,
         "import": import_,
+        "data": data,
         "fit": fit,
     },
     "Results": {
@@ -875,6 +954,7 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
     "Compare and measure": {
         "compare": compare,
         "bench": bench,
+        "degrade": degrade,
         "reproduce": reproduce,
     },
     "Check": {

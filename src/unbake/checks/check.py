@@ -1,0 +1,363 @@
+"""Check a data set: all that is wrong with it at once, each with where and the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import final
+
+import mitsuba as mi
+import numpy as np
+
+from ..acquisition.placement import view_counts
+from ..dataset.agreement import (
+    Exposures,
+    TurningLight,
+    exposures,
+    shared_points,
+    turning_light,
+)
+from ..dataset.alignment import Alignment, alignment
+from ..dataset.findings import (
+    Finding,
+    light_that_turns,
+    misaligned,
+    named,
+    unequal_exposures,
+)
+from ..dataset.outliers import told_outliers, without_outliers
+from ..dataset.photographs import Photographs
+from ..dataset.poses import pose_problems
+from ..dataset.small_views import Seen, SmallView, seen_by, small_camera, small_view
+from ..dataset.views import Dataset, View, check_cameras, read_masked
+from ..errors import UserError, printable
+from ..scene import edit, free_space
+from ..scene.parse import parse
+from .pictures import PictureFacts, blurred, picture_facts
+
+#: Share of the pixels of surfaces that may be clipped, of one view and of all.
+_CLIPPED, _CLIPPED_IN_ALL = 0.05, 0.01
+#: The same of black pixels.
+_BLACK, _BLACK_IN_ALL = 0.6, 0.3
+#: Share of the surface that no view sees, above which it is told.
+_UNSEEN = 0.3
+#: Cameras farther away than so many diagonals of the scene are doubtful.
+_FAR = 20.0
+#: Distance of cameras, in diagonals of the scene, and difference of the matrix of their axes, up to
+#: which poses are the same.
+_SAME = 1e-6
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class CheckedView:
+    """A view with what was found of it.
+
+    Args:
+        view: of the data set.
+        small: the same at low resolution, in radiance.
+        facts: what its pixels tell.
+        seen: what the pixels of the small view see.
+        share: of the pixels that should see a surface, those that do, in [0, 1].
+    """
+
+    view: View
+    small: SmallView
+    facts: PictureFacts
+    seen: Seen
+    share: float
+
+
+@final
+@dataclass(eq=False)
+class DataCheck:
+    """What was found of a data set.
+
+    Args:
+        folder: of the data set.
+        findings: what is wrong, errors first.
+        dataset: what could be read of it; None if nothing could.
+        scene: the scene; None if it cannot be used.
+        views: that could be read.
+        alignment: of edges; None where it cannot be told.
+        exposures: of the views, relative to each other; None where there is no scene.
+        light: whether it turns with the cameras; None where it cannot be told.
+        coverage: shares of the reachable surface that 0, 1, 2 and more training views see.
+    """
+
+    folder: Path
+    findings: list[Finding] = field(default_factory=list)
+    dataset: Dataset | None = None
+    scene: mi.Scene | None = None
+    views: list[CheckedView] = field(default_factory=list)
+    alignment: Alignment | None = None
+    exposures: Exposures | None = None
+    light: TurningLight | None = None
+    coverage: tuple[float, float, float, float] | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether a fit makes sense."""
+        return all(finding.level != "error" for finding in self.findings)
+
+    def count(self, level: str) -> int:
+        """The number of findings of a level."""
+        return sum(finding.level == level for finding in self.findings)
+
+    def add(self, *findings: Finding | None) -> None:
+        """Add what was found."""
+        self.findings += [finding for finding in findings if finding is not None]
+
+    def warn(
+        self, check: str, what: str, where: str | None = None, remedy: str | None = None
+    ) -> None:
+        """Add a warning."""
+        self.add(Finding("warning", check, what, where, remedy))
+
+
+def check_data(
+    folder: str | Path, *, allow_outside: bool = False, clip_negative: bool = False
+) -> DataCheck:
+    """Look for all that is wrong with a data set.
+
+    Args:
+        folder: of the data set.
+        allow_outside: read files that lie outside of the folder.
+        clip_negative: take negative pixels as zero.
+
+    Returns:
+        What was found. Bad input is no exception here, but an error among the findings.
+    """
+    result = DataCheck(Path(folder))
+    faults: list[UserError] = []
+    try:
+        result.dataset = Dataset.load(folder, allow_outside=allow_outside, faults=faults)
+    except UserError as error:
+        faults.append(error)
+    result.findings += _grouped(faults, Path(folder))
+    if result.dataset is not None:
+        _check_dataset(result, result.dataset, clip_negative)
+    order = ("error", "warning", "hint")
+    result.findings.sort(key=lambda finding: order.index(finding.level))
+    return result
+
+
+def _grouped(faults: Sequence[UserError], folder: Path) -> list[Finding]:
+    """One finding for all frames that have the same fault."""
+    groups: dict[tuple[str, str | None], list[str]] = {}
+    for fault in faults:
+        where = (fault.where or "").removeprefix(f"{folder}/")
+        groups.setdefault((fault.what, fault.remedy), []).append(where)
+    return [
+        Finding("error", "files", what, named([w for w in where if w]) or None, remedy)
+        for (what, remedy), where in groups.items()
+    ]
+
+
+def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:
+    try:
+        parsed = parse(dataset.scene, dataset.root)
+        edit.to_principled(parsed)
+        result.scene = scene = parsed.instantiate()
+    except UserError as error:
+        result.findings += [replace(f, check="scene") for f in _grouped([error], dataset.folder)]
+        return
+    faults: list[UserError] = []
+    cameras = [small_camera(view.camera) for view in dataset.views]
+    for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):
+        try:
+            result.views.append(_checked(seen, dataset, view, result, clip_negative))
+        except UserError as error:
+            faults.append(error)
+    result.findings += _grouped(faults, dataset.folder)
+    _check_masks(result)
+    train = [v for v in result.views if v.view.split == "train"]
+    if not train:
+        return
+    _check_poses(result, scene, train)
+    _check_pictures(result)
+    if any(finding.check == "alignment" for finding in result.findings):
+        return  # with such poses, what views share and see is something else
+    _check_light(result)
+    result.coverage = _coverage(scene, train)
+    if result.coverage is not None and result.coverage[0] > _UNSEEN:
+        what = f"{100 * result.coverage[0]:.0f} % of the surface is seen by no training view"
+        remedy = "What no photograph shows is guessed: take more, or accept that"
+        result.warn("coverage", what, None, remedy)
+
+
+def _checked(
+    seen: Seen, dataset: Dataset, view: View, result: DataCheck, clip_negative: bool
+) -> CheckedView:
+    camera, hidden = view.camera, dataset.background == "hidden"
+    photograph, mask = read_masked(view, clip_negative)
+    pixels = photograph.reshape(-1, 4)
+    counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
+    if hidden:
+        counted &= pixels[:, 3] > 0
+    cleaned, outliers = without_outliers(pixels, counted, view.name, camera.width)
+    if outliers is not None and (told := told_outliers([outliers])):
+        result.warn("outliers", told, None, "Remove them where they are no light that is seen")
+    alpha = cleaned[:, 3] * counted if hidden else counted
+    small = small_view(view.name, camera, cleaned[:, :3], alpha)
+    shape = (camera.height, camera.width)
+    hit = np.isfinite(seen.distance)
+    facts = picture_facts(
+        pixels[:, :3].reshape(*shape, 3),
+        _enlarged((hit & ~seen.emits).reshape(small.alpha.shape), shape),
+        counted.reshape(shape),
+        None,
+    )
+    wanted = (small.alpha > 0.5).ravel()
+    share = float(hit[wanted].mean()) if wanted.any() else 0.0
+    return CheckedView(view, small, facts, seen, share)
+
+
+def _check_masks(result: DataCheck) -> None:
+    """A warning where some views have a mask, and others not."""
+    bare = [v.view.name for v in result.views if v.view.mask is None]
+    if 0 < len(bare) < len(result.views):
+        what = "the view has no mask, as others have"
+        remedy = "Add 'mask_path' to the frame, if parts of it must not count"
+        result.warn("masks", what, named(bare), remedy)
+
+
+def _enlarged(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A mask of blocks as one of pixels; a remainder at the edges is False."""
+    block = min(side // small for side, small in zip(shape, mask.shape, strict=True))
+    large = mask.repeat(block, 0).repeat(block, 1)[: shape[0], : shape[1]]
+    return np.pad(large, [(0, s - n) for s, n in zip(shape, large.shape, strict=True)])
+
+
+# ------------------------------------------------------------------------------------------- poses
+
+
+def _check_poses(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -> None:
+    found = result.alignment = alignment(scene, [v.small for v in train])
+    better = misaligned(found)
+    result.add(better)
+    if better is None:
+        # What is wrong with the poses is told once.
+        hidden = result.dataset is not None and result.dataset.background == "hidden"
+        for problem in _pose_problems(scene, train, hidden, result.folder):
+            share = max(v.share for v in train)
+            level = "error" if share == 0 else "warning"
+            result.add(Finding(level, "geometry", problem.what, problem.where, problem.remedy))
+        inside = check_cameras(scene, {v.view.name: v.view.camera for v in result.views})
+        if inside:
+            what = "the camera seems to stand inside geometry"
+            remedy = "Check the pose, or remove the frame"
+            result.warn("geometry", what, named(inside), remedy)
+        _check_distance(result, scene, train)
+    _check_duplicates(result, free_space.bounds(scene)[2])
+
+
+def _pose_problems(
+    scene: mi.Scene, train: list[CheckedView], hidden: bool, folder: Path
+) -> list[UserError]:
+    views = [replace(v.view, camera=v.small.camera) for v in train]
+    rgb = np.concatenate([v.small.rgb.reshape(-1, 3) for v in train])
+    alpha = np.concatenate([v.small.alpha.ravel() > 0.5 for v in train])
+    cameras = [v.camera for v in views]
+    small = Photographs.of(cameras, rgb, alpha, foreground_only=hidden, smoothed=False)
+    return pose_problems(scene, views, small, folder)
+
+
+def _check_distance(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -> None:
+    low, high, diagonal = free_space.bounds(scene)
+    away = [np.linalg.norm(v.view.camera.origin - (low + high) / 2) / diagonal for v in train]
+    if np.median(away) > _FAR:
+        what = f"cameras stand {np.median(away):.0f} times the scene's extent away from it"
+        remedy = "Check that positions have the units of the mesh"
+        result.warn("units", what, None, remedy)
+
+
+def _check_duplicates(result: DataCheck, diagonal: float) -> None:
+    cameras = [v.view.camera for v in result.views]
+    origins = np.array([c.origin for c in cameras]) / diagonal
+    axes = np.array([c.to_world[:3, :3] for c in cameras]).reshape(-1, 9)
+    lenses = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras])
+    for i, one in enumerate(result.views):
+        posed = np.abs(origins[:i] - origins[i]).max(axis=1, initial=0) <= _SAME
+        posed &= np.abs(axes[:i] - axes[i]).max(axis=1, initial=0) <= _SAME
+        twice = posed & (lenses[:i] == lenses[i]).all(axis=1)
+        for j, other in enumerate(result.views[:i]):
+            pair = f"{printable(other.view.name)} and {printable(one.view.name)}"
+            if one.facts.digest == other.facts.digest:
+                what = "the photographs are the same" + (
+                    "" if posed[j] else ", and their poses not"
+                )
+                remedy = "Remove one of them" if posed[j] else "Correct 'file_path' of one of them"
+                result.warn("duplicates", what, pair, remedy)
+            elif twice[j]:
+                what = "two photographs have the same pose"
+                if one.view.split != other.view.split:
+                    what += ", one for training and one held out"
+                remedy = "Correct the pose of one, or leave one out"
+                result.warn("duplicates", what, pair, remedy)
+
+
+# -------------------------------------------------------------------------------------- photographs
+
+
+def _check_pictures(result: DataCheck) -> None:
+    views = result.views
+    _share(
+        result,
+        "clipped",
+        [v.facts.clipped for v in views],
+        (_CLIPPED, _CLIPPED_IN_ALL),
+        "of the pixels of surfaces are clipped: their light is not known",
+        "Expose less, or say from which value on pixels are clipped ('clipped')",
+    )
+    _share(
+        result,
+        "black",
+        [v.facts.black for v in views],
+        (_BLACK, _BLACK_IN_ALL),
+        "of the pixels of surfaces are black",
+        "Expose more, or check that the photographs are of these views",
+    )
+    soft = blurred([v.facts for v in views])
+    if soft:
+        remedy = "Leave them out: blur would be fitted as smoother materials"
+        what = "much less sharp than the other views"
+        result.warn("blur", what, named([views[i].view.name for i in soft]), remedy)
+
+
+def _share(
+    result: DataCheck,
+    check: str,
+    shares: list[float],
+    limits: tuple[float, float],
+    what: str,
+    remedy: str,
+) -> None:
+    """A warning where one view has too much of something, or all have on average."""
+    mean = float(np.mean(shares))
+    worst = [i for i in np.argsort(shares)[::-1].tolist() if shares[i] > limits[0]]
+    if not worst and mean <= limits[1]:
+        return
+    names = named([result.views[i].view.name for i in worst]) or None
+    told = f"{100 * (max(shares) if worst else mean):.2g} % {what}"
+    result.warn(check, ("up to " if worst else "") + told, names, remedy)
+
+
+def _check_light(result: DataCheck) -> None:
+    views = result.views
+    points = shared_points([v.small for v in views], [v.seen for v in views])
+    result.exposures = exposures(points, len(views))
+    result.add(unequal_exposures(result.exposures, [v.view.name for v in views]))
+    result.light = turning_light(points, result.exposures)
+    result.add(light_that_turns(result.light))
+
+
+def _coverage(
+    scene: mi.Scene, train: list[CheckedView]
+) -> tuple[float, float, float, float] | None:
+    counts = view_counts(scene, [v.view.camera for v in train])
+    if not len(counts):
+        return None
+    none, one, two = (float((counts == n).mean()) for n in range(3))
+    return none, one, two, float((counts > 2).mean())

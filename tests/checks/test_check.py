@@ -1,0 +1,249 @@
+"""What is wrong with a data set is told at once, with the remedy; good data raise no alarm."""
+
+import numpy as np
+import pytest
+
+from unbake.checks.check import check_data
+from unbake.checks.pictures import PictureFacts, blurred, picture_facts
+from unbake.dataset.agreement import exposures, shared_points, turning_light
+from unbake.dataset.camera import Camera
+from unbake.dataset.mistakes import OPENCV, all_mistakes
+from unbake.dataset.photographs import Photographs
+from unbake.dataset.quick_check import quick_findings
+from unbake.dataset.small_views import seen_by, small_view
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.imaging.pictures import write_exr
+from unbake.scene.parse import parse
+
+FLIP = np.diag([*np.diag(OPENCV), 1.0])
+
+
+def found(folder, check=None):
+    result = check_data(folder)
+    return [f for f in result.findings if check in (None, f.check)]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cornell",
+        "still",
+        pytest.param("cube", marks=pytest.mark.slow),
+        pytest.param("demo", marks=pytest.mark.slow),
+    ],
+)
+def test_good_data_raise_no_alarm(name, captured):
+    result = check_data(captured(name))
+    assert result.usable
+    assert [f for f in result.findings if f.level != "hint" and f.check != "coverage"] == []
+    assert result.exposures.spread < 0.3
+    assert result.alignment is None or result.alignment.best is None
+
+
+def test_three_faults_are_told_in_one_go(spoilt, unbake):
+    data = spoilt("cornell")
+    data.poses(lambda pose: pose @ FLIP)
+    data.picture(data.frames[2], lambda pixels: pixels[:, :30])
+    data.frames[4]["mask_path"] = "masks/train_004.png"
+    outcome = unbake("data", "check", data.save())
+    assert outcome.status == 2
+    text = " ".join(outcome.out.split())
+    assert "train_002.exr: the image has 30 x 40 pixels, its frame says 40 x 40" in text
+    assert "Correct 'w' and 'h'" in text
+    assert "masks/train_004.png: the image does not exist" in text
+    assert "poses seem to be in OpenCV's axes" in text
+    assert "Negate columns 2 and 3 of the matrix" in text
+    assert "3 errors; a fit makes no sense yet" in text
+
+
+def test_every_fault_of_a_frame_is_told_before_a_fit(spoilt):
+    data = spoilt("cornell")
+    for i, frame in enumerate(data.frames[:5]):
+        frame["file_path"] = f"images/none-{i}.exr"
+    data.frames[6]["fl_x"] = -1
+    with pytest.raises(UserError) as error:
+        Dataset.load(data.save())
+    told = str(error.value)
+    assert told.count("the image does not exist") == 3
+    assert told.endswith("and 3 more, all of which `unbake data check` tells")
+    faults = []
+    dataset = Dataset.load(data.folder, faults=faults)
+    assert len(faults) == 6 and len(dataset.train) == 2
+    grouped = found(data.folder, "files")
+    assert len(grouped) == 2 and grouped[0].where.endswith("none-2.exr and 2 more")
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_fit_looks_for_the_same_on_its_views(turned, spoilt):
+    data = spoilt("cornell")
+    if turned:
+        data.poses(lambda pose: pose @ FLIP)
+    else:
+        for frame in data.frames[::2]:
+            data.picture(frame, lambda pixels: pixels * [2, 2, 2, 1])
+    dataset = Dataset.load(data.save())
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    (finding,) = quick_findings(scene, dataset.train, Photographs.load(dataset, False))
+    told = "seem to be in OpenCV's axes" if turned else "stops brighter in one than in another"
+    assert told in str(finding)
+
+
+def test_a_fit_does_not_doubt_good_data(captured):
+    for name in ("cornell", "still"):
+        dataset = Dataset.load(captured(name))
+        scene = parse(dataset.scene, dataset.root).instantiate()
+        photographs = Photographs.load(dataset, False)
+        assert quick_findings(scene, dataset.train, photographs) == []
+        assert quick_findings(scene, dataset.train[:2], photographs) == []
+
+
+def test_metres_for_centimetres_are_told(spoilt, unbake):
+    data = spoilt("cornell")
+
+    def metres(pose):
+        pose[:3, 3] *= 0.01
+        return pose
+
+    data.poses(metres)
+    outcome = unbake("data", "check", data.save())
+    text = " ".join(outcome.out.split())
+    assert outcome.status == 2
+    assert "poses seem to be in other units" in text and "Multiply positions by 100" in text
+
+
+def test_a_world_that_is_turned_is_told(spoilt):
+    data = spoilt("cornell")
+    turn = np.eye(4)
+    turn[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    data.poses(lambda pose: turn @ pose)
+    (finding,) = found(data.save(), "alignment")
+    assert finding.level == "error" and "of a world with z up" in finding.what
+    assert finding.remedy == "Turn them by 90° about x"
+
+
+def test_photographs_upside_down_are_told(spoilt):
+    data = spoilt("cornell")
+    for frame in data.content["frames"]:
+        data.picture(frame, lambda pixels: pixels[::-1])
+    (finding,) = found(data.save(), "alignment")
+    assert "photographs seem to be mirrored top to bottom" in finding.what
+
+
+def turned_light(folder):
+    """Photographs of a grey object whose light is fixed to the camera: a turntable."""
+    dataset = Dataset.load(folder)
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    light = np.array([0.8, 0.5, 0.33])
+    for view in dataset.views:
+        (seen,) = seen_by(scene, [view.camera])
+        normal = seen.normal @ view.camera.to_world[:3, :3]
+        value = 0.1 + 0.8 * np.maximum(normal @ light, 0)
+        alpha = np.isfinite(seen.distance)
+        pixels = np.c_[np.repeat((value * alpha)[:, None], 3, 1), alpha]
+        write_exr(view.image, pixels.reshape(view.camera.height, view.camera.width, 4))
+
+
+def test_a_turntable_is_refused(spoilt, unbake):
+    data = spoilt("still")
+    turned_light(data.folder)
+    outcome = unbake("data", "check", data.folder)
+    text = " ".join(outcome.out.split())
+    assert outcome.status == 2
+    assert "light and shadow turn with the cameras, as where an object stands on a turn" in text
+    assert "the light must stand still" in text
+
+
+def test_exposures_that_differ_are_measured(spoilt):
+    data = spoilt("cornell")
+    stops = np.array([0.0, 1, -1, 0.5, 0, 1.5, -0.5, 0])
+    for frame, stop in zip(data.frames, stops, strict=True):
+        data.picture(frame, lambda p, s=stop: p * np.array([*[2.0**s] * 3, 1]))
+    result = check_data(data.save())
+    assert [f.check for f in result.findings if f.level == "warning"] == ["exposure"]
+    assert result.usable
+    train = [v.view.split == "train" for v in result.views]
+    measured = result.exposures.stops[train]
+    assert np.abs((measured - measured.mean()) - (stops - stops.mean())).max() < 0.15
+
+
+def test_clipped_black_blurred_and_double_photographs_are_told(spoilt):
+    data = spoilt("cornell")
+    frames = data.frames
+    data.picture(frames[0], lambda p: np.minimum(p, [0.15, 0.15, 0.15, 1]))
+    data.picture(frames[1], lambda p: p * [0, 0, 0, 1])
+    (data.folder / frames[3]["file_path"]).write_bytes(
+        (data.folder / frames[2]["file_path"]).read_bytes()
+    )
+    frames[5]["transform_matrix"] = frames[4]["transform_matrix"]
+    warnings = {f.check: f for f in found(data.save())}
+    assert "train_000" in warnings["clipped"].where
+    assert "train_001" in warnings["black"].where
+    pairs = {f.where: f.what for f in found(data.folder, "duplicates")}
+    assert pairs == {
+        "train_002 and train_003": "the photographs are the same, and their poses not",
+        "train_004 and train_005": "two photographs have the same pose",
+    }
+
+
+def test_a_photograph_that_is_blurred_is_named():
+    rng = np.random.default_rng(0)
+    every = np.ones((64, 64), bool)
+    facts = []
+    for i in range(6):
+        picture = np.exp(np.cumsum(np.cumsum(rng.normal(0, 0.02, (64, 64)), 0), 1))
+        if i == 4:
+            for _ in range(3):
+                picture = (picture + np.roll(picture, 1, 0) + np.roll(picture, 1, 1)) / 3
+        facts.append(picture_facts(np.repeat(picture[..., None], 3, 2), every, every, None))
+    assert blurred(facts) == [4]
+    assert blurred([PictureFacts(0, 0, None, "")] * 6) == []
+
+
+def test_a_data_set_that_is_none_is_one_error(unbake, tmp_path):
+    outcome = unbake("data", "check", tmp_path)
+    assert outcome.status == 2
+    text = " ".join(outcome.out.split())
+    assert "error: " in text and "no transforms.json in the folder" in text
+    assert "Traceback" not in outcome.out + outcome.err
+
+
+def test_the_screen_fits_and_the_page_stands_alone(captured, unbake, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(captured("cornell").parent)
+    page = tmp_path / "check.html"
+    outcome = unbake("data", "check", "cornell", "--out", page)
+    assert outcome.status == 0 and outcome.err == ""
+    lines = outcome.out.splitlines()
+    assert lines[-2] == f"wrote {page}" and lines[-1].startswith("nothing is wrong; next: ")
+    assert max(map(len, [*lines[:-2], lines[-1]])) <= 80 and len(lines) <= 24
+    text = page.read_text()
+    assert text.count("data:image/png;base64,") == 18
+    assert "http" not in text.replace("http-equiv", "") and "url(" not in text
+    for word in ("Coverage", "Exposures", "Edges of the geometry", "train_007"):
+        assert word in text
+
+
+def test_mistakes_are_undone():
+    rng = np.random.default_rng(0)
+    camera = Camera.look_at(rng.normal(size=3), rng.normal(size=3), [0, 0, 1], 60, 8, 8)
+    mistakes = all_mistakes()
+    assert len({m.told for m in mistakes}) == len(mistakes) > 140
+    for mistake in mistakes:
+        corrected = mistake.corrected(camera)
+        if mistake.inverted:
+            wrong = np.linalg.inv(corrected.to_world @ np.diag([*np.diag(mistake.flip), 1]))
+        else:
+            wrong = np.eye(4)
+            wrong[:3, :3] = mistake.turn.T @ corrected.to_world[:3, :3] @ mistake.flip
+            wrong[:3, 3] = mistake.turn.T @ corrected.origin / mistake.scale
+        assert np.abs(wrong - camera.to_world).max() < 1e-9
+
+
+def test_no_exposure_is_told_of_views_that_share_nothing(captured):
+    dataset = Dataset.load(captured("cornell"))
+    views = [small_view(v.name, v.camera, np.ones((1600, 3)), None) for v in dataset.train[:1]]
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    points = shared_points(views, seen_by(scene, [v.camera for v in views]))
+    known = exposures(points, 1)
+    assert known.pairs == 0 and known.spread == 0 and turning_light(points, known) is None
