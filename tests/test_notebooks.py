@@ -26,7 +26,7 @@ def notebook(repository, monkeypatch, tmp_path):
         (cell,) = (c for c in made.cells if "parameters" in c.metadata.get("tags", ()))
         cell.source = SMALL[name].format(**values)
         resources = {"metadata": {"path": str(tmp_path)}}
-        nbclient.NotebookClient(made, timeout=250, resources=resources).execute()
+        nbclient.NotebookClient(made, timeout=1000, resources=resources).execute()
         return made
 
     return run

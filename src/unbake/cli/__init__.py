@@ -313,6 +313,7 @@ def fit(
     resume: Flag = False,
     clip_negative: Flag = False,
     allow_outside: Flag = False,
+    tensorboard: Flag = False,
     *,
     fit: OmitArgPrefixes[FitFlags],
 ) -> int:
@@ -339,6 +340,7 @@ def fit(
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
+        tensorboard: Write losses and scores to OUT/tensorboard, too, for tensorboard --logdir OUT.
         fit: Settings that differ from those of the preset or the file.
     """
     changes = given(fit)
@@ -363,6 +365,7 @@ def fit(
         resume=resume,
         clip_negative=clip_negative,
         allow_outside=allow_outside,
+        tensorboard=tensorboard,
         console=console,
     )
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):

@@ -54,6 +54,7 @@ def fit(
     resume: bool = False,
     clip_negative: bool = False,
     allow_outside: bool = False,
+    tensorboard: bool = False,
     console: Console | None = None,
 ) -> Progress:
     """Recover materials or lighting of a scene from its photographs.
@@ -66,6 +67,7 @@ def fit(
         resume: go on with the run's newest checkpoint.
         clip_negative: take negative pixels as zero.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
+        tensorboard: write the numbers of the log for TensorBoard, too.
 
     Returns:
         How far the fit came, and what is wrong with it. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it
@@ -100,7 +102,7 @@ def fit(
             lock = held.enter_context(folder.lock())
             folder.require_new()
         stop = held.enter_context(deferred())
-        progress = _train(begun, folder, lock, stop, console)
+        progress = _train(begun, folder, lock, stop, console, tensorboard)
     if stop:
         console.print(f"stopped at step {progress.step}; go on with --resume", highlight=False)
     return progress
@@ -197,12 +199,18 @@ def _probes(
 
 
 def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
-    begun: _Begun, folder: RunFolder, lock: RunLock, stop: list[int], console: Console
+    begun: _Begun,
+    folder: RunFolder,
+    lock: RunLock,
+    stop: list[int],
+    console: Console,
+    tensorboard: bool,
 ) -> Progress:
     """Take the steps that are left.
 
     Args:
         stop: fills at any moment, when the fit should end.
+        tensorboard: whether numbers are written for it.
     """
     config, problem, state, score = begun.config, begun.problem, begun.state, begun.score
     progress = begun.restored or Progress()
@@ -223,7 +231,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     recent: list[dict[str, mi.Float]] = []
     watchdog = Watchdog(state, begun.step, progress, begun.views)
     failures: list[UserError] = []  # to write what was due last
-    with Monitor(folder.log_file, console, total) as monitor:
+    events = folder.events(progress.step + 1) if tensorboard else None
+    with Monitor(folder.log_file, console, total, events) as monitor:
         if score is not None and not progress.step:
             monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
         clock = time.perf_counter() - progress.seconds

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
 from ..transport.terms import LOGGED
+from .event_log import EventLog
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
@@ -34,9 +35,18 @@ class Monitor:
     A bar with loss terms, samples/s, time left and memory on a terminal, plain lines elsewhere.
     Lines of the log that cannot be written, on a full disk, wait for the next one; `failures` tells
     of those that were not written in the end.
+
+    Args:
+        log: the file to append to.
+        console: where progress is shown.
+        total: what `record` counts to.
+        events: takes the same numbers for TensorBoard, and is closed in the end.
     """
 
-    def __init__(self, log: Path, console: Console, total: float) -> None:
+    def __init__(
+        self, log: Path, console: Console, total: float, events: EventLog | None = None
+    ) -> None:
+        self._events = events
         self.failures: list[UserError] = []
         self._path = log
         self._file: IO[str]  # opened by `__enter__`
@@ -60,6 +70,8 @@ class Monitor:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+        if self._events is not None:
+            self._events.close()
         with suppress(OSError):  # it is in `failures`
             self._file.close()
 
@@ -115,6 +127,8 @@ class Monitor:
         self.say(f"step {entry['step']}, {entry['seconds']:.0f} s: {text}")
 
     def _write(self, entry: dict) -> None:
+        if self._events is not None:
+            self._events.add(entry)
         rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in entry.items()}
         told, self.failures = self.failures, []
         try:

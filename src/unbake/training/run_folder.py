@@ -9,6 +9,7 @@
       evaluation/metrics.json          what `unbake evaluate` measured
       evaluation/SPLIT/VIEW_QUANTITY.exr, .png
       evaluation/environment.exr, .png
+      tensorboard/                     the numbers of the log for TensorBoard, if wanted
       .lock                            the process that fits (`run_lock.py`)
 
 No other module names these files.
@@ -30,6 +31,7 @@ from ..errors import UserError
 from ..formats import check_format
 from ..io import read_object, read_text, require_utf8, write_json, write_text
 from . import run_numbers
+from .event_log import EventLog
 from .run_lock import RunLock
 
 #: The newest formats of `origin.json` and `metrics.json` that can be read, and those written.
@@ -104,6 +106,11 @@ class RunFolder:
         return self.path / "evaluation"
 
     @property
+    def tensorboard(self) -> Path:
+        """The folder of the log for TensorBoard."""
+        return self.path / "tensorboard"
+
+    @property
     def metrics_file(self) -> Path:
         """The numbers of the evaluation."""
         return self.evaluation / "metrics.json"
@@ -128,7 +135,8 @@ class RunFolder:
                 where=self.path,
                 remedy="Go on with --resume, or give another --out",
             )
-        left = [x.name for x in (self.checkpoints, self.previews, self.evaluation) if _filled(x)]
+        folders = (self.checkpoints, self.previews, self.evaluation, self.tensorboard)
+        left = [x.name for x in folders if _filled(x)]
         if self.log_file.is_symlink() or (self.log_file.exists() and self.log_file.stat().st_size):
             left.append(self.log_file.name)
         if left:
@@ -145,7 +153,7 @@ class RunFolder:
             UserError: a part of the run lies elsewhere, behind a symbolic link; on entering,
                 another process has the lock.
         """
-        for part in (self.log_file, self.checkpoints, self.previews):
+        for part in (self.log_file, self.checkpoints, self.previews, self.tensorboard):
             require_no_link(part)
         return RunLock(self.path, doing)
 
@@ -257,6 +265,20 @@ class RunFolder:
                 raise UserError(f"line {number}: {wrong}", file, "Remove the line")
             lines.append(line)
         return lines
+
+    def events(self, first: int) -> EventLog:
+        """A new file for TensorBoard; see `EventLog`.
+
+        Raises:
+            UserError: it cannot be made.
+        """
+        try:
+            return EventLog(self.tensorboard, first)
+        except OSError as error:
+            what = f"the log for TensorBoard cannot be written ({error.strerror})"
+            raise UserError(
+                what, self.tensorboard, "Make room, or leave out --tensorboard"
+            ) from None
 
     def forget_after(self, step: int) -> None:
         """Drop the lines of the log after a step, and lines that a killed fit left half-written.
