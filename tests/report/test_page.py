@@ -613,6 +613,18 @@ def test_folders_of_runs_that_were_moved_are_known_by_name(made, tmp_path: Path)
             lambda folder: _edit_json(folder / "render.json", frames=[{"name": "../x"}]),
             r"render\.json: cannot be read",
         ),
+        (
+            lambda folder: _edit_json(folder / "render.json", settings={"exposure": 10**400}),
+            r"render\.json: cannot be read",
+        ),
+        (
+            lambda folder: _edit_json(folder / "render.json", settings={"exposure": 1e308}),
+            r"render\.json: cannot be read",
+        ),
+        (
+            lambda folder: _edit_json(folder / "export.json", texels_per_unit=[1]),
+            r"export\.json: cannot be read",
+        ),
         (lambda folder: (folder / "train_000.exr").unlink(), r"train_000\.exr.*does not exist"),
         (lambda folder: (folder / "export.json").unlink(), r"export\.json.*--format textures"),
         (lambda folder: _edit_json(folder / "export.json", formats=["gltf"]), "holds no textures"),

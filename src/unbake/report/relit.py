@@ -50,7 +50,7 @@ def relit_sections(
             if key not in strips:
                 strips[key] = _strip(light, truth, exposure, names, allow_outside)
             strips[key]["rows"].append(_row(folder, manifest, number, strips[key]))
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             raise UserError("cannot be read", file, "Make the pictures again") from None
     return [strip for _, strip in sorted(strips.items(), key=lambda item: item[0][0])]
 

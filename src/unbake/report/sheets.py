@@ -45,15 +45,15 @@ def _section(folder: Path, runs: list[Run]) -> dict[str, Any]:
     try:
         rows = sorted(rows, key=lambda row: -float(row["area"]))
         materials = [_material(folder / "textures", row) for row in rows[:MOST]]
-    except (KeyError, TypeError, ValueError, AttributeError):
+        return {
+            "run": number,
+            "materials": materials,
+            "more": len(rows) - len(materials),
+            "texels": float(manifest.get("texels_per_unit") or 0),
+            "unobserved": float(manifest.get("unobserved_share") or 0),
+        }
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         raise UserError("cannot be read", file, "Export the run again") from None
-    return {
-        "run": number,
-        "materials": materials,
-        "more": len(rows) - len(materials),
-        "texels": float(manifest.get("texels_per_unit") or 0),
-        "unobserved": float(manifest.get("unobserved_share") or 0),
-    }
 
 
 def _material(folder: Path, row: dict[str, Any]) -> dict[str, Any]:

@@ -110,7 +110,7 @@ _METRICS: Mapping[str, Check] = {
     **dict.fromkeys(("heldout", "train"), _or_none(_SCORES)),
     "yardsticks": _yardsticks,
     "convergence": _or_none(_object_of(_score, trend=_text)),
-    "display_exposure": _number,
+    "display_exposure": _score,
     "per_view": _list_of(_object_of(_score, name=_text, split=_text)),
     "environment": _or_none(_SCORES),
     "emission": _or_none(
