@@ -9,6 +9,7 @@ from ..fields.settings import (
     GridConfig,
     NetworkConfig,
 )
+from .camera import CameraConfig
 from .fit import (
     MOST_BOUNCES,
     PAPER_DEPTH,
@@ -34,6 +35,7 @@ __all__ = [
     "PAPER_DEPTH",
     "QUALITIES",
     "BitmapConfig",
+    "CameraConfig",
     "DenseGridConfig",
     "Estimator",
     "FieldSettings",

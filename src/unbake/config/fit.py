@@ -15,6 +15,7 @@ from ..fields.registry import representation, representations
 from ..fields.settings import RATES, FieldSettings
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
 from ..transport.methods import METHODS, PATH_REPLAY, Method
+from .camera import CameraConfig
 from .flag import Flag
 from .tables import update
 
@@ -285,6 +286,7 @@ class FitConfig:
     regularization: RegularizationConfig = field(default_factory=RegularizationConfig)
     transport: TransportConfig = field(default_factory=TransportConfig)
     path: PathConfig = field(default_factory=PathConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
 
     checkpoint_seconds: float = 60.0  #: time between checkpoints
     preview_seconds: float = 30.0  #: time between preview pictures

@@ -20,10 +20,10 @@ _CHUNK = 1 << 20  # bytes
 def fingerprint(dataset: Dataset) -> dict[str, str]:
     """SHA-256 of the parts of a data set: `photographs`, `poses`, `views` and `scene`.
 
-    `photographs` are the image files and their masks, `poses` the cameras with their intrinsics,
-    `views` the names and splits, and `scene` the scene with its meshes, textures and included
-    files. Where the folder lies does not count. Files are read, not decoded: about a second for a
-    gigabyte on each core.
+    `photographs` are the image files with their masks, exposures and limits, `poses` the cameras
+    with their intrinsics, `views` the names and splits, and `scene` the scene with its meshes,
+    textures and included files. Where the folder lies does not count. Files are read, not decoded:
+    about a second for a gigabyte on each core.
 
     Raises:
         UserError: a file cannot be read, or the scene is none.
@@ -34,6 +34,9 @@ def fingerprint(dataset: Dataset) -> dict[str, str]:
     if masks:
         files = _of_files(view.mask for view in views if view.mask is not None)
         photographs = [photographs, masks, files]
+    known = [[view.exposure, view.clipped] for view in views]
+    if any(pair != [1, None] for pair in known):
+        photographs = [photographs, known]
     return {"photographs": _of_values(photographs)} | _of_geometry(dataset)
 
 

@@ -45,8 +45,9 @@ class Photographs:
     """Linear RGB of all pixels of several views, row by row and view after view.
 
     Args:
-        table: float32, shape (pixels, 3): radiance; or (pixels, 6): radiance, and the radiance that
-            errors are relative to, which is blurred over 5 x 5 pixels and knows the noise.
+        table: float32, shape (pixels, 3): radiance, which is the image divided by its exposure; or
+            (pixels, 6): radiance, and the radiance that errors are relative to, which is blurred
+            over 5 x 5 pixels and knows the noise.
         chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
             background pixels say nothing about the scene and only those with alpha > 0 are taken
             (the paper: at least half of them). Pixels that are masked are never taken.
@@ -153,10 +154,32 @@ def _decode_into(
             pixels, found = without_outliers(pixels, counted, view.name, camera.width)
             if found is not None:
                 outliers.append(found)
-            yield camera, pixels, counted
+            yield camera, _in_radiance(pixels, view), counted
 
     some = foreground_only or any(view.mask is not None for view in views)
     return replace(_fill(table, images(), some), outliers=tuple(outliers))
+
+
+def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
+    """The pixels of a photograph, RGBA, divided by its exposure.
+
+    Errors are relative to a squared reference plus ε (`RelativeL2`). Dividing the photograph and
+    its reference by the exposure e is the same as multiplying the rendering by e, if ε is
+    multiplied by e², too: (eI − G)² / (R² + e²ε) = (I − G/e)² / (R²/e² + ε). So ε is a radiance of
+    the scene: a surface that is exposed twice weighs as much in both photographs, and a data set
+    weighs its pixels as if all had been taken alike. That a photograph of less light is noisier
+    is in the reference, which knows the noise. L_θ learns from the same pixels, in units of the
+    scene.
+    """
+    if view.exposure == 1:
+        return pixels
+    pixels = pixels.copy()
+    with np.errstate(over="ignore"):
+        pixels[:, :3] /= np.float32(view.exposure)
+    if not np.isfinite(pixels).all():
+        what = f"an exposure of {view.exposure:g} makes pixels infinite"
+        raise UserError(what, view.image, "Correct 'exposure' of its frame")
+    return pixels
 
 
 def _fill(table: np.ndarray, images: Iterable[_Image], some: bool) -> Photographs:
@@ -268,6 +291,8 @@ def _cached(
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": _RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
+    if any(view.exposure != 1 for view in views):
+        key["exposures"] = [view.exposure for view in views]
     data.require_own_cache()
     found = _find_cache(data, key)
     if found is not None:

@@ -63,10 +63,7 @@ class CameraRays:
             pixel: numbers of pixels.
             offset: position inside the pixel, [0,1]², from its top left corner.
         """
-        view = mi.UInt32(
-            dr.binary_search(0, self.views, lambda i: dr.gather(mi.UInt32, self._first, i) <= pixel)
-        )
-        view -= 1
+        view = self.view_of(pixel)
         n = dr.width(pixel)
         pixel = pixel - dr.gather(mi.UInt32, self._first, view)
         # Lanes that only fill up a vector divide as well, by the zero that they gather.
@@ -80,6 +77,31 @@ class CameraRays:
         direction = mi.Vector3f([dr.dot(row, local) for row in rows])
         return mi.Ray3f(mi.Point3f(m[3], m[7], m[11]), direction)
 
+    def radius2(self, pixel: mi.UInt32, view: mi.UInt32) -> mi.Float:
+        """Squared distances of the centres of pixels from the principal point.
+
+        They are relative to half of the image's diagonal: 1 is about that of a corner.
+
+        Args:
+            view: of each pixel.
+        """
+        first = dr.gather(mi.UInt32, self._first, view)
+        width = dr.maximum(dr.gather(mi.UInt32, self._width, view), 1)
+        height = (dr.gather(mi.UInt32, self._first, view + 1) - first) // width
+        _, _, cx, cy = dr.gather(mi.ArrayXf, self._lens, view, shape=(4, dr.width(pixel)))
+        place = pixel - first
+        x, y = mi.Float(place % width) + 0.5 - cx, mi.Float(place // width) + 0.5 - cy
+        half = dr.square(mi.Float(width)) + dr.square(mi.Float(height))
+        return 4 * (dr.square(x) + dr.square(y)) / dr.maximum(half, 1)
+
+    def view_of(self, pixel: mi.UInt32) -> mi.UInt32:
+        """The views of pixels, from 0."""
+        view = mi.UInt32(
+            dr.binary_search(0, self.views, lambda i: dr.gather(mi.UInt32, self._first, i) <= pixel)
+        )
+        view -= 1
+        return view
+
 
 @dataclass
 class PixelBatch:
@@ -87,15 +109,28 @@ class PixelBatch:
 
     count: int
     smoothed: bool  # whether blurred photographs are with them
+    clipped: bool  # whether the radiance from which on photographs are clipped is with them
     _packed: mi.UInt32  # numbers, then bits of colours: one array, so that a step copies one
 
     @staticmethod
-    def of(numbers: np.ndarray, colours: np.ndarray) -> PixelBatch:
-        """Pixels by their numbers, shape (n,), and the rows of `Photographs.table`."""
-        packed = np.empty((1 + colours.shape[1], len(numbers)), np.uint32)
+    def of(
+        numbers: np.ndarray, colours: np.ndarray, limits: np.ndarray | None = None
+    ) -> PixelBatch:
+        """Pixels by number.
+
+        Args:
+            numbers: shape (n,).
+            colours: rows of `Photographs.table`.
+            limits: radiance from which on the photograph of each is clipped, float32, shape (n,);
+                None: none is.
+        """
+        columns = colours if limits is None else np.c_[colours, limits].astype(np.float32)
+        packed = np.empty((1 + columns.shape[1], len(numbers)), np.uint32)
         packed[0] = numbers
-        packed[1:] = np.ascontiguousarray(colours.T).view(np.uint32)
-        return PixelBatch(len(numbers), colours.shape[1] > 3, from_numpy(mi.UInt32, packed))
+        packed[1:] = np.ascontiguousarray(columns.T).view(np.uint32)
+        return PixelBatch(
+            len(numbers), colours.shape[1] > 3, limits is not None, from_numpy(mi.UInt32, packed)
+        )
 
     def batch(self, rays: CameraRays, sampler: mi.Sampler, spp: int) -> RayBatch:
         """Jittered camera rays through the pixels (box filter), and their colours.
@@ -106,14 +141,32 @@ class PixelBatch:
         number = self._row(0, dr.arange(mi.UInt32, self.count * spp) // spp)
         ray = rays.through(number, sampler.next_2d())
         pixel = dr.arange(mi.UInt32, self.count)
-        columns = range(6 if self.smoothed else 3)
-        rgb = [dr.reinterpret_array(mi.Float, self._row(1 + i, pixel)) for i in columns]
-        return RayBatch(mi.Color3f(rgb[:3]), mi.Color3f(rgb[3:]) if self.smoothed else None, ray)
+        columns = 6 if self.smoothed else 3
+        rgb = [self._float(i, pixel) for i in range(columns)]
+        target = mi.Color3f(rgb[:3])
+        clipped = target >= self._float(columns, pixel) if self.clipped else None
+        smoothed = mi.Color3f(rgb[3:]) if self.smoothed else None
+        return RayBatch(target, smoothed, ray, clipped)
+
+    def numbers(self) -> mi.UInt32:
+        """The numbers of the pixels, one lane a pixel."""
+        return self._row(0, dr.arange(mi.UInt32, self.count))
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Back to NumPy: the numbers, shape (n,), and the rows of `Photographs.table`."""
         packed = np.array(self._packed).reshape(-1, self.count)
-        return packed[0], packed[1:].view(np.float32).T
+        return packed[0], packed[1 : 7 if self.smoothed else 4].view(np.float32).T
+
+    def read_clipped(self) -> np.ndarray | None:
+        """Which channels are clipped, shape (n, 3) bool, in NumPy; None where none can be."""
+        if not self.clipped:
+            return None
+        _, colours = self.read()
+        limits = np.array(self._packed).reshape(-1, self.count)[-1].view(np.float32)
+        return colours[:, :3] >= limits[:, None]
+
+    def _float(self, column: int, pixel: mi.UInt32) -> mi.Float:
+        return dr.reinterpret_array(mi.Float, self._row(1 + column, pixel))
 
     def _row(self, row: int, pixel: mi.UInt32) -> mi.UInt32:
         return dr.gather(mi.UInt32, self._packed, pixel + row * self.count)
@@ -126,6 +179,7 @@ class RayBatch:
     target: mi.Color3f  # photographs, linear RGB, one lane a pixel
     smoothed: mi.Color3f | None  # the same from photographs blurred over 5 x 5 pixels, if kept
     ray: mi.Ray3f  # `spp` consecutive lanes a pixel, world space
+    clipped: mi.Bool | None = None  # channels that say "at least that much", as a colour has them
 
 
 @final
@@ -140,11 +194,15 @@ class PixelSource:
         photographs: of the same views.
         held: places among the pixels to train on that are never drawn, in rising order, shape
             (n,); None: all are drawn.
+        limits: radiance from which on each view is clipped, float32, shape (views,); None: none is.
+        exposures: of each view, by which its photograph was divided, shape (views,); None: 1.
     """
 
     rays: CameraRays
     photographs: Photographs
     held: np.ndarray | None = None
+    limits: np.ndarray | None = None
+    exposures: np.ndarray | None = None
 
     @staticmethod
     def of(
@@ -259,7 +317,13 @@ class PixelSource:
         return places if chosen is None else chosen[places]
 
     def _batch(self, numbers: np.ndarray) -> PixelBatch:
-        return PixelBatch.of(numbers, self.photographs.table[numbers])
+        limits = None if self.limits is None else self.limits[self.views_of(numbers)]
+        return PixelBatch.of(numbers, self.photographs.table[numbers], limits)
+
+    def views_of(self, numbers: np.ndarray) -> np.ndarray:
+        """The views of pixels, from 0."""
+        first = [first for first, *_ in self._layout]
+        return np.searchsorted(first, numbers, "right") - 1
 
     @cached_property
     def _layout(self) -> list[tuple[int, int, int]]:
@@ -273,8 +337,7 @@ class PixelSource:
         """The views with pixels to train on."""
         if self.photographs.chosen is None:
             return np.arange(self.rays.views)
-        first = [first for first, *_ in self._layout]
-        return np.unique(np.searchsorted(first, self.photographs.chosen, "right") - 1)
+        return np.unique(self.views_of(self.photographs.chosen))
 
     @cached_property
     def _found(self) -> dict[tuple[int, int], np.ndarray]:

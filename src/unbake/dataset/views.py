@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,12 @@ _MOST_CHANNELS = 4
 _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 #: Memory in bytes that takes part in decoding a pixel, blurring it included.
 PIXEL_BYTES = 100
+#: Least and greatest exposure, and value at which a photograph is clipped.
+_MEASURABLE = (1e-12, 1e12)
+_MEANT = {
+    "exposure": "the photograph is radiance times this number, 1 by default",
+    "clipped": "from this value on the photograph says only that it is as bright at least",
+}
 #: Bytes of the name of a view, which files of results are named after.
 _LONGEST_NAME = 200
 #: Faults of frames that an error tells.
@@ -52,12 +59,16 @@ class View:
         name: the image's file name without its suffix, unique in the data set.
         split: "train" or "heldout".
         camera: pose and intrinsics, in the image's pixels.
-        image: RGB radiance, alpha 1 where a surface is seen; inside the data folder.
+        image: RGB, radiance times the exposure; alpha 1 where a surface is seen; inside the data
+            folder.
         truth: true pictures by quantity, of those that the data set has.
         encoding: "linear" where the image holds radiance; "srgb" where it holds code values of 8 or
             16 bits, which the sRGB curve decodes to [0, 1].
         mask: an image of the same size, zero where a pixel counts neither in a fit nor in scores;
             None: all count.
+        exposure: the photograph is radiance times this number.
+        clipped: value of the decoded photograph from which on a channel says "at least that much";
+            None: it says what it says.
     """
 
     name: str
@@ -67,6 +78,8 @@ class View:
     truth: Mapping[str, Path]
     encoding: str = "linear"
     mask: Path | None = None
+    exposure: float = 1.0
+    clipped: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image", Path(self.image))
@@ -74,6 +87,33 @@ class View:
             object.__setattr__(self, "mask", Path(self.mask))
         truth = {name: Path(file) for name, file in self.truth.items()}
         object.__setattr__(self, "truth", truth)
+
+    @property
+    def limit(self) -> float:
+        """The radiance from which on the photograph is clipped; infinite where it never is."""
+        if self.clipped is None:
+            return math.inf
+        # In single precision, as pixels are divided: what is equal stays equal.
+        return float(np.float32(self.clipped) / np.float32(self.exposure))
+
+    def photographed(self, picture: np.ndarray, gain: float = 1.0) -> np.ndarray:
+        """Radiance as the photograph shows it: exposed, and at most as bright as it can be.
+
+        Scores of renderings against photographs are made of such pictures.
+
+        Args:
+            picture: linear RGB radiance, any shape.
+            gain: how much brighter the photograph is than its exposure tells.
+        """
+        factor = self.exposure * gain
+        exposed = picture if factor == 1 else picture * np.asarray(factor, picture.dtype)
+        return self.readable(exposed)
+
+    def readable(self, photograph: np.ndarray) -> np.ndarray:
+        """The photograph with all that is clipped at the same value."""
+        if self.clipped is None:
+            return photograph
+        return np.minimum(photograph, np.asarray(self.clipped, photograph.dtype))
 
 
 @final
@@ -355,6 +395,7 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
     mask = None
     if "mask_path" in frame:
         mask = data.inside(text(frame, "mask_path", where), f"{where}: 'mask_path'")
+    clipped = _positive(frame if "clipped" in frame else top, "clipped", where)
     return View(
         image.stem,
         split,
@@ -363,7 +404,24 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
         {name: file for name, file in known.items() if data.known(file)},
         encoding=encoding,
         mask=mask,
+        exposure=_positive(frame, "exposure", where) or 1.0,
+        clipped=clipped,
     )
+
+
+def _positive(table: dict[str, Any], key: str, where: str) -> float | None:
+    """A positive number of single precision; None where the table has none, or null."""
+    if table.get(key) is None:
+        return None
+    low, high = _MEASURABLE
+    try:
+        found = number(table, key, where)
+    except UserError:
+        found = math.nan
+    if not low <= found <= high:
+        what = f"{key!r} is not a number from {low:g} to {high:g}"
+        raise UserError(what, where, f"Correct it, or remove it: {_MEANT[key]}")
+    return found
 
 
 def _valid_pixels(pixels: np.ndarray, path: Path, clip_negative: bool) -> np.ndarray:
@@ -429,6 +487,8 @@ def _frame(data: DataFolder, view: View) -> dict[str, Any]:
         "transform_matrix": camera.to_world.tolist(),
         **({} if view.encoding == "linear" else {"encoding": view.encoding}),
         **({} if view.mask is None else {"mask_path": data.relative(view.mask)}),
+        **({} if view.exposure == 1 else {"exposure": view.exposure}),
+        **({} if view.clipped is None else {"clipped": view.clipped}),
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
 from ..quantities import QUANTITIES
 from ..scene import edit
 from ..scene.parse import parse
+from ..training.cameras import Cameras
 from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
@@ -35,7 +36,8 @@ DEFINITIONS = {
     "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
     "value of a split is the mean over its views. Renderings: both pictures clipped to [0,1], "
     "because one caustic pixel of a photograph would decide all; render_psnr_unclamped does not. "
-    "Quantities of materials are not clipped",
+    "Quantities of materials are not clipped. Renderings are compared as photographs show them: "
+    "times the exposure of the view, and no brighter than the value at which it is clipped",
     "true_render_psnr": "render_psnr of the scene with its true materials and lights, with as many "
     "samples: the limit that the noise of renderings and photographs sets",
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
@@ -47,6 +49,16 @@ DEFINITIONS = {
     "data_changed": "parts of the data set that differ from those that the run was fit to",
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",
+}
+
+
+CAMERA_DEFINITIONS = {
+    "camera": "what was fitted of the cameras. A photograph is f⁻¹(exposure · white balance · v(r) "
+    "· radiance). stops: log2 of the exposure over what the data set tells; the first training "
+    "view is the anchor, 0. Red and blue are gains relative to green. Nothing is learned from "
+    "other views: theirs are the median ratio of photograph and rendering, and their render_psnr "
+    "is that of photographs after their own exposure. vignetting: v = 1 + a r² + b r⁴ + c r⁶, r is "
+    "1 in a corner. response: f(u^2.2)^(1/2.2) at equal steps of u from 0 to 1",
 }
 
 
@@ -103,11 +115,15 @@ def _evaluate(
     recovered_lighting = _evaluate_lighting(recovered, folder, tell)
     clip = settings.clip_negative or recovered.clip_negative
     exposure = exposure_of(read_photograph(view, clip) for view in views)
-    rows, materials = [], []
+    cameras = Cameras(recovered.problem.camera, dataset.train)
+    rows, materials, gains = [], [], []
     for view in views:
         lock.require_held()
-        row, seen, truth = _evaluate_view(recovered, view, folder, settings, true_scene, exposure)
+        row, seen, truth, gain = _evaluate_view(
+            recovered, cameras, view, folder, settings, true_scene, exposure
+        )
         rows.append(row)
+        gains.append(gain)
         materials.append((seen, truth))
         told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
         values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told)
@@ -119,6 +135,7 @@ def _evaluate(
     if recovered.config.learns_materials:
         heldout = materials[: len(dataset.heldout)]
         measures["yardsticks"] = asdict(find_yardsticks(dataset, recovered.config, heldout))
+    found = _evaluate_cameras(recovered, cameras, views, gains, tell)
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
         "steps": recovered.progress.step,
@@ -131,11 +148,13 @@ def _evaluate(
         **measures,
         **recovered_lighting,
         "display_exposure": exposure,
+        **found,
         "per_view": rows,
         "definitions": DEFINITIONS
         | renderings.DEFINITIONS
         | (yardsticks.DEFINITIONS if measures else {})
-        | (lighting.DEFINITIONS if recovered_lighting else {}),
+        | (lighting.DEFINITIONS if recovered_lighting else {})
+        | (CAMERA_DEFINITIONS if found else {}),
         "data": origin.data,
         "data_changed": data_changed,
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
@@ -191,12 +210,13 @@ def _true_scene(recovered: Recovered) -> SceneView:
 
 def _evaluate_view(
     recovered: Recovered,
+    cameras: Cameras,
     view: View,
     folder: RunFolder,
     settings: EvaluationSettings,
     true_scene: SceneView | None,
     exposure: float,
-) -> tuple[dict, MaterialBuffers | None, GroundTruth | None]:
+) -> tuple[dict, MaterialBuffers | None, GroundTruth | None, np.ndarray]:
     problem = recovered.problem
     radiance = render_camera(problem.scene_view, view.camera, settings, problem.hide_emitters)
     photograph = read_photograph(view, settings.clip_negative or recovered.clip_negative)
@@ -205,6 +225,11 @@ def _evaluate_view(
         seen = seen_materials(problem, view, settings.material_spp)
     alpha = photograph[..., 3] if seen is None else seen.coverage
     mask = counted_pixels(photograph, seen, truth)
+    # All that follows is of pictures as the photograph shows them.
+    dimmed = cameras.dimmed(view, radiance)
+    counted = mask if mask.any() else np.ones_like(mask)
+    gain = cameras.gain(view, dimmed[counted], photograph[counted][:, :3])
+    radiance = cameras.photographed(view, dimmed, gain)
 
     pictures = {"render": (radiance, tonemap(radiance))}
     if seen is not None:
@@ -219,14 +244,46 @@ def _evaluate_view(
     limits = () if true_scene is None else ("true_render_psnr",)
     row = {"name": view.name, "split": view.split} | dict.fromkeys((*keys, *limits))
     if mask.any():
-        row |= render_scores(radiance, photograph[..., :3], mask, exposure)
+        compared = view.readable(photograph[..., :3])
+        row |= render_scores(radiance, compared, mask, exposure)
         if true_scene is not None:
             limit = render_camera(true_scene, view.camera, settings, problem.hide_emitters)
-            found = render_scores(limit, photograph[..., :3], mask, exposure)
-            row["true_render_psnr"] = found["render_psnr"]
+            exposed = cameras.photographed(view, cameras.dimmed(view, limit), gain)
+            scores = render_scores(exposed, compared, mask, exposure)
+            row["true_render_psnr"] = scores["render_psnr"]
     if seen is not None and truth is not None:
         row |= seen.psnr(truth)
-    return row, seen, truth
+    return row, seen, truth, gain
+
+
+def _evaluate_cameras(
+    recovered: Recovered,
+    cameras: Cameras,
+    views: Sequence[View],
+    gains: Sequence[np.ndarray],
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    """What was fitted of the cameras; empty if all is known.
+
+    Args:
+        views: that were evaluated.
+        gains: of these.
+    """
+    model = recovered.problem.camera
+    if model is None:
+        return {}
+    train = recovered.dataset.train
+    found = {"unknown": list(recovered.config.camera.unknowns)} | cameras.told()
+    if cameras.solves:
+        found["anchor"] = train[0].name
+        others = [(v, gain) for v, gain in zip(views, gains, strict=True) if v.split != "train"]
+        pairs = [*zip(train, model.gains(), strict=True), *others]
+        found["images"] = rows = [cameras.told_of(view, gain) for view, gain in pairs]
+        stops = [row["stops"] for row in rows if row["split"] == "train"]
+        tell(
+            f"exposures: {min(stops):+.2f} to {max(stops):+.2f} stops over what the data set tells"
+        )
+    return {"camera": found}
 
 
 def _evaluate_lighting(

@@ -310,7 +310,8 @@ def _scores(
     mask = counted_pixels(photograph, seen, truth)
     if not mask.any():
         return dict.fromkeys(METRICS)
-    return render_scores(radiance, photograph[..., :3], mask, settings.exposure)
+    shown, compared = shot.truth.photographed(radiance), shot.truth.readable(photograph[..., :3])
+    return render_scores(shown, compared, mask, settings.exposure)
 
 
 def _frame(shot: _Shot) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from unbake.imaging import pictures
 from unbake.io import write_text
 from unbake.quantities import QUANTITIES
 from unbake.report import charts, display
+from unbake.report.cameras import camera_section
 from unbake.report.lighting import lighting_section
 from unbake.report.relit import relit_sections
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
@@ -155,6 +156,7 @@ def write_report(
             light=lighting,
             textures=textures,
             strips=strips,
+            cameras=camera_section(loaded),
             optimized=_optimized(loaded),
             materials=bool(materials),
             known=any(name in view.truth for view in views for name in QUANTITIES),
@@ -457,7 +459,9 @@ def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
         kind: [_told(run, words) if run.optimizes(kind) else {} for run in runs]
         for kind, words in LIGHT_DEFINED.items()
     }
-    return {part: _grouped(runs, said) for part, said in ({"numbers": numbers} | lighting).items()}
+    cameras = [_told(run, {"camera": "Cameras"}) for run in runs]
+    parts = {"numbers": numbers, "camera": cameras} | lighting
+    return {part: _grouped(runs, said) for part, said in parts.items()}
 
 
 def _told(run: Run, names: dict[str, str]) -> dict[str, str]:

@@ -13,6 +13,7 @@ from ..config import FitConfig
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from .defaults import with_defaults
+from .first_gains import begin_cameras
 from .problem import Problem, make_problem, training_pixels
 from .schedule import learning_rates
 from .state import State, initial_state
@@ -39,7 +40,10 @@ def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     smoothed = config.loss_reference == "smoothed"
     pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed)
     mean = pixels.photographs.mean
-    problem = make_problem(dataset.scene, dataset.background, config, mean, dataset.root)
+    problem = make_problem(
+        dataset.scene, dataset.background, config, mean, dataset.root, views=dataset.train
+    )
+    begin_cameras(problem, dataset, pixels)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))
 

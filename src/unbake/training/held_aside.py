@@ -8,11 +8,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
+import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
 from ..dataset.pixels import HELD_GROUPS, MOST_HELD, CameraRays, PixelBatch
-from ..dataset.views import Dataset, read_photograph
+from ..dataset.views import Dataset, View, read_photograph
+from ..fields.arrays import from_numpy
+from ..fields.camera import CameraModel
+from .cameras import Cameras
 from .checkpoint import Progress
 from .state import State
 from .step import TrainingStep
@@ -67,16 +71,22 @@ class _Probe:
         ]
         return np.concatenate(found)[: len(self.target)].astype(np.float64)
 
-    def squared_errors(self, state: State, limit: float = math.inf) -> np.ndarray:
-        """Squared errors without the noise of the rendering, shape (n, 3); single ones may be < 0.
 
-        Args:
-            limit: radiance above which pictures and photographs are clipped.
-        """
-        first, second = np.moveaxis(self.halves(state), 1, 0)
-        target = np.minimum(self.target, limit)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return (np.minimum(first, limit) - target) * (np.minimum(second, limit) - target)
+def _squared_errors(
+    halves: np.ndarray, target: np.ndarray, clipped: np.ndarray | None = None
+) -> np.ndarray:
+    """Squared errors without the noise of the rendering, shape (n, 3); single ones may be < 0.
+
+    Args:
+        halves: two independent estimates of each pixel, shape (n, 2, 3).
+        target: the photograph, shape (n, 3).
+        clipped: channels of which only a shortfall counts, shape (n, 3); None: no channel.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        first, second = (half - target for half in np.moveaxis(halves, 1, 0))
+        if clipped is not None:
+            first, second = (np.where(clipped & (x > 0), 0, x) for x in (first, second))
+        return first * second
 
 
 @final
@@ -92,20 +102,46 @@ class HeldAside:
         rays: through the training views and maybe others after them.
         held: the pixels that are held aside.
         config: of the fit.
+        camera: what is fitted of the cameras.
+        exposures: of the training views, as the data set tells; None: 1.
     """
 
     def __init__(
-        self, step: TrainingStep, rays: CameraRays, held: PixelBatch, config: FitConfig
+        self,
+        step: TrainingStep,
+        rays: CameraRays,
+        held: PixelBatch,
+        config: FitConfig,
+        *,
+        camera: CameraModel | None = None,
+        exposures: np.ndarray | None = None,
     ) -> None:
         numbers, colours = held.read()
         self._probe = _Probe(step, rays, numbers, colours, config)
+        self._clipped, self._epsilon = held.read_clipped(), config.loss_epsilon
         smoothed = config.loss_reference == "smoothed"
-        reference = colours[:, 3:].astype(np.float64) if smoothed else self._probe.target
-        self._weight = 1 / (reference**2 + config.loss_epsilon)
+        self._reference = colours[:, 3:].astype(np.float64) if smoothed else self._probe.target
+        self._camera = camera
+        if camera is not None:
+            pixel = from_numpy(mi.UInt32, numbers)
+            view = rays.view_of(pixel)
+            self._views, self._radius2 = np.array(view), np.array(rays.radius2(pixel, view))
+            told = np.ones(camera.views) if exposures is None else exposures
+            self._told = told[self._views, None].astype(np.float64)
 
     def measure(self, state: State) -> dict[str, Any]:
         """The error now, as numbers of a line of the log: its mean, and those of 16 groups."""
-        errors = (self._probe.squared_errors(state) * self._weight).mean(-1)
+        halves, camera = self._probe.halves(state), self._camera
+        target, reference, gain = self._probe.target, self._reference, 1.0
+        if camera is not None:
+            camera.assign(dict(state.phi.items()))
+            gain = camera.gains()[self._views] * camera.falloff(self._radius2)[:, None]
+            halves = halves * gain[:, None]
+            target, reference = (
+                camera.light(light * self._told) / self._told for light in (target, reference)
+            )
+        weight = 1 / (reference**2 + self._epsilon * np.square(gain))
+        errors = (_squared_errors(halves, target, self._clipped) * weight).mean(-1)
         # Pixels are in the order of views: every 16th is in a group, so that each has all views.
         groups = errors.reshape(-1, HELD_GROUPS).mean(0)
         return {ERROR: float(errors.mean()), GROUPS: [round(float(e), 7) for e in groups]}
@@ -176,6 +212,7 @@ class HeldOutPhotographs:
         dataset: of the fit, with held-out views.
         config: of the fit.
         clip_negative: take negative pixels of the photographs as zero.
+        camera: what is fitted of the cameras.
 
     Raises:
         UserError: a photograph cannot be read.
@@ -189,7 +226,10 @@ class HeldOutPhotographs:
         config: FitConfig,
         *,
         clip_negative: bool,
+        camera: CameraModel | None = None,
     ) -> None:
+        self._camera, self._cameras = camera, Cameras(camera, dataset.train)
+        self._views: list[tuple[View, np.ndarray]] = []  # with the numbers of pixels in it
         start = sum(view.camera.width * view.camera.height for view in dataset.train)
         each = max(MOST_HELD // len(dataset.heldout), 1)
         rng, numbers, colours = np.random.default_rng(config.seed), [], []
@@ -199,6 +239,7 @@ class HeldOutPhotographs:
             chosen = seen[rng.permutation(len(seen))[:each]]
             numbers.append(start + chosen)
             colours.append(pixels[chosen, :3])
+            self._views.append((view, chosen))
             start += len(pixels)
         found = np.concatenate(numbers).astype(np.uint32)
         pixels = np.concatenate(colours)
@@ -207,14 +248,33 @@ class HeldOutPhotographs:
     def measure(self, state: State) -> dict[str, Any] | None:
         """The PSNR of their pictures in dB, clipped to [0,1]; None where no pixel is in the scene.
 
+        Pictures are as photographs show them, times their exposure and clipped where these are.
         Pictures are as a step sees them, with L_θ after the first bounces, without their noise.
         """
         if self._probe is None:
             return None
-        error = float(self._probe.squared_errors(state, limit=1.0).mean())
+        halves, target = self._probe.halves(state), self._probe.target
+        if self._camera is not None:
+            self._camera.assign(dict(state.phi.items()))
+        errors, start = [], 0
+        for view, numbers in self._views:
+            part = slice(start, start + len(numbers))
+            start = part.stop
+            shown = self._shown(view, numbers, halves[part], target[part]).clip(max=1)
+            compared = view.readable(target[part]).clip(max=1)
+            errors.append(_squared_errors(shown, compared))
+        error = float(np.concatenate(errors).mean())
         if not 0 < error < math.inf:
             return None
         return {"split": "heldout", "render_psnr": -10 * math.log10(error)}
+
+    def _shown(
+        self, view: View, numbers: np.ndarray, halves: np.ndarray, photograph: np.ndarray
+    ) -> np.ndarray:
+        """Estimates of pixels as the photograph would show them, shape (n, 2, 3)."""
+        cameras, dimmed = self._cameras, self._cameras.dimmed(view, halves, numbers)
+        gain = cameras.gain(view, dimmed.mean(1), photograph)
+        return cameras.photographed(view, dimmed, gain)
 
 
 @final

@@ -20,9 +20,11 @@ from ..dataset.photographs import MOST_PIXELS
 from ..dataset.pixels import CameraRays, PixelSource
 from ..dataset.views import Dataset
 from ..errors import UserError
+from ..fields.camera import CameraModel
 from ..signals import deferred
 from .checkpoint import Progress, load_checkpoint
 from .defaults import with_defaults
+from .first_gains import begin_cameras
 from .held_aside import ERROR, ErrorCurve, HeldAside, HeldOutPhotographs
 from .memory import memory_mb
 from .monitor import Monitor
@@ -153,8 +155,14 @@ def _begin(
     if before is not None:
         _require_same_data(folder, before, origin)
     problem = make_problem(
-        dataset.scene, dataset.background, config, origin.mean_radiance, dataset.root
+        dataset.scene,
+        dataset.background,
+        config,
+        origin.mean_radiance,
+        dataset.root,
+        views=dataset.train,
     )
+    begin_cameras(problem, dataset, pixels)
     for warning in data_warnings(dataset, pixels, problem):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
@@ -168,7 +176,9 @@ def _begin(
     preview = Preview(problem, dataset, folder)
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
-    aside, photographs = _probes(dataset, pixels, step, config, preview, clip_negative)
+    aside, photographs = _probes(
+        dataset, pixels, step, config, preview, clip_negative, problem.camera
+    )
     step.require_memory(state)
     names = [view.name for view in dataset.train]
     return _Begun(
@@ -183,6 +193,7 @@ def _probes(
     config: FitConfig,
     preview: Preview,
     clip_negative: bool,
+    camera: CameraModel | None,
 ) -> tuple[HeldAside | None, HeldOutPhotographs | None]:
     """What is measured beside the training, from photographs alone."""
     compared = [] if preview.has_truth else dataset.heldout
@@ -191,10 +202,14 @@ def _probes(
         compared = []
     rays = CameraRays.of([view.camera for view in (*dataset.train, *compared)])
     held = pixels.held_aside()
-    aside = None if held is None else HeldAside(step, rays, held, config)
+    aside = None
+    if held is not None:
+        aside = HeldAside(step, rays, held, config, camera=camera, exposures=pixels.exposures)
     photographs = None
     if compared:
-        photographs = HeldOutPhotographs(step, rays, dataset, config, clip_negative=clip_negative)
+        photographs = HeldOutPhotographs(
+            step, rays, dataset, config, clip_negative=clip_negative, camera=camera
+        )
     return aside, photographs
 
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
-from ..config import FitConfig
+from ..config import CameraConfig, FitConfig
 from ..dataset.data_folder import TRANSFORMS
 from ..dataset.photographs import Photographs
 from ..dataset.pixels import CameraRays, PixelSource
-from ..dataset.views import Dataset
+from ..dataset.views import Dataset, View
 from ..errors import UserError
+from ..fields.camera import CameraModel
 from ..fields.domain import Domain
 from ..fields.emission import Emission, emission_textures
 from ..fields.envmap import EnvironmentMap, environment_emitter
@@ -49,6 +50,7 @@ class Problem:
     radiance: RadianceField | None
     hide_emitters: bool
     half_precision: bool  #: in products of its networks
+    camera: CameraModel | None = None  #: of the training views; None: all is as the data set tells
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -67,7 +69,7 @@ class Problem:
             named |= self.materials.parameters()
         for word, light in self._lighting():
             named |= {f"{word}.{key}": value for key, value in light.parameters().items()}
-        return named
+        return named if self.camera is None else named | self.camera.parameters()
 
     def assign(self, parameters: Parameters) -> None:
         """Use these arrays, and update the tables that are derived from them."""
@@ -76,6 +78,8 @@ class Problem:
         for word, light in self._lighting():
             light.assign({key: parameters[f"{word}.{key}"] for key in light.parameters()})
             light.prepare()
+        if self.camera is not None:
+            self.camera.assign(parameters)
 
     def read_by_scene(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The arrays that the scene's textures and emitters look into."""
@@ -100,6 +104,7 @@ def make_problem(
     scale: float,
     root: str | Path | None = None,
     *,
+    views: Sequence[View] = (),
     change: Callable[[ParsedScene], object] | None = None,
 ) -> Problem:
     """Replace the unknowns of a scene by untrained fields.
@@ -110,12 +115,14 @@ def make_problem(
         scale: radiance of the untrained radiance field and emitters, and of the environment unless
             the settings say it.
         root: folder that the scene's files must not leave; None: the scene's own.
+        views: the training views, where something of their cameras is unknown.
         change: called with the scene once the fields are in it, such as to change its light. Points
             are located in the scene without that change.
 
     Raises:
         UserError: the scene cannot be loaded, has no emitter or nothing to fit, has meshes without
             the texture coordinates that bitmaps need, or the fields do not fit the memory.
+        ValueError: something of the cameras is unknown, and there are no views.
     """
     scene, root = Path(scene), None if root is None else Path(root)
     parsed = parse(scene, root)
@@ -167,6 +174,21 @@ def make_problem(
         radiance,
         background == "hidden",
         config.half_precision,
+        _unknown_camera(config.camera, len(views)),
+    )
+
+
+def _unknown_camera(config: CameraConfig, views: int) -> CameraModel | None:
+    if not config.unknowns:
+        return None
+    if not views:
+        raise ValueError("something of the cameras is unknown: give the training views")
+    return CameraModel(
+        views,
+        exposure=config.exposure == "per-image",
+        white_balance=config.white_balance,
+        vignetting=config.vignetting == "radial",
+        response=config.response == "monotone",
     )
 
 
@@ -226,4 +248,9 @@ def training_pixels(dataset: Dataset, *, clip_negative: bool, smoothed: bool = T
         raise UserError("no foreground pixel in any training view", dataset.folder)
     if photographs.mean <= 0:
         raise UserError("all training images are black", dataset.folder)
-    return PixelSource(CameraRays.of([view.camera for view in views]), photographs)
+    limits = None
+    if any(view.clipped is not None for view in views):
+        limits = np.array([view.limit for view in views], np.float32)
+    exposures = np.array([view.exposure for view in views], np.float32)
+    rays = CameraRays.of([view.camera for view in views])
+    return PixelSource(rays, photographs, limits=limits, exposures=exposures)

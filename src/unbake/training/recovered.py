@@ -66,7 +66,13 @@ def open_run(
         raise UserError(f"the data set of the run {run} is gone", data, moved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     problem = make_problem(
-        dataset.scene, dataset.background, config, origin.mean_radiance, dataset.root, change=change
+        dataset.scene,
+        dataset.background,
+        config,
+        origin.mean_radiance,
+        dataset.root,
+        views=dataset.train,
+        change=change,
     )
     return OpenedRun(folder, problem, dataset, config, initial_state(problem), origin.clip_negative)
 

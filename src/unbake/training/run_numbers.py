@@ -92,6 +92,20 @@ def _yardsticks(value: Any) -> bool:
     )
 
 
+def _camera(value: Any) -> bool:
+    checks = {
+        "unknown": _list_of(_text),
+        "anchor": _text,
+        "images": _list_of(_object_of(_number, name=_text, split=_text)),
+        "white_balance": _object_of(_number),
+        "vignetting": _object_of(_number),
+        "response": _object_of(_list_of(_number)),
+    }
+    return isinstance(value, dict) and all(
+        check(value[key]) for key, check in checks.items() if key in value
+    )
+
+
 _LOG: Mapping[str, Check] = {
     **dict.fromkeys(("step", "seconds", "samples", "skipped"), _count),
     **dict.fromkeys(("samples_per_second", "memory_mb", "learning_rate"), _number),
@@ -119,6 +133,7 @@ _METRICS: Mapping[str, Check] = {
         )
     ),
     "albedo_scale": _or_none(_NUMBERS),
+    "camera": _or_none(_camera),
     "definitions": _or_none(_object_of(_text)),
     **dict.fromkeys(("render", "evaluation"), _or_none(_object)),
     "rate_factors": _or_none(_SCORES),

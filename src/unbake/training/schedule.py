@@ -28,4 +28,6 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
         name: rate * (config.rate_factors[name] or 1.0) * decay * rise
         for name, rate in unknowns.items()
     }
+    # Nothing waits for L_θ here: exposures had better be ahead of materials.
+    rates |= dict.fromkeys(config.camera.unknowns, config.camera.learning_rate * decay)
     return rates | {"radiance": config.radiance_settings.learning_rate * decay}

@@ -19,6 +19,8 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
 from ..errors import UserError
+from ..fields.arrays import from_numpy
+from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..transport.loss import RelativeL2, pixel_means
@@ -48,6 +50,7 @@ class Inputs:
     second: mi.Sampler  # of those that L_θ learns from, if these are fewer
     single: mi.Sampler  # of one camera sample a pixel, for regularizers
     seed: mi.UInt32
+    told: mi.Float | None = None  # exposures of the views as the data set tells, if they are read
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,12 @@ class TrainingStep:
         self._pixels = pixels
         self._config = config
         self._path_sampler = make_sampler(_context(problem, config))
+        self._told = None
+        if problem.camera is not None and problem.camera.has_response:
+            exposures = pixels.exposures
+            self._told = from_numpy(
+                mi.Float, np.ones(problem.camera.views) if exposures is None else exposures
+            )
         self._sampler = mi.load_dict({"type": "independent"})
         self._second = mi.load_dict({"type": "independent"})
         self._single = mi.load_dict({"type": "independent"})
@@ -188,7 +197,7 @@ class TrainingStep:
     @property
     def rate_names(self) -> tuple[str, ...]:
         """The names of learning rates that a step takes."""
-        return (*self._config.unknowns, "radiance")
+        return (*self._config.unknowns, *self._config.camera.unknowns, "radiance")
 
     def loss_of_black(self) -> float:
         """About the photometric loss of black pictures."""
@@ -317,6 +326,7 @@ class TrainingStep:
             second=self._second,
             single=self._single,
             seed=dr.opaque(mi.UInt32, int(seeds[1])),
+            told=self._told,
         )
 
     def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
@@ -355,12 +365,18 @@ class TrainingStep:
                     image = path_sampler.image(scene, again.ray, sampler)
                     primal = pixel_means(image, config.spp)
             smoothed = config.loss_reference == "smoothed"
-            loss = RelativeL2(config.loss_epsilon, batch.smoothed if smoothed else None)
+            reference, target = batch.smoothed if smoothed else None, batch.target
+            gain = None
+            camera = self._problem.camera
+            if camera is not None:
+                target, reference, gain = self._through_camera(camera, inputs, target, reference)
+            loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain)
             subset = _subset(config, inputs)
-            terms = path_sampler.terms(
-                scene, batch.ray, batch.target, sampler, subset, loss, primal
-            )
+            terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
             terms |= self._regularization(inputs, batch.ray, terms[PHOTOMETRIC])
+            if camera is not None and camera.has_response and config.camera.smoothness:
+                value = camera.roughness_of_response()
+                terms["response_smoothness"] = config.camera.smoothness * value
             total = sum(terms.values())
             dr.backward(total if state.scale is None else total * state.scale)
         return terms
@@ -376,6 +392,26 @@ class TrainingStep:
         inputs.single.seed(inputs.seed + 2, inputs.pixels.count)
         ray = dr.gather(mi.Ray3f, ray, chosen)
         return regularization_terms(problem, config, inputs.scene, ray, inputs.single, photometric)
+
+    def _through_camera(
+        self,
+        camera: CameraModel,
+        inputs: Inputs,
+        target: mi.Color3f,
+        reference: mi.Color3f | None,
+    ) -> tuple[mi.Color3f, mi.Color3f | None, mi.Color3f]:
+        """Photographs as light, what errors are relative to, and gains of renderings."""
+        numbers = inputs.pixels.numbers()
+        view = inputs.rays.view_of(numbers)
+        gain = camera.gain(view, inputs.rays.radius2(numbers, view))
+        if camera.has_response:
+            assert inputs.told is not None
+            # The response is of the photograph, before it was divided by its exposure.
+            told = dr.gather(mi.Float, inputs.told, view)
+            if reference is not None:
+                reference = dr.detach(camera.exposed(reference * told) / told)
+            target = camera.exposed(target * told) / told
+        return target, reference, gain
 
 
 def _context(problem: Problem, config: FitConfig) -> SamplerContext:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import FitConfig, with_method
+from ..config import CameraConfig, FitConfig, with_method
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
@@ -127,7 +127,8 @@ class TruthFit:
             raise UserError(what, "unknown", "Set it to materials")
         self.maps = TrueMaps.load(dataset, config.quantities)
         # The cheapest method: none of its light is computed here.
-        config = with_method(replace(config, unknown="materials", precision="single"), "direct")
+        config = replace(config, unknown="materials", precision="single", camera=CameraConfig())
+        config = with_method(config, "direct")
         self.problem: Problem = make_problem(
             dataset.scene, dataset.background, config, 1.0, dataset.root
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -21,17 +21,41 @@ class RelativeL2:
     Args:
         epsilon: added to the squared reference.
         reference: linear RGB, one lane a pixel; None: the photograph itself.
+        clipped: channels of pixels whose photograph says "at least that much"; None: no channel.
+        gain: by which renderings are multiplied before they are compared, linear RGB, one lane a
+            pixel; None: 1. ε is of radiance, so that it is multiplied by the squared gain: with the
+            true gains errors are the same as if photographs had been divided by them.
 
     Paper: Sec. 5.4.
     """
 
     epsilon: float
     reference: mi.Color3f | None = None
+    clipped: mi.Bool | None = None
+    gain: mi.Color3f | None = None
+
+    def of_known_camera(self) -> RelativeL2:
+        """The same loss without gradients to the gain."""
+        return self if self.gain is None else replace(self, gain=dr.detach(self.gain))
+
+    def error(
+        self,
+        samples: mi.Color3f,
+        target: mi.Color3f,
+        spp: int,
+        primal: mi.Color3f | None = None,
+    ) -> mi.Float:
+        """The relative squared error of pixels; arguments as of `squared_error`."""
+        weight = self.weight(target)
+        return squared_error(samples, target, spp, weight, primal, self.clipped, self.gain)
 
     def weight(self, target: mi.Color3f) -> mi.Color3f:
-        """1 / (reference² + ε) of each pixel."""
+        """1 / (reference² + ε) of each pixel, a constant."""
         reference = target if self.reference is None else self.reference
-        return dr.rcp(dr.square(reference) + self.epsilon)
+        if self.gain is None:
+            return dr.rcp(dr.square(reference) + self.epsilon)
+        reference, gain = dr.detach(reference), dr.detach(self.gain)
+        return dr.rcp(dr.square(reference) + self.epsilon * dr.square(gain))
 
 
 def squared_error(
@@ -40,6 +64,8 @@ def squared_error(
     spp: int,
     weight: mi.Color3f,
     primal: mi.Color3f | None = None,
+    clipped: mi.Bool | None = None,
+    gain: mi.Color3f | None = None,
 ) -> mi.Float:
     """Weighted squared error of pixels, w (I − G)², whose gradient is unbiased.
 
@@ -48,11 +74,18 @@ def squared_error(
     of (I_A − G)(I_B − G) is the squared error of the expected image, and so for its gradient. With
     `primal`, an estimate from other random numbers, the factors are that one and ∂I.
 
+    Of a clipped channel only a shortfall counts: an estimate above G has no error and no gradient.
+    With halves the expectation is the square of the expected shortfall, E[min(I_A − G, 0)]², whose
+    gradient is unbiased in turn. Where noise is as large as the distance to G it is more than zero
+    although I is above G.
+
     Args:
         samples: linear RGB, `spp` consecutive lanes a pixel.
         target: G, linear RGB, one lane a pixel.
         weight: of each pixel and channel, a constant.
         primal: I from an independent pass, one lane a pixel.
+        clipped: channels of pixels for which G is the least that they can be; None: no channel.
+        gain: takes the place of I by gain · I, one lane a pixel; it may pass gradients, as G may.
 
     Returns:
         Mean over pixels and channels.
@@ -61,15 +94,26 @@ def squared_error(
     """
     if primal is not None:
         image = pixel_means(samples, spp)
-        error = dr.detach(primal) - target
+        if gain is not None:
+            image, primal = image * gain, primal * dr.detach(gain)
+        error = one_sided(dr.detach(primal) - target, clipped)
         # The value is the squared error of the primal image, the gradient 2 (primal − G) ∂I.
         squared = dr.square(error) + 2 * error * (image - dr.detach(image))
     else:
         halves = pixel_means(samples, spp // 2)
         even = 2 * dr.arange(mi.UInt32, dr.width(target))
         a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
-        squared = (a - target) * (b - target)
+        if gain is not None:
+            a, b = a * gain, b * gain
+        squared = one_sided(a - target, clipped) * one_sided(b - target, clipped)
     return dr.mean(dr.mean(squared * weight))
+
+
+def one_sided(error: mi.Color3f, clipped: mi.Bool | None) -> mi.Color3f:
+    """Errors of pixels, without those of clipped channels that are too bright."""
+    if clipped is None:
+        return error
+    return dr.select(clipped & (error > 0), 0, error)
 
 
 def pixel_means(samples: mi.Color3f, spp: int) -> mi.Color3f:

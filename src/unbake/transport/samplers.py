@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from ..errors import UserError, require_name
 from ..fields.radiance import RadianceField
-from .loss import RelativeL2, squared_error
+from .loss import RelativeL2
 from .methods import BOUNCES, KEPT_PATHS, PATH_REPLAY, PHOTOMETRIC, Method
 from .objective import objective, requirements
 from .path_sample import PathSample, SampleSubset, rhs, trace
@@ -188,8 +188,7 @@ class _WholePathSampler(ABC):
     ) -> dict[str, mi.Float]:
         """The terms of the objective: the photometric one."""
         image = self.image(scene, ray, sampler)
-        weight = loss.weight(target)
-        return {PHOTOMETRIC: squared_error(image, target, self._context.spp, weight, primal)}
+        return {PHOTOMETRIC: loss.error(image, target, self._context.spp, primal)}
 
 
 class KeptPathSampler(_WholePathSampler):

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UserError, require_name
-from .loss import RelativeL2, squared_error
+from .loss import RelativeL2
 from .methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, PRIOR_PAIR, Attached
 from .path_sample import PathSample, lhs, rhs
 from .prior import residual, residual_norm
@@ -139,7 +139,7 @@ def photometric(x: TermInputs) -> mi.Float:
     Paper: Eq. 5, Eq. 12.
     """
     pixels = rhs(x.sample, x.rhs[x.bounces], x.bounces)
-    return squared_error(pixels, x.target, x.spp, x.loss.weight(x.target), x.primal)
+    return x.loss.error(pixels, x.target, x.spp, x.primal)
 
 
 def prior(x: TermInputs) -> mi.Float:
@@ -181,10 +181,13 @@ def prior_extra(x: TermInputs) -> mi.Float:
 def lhs_loss(x: TermInputs) -> mi.Float:
     """The squared error of the radiance field seen directly.
 
+    L_θ is radiance of the scene. What is unknown of the camera is a constant here: only pictures of
+    materials and lights train it.
+
     Paper: Eq. 14, Sec. 4.3.
     """
-    pixels = lhs(x.sample, x.lhs[0])
-    return squared_error(pixels, x.target, x.spp, x.loss.weight(x.target))
+    pixels, target = lhs(x.sample, x.lhs[0]), dr.detach(x.target)
+    return x.loss.of_known_camera().error(pixels, target, x.spp)
 
 
 for _term in (

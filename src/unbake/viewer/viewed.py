@@ -26,6 +26,7 @@ from ..fields.materials import Materials
 from ..fields.pieces import Pieces, decoded
 from ..imaging.pictures import absolute_error, block_means, false_colour, shown, tonemap
 from ..quantities import QUANTITIES
+from ..training.cameras import Cameras
 from ..training.checkpoint import Progress, load_written
 from ..training.recovered import open_run
 from ..training.validation import MaterialBuffers, read_view
@@ -313,6 +314,9 @@ class ViewedRun(ViewedData):
         if self.progress is None:
             return [first]
         image, how = self._rendered(camera)
+        cameras = Cameras(self._problem.camera, self._run.dataset.train)
+        dimmed = cameras.dimmed(replace(view, camera=camera), image)
+        image = cameras.photographed(view, dimmed, cameras.gain(view, dimmed, photograph))
         gain = 2.0**exposure
         error = absolute_error(image.clip(0, 1 / gain), photograph.clip(0, 1 / gain)) * gain
         first.append(Picture(how, tonemap(image, exposure)))

@@ -1,0 +1,61 @@
+"""What is unknown of the cameras. Needs neither Mitsuba nor Dr.Jit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from ..errors import require_ranges
+from .flag import Flag
+
+Exposures = Literal["known", "per-image"]
+WhiteBalance = Literal["known", "common", "per-image"]
+Vignetting = Literal["known", "radial"]
+Response = Literal["known", "monotone"]
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """What is unknown of the cameras that took the photographs (ours).
+
+    `known` is as the data set tells: `exposure` of its frames, and else a linear camera without
+    vignetting and with one white balance. See `fields/camera.py`.
+    """
+
+    exposure: Annotated[
+        Exposures,
+        Flag(
+            "Exposures: known, as the data set tells, or per-image, where each is fitted but that "
+            "of the first training view",
+            name="exposures",
+        ),
+    ] = "known"
+    white_balance: Annotated[
+        WhiteBalance,
+        Flag(
+            "Gains of red and blue relative to green: known, one pair that is common to all "
+            "photographs, or per-image, relative to the first training view"
+        ),
+    ] = "known"
+    vignetting: Annotated[
+        Vignetting,
+        Flag("How photographs darken to their edges: known, or radial, a fitted polynomial"),
+    ] = "known"
+    response: Annotated[
+        Response,
+        Flag(
+            "Response of the camera: known (photographs are linear), or monotone, a curve for each "
+            "channel between the values 0 and 1"
+        ),
+    ] = "known"
+    learning_rate: float = 0.02  #: Adam; of logs of gains and slopes, and of coefficients
+    smoothness: float = 1e-3  #: weight of differences along the response
+
+    def __post_init__(self) -> None:
+        require_ranges(self, {"learning_rate": (0, 1e3), "smoothness": (0, 1e6)})
+
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """What is fitted, each with parameters of its own."""
+        names = ("exposure", "white_balance", "vignetting", "response")
+        return tuple(name for name in names if getattr(self, name) != "known")

@@ -1,0 +1,268 @@
+"""What is unknown of the cameras that took the photographs (ours).
+
+A photograph P shows radiance L through a camera, channel by channel:
+
+    f(P) = e · w · v(r) · L
+
+with e the exposure of the image, w its white balance, v(r) the vignetting at the radius r of the
+pixel, and f the inverse of the camera's response. The gain e · w · v is applied to renderings and f
+to photographs: a loss is then linear in what is noisy, the rendering, and its gradients stay
+unbiased.
+
+Photographs alone leave some of it open, which conventions decide:
+
+- All exposures times a number is all radiance divided by it. The exposure of the first training
+  view is as the data set tells, and so is its white balance where each image has one of its own.
+- A white balance that all images share is told from the colour of albedo by interreflection, and
+  by lights that are seen, alone.
+- v is 1 at the centre, and f(0) = 0, f(1) = 1.
+- A power of f, of all exposures and of all radiance explains the same differences between
+  photographs. What lights and geometry say of radiance decides the exponent; where they say
+  little, the smoothness of f does, whose optimum is f(P) = P.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .arrays import from_numpy
+
+#: Which images share a white balance.
+Balance = Literal["known", "common", "per-image"]
+
+#: Of the log of exposures and white balances, so that nothing overflows single precision.
+BOUND = 20.0
+#: The least that vignetting leaves of the light.
+_DARKEST = 0.05
+#: Pieces of f, of equal length where photographs are as an 8-bit file has them.
+PIECES, _GAMMA = 16, 2.2
+#: `softplus` of it is 1.
+_UNIT = math.log(math.e - 1)
+
+
+@final
+class CameraModel:
+    """The unknown exposures, white balance, vignetting and response of training views.
+
+    Before it is trained all is as the data set tells: every gain is 1, and f(P) = P.
+
+    Args:
+        views: number of training views.
+        exposure: whether each image has an exposure of its own.
+        white_balance: of red and blue relative to green.
+        vignetting: whether there is one, 1 + a r² + b r⁴ + c r⁶ for all images.
+        response: whether the response is unknown, a curve for each channel.
+    """
+
+    def __init__(
+        self,
+        views: int,
+        *,
+        exposure: bool = False,
+        white_balance: Balance = "known",
+        vignetting: bool = False,
+        response: bool = False,
+    ) -> None:
+        self.views = views
+        self.white_balance = white_balance
+        sizes = {
+            "exposure.log": views * exposure,
+            "white_balance.log": 2 * {"known": 0, "common": 1, "per-image": views}[white_balance],
+            "vignetting.terms": 3 * vignetting,
+            "response.log": 3 * PIECES * response,
+        }
+        self._arrays = {key: dr.zeros(mi.Float, size) for key, size in sizes.items() if size}
+        dr.make_opaque(self._arrays)
+
+    @property
+    def has_response(self) -> bool:
+        """Whether the response is unknown."""
+        return "response.log" in self._arrays
+
+    def parameters(self) -> dict[str, mi.Float]:
+        """The trainable arrays; `assign` takes them back."""
+        return dict(self._arrays)
+
+    def assign(self, parameters: Mapping[str, Any]) -> None:
+        """Use these arrays from now on; gradients arrive in the arrays given."""
+        self._arrays = {key: parameters[key] for key in self._arrays}
+
+    def start(self, gains: np.ndarray) -> None:
+        """Begin with other gains than 1, as far as these are unknown.
+
+        Args:
+            gains: linear RGB of each view, shape (views, 3).
+        """
+        logs = np.log(gains)
+        if "exposure.log" in self._arrays:
+            found = logs[:, 1] if self.white_balance == "per-image" else logs.mean(1)
+            self._arrays["exposure.log"] = from_numpy(mi.Float, found.astype(np.float32))
+        if self.white_balance == "per-image":
+            found = logs[:, [0, 2]] - logs[:, [1]]
+            self._arrays["white_balance.log"] = from_numpy(mi.Float, found.astype(np.float32))
+
+    # ---------------------------------------------------------------------------- in a step
+
+    def gain(self, view: mi.UInt32, radius2: mi.Float) -> mi.Color3f:
+        """The gains e · w · v of pixels, by which their renderings are multiplied.
+
+        Args:
+            view: of each pixel.
+            radius2: squared distance of each pixel from the principal point; 1 is that of a corner.
+        """
+        lanes = dr.width(view)
+        gain = mi.Color3f(dr.ones(mi.Float, lanes))
+        if "exposure.log" in self._arrays:
+            gain *= _exp(self._relative("exposure.log", view, 0, 1))
+        if self.white_balance == "common":
+            array = self._arrays["white_balance.log"]
+            red, blue = (_read(array, dr.full(mi.UInt32, i, lanes)) for i in range(2))
+            gain *= mi.Color3f(_exp(red), 1, _exp(blue))
+        elif self.white_balance == "per-image":
+            red, blue = (self._relative("white_balance.log", view, i, 2) for i in range(2))
+            gain *= mi.Color3f(_exp(red), 1, _exp(blue))
+        if "vignetting.terms" in self._arrays:
+            array = self._arrays["vignetting.terms"]
+            a, b, c = (_read(array, dr.full(mi.UInt32, i, lanes)) for i in range(3))
+            falloff = dr.fma(radius2, dr.fma(radius2, dr.fma(radius2, c, b), a), 1)
+            gain *= dr.maximum(falloff, _DARKEST)
+        return gain
+
+    def exposed(self, photograph: mi.Color3f) -> mi.Color3f:
+        """Photographs through f, linear RGB; the same where the response is known."""
+        if not self.has_response:
+            return photograph
+        heights = self._heights()
+        return mi.Color3f([self._inverse(photograph[i], heights, i) for i in range(3)])
+
+    def roughness_of_response(self) -> mi.Float:
+        """Mean squared difference between neighbouring pieces of f, of the logs of their slopes."""
+        logs = self._arrays["response.log"]
+        piece = dr.arange(mi.UInt32, 3 * (PIECES - 1))
+        index = piece // (PIECES - 1) * PIECES + piece % (PIECES - 1)
+        return dr.mean(dr.square(_read(logs, index + 1) - _read(logs, index)))
+
+    def _relative(self, key: str, view: mi.UInt32, offset: int, stride: int) -> mi.Float:
+        """Entries of views less that of the first view, which is the anchor."""
+        array = self._arrays[key]
+        anchor = _read(array, dr.full(mi.UInt32, offset, dr.width(view)))
+        return _read(array, stride * view + offset) - anchor
+
+    def _heights(self) -> mi.Float:
+        """The curve f at `PIECES` + 1 places of each channel, as `curves`."""
+        row, column = PIECES + 1, PIECES
+        lane = dr.arange(mi.UInt32, 3 * row * column)
+        place, piece = lane // column, lane % column
+        channel = place // row
+        logs = self._arrays["response.log"]
+        slopes = _softplus(_read(logs, channel * PIECES + piece) + _UNIT)
+        risen = dr.block_sum(dr.select(piece < place % row, slopes, 0), column)
+        whole = dr.block_sum(slopes, column)
+        heights = risen / whole
+        dr.eval(heights)
+        return heights
+
+    def _inverse(self, value: mi.Float, heights: mi.Float, channel: int) -> mi.Float:
+        """One channel through f: pieces of positive slope, equal ones for 8-bit files."""
+        place = dr.power(value, 1 / _GAMMA) * PIECES
+        piece = dr.minimum(mi.UInt32(place), PIECES - 1)
+        index = piece + channel * (PIECES + 1)
+        low, high = _read(heights, index), _read(heights, index + 1)
+        height = dr.fma(high - low, place - mi.Float(piece), low)
+        return dr.power(dr.maximum(height, 1e-6), _GAMMA)
+
+    # ----------------------------------------------------------------------------- as numbers
+
+    def gains(self) -> np.ndarray:
+        """The gains e · w of training views, shape (views, 3)."""
+        gains = np.ones((self.views, 3))
+        if "exposure.log" in self._arrays:
+            logs = self._array("exposure.log")
+            gains *= np.exp(logs - logs[0])[:, None]
+        if self.white_balance != "known":
+            logs = self._array("white_balance.log").reshape(-1, 2)
+            if self.white_balance == "per-image":
+                logs = logs - logs[0]
+            gains[:, [0, 2]] *= np.exp(logs)
+        return gains
+
+    def common_gain(self) -> np.ndarray:
+        """The gain of a view that is none of the training views, of unknown exposure, (3,)."""
+        return self.gains()[0] if self.white_balance == "common" else np.ones(3)
+
+    def vignetting(self) -> np.ndarray | None:
+        """The coefficients a, b, c; None where there are none."""
+        known = "vignetting.terms" in self._arrays
+        return self._array("vignetting.terms") if known else None
+
+    def falloff(self, radius2: np.ndarray) -> np.ndarray:
+        """Vignetting v at squared radii."""
+        terms = self.vignetting()
+        if terms is None:
+            return np.ones_like(radius2)
+        a, b, c = terms
+        return np.maximum(1 + radius2 * (a + radius2 * (b + radius2 * c)), _DARKEST)
+
+    def curves(self) -> np.ndarray | None:
+        """The curve f at `PIECES` + 1 places, shape (3, places); None where it is known.
+
+        Photographs are u^2.2, with u from 0 to 1 in equal steps, and f(u^2.2) is value^2.2.
+        """
+        if not self.has_response:
+            return None
+        slopes = np.logaddexp(0, self._array("response.log").reshape(3, PIECES) + _UNIT)
+        heights = np.concatenate([np.zeros((3, 1)), np.cumsum(slopes, 1)], 1)
+        return heights / heights[:, -1:]
+
+    def photographed(self, exposed: np.ndarray) -> np.ndarray:
+        """The photograph of light times gain, the inverse of f; shape (..., 3)."""
+        curves = self.curves()
+        if curves is None:
+            return exposed
+        places, found = np.linspace(0, 1, PIECES + 1), []
+        for curve, channel in zip(curves, np.moveaxis(exposed, -1, 0), strict=True):
+            height = np.maximum(channel, 0) ** (1 / _GAMMA)
+            place = np.interp(height, curve, places)
+            last = (places[-1] - places[-2]) / (curve[-1] - curve[-2])
+            found.append(np.where(height > 1, 1 + (height - 1) * last, place) ** _GAMMA)
+        return np.stack(found, -1).astype(exposed.dtype)
+
+    def light(self, photograph: np.ndarray) -> np.ndarray:
+        """Photographs through f, in NumPy; shape (..., 3)."""
+        curves = self.curves()
+        if curves is None:
+            return photograph
+        places, found = np.linspace(0, 1, PIECES + 1), []
+        for curve, channel in zip(curves, np.moveaxis(photograph, -1, 0), strict=True):
+            place = np.maximum(channel, 0) ** (1 / _GAMMA)
+            height = np.interp(place, places, curve)
+            last = (curve[-1] - curve[-2]) * PIECES
+            found.append(np.where(place > 1, 1 + (place - 1) * last, height) ** _GAMMA)
+        return np.stack(found, -1).astype(photograph.dtype)
+
+    def _array(self, key: str) -> np.ndarray:
+        return np.array(dr.detach(self._arrays[key]), np.float64)
+
+
+def _read(array: mi.Float, index: mi.UInt32) -> mi.Float:
+    """Entries of a small array, an index a lane.
+
+    Dr.Jit 1.5 on LLVM now and then loses gradients in the buffers by which it adds to small arrays;
+    `Local` has none.
+    """
+    return dr.gather(mi.Float, array, index, mode=dr.ReduceMode.Local)
+
+
+def _exp(log: mi.Float) -> mi.Float:
+    # What is clipped keeps a gradient, which brings it back.
+    return dr.exp(log + dr.detach(dr.clip(log, -BOUND, BOUND) - log))
+
+
+def _softplus(x: mi.Float) -> mi.Float:
+    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))

@@ -1,0 +1,464 @@
+"""Cameras: exposures and clipping that the data set tells, and what a fit makes of them."""
+
+import json
+import shutil
+import signal
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
+
+from unbake.config import CameraConfig, from_toml, read_toml, to_toml
+from unbake.dataset.fingerprint import changed, fingerprint
+from unbake.dataset.photographs import Photographs
+from unbake.dataset.pixels import CameraRays
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.evaluation.evaluate import evaluate
+from unbake.evaluation.settings import EvaluationSettings
+from unbake.fields.camera import CameraModel
+from unbake.imaging.pictures import read_exr, write_exr
+from unbake.report.page import write_report
+from unbake.scene.parse import parse
+from unbake.training.first_gains import _solved, first_gains
+from unbake.training.fresh_fit import begin_fit
+from unbake.training.held_aside import HeldAside, HeldOutPhotographs
+from unbake.training.loop import fit
+from unbake.training.problem import make_problem, training_pixels
+from unbake.training.run_folder import RunFolder
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
+from unbake.transport.loss import RelativeL2, pixel_means
+
+#: Powers of two, so that dividing by them gives back the very numbers.
+EXPOSURES = (4.0, 0.5, 2.0)
+
+
+def edit_frames(data, change):
+    """Change the frames of a data set: `change(frame, number)`."""
+    file = data / "transforms.json"
+    content = json.loads(file.read_text())
+    for number, frame in enumerate(content["frames"]):
+        change(frame, number)
+    file.write_text(json.dumps(content))
+    return data
+
+
+def expose(data, exposures, *, told=True):
+    """Multiply the photographs of a data set, and tell so or not."""
+
+    def change(frame, number):
+        image = data / frame["file_path"]
+        pixels = read_exr(image)
+        pixels[..., :3] *= exposures[number]
+        write_exr(image, pixels)
+        if told:
+            frame["exposure"] = exposures[number]
+
+    return edit_frames(data, change)
+
+
+@pytest.fixture(scope="module")
+def exposed(cornell, tmp_path_factory):
+    """The room, each photograph with an exposure that the data set tells."""
+    data = shutil.copytree(cornell, tmp_path_factory.mktemp("exposed") / "data")
+    return expose(data, EXPOSURES)
+
+
+@pytest.fixture(scope="module")
+def config(tiny):
+    return replace(read_toml(tiny), method="direct", held_aside=0.25)
+
+
+# ------------------------------------------------------------------------------ what data sets tell
+
+
+def test_exposure_and_limit_are_read_and_saved_again(exposed, tmp_path):
+    data = shutil.copytree(exposed, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    content["clipped"] = 0.75
+    content["frames"][1]["clipped"] = None
+    (data / "transforms.json").write_text(json.dumps(content))
+    for _ in range(2):
+        views = Dataset.load(data).views
+        assert [view.exposure for view in views] == list(EXPOSURES)
+        assert [view.clipped for view in views] == [0.75, None, 0.75]
+        assert [view.limit for view in views] == [0.1875, np.inf, 0.375]
+        Dataset.load(data).save(data)
+    assert "clipped" not in json.loads((data / "transforms.json").read_text())
+
+
+@pytest.mark.parametrize("key", ["exposure", "clipped"])
+@pytest.mark.parametrize("value", [0, -1, "bright", 1e13, True])
+def test_values_that_no_camera_has_are_refused(cornell, tmp_path, key, value):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    edit_frames(data, lambda frame, number: frame.update({key: value}))
+    with pytest.raises(UserError, match=f"'{key}' is not a number from 1e-12 to 1e"):
+        Dataset.load(data)
+
+
+def test_a_photograph_is_exposed_and_clipped_radiance(cornell):
+    view = replace(Dataset.load(cornell).views[0], exposure=2.0, clipped=1.5)
+    radiance = np.array([0.0, 0.5, 0.75, 1.0], np.float32)
+    np.testing.assert_array_equal(view.photographed(radiance), [0, 1, 1.5, 1.5])
+    np.testing.assert_array_equal(view.photographed(radiance, 0.5), [0, 0.5, 0.75, 1])
+    plain = replace(view, exposure=1.0, clipped=None)
+    assert plain.photographed(radiance) is radiance
+
+
+# ---------------------------------------------------------------------------------- known exposures
+
+
+def test_photographs_of_known_exposure_are_the_radiance_of_the_scene(cornell, exposed, monkeypatch):
+    plain = Photographs.load(Dataset.load(cornell), False)
+    found = Photographs.load(Dataset.load(exposed), False)
+    np.testing.assert_array_equal(found.table, plain.table)
+    assert found.mean == plain.mean
+    # Those that lie in a file are made anew where an exposure is another one
+    monkeypatch.setattr("unbake.dataset.photographs.IN_MEMORY", 0)
+    dataset = Dataset.load(exposed)
+    np.testing.assert_array_equal(Photographs.load(dataset, False).table, plain.table)
+    darker = replace(dataset, views=tuple(replace(v, exposure=8.0) for v in dataset.views))
+    first = dataset.train[0].camera.width * dataset.train[0].camera.height
+    table = Photographs.load(darker, False).table
+    np.testing.assert_array_equal(table[:first], plain.table[:first] / 2)
+
+
+def test_exposures_are_part_of_what_a_run_was_fit_to(exposed):
+    dataset = Dataset.load(exposed)
+    views = (replace(dataset.views[0], clipped=1.0), *dataset.views[1:])
+    before, now = fingerprint(dataset), fingerprint(replace(dataset, views=views))
+    assert changed(before, now) == ["photographs"]
+    plain = replace(dataset, views=tuple(replace(view, exposure=1.0) for view in dataset.views))
+    assert changed(before, fingerprint(plain)) == ["photographs"]
+
+
+class Grey:
+    """A step whose pictures have one value everywhere."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def probe(self, state, rays, pixels, seed):
+        return np.full((pixels.count, 2, 3), self.value)
+
+
+def test_held_out_photographs_are_compared_as_they_are(exposed, config):
+    dataset = Dataset.load(exposed)
+    rays = CameraRays.of([view.camera for view in dataset.views])
+    views = {None: dataset.views[2], 0.25: replace(dataset.views[2], clipped=0.25)}
+    photograph = read_exr(views[None].image)[..., :3].astype(float)
+    assert (photograph > 0.25).any() and (photograph < 0.25).any()
+    for limit, view in views.items():
+        one = replace(dataset, views=(*dataset.train, view))
+        probe = HeldOutPhotographs(Grey(0.2), rays, one, config, clip_negative=False)
+        top = limit or 1.0
+        error = ((min(2 * 0.2, top) - photograph.clip(max=top)) ** 2).mean()
+        assert probe.measure(None)["render_psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-4)
+
+
+# ----------------------------------------------------------------------------------------- clipping
+
+
+def one_sided_case(primal):
+    """Loss and gradient of three pixels: above, below, and one that is not clipped."""
+    value = mi.Float([0.9, 0.9, 0.3, 0.3, 0.9, 0.9])
+    dr.enable_grad(value)
+    target = mi.Color3f(mi.Float([0.5, 0.5, 0.5]))
+    clipped = dr.mask_t(mi.Color3f)(mi.Bool([True, True, False]))
+    loss = RelativeL2(0.01, clipped=clipped)
+    first = mi.Color3f(pixel_means(mi.Color3f(dr.detach(value)), 2)) if primal else None
+    error = loss.error(mi.Color3f(value), target, 2, first)
+    dr.backward(error)
+    return float(error[0]), np.array(dr.grad(value)).reshape(3, 2).sum(1)
+
+
+@pytest.mark.parametrize("primal", [False, True])
+def test_what_is_clipped_has_neither_loss_nor_gradient_above(primal):
+    loss, gradient = one_sided_case(primal)
+    weight = 1 / (0.5**2 + 0.01)
+    assert loss == pytest.approx(weight * (0.2**2 + 0.4**2) / 3, rel=1e-5)
+    assert gradient[0] == 0
+    np.testing.assert_allclose(gradient[1:], weight * 2 / 3 * np.array([-0.2, 0.4]), rtol=1e-5)
+
+
+def test_pixels_know_which_of_their_channels_are_clipped(exposed, config):
+    data = Dataset.load(exposed)
+    first, second, heldout = data.views
+    views = (replace(first, clipped=0.5), second, heldout)
+    begun = begin_fit(replace(data, views=views), config)
+    pixels = begun.pixels.holding_aside(0.25, 0)
+    for drawn in (pixels.draw(3, 64), pixels.held_aside()):
+        numbers, colours = drawn.read()
+        in_first = numbers < first.camera.width * first.camera.height
+        expected = (colours[:, :3] * 4 >= 0.5) & in_first[:, None]
+        assert expected.any() and not expected.all() and colours.shape[1] == 6
+        np.testing.assert_array_equal(drawn.read_clipped(), expected)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, 2 * drawn.count)
+        batch = drawn.batch(pixels.rays, sampler, 2)
+        np.testing.assert_array_equal(np.array(batch.clipped).T, expected)
+    aside = HeldAside(Grey(100.0), pixels.rays, pixels.held_aside(), begun.config)
+    held = pixels.held_aside()
+    _, colours = held.read()
+    errors = (100.0 - colours[:, :3].astype(float)) ** 2 * ~held.read_clipped()
+    expected = (errors / (colours[:, 3:] ** 2 + config.loss_epsilon)).mean()
+    assert aside.measure(None)["held_aside"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_renderings_of_a_run_are_as_its_photographs_show_them(exposed, config, tmp_path):
+    data = shutil.copytree(exposed, tmp_path / "data")
+
+    def clip(frame, number):
+        image = data / frame["file_path"]
+        pixels = read_exr(image)
+        limit = float(np.quantile(pixels[..., :3], 0.9))
+        pixels[..., :3] = pixels[..., :3].clip(max=limit)
+        write_exr(image, pixels)
+        frame["clipped"] = limit
+
+    edit_frames(data, clip)
+    fit(data, tmp_path / "run", replace(config, steps=20))
+    few = EvaluationSettings(spp=16, max_depth=6, train_views=1)
+    found = evaluate(tmp_path / "run", few, tell=lambda line: None)
+    for row in found["per_view"]:
+        view = next(v for v in Dataset.load(data).views if v.name == row["name"])
+        render = tmp_path / "run" / "evaluation" / view.split / f"{view.name}_render.exr"
+        picture, photograph = read_exr(render)[..., :3], read_exr(view.image)[..., :3]
+        assert picture.max() <= view.clipped
+        # A picture in other units would be off by the exposure, 2 at least.
+        assert 0.7 < picture.mean() / photograph.mean() < 1.4
+
+
+# ------------------------------------------------------------------------- the model of the camera
+
+EVERYTHING = CameraConfig("per-image", "per-image", "radial", "monotone")
+
+
+def trained_model(seed=0):
+    """A model with an unknown of each kind, as if it had been trained, and its arrays."""
+    model = CameraModel(3, exposure=True, white_balance="per-image", vignetting=True, response=True)
+    rng = np.random.default_rng(seed)
+    arrays = {
+        key: mi.Float(rng.normal(0, 0.3, dr.width(value)).astype(np.float32))
+        for key, value in model.parameters().items()
+    }
+    dr.enable_grad(arrays)
+    model.assign(arrays)
+    return model, arrays
+
+
+def test_an_untrained_camera_changes_nothing():
+    model = CameraModel(3, exposure=True, white_balance="common", vignetting=True, response=True)
+    view, radius2 = mi.UInt32([0, 1, 2]), mi.Float([0, 0.5, 1])
+    np.testing.assert_array_equal(np.array(model.gain(view, radius2)), 1)
+    values = np.array([0.0, 1e-4, 0.2, 0.5, 1.0, 3.0], np.float32)
+    np.testing.assert_allclose(
+        np.array(model.exposed(mi.Color3f(mi.Float(values)))), [values] * 3, rtol=1e-4, atol=1e-7
+    )
+    assert model.gains().tolist() == [[1, 1, 1]] * 3
+
+
+def test_gains_and_responses_are_the_same_in_steps_and_in_evaluations():
+    model, arrays = trained_model()
+    view, radius2 = np.repeat(np.arange(3), 4), np.tile([0.0, 0.3, 0.6, 1.0], 3)
+    gain = model.gain(mi.UInt32(view), mi.Float(radius2))
+    expected = model.gains()[view] * model.falloff(radius2)[:, None]
+    np.testing.assert_allclose(np.array(gain).T, expected, rtol=1e-5)
+    np.testing.assert_allclose(expected[0], 1)  # the first view is the anchor
+    assert np.abs(np.log(model.gains()[1:])).max() > 0.1
+    values = np.linspace(0, 1.5, 31, dtype=np.float32)[:, None].repeat(3, 1)
+    light = np.array(model.exposed(mi.Color3f([mi.Float(x) for x in values.T]))).T
+    np.testing.assert_allclose(light, model.light(values), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(light[[0, 20]], [[0] * 3, [1] * 3], atol=1e-6)
+    assert (np.diff(light, axis=0) > 0).all()
+    np.testing.assert_allclose(model.photographed(light), values, rtol=1e-3, atol=1e-5)
+    # Gradients reach all of it, but the anchor through exposures of its own
+    loss = dr.sum(dr.sum(gain) + dr.sum(model.exposed(mi.Color3f(mi.Float(values[:12, 0])))))
+    dr.backward(loss)
+    for key, array in arrays.items():
+        gradient = np.array(dr.grad(array))
+        assert np.isfinite(gradient).all() and (gradient != 0).any(), key
+
+
+def test_a_gain_that_is_right_is_as_good_as_a_divided_photograph():
+    """Also in the denominator, with its ε; and gradients of the gain are those of a square."""
+    rng = np.random.default_rng(5)
+    samples = mi.Color3f([mi.Float(rng.uniform(0, 1, 16).astype(np.float32)) for _ in range(3)])
+    target = mi.Color3f([mi.Float(rng.uniform(0, 1, 4).astype(np.float32)) for _ in range(3)])
+    reference = target * 0.9
+    for primal in (None, pixel_means(samples * 1.1, 4)):
+        plain = RelativeL2(0.1, reference).error(samples, target, 4, primal)
+        gain = mi.Color3f(4, 2, 0.5) * dr.ones(mi.Float, 4)
+        dr.enable_grad(gain)
+        found = RelativeL2(0.1, reference * gain, gain=gain)
+        error = found.error(samples, target * dr.detach(gain), 4, primal)
+        assert float(error[0]) == pytest.approx(float(plain[0]), rel=1e-5)
+        dr.backward(error)
+        assert all((np.array(dr.grad(c)) != 0).all() for c in gain)
+        known = found.of_known_camera()
+        assert not dr.grad_enabled(known.error(samples, target, 4, primal))
+
+
+def start(built_in, camera, **more):
+    config = replace(TINY_FIT, camera=camera, **more)
+    cameras = built_in_cameras("cornell", 8, views=2)
+    views = [None] * len(cameras)
+    problem = make_problem(built_in("cornell"), "visible", config, 0.2, views=views)
+    return TrainingStep(problem, grey_photographs(cameras), config), initial_state(problem)
+
+
+def rates(number):
+    names = ("albedo", "roughness", "radiance", *EVERYTHING.unknowns)
+    return dict.fromkeys(names, 2e-3 * 0.9**number)
+
+
+@pytest.mark.parametrize("method", ["direct", pytest.param("ours", marks=pytest.mark.slow)])
+def test_nothing_is_compiled_after_the_first_steps_and_all_is_trained(built_in, method):
+    step, state = start(built_in, EVERYTHING, method=method)
+    before = {key: np.array(value) for key, value in state.phi.items()}
+    names = {key.partition(".")[0] for key in before}
+    assert names == {"albedo", "roughness", *EVERYTHING.unknowns}
+    assert step.rate_names == ("albedo", "roughness", *EVERYTHING.unknowns, "radiance")
+    assert_only_replayed(step, state, rates)
+    for key, value in state.phi.items():
+        assert (np.array(value) != before[key]).any() and np.isfinite(np.array(value)).all(), key
+
+
+def test_what_is_off_costs_nothing(built_in, one_thread, monkeypatch):
+    """A step without any of it has the loss of before, to the last bit."""
+
+    def as_before(self, samples, target, spp, primal=None):
+        assert (self.clipped, self.gain, primal) == (None, None, None)
+        halves = pixel_means(samples, spp // 2)
+        even = 2 * dr.arange(mi.UInt32, dr.width(target))
+        a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
+        weight = dr.rcp(dr.square(self.reference) + self.epsilon)
+        return dr.mean(dr.mean((a - target) * (b - target) * weight))
+
+    found = []
+    for number in range(2):
+        if number:
+            monkeypatch.setattr(RelativeL2, "error", as_before)
+        step, state = start(built_in, CameraConfig())
+        assert step._inputs(0).told is None and step._problem.camera is None
+        terms = [step(state, i, rates(i)) for i in range(2)]
+        arrays = {k: np.array(v) for _, o in state.optimizers() for k, v in o.items()}
+        found.append(({k: float(v[0]) for t in terms for k, v in t.items()}, arrays))
+    assert found[0][0] == found[1][0]
+    for key, value in found[0][1].items():
+        np.testing.assert_array_equal(value, found[1][1][key])
+
+
+def test_cameras_need_the_views_that_they_took(built_in):
+    config = replace(TINY_FIT, camera=EVERYTHING)
+    with pytest.raises(ValueError, match="give the training views"):
+        make_problem(built_in("cornell"), "visible", config, 0.2)
+
+
+# -------------------------------------------------------------------------------- unknown exposures
+
+UNTOLD = (1.5, 0.4, 2.5)
+
+
+@pytest.fixture(scope="module")
+def unknown(cornell, tmp_path_factory):
+    """The room, each photograph with an exposure that nobody tells."""
+    data = shutil.copytree(cornell, tmp_path_factory.mktemp("unknown") / "data")
+    return expose(data, UNTOLD, told=False)
+
+
+def test_exposures_begin_at_what_photographs_say_of_the_same_points(unknown, exposed):
+    for data, truth in ((unknown, UNTOLD), (exposed, (1, 1))):
+        dataset = Dataset.load(data)
+        pixels = training_pixels(dataset, clip_negative=False)
+        scene = parse(dataset.scene, dataset.root).instantiate()
+        gains = first_gains(scene, dataset.train, pixels)
+        assert gains.shape == (2, 3) and (gains[0] == 1).all()
+        np.testing.assert_allclose(np.log2(gains[1]), np.log2(truth[1] / truth[0]), atol=0.15)
+
+
+def test_gains_of_views_are_the_least_squares_ones():
+    whole = np.log([[1, 1, 1], [9, 9, 9], [3, 3, 3]])
+    # Nothing is shared with the last view: what its photograph says as a whole has to do.
+    found = np.exp(_solved(whole, [(0, 1, 1e3, np.log([2, 4, 8]))]))
+    np.testing.assert_allclose(found, [[1, 1, 1], [2, 4, 8], [3, 3, 3]], rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def fitted(unknown, tiny, tmp_path_factory):
+    """A short fit of all that can be unknown of a camera, and its evaluation."""
+    run = tmp_path_factory.mktemp("fitted") / "run"
+    settings = replace(read_toml(tiny), method="direct", steps=60, camera=EVERYTHING)
+    fit(unknown, run, replace(settings, held_aside=0.25))
+    few = EvaluationSettings(spp=16, max_depth=6, train_views=1, truth=True)
+    return run, evaluate(run, few, tell=lambda line: None)
+
+
+def test_a_fit_finds_exposures_and_tells_them(fitted, tmp_path):
+    run, found = fitted
+    camera = found["camera"]
+    assert camera["unknown"] == list(EVERYTHING.unknowns) and camera["anchor"] == "train_000"
+    rows = {row["name"]: row for row in camera["images"]}
+    assert rows["train_000"]["stops"] == 0 and rows["heldout_000"]["split"] == "heldout"
+    truth = np.log2(UNTOLD[1] / UNTOLD[0])
+    # With so much unknown and light after one bounce missing, it is no more than about there.
+    assert rows["train_001"]["stops"] == pytest.approx(truth, abs=1)
+    assert set(camera["vignetting"]) == {"a", "b", "c"}
+    assert [len(camera["response"][c]) for c in ("red", "green", "blue")] == [17] * 3
+    # Held-out photographs after their own exposure are about as dark as the rendering then is.
+    for row in found["per_view"]:
+        assert row["render_psnr"] > 12 and row["true_render_psnr"] > 12
+    assert RunFolder(run).metrics()["camera"] == camera
+    page = write_report([run], tmp_path / "report.html").read_text()
+    assert "<h2>Cameras</h2>" in page and "train_001" in page and "after their own exposure" in page
+    settings = RunFolder(run).settings()
+    assert settings.camera == EVERYTHING and from_toml(to_toml(settings)) == settings
+    last = sorted((run / "checkpoints").glob("step-*"))[-1]
+    names = load_file(last / "state.safetensors")
+    assert {f"phi.{key}" for key in trained_model()[1]} <= names.keys()
+
+
+def test_a_resumed_fit_goes_on_bit_for_bit(unknown, tiny, tmp_path, monkeypatch):
+    threads, call, stop_at = dr.thread_count(), TrainingStep.__call__, []
+    settings = replace(read_toml(tiny), method="direct", steps=8, camera=EVERYTHING)
+
+    def one_thread(self, state, number, learning_rates):
+        # From the first step on: Mitsuba reads no OpenEXR without a second thread.
+        dr.set_thread_count(1)
+        if number in stop_at:
+            signal.raise_signal(signal.SIGINT)
+        return call(self, state, number, learning_rates)
+
+    def train(name, **more):
+        try:
+            fit(unknown, tmp_path / name, settings, **more)
+        finally:
+            dr.set_thread_count(threads)
+        last = sorted((tmp_path / name / "checkpoints").glob("step-*"))[-1]
+        return load_file(last / "state.safetensors")
+
+    monkeypatch.setattr(TrainingStep, "__call__", one_thread)
+    whole = train("whole")
+    stop_at.append(4)
+    train("parts")
+    stop_at.clear()
+    parts = train("parts", resume=True)
+    assert whole.keys() == parts.keys() and len(whole["phi.exposure.log"]) == 2
+    for key, value in whole.items():
+        assert np.array_equal(value, parts[key]), key
+
+
+def test_the_command_line_says_what_is_unknown(unbake, unknown, tiny, tmp_path):
+    words = ("--settings", tiny, "--method", "direct", "--steps", "0")
+    options = ("--exposures", "per-image", "--white-balance", "common", "--response", "known")
+    done = unbake("fit", unknown, "--out", tmp_path / "run", *words, *options)
+    assert done.status == 0, done.err
+    settings = RunFolder(tmp_path / "run").settings()
+    assert settings.camera == CameraConfig("per-image", "common")
+    refused = unbake("fit", unknown, "--out", tmp_path / "other", "--exposures", "free")
+    assert refused.status == 2 and "--exposures" in refused.err
