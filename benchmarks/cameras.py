@@ -4,10 +4,10 @@
         [--steps 2400] [--settings FILE]
 
 The photographs of a data set of known exposures are multiplied by random ones, uniform in stops up
-to ±`--stops`, each view by its own. Three fits follow: of the photographs as they were, of the new
-ones taken for known, and of the new ones with `--exposures per-image`. Scores are PSNRs in dB of
-linear RGB by `unbake evaluate`, mean over held-out views; errors of exposures are of training
-views, in stops over the first one, which is the anchor.
+to ±`--stops`, each view by its own, but for the first training view: it is the anchor. Three fits
+follow: of the photographs as they were, of the new ones taken for known, and of the new ones with
+`--exposures per-image`. Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
+held-out views; errors of exposures are of the other training views, in stops.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def main() -> None:
 def with_exposures(data: Path, out: Path, most: float, seed: int) -> tuple[Path, dict[str, float]]:
     """A copy of a data set that does not tell its new exposures, and these, in stops by view."""
     shutil.copytree(data, out, ignore=shutil.ignore_patterns(DataFolder(data).cache.name))
-    rng, found = np.random.default_rng(seed), {}
-    for view in Dataset.load(out).views:
-        found[view.name] = float(rng.uniform(-most, most))
+    rng, found, dataset = np.random.default_rng(seed), {}, Dataset.load(out)
+    for view in dataset.views:
+        found[view.name] = 0.0 if view is dataset.train[0] else float(rng.uniform(-most, most))
         pixels = read_exr(view.image)
         pixels[..., :3] *= 2.0 ** found[view.name]
         write_exr(view.image, pixels)
@@ -105,9 +105,8 @@ def fit(
     scores = {key: metrics["heldout"][key] for key in SCORES}
     camera = metrics.get("camera")
     if camera is not None:
-        anchor = stops[camera["anchor"]]
         errors = [
-            row["stops"] - (stops[row["name"]] - anchor)
+            row["stops"] - stops[row["name"]]
             for row in camera["images"]
             if row["split"] == "train" and row["name"] != camera["anchor"]
         ]

@@ -48,7 +48,7 @@ class CameraConfig:
             "channel between the values 0 and 1"
         ),
     ] = "known"
-    learning_rate: float = 0.02  #: Adam; of logs of gains and slopes, and of coefficients
+    learning_rate: float = 0.005  #: Adam; of logs of gains and slopes, and of coefficients
     smoothness: float = 1e-3  #: weight of differences along the response
 
     def __post_init__(self) -> None:

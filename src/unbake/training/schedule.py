@@ -5,6 +5,9 @@ from __future__ import annotations
 from ..config import FitConfig
 from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 
+#: Fraction of a fit over which the rates of what is unknown of cameras rise, as its square.
+_CAMERA_WAITS = 0.2
+
 
 def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float]:
     """Adam's rates, by the first word of a parameter's name; `radiance` is that of L_θ.
@@ -28,6 +31,7 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
         name: rate * (config.rate_factors[name] or 1.0) * decay * rise
         for name, rate in unknowns.items()
     }
-    # Nothing waits for L_θ here: exposures had better be ahead of materials.
-    rates |= dict.fromkeys(config.camera.unknowns, config.camera.learning_rate * decay)
+    # Exposures begin near where they belong: while albedo is not, they would only move away.
+    late = min(1.0, done / _CAMERA_WAITS) ** 2
+    rates |= dict.fromkeys(config.camera.unknowns, config.camera.learning_rate * decay * late)
     return rates | {"radiance": config.radiance_settings.learning_rate * decay}
