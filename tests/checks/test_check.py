@@ -165,6 +165,10 @@ def test_exposures_that_differ_are_measured(spoilt):
     train = [v.view.split == "train" for v in result.views]
     measured = result.exposures.stops[train]
     assert np.abs((measured - measured.mean()) - (stops - stops.mean())).max() < 0.15
+    # Those that the data set tells are taken into account.
+    for frame, stop in zip(data.frames, stops, strict=True):
+        frame["exposure"] = 2.0**stop
+    assert [f.check for f in found(data.save()) if f.level == "warning"] == []
 
 
 def test_clipped_black_blurred_and_double_photographs_are_told(spoilt):

@@ -200,7 +200,8 @@ def _checked(
     if outliers is not None and (told := told_outliers([outliers])):
         result.warn("outliers", told, None, "Remove them where they are no light that is seen")
     alpha = cleaned[:, 3] * counted if hidden else counted
-    small = small_view(view.name, camera, cleaned[:, :3], alpha)
+    light = cleaned[:, :3] if view.exposure == 1 else cleaned[:, :3] / np.float32(view.exposure)
+    small = small_view(view.name, camera, light, alpha)
     shape = (camera.height, camera.width)
     hit = np.isfinite(seen.distance)
     facts = picture_facts(

@@ -40,7 +40,9 @@ def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> li
         found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
         found += pose_warnings(scene, dataset.train, pixels.photographs, dataset.folder)
         quick = [] if found else quick_findings(scene, dataset.train, pixels.photographs)
-        found += map(str, quick)
+        # Exposures that are fitted may differ.
+        fitted = problem.camera is not None and "exposure.log" in problem.camera.parameters()
+        found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
         units = None if found else _other_units(pixels, problem)
     return [line for line in (*found, units, told_outliers(pixels.photographs.outliers)) if line]
 
