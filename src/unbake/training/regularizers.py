@@ -55,9 +55,9 @@ def regularization_terms(
         sampler: of as many lanes.
         photometric: the photometric loss of the batch.
     """
-    if not has_terms(problem, config):
-        return {}
     materials, r = problem.materials, config.regularization
+    if materials is None or not has_terms(problem, config):
+        return {}
     scene_view, everywhere = problem.scene_view.with_scene(scene), mi.Bool(True)
     vertex = find_vertex(scene_view, ray, everywhere, sampler, hide_emitters=problem.hide_emitters)
     valid = vertex.valid & scene_view.is_optimized(vertex.si.shape)
