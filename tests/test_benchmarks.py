@@ -118,6 +118,18 @@ def test_searches_of_rates_have_a_job_a_method(repository, benchmarks, tmp_path)
     assert run["BENCHMARKS"]["rates"].seconds["prb"] == search["settings"]["seconds"]
 
 
+@pytest.mark.slow
+def test_a_solved_scene_is_measured(repository, tmp_path):
+    small = ("--steps", 3, "--views", 1, "--resolution", 8, "--final-spp", 4, "--reference-spp", 4)
+    out = tmp_path / "out.json"
+    words = ("--scene", "furnace", "--work", tmp_path / "solved", "--out", out)
+    done = call(repository, "solve_demo.py", *words, *small)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "rhs: relMSE" in done.stdout and "cores busy" in done.stdout
+    last = read(out)["measurements"][-1]
+    assert (last["step"], last["spp"]) == (3, 4) and last["cpu_seconds"] > 0
+
+
 def test_a_plan_tells_what_is_left_and_what_is_left_out(repository, tmp_path):
     done = call(repository, "run.py", "long", "--plan", "--out", tmp_path)
     assert done.returncode == 0, done.stderr

@@ -15,7 +15,7 @@ from unbake.fields.radiance import make_radiance
 from unbake.fields.settings import GridConfig, NetworkConfig
 from unbake.imaging.pictures import read_exr
 from unbake.io import read_object
-from unbake.solver.pictures import relative_mse
+from unbake.solver.pictures import debiased_relative_mse, relative_mse
 from unbake.solver.points import SurfacePoints
 from unbake.solver.settings import SolveSettings
 from unbake.solver.solve import load_radiance, solve
@@ -26,8 +26,9 @@ SMALL = NetworkConfig(
     grid=GridConfig(levels=2, features=2, table_log2=10, base_resolution=2), width=16, hidden=1
 )
 SETTINGS = SolveSettings(
-    steps=400, batch=1024, samples=2, views=2, resolution=8, spp=64, reference_spp=8, radiance=SMALL
-)
+    steps=400, batch=1024, samples=2, views=2, resolution=8, spp=16, final_spp=64, reference_spp=8,
+    radiance=SMALL,
+)  # fmt: skip
 TRUTH = 2.0  # 1 / (1 - 0.5), the radiance in the furnace
 
 
@@ -52,6 +53,20 @@ def test_the_untrained_field_did_not_know_it(solved):
     first, *_, last = read_object(solved / "solve.json")["measurements"]
     assert (first["step"], last["step"]) == (0, SETTINGS.steps)
     assert first["relmse"]["lhs"] > 10 * last["relmse"]["lhs"]
+    assert first["cpu_seconds"] == 0 < last["cpu_seconds"]
+    assert (first["spp"], last["spp"]) == (SETTINGS.spp, SETTINGS.final_spp)
+
+
+def test_noise_of_the_reference_can_be_taken_out_of_an_error():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.5, 2, (64, 64, 3))
+    halves = [[truth + 0.05 * rng.standard_normal(truth.shape)] for _ in range(2)]
+    reference = [(halves[0][0] + halves[1][0]) / 2]
+    off = [truth + 0.03 * rng.choice([-1, 1], truth.shape)]
+    true = relative_mse(off, [truth])
+    assert debiased_relative_mse(off, halves) == pytest.approx(true, rel=0.1)
+    assert relative_mse(off, reference) > 2 * true
+    assert abs(debiased_relative_mse([truth], halves)) < 0.1 * true
 
 
 def test_what_is_written_is_told_and_can_be_read_again(solved):

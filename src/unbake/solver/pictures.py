@@ -30,22 +30,26 @@ def both_sides(
     scene_view: SceneView,
     radiance: RadianceField,
     cameras: Sequence[Camera],
-    settings: SolveSettings,
+    spp: int,
+    seed: int,
     *,
     hide_emitters: bool,
 ) -> dict[str, list[np.ndarray]]:
     """What cameras see of both sides: `lhs`, E + L_θ at x₁, and `rhs`, one bounce and L_θ at x₂.
+
+    Args:
+        spp: samples a pixel.
 
     Returns:
         Pictures of each camera, linear RGB, float32, (H, W, 3).
 
     Paper: Eq. 12, Eq. 13, Sec. 3.1.
     """
-    rays, spp = CameraRays.of(cameras), settings.spp
+    rays = CameraRays.of(cameras)
     images = {side: np.zeros((rays.pixels, 3), np.float32) for side in ("lhs", "rhs")}
     sampler = mi.load_dict({"type": "independent"})
-    for part, ray, seed in parts_of(rays.through, rays.pixels, spp, settings.seed ^ _PICTURES):
-        sampler.seed(dr.opaque(mi.UInt32, seed), dr.width(ray))
+    for part, ray, number in parts_of(rays.through, rays.pixels, spp, seed ^ _PICTURES):
+        sampler.seed(dr.opaque(mi.UInt32, number), dr.width(ray))
         with dr.suspend_grad():
             sample = trace(
                 scene_view, radiance, ray, sampler, _BOTH_SIDES, hide_emitters=hide_emitters
@@ -97,10 +101,27 @@ def relative_mse(images: Sequence[np.ndarray], reference: Sequence[np.ndarray]) 
         images: a, linear RGB, (H, W, 3) each.
         reference: b, the same.
     """
-    a, b = (
-        np.concatenate([x.ravel() for x in each]).astype(np.float64) for each in (images, reference)
-    )
+    a, b = _flat(images), _flat(reference)
     return float(np.mean((a - b) ** 2 / (b**2 + EPSILON)))
+
+
+def debiased_relative_mse(
+    images: Sequence[np.ndarray], halves: Sequence[Sequence[np.ndarray]]
+) -> float:
+    """RelMSE that the noise of the reference adds nothing to; it may be negative.
+
+    The square is the product of the differences from two independent references.
+
+    Args:
+        images: linear RGB, (H, W, 3) each.
+        halves: two references, the same; their mean is what errors are relative to.
+    """
+    a, b, c = _flat(images), *(_flat(half) for half in halves)
+    return float(np.mean((a - b) * (a - c) / (((b + c) / 2) ** 2 + EPSILON)))
+
+
+def _flat(images: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate([x.ravel() for x in images]).astype(np.float64)
 
 
 def _parted(pixels: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:

@@ -49,7 +49,13 @@ class SolveSettings:
     views: Annotated[int, Flag("Pictures. Cameras are placed automatically")] = 4
     #: Unless the camera file has its own.
     resolution: Annotated[int, Flag("Width and height of the pictures in pixels")] = 64
-    spp: Annotated[int, Flag("Samples per pixel of the pictures of both sides")] = 64
+    spp: Annotated[
+        int, Flag("Samples per pixel of both sides, where they are measured on the way")
+    ] = 64
+    #: With fewer, the right-hand side would be judged by the noise of its bounces.
+    final_spp: Annotated[
+        int, Flag("Samples per pixel of the pictures of both sides, in the end")
+    ] = 1024
     reference_spp: Annotated[
         int, Flag("Samples per pixel of the path traced reference, an even number; 0: none")
     ] = 256
@@ -73,7 +79,7 @@ class SolveSettings:
                 "seed": (0, (1 << 31) - 1),
                 "views": (1, 10_000),
                 "resolution": (2, 16_384),
-                "spp": (1, MOST_SAMPLES),
+                **dict.fromkeys(("spp", "final_spp"), (1, MOST_SAMPLES)),
                 "reference_spp": (0, MOST_SAMPLES),
                 "max_depth": (1, DEEPEST),
                 "rr_depth": (1, DEEPEST),

@@ -43,7 +43,7 @@ from ..training.monitor import Monitor
 from ..transport.operator import attach_albedo, bounce, transported
 from ..transport.vertex import SceneView, find_vertex
 from ..version import VERSION
-from .pictures import both_sides, path_traced_halves, relative_mse
+from .pictures import both_sides, debiased_relative_mse, path_traced_halves, relative_mse
 from .points import SurfacePoints
 from .settings import SolveSettings
 from .step import SolverStep
@@ -61,13 +61,18 @@ _LIT_POINTS = 1 << 15
 _DEFINITIONS = {
     "relmse": "mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of all pictures; "
     "a: lhs or rhs, b: the path traced reference",
+    "relmse_debiased": "the same without the noise of the reference: (a - b) (a - c) in the place "
+    "of the square, b and c independent halves of the reference; the noise of a is in it",
+    "spp": "samples per pixel of a",
     "lhs": "E + L_theta at the first surface that is not specular",
     "rhs": "one bounce, and L_theta at its end",
     "reference_noise": "expected relMSE of the reference against itself without noise, from two "
-    "independent halves of its samples; every relMSE has it in it",
+    "independent halves of its samples; every relmse has it in it",
     "residual": "mean of (L_theta - T)^2 / (L_theta^2 + epsilon), T a mean of M samples; it keeps "
     "their variance",
     "seconds": "of training, without measurements and without the reference",
+    "cpu_seconds": "the same of all cores that were at work for it; on a machine that does nothing "
+    "else, at most the seconds times its cores",
 }
 
 
@@ -223,6 +228,7 @@ class _Run:
     manifest: dict[str, Any]
     tell: Callable[[str], None]
     pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    halves: list[list[np.ndarray]] = field(default_factory=list)  #: of the reference
 
     def make_reference(self) -> None:
         """Path trace the reference, if it is wanted."""
@@ -234,6 +240,7 @@ class _Run:
         halves = path_traced_halves(
             known.scene_view.scene, cameras, self.settings, room=known.room, tell=self.tell
         )
+        self.halves = [list(half) for half in halves]
         pairs = list(zip(*halves, strict=True))
         reference = [(a + b) / 2 for a, b in pairs]
         self.pictures["reference"] = reference
@@ -248,16 +255,16 @@ class _Run:
         optimizer = mi.ad.Adam(rate, self.radiance.parameters(), mask_updates=True)
         step = SolverStep(self.known.scene_view, self.radiance, self.points, settings)
         total = settings.seconds or settings.steps
-        number, seconds, skipped, due = 0, 0.0, 0, list(MEASURED)
+        number, seconds, cpu, skipped, due = 0, 0.0, 0.0, 0, list(MEASURED)
         recent: list[dict[str, mi.Float]] = []
 
         def done() -> float:
             return (seconds if settings.seconds else number) / total
 
         with deferred() as stop, Monitor(self.out / LOG, console, total) as monitor:
-            self._measure(optimizer, 0, 0.0, 0, monitor.say)
+            self._measure(optimizer, _entry(0, 0.0, 0.0, 0, settings.spp), monitor.say)
             due.pop(0)
-            clock = time.perf_counter()
+            clock, cpu_clock = time.perf_counter(), time.process_time()
             while done() < 1 and not stop:
                 now = rate * settings.final_learning_rate ** min(done(), 1.0)
                 recent.append(step(optimizer, number, now))
@@ -266,7 +273,7 @@ class _Run:
                 if not (last or number % _TIMED == 0):
                     continue
                 dr.sync_thread()
-                seconds = time.perf_counter() - clock
+                seconds, cpu = time.perf_counter() - clock, time.process_time() - cpu_clock
                 last = last or done() >= 1
                 reached = done() >= due[0]
                 if not (last or reached or len(recent) >= _READ):
@@ -276,8 +283,10 @@ class _Run:
                 if last or reached:
                     while len(due) > 1 and done() >= due[0]:
                         due.pop(0)
-                    self._measure(optimizer, number, seconds, skipped, monitor.say)
-                    clock = time.perf_counter() - seconds
+                    spp = settings.final_spp if last else settings.spp
+                    entry = _entry(number, seconds, cpu, skipped, spp)
+                    self._measure(optimizer, entry, monitor.say)
+                    clock, cpu_clock = time.perf_counter() - seconds, time.process_time() - cpu
             for failure in monitor.failures:
                 raise failure
         self.manifest["finished"] = not stop
@@ -293,28 +302,33 @@ class _Run:
     def _measure(
         self,
         optimizer: mi.ad.Adam,
-        number: int,
-        seconds: float,
-        skipped: int,
+        entry: dict[str, Any],
         say: Callable[[str], None],
     ) -> None:
-        """Measure both sides now, tell it, and write it with the field."""
+        """Measure both sides now, tell it, and write it with the field.
+
+        Args:
+            entry: when this is; it gets what is measured.
+        """
         self.radiance.assign(dict(optimizer.items()))
         cameras = list(self.known.cameras.values())
         sides = both_sides(
             self.known.scene_view,
             self.radiance,
             cameras,
-            self.settings,
+            entry["spp"],
+            self.settings.seed,
             hide_emitters=not self.known.room,
         )
-        entry: dict[str, Any] = {"step": number, "seconds": round(seconds, 3), "skipped": skipped}
         reference = self.pictures.get("reference")
         if reference is not None:
             found = {side: relative_mse(images, reference) for side, images in sides.items()}
             entry["relmse"] = found
+            entry["relmse_debiased"] = {
+                side: debiased_relative_mse(images, self.halves) for side, images in sides.items()
+            }
             told = ", ".join(f"{side.upper()} {value:.4f}" for side, value in found.items())
-            say(f"step {number}, {seconds:.0f} s: relMSE of {told}")
+            say(f"step {entry['step']}, {entry['seconds']:.0f} s: relMSE of {told}")
         self.manifest["measurements"].append(entry)
         self.pictures |= sides
         self._write()
@@ -323,6 +337,12 @@ class _Run:
         arrays = {key: _numpy(value) for key, value in self.radiance.parameters().items()}
         write_atomically(self.out / FIELD, lambda path: save_file(arrays, os.fspath(path)))
         write_json(self.out / MANIFEST, self.manifest, allow_nan=False)
+
+
+def _entry(number: int, seconds: float, cpu: float, skipped: int, spp: int) -> dict[str, Any]:
+    """The beginning of a measurement in `solve.json`."""
+    times = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu, 3)}
+    return {"step": number, **times, "skipped": skipped, "spp": spp}
 
 
 def _record(
