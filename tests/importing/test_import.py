@@ -34,6 +34,7 @@ from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.settings import ImportSettings
 from unbake.scene.edit import material_names
+from unbake.scene.free_space import trace
 from unbake.scene.parse import parse
 
 
@@ -188,6 +189,28 @@ def test_masked_pixels_are_neither_drawn_nor_scored(captured, nerfstudio, meshes
     train = [mask for view, mask in zip(found.views, kept, strict=True) if view.split == "train"]
     assert np.array_equal(photographs.chosen, np.flatnonzero(np.concatenate(train)))
     assert photographs.mean == pytest.approx(photographs.table[photographs.chosen, :3].mean())
+
+
+def test_a_hidden_background_leaves_the_pixels_of_the_mesh(captured, nerfstudio, meshes, tmp_path):
+    boxes = [mesh for mesh in meshes if mesh.stem in ("short", "tall")]
+    save(np.zeros((16, 16), np.uint8), nerfstudio / "masks" / "0.png")
+    change(nerfstudio, set_frame("mask_path", "masks/0.png"))
+    settings = ImportSettings(background="hidden")
+    import_data(nerfstudio, tmp_path / "data", boxes, settings, tell=quiet)
+    found = Dataset.load(tmp_path / "data")
+    assert found.background == "hidden"
+    scene = parse(found.scene).instantiate()
+    for number, view in enumerate(found.views):
+        y, x = np.divmod(np.arange(256), 16)
+        origins, directions = view.camera.rays(x + 0.5, y + 0.5)
+        seen = np.isfinite(trace(scene, origins, directions).distance).reshape(16, 16)
+        counted = read_photograph(view)[..., 3] > 0
+        assert not (counted & ~seen).any() and 0 < seen.mean() < 1
+        # Pixels of an edge see both, and the second frame is masked as a whole
+        inner = seen.copy()
+        for axis in (0, 1):
+            inner &= np.roll(seen, 1, axis) & np.roll(seen, -1, axis)
+        assert not counted.any() if number == 1 else (counted.sum() >= 0.8 * inner.sum() > 0)
 
 
 def with_exif(folder, captured, tags):

@@ -92,16 +92,20 @@ def import_data(
     splits = _splits(found.shots, settings.holdout)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
-        scene, seen = _write_scene(data, parts, light, allow_outside, found.shots, tell)
+        file, scene = _write_scene(data, parts, light, allow_outside, tell)
+        seen = _shares_seen(scene, found.shots)
         background = settings.background
         if background == "auto":
-            background = _background(found.shots)
-        frames = [
-            _write_view(data, shot, names[shot.name], splits[shot.name], known)
-            for shot in found.shots
-        ]
+            background = "hidden" if all(map(_has_alpha, found.shots)) else "visible"
+        frames = []
+        for shot in found.shots:
+            cut = background == "hidden" and not _has_alpha(shot)
+            on_mesh = _on_mesh(scene, shot.lens.camera(shot.to_world)) if cut else None
+            frames.append(
+                _write_view(data, shot, names[shot.name], splits[shot.name], known, on_mesh)
+            )
         data.write_transforms(
-            {"scene": data.relative(scene), "background": background}
+            {"scene": data.relative(file), "background": background}
             | _clipped(found.shots)
             | {"frames": frames}
         )
@@ -224,10 +228,9 @@ def _write_scene(
     parts: Sequence[Part],
     light: LightConfig | None,
     allow_outside: bool,
-    shots: Sequence[Shot],
     tell: Callable[[str], None],
-) -> tuple[Path, np.ndarray]:
-    """Write the scene; returns its file, and the share of each view's pixels that see the mesh."""
+) -> tuple[Path, mi.Scene]:
+    """Write the scene; returns its file, and what Mitsuba makes of it."""
     file = write_scene(parts, data.scene, environment=light is None)
     if light is not None:
         parsed = parse(file)
@@ -238,8 +241,14 @@ def _write_scene(
             for line in relight.put_lights(parsed, light.lights, root):
                 tell(line)
         file = write(parsed, data.scene.resolve())
-    scene = parse(file).instantiate()
-    seen = np.array([_share_seen(scene, shot.lens.camera(shot.to_world)) for shot in shots])
+    return file, parse(file).instantiate()
+
+
+def _shares_seen(scene: mi.Scene, shots: Sequence[Shot]) -> np.ndarray:
+    """The share of each photograph's pixels that see the mesh."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*[(np.arange(_RAYS) + 0.5) / _RAYS] * 2))
+    cameras = [shot.lens.camera(shot.to_world) for shot in shots]
+    seen = np.array([_hits(scene, c, x * c.width, y * c.height).mean() for c in cameras])
     if not seen.any():
         raise UserError(
             "no photograph sees the mesh",
@@ -247,19 +256,34 @@ def _write_scene(
             "Mesh and cameras must be in one frame and unit; --keep-applied-transform leaves "
             "nerfstudio's cameras in the frame of their file",
         )
-    return file, seen
+    return seen
 
 
-def _share_seen(scene: mi.Scene, camera: Camera) -> float:
-    x, y = (axis.ravel() for axis in np.meshgrid(*[(np.arange(_RAYS) + 0.5) / _RAYS] * 2))
-    origins, directions = camera.rays(x * camera.width, y * camera.height)
-    return float(np.isfinite(free_space.trace(scene, origins, directions).distance).mean())
+def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:
+    """Which pixels see nothing but the mesh, by their four corners: (H, W) bool."""
+    x, y = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
+    hit = _hits(scene, camera, x.ravel(), y.ravel()).reshape(x.shape)
+    return hit[:-1, :-1] & hit[:-1, 1:] & hit[1:, :-1] & hit[1:, 1:]
+
+
+def _hits(scene: mi.Scene, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Whether rays through places (n,) of a picture hit something."""
+    return np.isfinite(free_space.trace(scene, *camera.rays(x, y)).distance)
 
 
 def _write_view(
-    data: DataFolder, shot: Shot, name: str, split: str, exposures: Mapping[str, float]
+    data: DataFolder,
+    shot: Shot,
+    name: str,
+    split: str,
+    exposures: Mapping[str, float],
+    on_mesh: np.ndarray | None,
 ) -> dict[str, Any]:
-    """Write the photograph and the mask of a view; returns its frame."""
+    """Write the photograph and the mask of a view; returns its frame.
+
+    Args:
+        on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
+    """
     camera = shot.lens.camera(shot.to_world)
     if shot.lens.straight:
         image = data.image(name, shot.image.suffix.lower())
@@ -284,13 +308,17 @@ def _write_view(
         frame["encoding"] = "srgb"
     if shot.name in exposures:
         frame["exposure"] = exposures[shot.name]
+    counted = on_mesh
     if shot.mask is not None:
-        counted = _mask(shot)[..., None].astype(np.float32)
+        mask = _mask(shot)
         if not shot.lens.straight:
-            counted = shot.lens.straightened(counted, camera.fl_x)
-        mask = data.mask(name)
-        _write_codes(mask, np.where(counted >= 1, 255, 0).astype(np.uint8))
-        frame["mask_path"] = data.relative(mask)
+            straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
+            mask = straight[..., 0] >= 1
+        counted = mask if on_mesh is None else mask & on_mesh
+    if counted is not None:
+        file = data.mask(name)
+        _write_codes(file, np.where(counted, 255, 0).astype(np.uint8)[..., None])
+        frame["mask_path"] = data.relative(file)
     return frame
 
 
@@ -312,9 +340,8 @@ def _write_codes(file: Path, codes: np.ndarray) -> None:
     write_atomically(file, lambda p: bitmap.write(str(p), mi.Bitmap.FileFormat.PNG))
 
 
-def _background(shots: Sequence[Shot]) -> str:
-    """Hidden where every photograph has alpha, as pictures of objects rendered by themselves."""
-    return "hidden" if all(image_header(s.image).channels in (2, 4) for s in shots) else "visible"
+def _has_alpha(shot: Shot) -> bool:
+    return image_header(shot.image).channels in (2, 4)
 
 
 def _clipped(shots: Sequence[Shot]) -> dict[str, float]:

@@ -26,7 +26,8 @@ class ImportSettings:
         Literal["auto", "visible", "hidden"],
         Flag(
             "What photographs show behind the mesh: visible, the environment, which lights it; "
-            "hidden, nothing of it, where alpha is 0; auto, hidden if all photographs have alpha"
+            "hidden, what is left out, by alpha or, without alpha, where the mesh is not seen; "
+            "auto, hidden if all photographs have alpha"
         ),
     ] = "auto"
     keep_applied_transform: Annotated[
