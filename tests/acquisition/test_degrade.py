@@ -1,15 +1,16 @@
 """What cameras do to photographs is done as told, the same for the same seed, with its truth."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
-from unbake.acquisition.degrade import degrade, displacement, response
+from unbake.acquisition.degrade import _encoded, degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings
-from unbake.dataset.views import Dataset
+from unbake.dataset.views import Dataset, read_masked
 from unbake.errors import UserError
-from unbake.imaging.pictures import read_exr
+from unbake.imaging.pictures import read_exr, write_exr
 from unbake.io import read_json
 
 
@@ -148,6 +149,38 @@ def test_the_command_says_where_it_wrote(cornell, unbake, tmp_path):
     again = unbake("degrade", cornell, "--out", out)
     assert again.status == 2 and "the folder is not empty" in again.err
     assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize(("kind", "error"), [("png", 0.51), ("jpeg", 20)])
+def test_photographs_of_8_bits_are_read_as_they_were(kind, error, degraded):
+    coded, truth = degraded(format=kind, exposure=1.0)
+    plain, _ = degraded(clip=0.01, exposure=1.0)
+    assert {view.encoding for view in coded.views} == {"srgb"}
+    assert truth["gain"] != 1
+    for one, other in zip(coded.views, plain.views, strict=True):
+        assert one.image.suffix == (".png" if kind == "png" else ".jpg")
+        assert (one.clipped, one.exposure) == (1, other.exposure)
+        read, linear = (read_masked(view)[0][..., :3] for view in (one, other))
+        codes = [255 * _encoded(np.asarray(x, np.float64)) for x in (read, linear)]
+        assert np.abs(codes[0] - codes[1]).max() < error
+
+
+def test_a_jpeg_has_a_mask_where_the_background_is_hidden(cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    (data / "transforms.json").write_text(json.dumps(content | {"background": "hidden"}))
+    file = data / "images" / "train_000.exr"
+    pixels = read_exr(file)
+    pixels[:4] = 0
+    write_exr(file, pixels)
+    out = tmp_path / "out"
+    dataset = degrade(data, out, DegradeSettings(format="jpeg"), tell=lambda line: None)
+    counted = read_masked(next(v for v in dataset.views if v.name == "train_000"))[1]
+    assert not counted[:4].any() and np.array_equal(counted[4:], pixels[4:, :, 3] > 0)
+    dataset = degrade(data, tmp_path / "png", DegradeSettings(format="png"), tell=lambda line: None)
+    assert all(view.mask is None for view in dataset.views)
+    read = read_masked(next(v for v in dataset.views if v.name == "train_000"))[0]
+    assert (read[:4] == 0).all()
 
 
 def test_read_noise_needs_electrons():

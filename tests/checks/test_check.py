@@ -51,7 +51,8 @@ def test_three_faults_are_told_in_one_go(spoilt, unbake):
     text = " ".join(outcome.out.split())
     assert "train_002.exr: the image has 30 x 40 pixels, its frame says 40 x 40" in text
     assert "Correct 'w' and 'h'" in text
-    assert "masks/train_004.png: the image does not exist" in text
+    assert "masks/train_004.png: the mask does not exist. Add it, or remove 'mask_path'" in text
+    assert "truth/" not in text
     assert "poses seem to be in OpenCV's axes" in text
     assert "Negate columns 2 and 3 of the matrix" in text
     assert "3 errors; a fit makes no sense yet" in text

@@ -366,7 +366,7 @@ def test_the_fingerprint_knows_masks(folder):
         ({"encoding": "gamma"}, "unknown encoding 'gamma'"),
         ({"encoding": 3}, "unknown encoding 3"),
         ({"file_path": "images/train_001.exr"}, "the image holds no code values: it is .exr"),
-        ({"mask_path": "none.png"}, "none.png: the image does not exist"),
+        ({"mask_path": "none.png"}, "none.png: the mask does not exist"),
         ({"mask_path": "images/train_001.exr"}, "holds no code values"),
         ({"mask_path": "../a.png"}, "'../a.png' lies outside"),
         ({"mask_path": 1}, "'mask_path' is not a text"),

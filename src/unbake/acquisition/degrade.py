@@ -26,8 +26,8 @@ from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
 from ..dataset.views import Dataset, View, read_masked
-from ..imaging.pictures import write_exr
-from ..io import filled_folder, require_new_folder, write_json
+from ..imaging.pictures import to_bytes, write_exr, write_png
+from ..io import filled_folder, require_new_folder, write_atomically, write_json
 from ..scene import free_space
 from ..scene.parse import ParsedScene, parse, write
 from .settings import DegradeSettings
@@ -87,6 +87,8 @@ def degrade(
     gain = _gain(dataset, settings)
     cameras = _moved(scene, dataset.views, settings)
     truths = _camera_truths(dataset.views, gain, settings)
+    lost = settings.format == "jpeg" and dataset.background == "hidden"
+    masked = lost or any(view.mask is not None for view in dataset.views)
     with filled_folder(out) as partial:
         folder = DataFolder(partial)
         folder.scene.mkdir()
@@ -94,11 +96,16 @@ def degrade(
         path = write(parsed, folder.scene)
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
             pixels = _photograph(view, number, truth, settings)
-            write_exr(folder.image(view.name), pixels)
-            _copy_files(view, DataFolder(dataset.folder), folder)
+            _write_photograph(_image(folder, view, settings), pixels, dataset.background, settings)
+            _copy_truth(view, folder)
+            _write_mask(view, pixels, folder, masked)
         _copy_lighting(DataFolder(dataset.folder, allow_outside), folder)
         content = DataFolder(dataset.folder, allow_outside).read_transforms()
-        _write_transforms(folder, content, path, dataset, cameras, truths, gain, settings)
+        files = {view.name: _image(folder, view, settings) for view in dataset.views}
+        masks = {view.name: _mask(folder, view) for view in dataset.views if masked}
+        _write_transforms(
+            folder, content, path, dataset, cameras, truths, gain, settings, files, masks
+        )
         write_json(
             folder.degraded_file,
             _truth(dataset, truths, gain, settings, displaced, diagonal),
@@ -157,7 +164,7 @@ def _gain(dataset: Dataset, settings: DegradeSettings) -> float:
     for view in dataset.train:
         pixels = read_masked(view)[0].reshape(-1, 4)
         kept = pixels[pixels[:, 3] > 0] if hidden else pixels
-        brightest.append(kept[:, :3].max(axis=1))
+        brightest.append(kept[:, :3].max(axis=1) / view.exposure)
     white = float(np.quantile(np.concatenate(brightest), 1 - settings.white))
     return 1 / white if white > 0 else 1.0
 
@@ -182,7 +189,8 @@ def _photograph(
     """The degraded photograph, (height, width, 4)."""
     camera = view.camera
     pixels, _ = read_masked(view)
-    rgb = pixels[..., :3].astype(np.float64) * truth.exposure * np.array(truth.white_balance)
+    rgb = pixels[..., :3].astype(np.float64) / view.exposure
+    rgb *= truth.exposure * np.array(truth.white_balance)
     rgb *= vignetting(camera, settings.vignetting)[..., None]
     if settings.electrons:
         rng = _random(settings, _NOISE, number)
@@ -194,6 +202,31 @@ def _photograph(
     if settings.white is not None:
         rgb = response(np.minimum(rgb, 1), settings.response)
     return np.dstack([rgb, pixels[..., 3]])
+
+
+def _image(folder: DataFolder, view: View, settings: DegradeSettings) -> Path:
+    suffix = {"exr": ".exr", "png": ".png", "jpeg": ".jpg"}[settings.format]
+    return folder.image(view.name).with_suffix(suffix)
+
+
+def _mask(folder: DataFolder, view: View) -> Path:
+    return folder.path / "masks" / f"{view.name}.png"
+
+
+def _write_photograph(
+    file: Path, pixels: np.ndarray, background: str, settings: DegradeSettings
+) -> None:
+    """Write decoded values as they are, or as 8-bit code values; JPEG files hold no alpha."""
+    if settings.format == "exr":
+        write_exr(file, pixels)
+        return
+    codes = to_bytes(_encoded(pixels[..., :3]))
+    if settings.format == "png":
+        alpha = to_bytes(pixels[..., 3:])
+        write_png(file, np.dstack([codes, alpha]) if background == "hidden" else codes)
+        return
+    bitmap, jpeg = mi.Bitmap(np.ascontiguousarray(codes)), mi.Bitmap.FileFormat.JPEG
+    write_atomically(file, lambda p: bitmap.write(str(p), jpeg, settings.quality))
 
 
 # --------------------------------------------------------------------------------- poses and meshes
@@ -294,12 +327,15 @@ def displacement(positions: np.ndarray, settings: DegradeSettings, diagonal: flo
 # -------------------------------------------------------------------------------------------- files
 
 
-def _copy_files(view: View, source: DataFolder, folder: DataFolder) -> None:
-    """Copy the true pictures of a view, and its mask."""
-    if view.mask is not None:
-        target = folder.path / source.relative(view.mask)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(view.mask, target)
+def _write_mask(view: View, pixels: np.ndarray, folder: DataFolder, masked: bool) -> None:
+    """Write what pixels of a view count, where not all do."""
+    if masked:
+        counted = read_masked(view)[1]
+        counted = np.ones(pixels.shape[:2], bool) if counted is None else counted
+        write_png(_mask(folder, view), to_bytes(counted & (pixels[..., 3] > 0)))
+
+
+def _copy_truth(view: View, folder: DataFolder) -> None:
     for quantity, file in view.truth.items():
         target = folder.truth(quantity, view.name)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -326,20 +362,28 @@ def _write_transforms(
     truths: list[CameraTruth],
     gain: float,
     settings: DegradeSettings,
+    files: dict[str, Path],
+    masks: dict[str, Path],
 ) -> None:
     """The frames with other poses, and with what a camera tells of its exposures."""
     frames = []
     for frame, view, camera, truth in zip(
         content["frames"], dataset.views, cameras, truths, strict=True
     ):
-        new = {key: value for key, value in frame.items() if key != "encoding"}
-        new["file_path"] = folder.relative(folder.image(view.name))
+        replaced = ("encoding", "exposure", "clipped", "mask_path")
+        new = {key: value for key, value in frame.items() if key not in replaced}
+        new["file_path"] = folder.relative(files[view.name])
+        if view.name in masks:
+            new["mask_path"] = folder.relative(masks[view.name])
         new["transform_matrix"] = camera.to_world.tolist()
         exposure = truth.exposure if settings.tell_exposures else gain
         if exposure != 1:
             new["exposure"] = exposure
         frames.append(new)
-    content.pop("encoding", None)
+    for key in ("encoding", "clipped"):
+        content.pop(key, None)
+    if settings.format != "exr":
+        content["encoding"] = "srgb"
     content |= {"scene": folder.relative(scene), "frames": frames}
     if settings.white is not None:
         content["clipped"] = 1.0

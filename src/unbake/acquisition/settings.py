@@ -58,6 +58,8 @@ class CaptureSettings:
 
 #: Names of responses; see `acquisition/degrade.py`.
 Response = Literal["srgb", "gamma", "contrast"]
+#: Formats of degraded photographs.
+Format = Literal["exr", "png", "jpeg"]
 
 
 @dataclass(frozen=True)
@@ -86,13 +88,13 @@ class DegradeSettings:
     electrons: Annotated[
         float, Flag("Electrons that white counts, which makes shot noise; 0: none")
     ] = 0.0
-    read_noise: Annotated[float, Flag("Read noise in electrons, for --electrons")] = 0.0
+    read_noise: Annotated[float, Flag("Read noise in electrons; it needs a number at white")] = 0.0
     clip: Annotated[
         float | None,
         Flag(
             "Share of the pixels of an exposure without jitter that is brighter than white and "
-            "clipped (default: 0.01 where a response or noise needs a white, else nothing is "
-            "clipped)",
+            "clipped (default: 0.01 where a response, noise or 8 bits need a white, else nothing "
+            "is clipped)",
             metavar="NUMBER",
             tell_default=False,
         ),
@@ -101,6 +103,13 @@ class DegradeSettings:
     displace: Annotated[
         float, Flag("Meshes are off by so much, as a share of the scene's diagonal")
     ] = 0.0
+    format: Annotated[
+        Format,
+        Flag(
+            "Format of the photographs: exr, or 8-bit code values of the sRGB curve as png or jpeg"
+        ),
+    ] = "exr"
+    quality: Annotated[int, Flag("Quality of JPEG files, from 1 to 100")] = 92
     tell_exposures: Annotated[
         bool, Flag("Write the true exposures to the frames, as EXIF would tell them")
     ] = False
@@ -118,15 +127,19 @@ class DegradeSettings:
                 "clip": (0, 0.9),
                 "pose_jitter": (0, 100),
                 "displace": (0, 0.1),
+                "quality": (1, 100),
                 "seed": (0, (1 << 31) - 1),
             },
         )
         if self.read_noise and not self.electrons:
-            raise UserError("needs electrons", "read_noise", "Give --electrons, such as 10000")
+            raise UserError(
+                "needs electrons", "read_noise", "Give electrons at white, such as 10000"
+            )
 
     @property
     def white(self) -> float | None:
         """Share of the pixels that is clipped; None where there is no white."""
-        if self.clip is None and (self.electrons or self.response != "srgb"):
+        ends = self.electrons or self.response != "srgb" or self.format != "exr"
+        if self.clip is None and ends:
             return 0.01
         return self.clip

@@ -36,8 +36,9 @@ from ..scene import edit, free_space
 from ..scene.parse import parse
 from .pictures import PictureFacts, blurred, picture_facts
 
-#: Share of the pixels of surfaces that may be clipped, of one view and of all.
-_CLIPPED, _CLIPPED_IN_ALL = 0.05, 0.01
+#: Share of the pixels of surfaces that may be clipped, of one view and of all; and of one view
+#: where it is told from which value on they are.
+_CLIPPED, _CLIPPED_IN_ALL, _CLIPPED_AND_TOLD = 0.05, 0.01, 0.25
 #: The same of black pixels.
 _BLACK, _BLACK_IN_ALL = 0.6, 0.3
 #: Share of the surface that no view sees, above which it is told.
@@ -208,7 +209,7 @@ def _checked(
         pixels[:, :3].reshape(*shape, 3),
         _enlarged((hit & ~seen.emits).reshape(small.alpha.shape), shape),
         counted.reshape(shape),
-        None,
+        view.clipped,
     )
     wanted = (small.alpha > 0.5).ravel()
     share = float(hit[wanted].mean()) if wanted.any() else 0.0
@@ -307,7 +308,7 @@ def _check_pictures(result: DataCheck) -> None:
     _share(
         result,
         "clipped",
-        [v.facts.clipped for v in views],
+        [_untold(v) for v in views],
         (_CLIPPED, _CLIPPED_IN_ALL),
         "of the pixels of surfaces are clipped: their light is not known",
         "Expose less, or say from which value on pixels are clipped ('clipped')",
@@ -325,6 +326,12 @@ def _check_pictures(result: DataCheck) -> None:
         remedy = "Leave them out: blur would be fitted as smoother materials"
         what = "much less sharp than the other views"
         result.warn("blur", what, named([views[i].view.name for i in soft]), remedy)
+
+
+def _untold(view: CheckedView) -> float:
+    """The clipped share of a view; 0 where it is told from which value on, and it is not much."""
+    told = view.view.clipped is not None
+    return 0.0 if told and view.facts.clipped < _CLIPPED_AND_TOLD else view.facts.clipped
 
 
 def _share(

@@ -52,7 +52,10 @@ def picture_facts(
     clipped = black = 0.0
     if len(shown):
         top = float(rgb[counted].max()) if limit is None else limit
-        clipped = float((shown >= top).any(axis=1).mean()) if top > 0 else 0.0
+        full = (shown >= top).any(axis=1)
+        # One pixel is the brightest of any picture.
+        if top > 0 and (limit is not None or full.sum() > 1):
+            clipped = float(full.mean())
         black = float((shown <= 0).all(axis=1).mean())
     digest = hashlib.sha256(rgb.astype(np.float32).tobytes()).hexdigest()
     return PictureFacts(clipped, black, _detail(rgb, counted), digest)

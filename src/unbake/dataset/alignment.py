@@ -148,7 +148,9 @@ def photograph_edges(view: SmallView) -> np.ndarray:
     return _blurred(np.minimum(slope / top, 1)) if top > 1e-9 else np.zeros_like(slope)
 
 
-def geometry_edges(camera: Camera, distance: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def geometry_edges(
+    camera: Camera, distance: np.ndarray, normal: np.ndarray, *, blurred: bool = True
+) -> np.ndarray:
     """Edges of what is seen: jumps and folds of depth, creases of normals; (height, width).
 
     On a plane the inverse of depth is a linear function of the pixel, so that its second
@@ -158,6 +160,7 @@ def geometry_edges(camera: Camera, distance: np.ndarray, normal: np.ndarray) -> 
         camera: of the picture.
         distance: along the rays through the pixels, (pixels,), infinite where nothing is seen.
         normal: (pixels, 3), zero there.
+        blurred: over 3 x 3 pixels, to be compared with those of photographs.
     """
     shape = (camera.height, camera.width)
     _, directions = pixel_rays([camera])
@@ -174,7 +177,7 @@ def geometry_edges(camera: Camera, distance: np.ndarray, normal: np.ndarray) -> 
         jump = middle / np.maximum(_JUMP * largest, 1e-30)
         crease = np.linalg.norm(along[2:] - along[:-2], axis=-1) / _CREASE
         out[1:-1] = np.maximum(out[1:-1], np.minimum(np.maximum(jump, crease), 1))
-    return _blurred(strength)
+    return _blurred(strength) if blurred else strength
 
 
 def _blurred(picture: np.ndarray) -> np.ndarray:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
@@ -365,16 +366,25 @@ def _read_views(
 
 def _file_faults(view: View) -> list[UserError]:
     """What is wrong with the files of a view, without reading their pixels."""
-    found = []
-    files = [(view.image, view.encoding), *((image, "linear") for image in view.truth.values())]
-    if view.mask is not None:
-        files.append((view.mask, "srgb"))
-    for image, encoding in files:
+    size = view.camera.width, view.camera.height
+
+    def fault(check: Callable[[], None]) -> list[UserError]:
         try:
-            _check_header(image, view.camera.width, view.camera.height, encoding)
+            check()
         except UserError as error:
-            found.append(error)
-    return found
+            return [error]
+        return []
+
+    def check_mask() -> None:
+        if view.mask is not None:
+            require_file(view.mask, "mask", "Add it, or remove 'mask_path' from the frame")
+            _check_header(view.mask, *size, "srgb")
+
+    found = fault(lambda: _check_header(view.image, *size, view.encoding))
+    # True pictures have the size of the image: if that is wrong, it is told once.
+    for image in () if found else view.truth.values():
+        found += fault(partial(_check_header, image, *size))
+    return found + fault(check_mask)
 
 
 def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:

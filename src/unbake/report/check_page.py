@@ -49,7 +49,7 @@ def write_check(result: DataCheck, out: str | Path, *, clip_negative: bool = Fal
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     page = template.render(
         result=result,
-        name=result.folder.resolve().name,
+        name=result.folder.absolute().name,
         rows=told_rows(result),
         overlays=_overlays(result, clip_negative),
         exposures=_histogram(result),
@@ -111,7 +111,7 @@ def _overlay(
 def _drawn(scene: mi.Scene, camera: Camera, picture: np.ndarray) -> str:
     """A darkened picture with the edges that a camera sees."""
     (seen,) = seen_by(scene, [camera])
-    edges = geometry_edges(camera, seen.distance, seen.normal)
+    edges = geometry_edges(camera, seen.distance, seen.normal, blurred=False)
     strength = np.clip((edges - _EDGE) / _EDGE, 0, 1)[..., None]
     mixed = (1 - strength) * 0.75 * picture + strength * np.array(_COLOUR)
     return pictures.png_data_uri(np.round(mixed).astype(np.uint8))
