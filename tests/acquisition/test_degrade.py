@@ -151,7 +151,7 @@ def test_the_command_says_where_it_wrote(cornell, unbake, tmp_path):
     assert list(tmp_path.iterdir()) == [out]
 
 
-@pytest.mark.parametrize(("kind", "error"), [("png", 0.51), ("jpeg", 20)])
+@pytest.mark.parametrize(("kind", "error"), [("png", 0.3), ("jpeg", 6)])
 def test_photographs_of_8_bits_are_read_as_they_were(kind, error, degraded):
     coded, truth = degraded(format=kind, exposure=1.0)
     plain, _ = degraded(clip=0.01, exposure=1.0)
@@ -159,10 +159,11 @@ def test_photographs_of_8_bits_are_read_as_they_were(kind, error, degraded):
     assert truth["gain"] != 1
     for one, other in zip(coded.views, plain.views, strict=True):
         assert one.image.suffix == (".png" if kind == "png" else ".jpg")
-        assert (one.clipped, one.exposure) == (1, other.exposure)
+        assert one.exposure == other.exposure
+        assert one.clipped == 1 if kind == "png" else 0.95 < one.clipped < 1
         read, linear = (read_masked(view)[0][..., :3] for view in (one, other))
         codes = [255 * _encoded(np.asarray(x, np.float64)) for x in (read, linear)]
-        assert np.abs(codes[0] - codes[1]).max() < error
+        assert np.abs(codes[0] - codes[1]).mean() < error
 
 
 def test_a_jpeg_has_a_mask_where_the_background_is_hidden(cornell, tmp_path):

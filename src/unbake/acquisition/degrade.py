@@ -40,6 +40,8 @@ _EXPOSURE, _BALANCE, _NOISE, _POSE, _MESH = range(5)
 _MESHES = ("ply", "obj", "serialized")
 #: Of the displacement: waves, and their shortest and longest length in diagonals of the scene.
 _WAVES, _LENGTHS = 24, (0.05, 0.5)
+#: The code value from which on pixels of a JPEG file count as clipped.
+_JPEG_WHITE = 250
 #: How much an S-shaped response differs from the sRGB curve.
 _CONTRAST = 0.5
 
@@ -202,6 +204,11 @@ def _photograph(
     if settings.white is not None:
         rgb = response(np.minimum(rgb, 1), settings.response)
     return np.dstack([rgb, pixels[..., 3]])
+
+
+def _clipped(settings: DegradeSettings) -> float:
+    """The value from which on photographs are clipped: JPEG makes white a little darker."""
+    return float(_decoded(np.array(_JPEG_WHITE / 255))) if settings.format == "jpeg" else 1.0
 
 
 def _image(folder: DataFolder, view: View, settings: DegradeSettings) -> Path:
@@ -386,7 +393,7 @@ def _write_transforms(
         content["encoding"] = "srgb"
     content |= {"scene": folder.relative(scene), "frames": frames}
     if settings.white is not None:
-        content["clipped"] = 1.0
+        content["clipped"] = _clipped(settings)
     folder.write_transforms(content)
 
 
@@ -402,7 +409,7 @@ def _truth(
     return {
         "settings": asdict(settings),
         "gain": gain,
-        "clipped": None if settings.white is None else 1.0,
+        "clipped": None if settings.white is None else _clipped(settings),
         "response": {
             "linear": linear.tolist(),
             "read": response(linear, settings.response).tolist(),
