@@ -69,7 +69,7 @@ _NARROWEST = 40
 _LONGEST = 1 << 14
 
 _DESCRIPTION = (
-    "Recovers the materials or the lighting of a scene with known geometry from posed HDR "
+    "Recovers the materials or the lighting of a scene with known geometry from posed "
     "photographs, with the global illumination taken out."
 )
 _START = (
