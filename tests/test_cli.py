@@ -232,7 +232,7 @@ def test_the_help_breaks_lines_where_they_are_full(unbake, monkeypatch):
     for command in COMMANDS:
         lines = unbake(command, "--help").out.splitlines()
         texts = [line.strip("│ ") for line in lines if line.startswith("│  ")]
-        full = max(map(len, texts))  # the column depends on the widths of all options
+        full = max(map(len, texts), default=0)  # the column depends on the widths of all options
         for line, following in pairwise(texts):
             if line and line[-1] in ",a" and following[:1].islower():
                 word = following.split()[0]

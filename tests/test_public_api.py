@@ -112,6 +112,7 @@ def test_paths_may_be_texts(tmp_path):
     refused = {
         "capture": lambda: unbake.capture(f"{none}.xml", none, unbake.CaptureSettings()),
         "import_data": lambda: unbake.import_data(none, f"{none}-data", [f"{none}.ply"]),
+        "degrade": lambda: unbake.degrade(none, f"{none}-worse", unbake.DegradeSettings()),
         "fit": lambda: unbake.fit(none, f"{none}-run", cpu),
         "evaluate": lambda: unbake.evaluate(none),
         "render": lambda: unbake.render(none, f"{none}-pictures"),
@@ -143,6 +144,8 @@ def test_paths_may_be_texts(tmp_path):
     assert run.written_checkpoints() == [checkpoint]
     tried = {"Dataset.save", "DataFolder.known", "DataFolder.relative"}
     tried |= {"RunFolder.tidy_checkpoints"}
+    assert "none" in str(unbake.check_data(none).findings)
+    tried |= {"check_data"}
     elsewhere = {"Run.export", "Run.relight", "Run.report"}  # in test_run.py
     assert found.keys() == refused.keys() | tried | elsewhere
 

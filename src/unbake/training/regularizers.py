@@ -71,7 +71,9 @@ def regularization_terms(
     if smooths_albedo(problem, config):
         radius = r.albedo_radius or USUAL.footprint
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), radius)
-        unexplained = dr.clip(dr.detach(photometric), 0, _LARGEST_LOSS)
+        loss = dr.detach(photometric)
+        # A loss that is not finite is told by itself.
+        unexplained = dr.select(dr.isfinite(loss), dr.clip(loss, 0, _LARGEST_LOSS), 0)
         value = albedo_smoothness(here, near, valid)
         terms["albedo_smoothness"] = r.albedo_smoothness * unexplained * value
     if r.albedo_ties_roughness:
