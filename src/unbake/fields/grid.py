@@ -13,6 +13,9 @@ from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
 from .settings import DenseGridConfig, features_of
 
+#: The largest number below 1 in single precision.
+_LAST = 1 - 2.0**-24
+
 
 class DenseGrid(Field):
     """A vector-valued function of a position in [0,1]³, trilinear between the corners of cells.
@@ -56,7 +59,9 @@ class DenseGrid(Field):
         engine: Engine | None = None,
     ) -> list[mi.Float]:
         """Look the grid up; the caller masks points outside of [0,1]³ or not finite."""
-        outputs = list(self.grid(list(point.position)))[: self.outputs]
+        # At 1 the corners beyond the last weigh nothing, but are read: from outside of the array.
+        inside = [dr.minimum(x, _LAST) for x in point.position]
+        outputs = list(self.grid(inside))[: self.outputs]
         return [sigmoid(x) for x in outputs] if self.bounded else outputs
 
     def cost(self) -> Cost:
