@@ -195,6 +195,16 @@ def test_a_term_of_ones_own_trains_in_a_method_of_ones_own(built_in):
     assert config.from_toml(config.to_toml(settings)) == settings
 
 
+def test_a_method_of_ones_own_needs_no_photometric_term(built_in):
+    """Albedo is as smooth as photographs are left unexplained: here they explain nothing."""
+    register_method(Method("blind", "no photographs", {PRIOR: Attached(scene=True, lhs=True)}))
+    regularization = config.RegularizationConfig(albedo_smoothness=1.0, roughness_smoothness=1.0)
+    step, state = start(built_in, replace(TINY_FIT, method="blind", regularization=regularization))
+    terms = step(state, 0, RATES)
+    assert set(terms) == {PRIOR, "roughness_smoothness", "skipped"}
+    assert all(np.isfinite(value[0]) for value in terms.values()) and terms["skipped"][0] == 0
+
+
 @pytest.mark.parametrize("radiance_spp", [0, 2])
 def test_a_method_that_attaches_every_edge_is_recorded_and_replayed(built_in, radiance_spp):
     row = {

@@ -38,12 +38,12 @@ def regularization_terms(
     scene: mi.Scene,
     ray: mi.Ray3f,
     sampler: mi.Sampler,
-    photometric: mi.Float,
+    photometric: mi.Float | None,
 ) -> dict[str, mi.Float]:
     """Weighted terms, at the points of optimized material that camera rays hit.
 
-    No term where none has a weight. They are the same for all methods, and cost one more ray a
-    pixel.
+    They are the same for all methods, and cost one more ray a pixel. `has_terms` tells whether
+    there are any.
 
     Differences of albedo weigh as much as photographs are left unexplained. What the noise of
     photographs is cannot be told from a photograph alone, where texture looks like it. A fit can
@@ -53,10 +53,11 @@ def regularization_terms(
     Args:
         ray: a camera ray for each pixel of the batch.
         sampler: of as many lanes.
-        photometric: the photometric loss of the batch.
+        photometric: the photometric loss of the batch. Where it is None, because a method has no
+            such term, differences of albedo have no weight.
     """
     materials, r = problem.materials, config.regularization
-    if materials is None or not has_terms(problem, config):
+    if materials is None:
         return {}
     scene_view, everywhere = problem.scene_view.with_scene(scene), mi.Bool(True)
     vertex = find_vertex(scene_view, ray, everywhere, sampler, hide_emitters=problem.hide_emitters)
@@ -68,7 +69,7 @@ def regularization_terms(
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), r.radius)
         value = roughness_smoothness(here, near, valid)
         terms["roughness_smoothness"] = r.roughness_smoothness * value
-    if smooths_albedo(problem, config):
+    if photometric is not None and smooths_albedo(problem, config):
         radius = r.albedo_radius or USUAL.footprint
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), radius)
         loss = dr.detach(photometric)

@@ -373,7 +373,7 @@ class TrainingStep:
             loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain)
             subset = _subset(config, inputs)
             terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
-            terms |= self._regularization(inputs, batch.ray, terms[PHOTOMETRIC])
+            terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))
             if camera is not None and camera.has_response and config.camera.smoothness:
                 value = camera.roughness_of_response()
                 terms["response_smoothness"] = config.camera.smoothness * value
@@ -382,7 +382,7 @@ class TrainingStep:
         return terms
 
     def _regularization(
-        self, inputs: Inputs, ray: mi.Ray3f, photometric: mi.Float
+        self, inputs: Inputs, ray: mi.Ray3f, photometric: mi.Float | None
     ) -> dict[str, mi.Float]:
         """The regularizers, at the first camera sample of each pixel."""
         problem, config = self._problem, self._config
