@@ -176,8 +176,8 @@ def capture(
 def import_(
     source: Positional[Source],
     /,
-    mesh: Meshes,
     out: Out,
+    mesh: Meshes = (),
     images: Folder = None,
     exposures: File = None,
     envmap: File = None,
@@ -197,8 +197,9 @@ def import_(
 
     Args:
         source: Folder or transforms.json of nerfstudio, Blender-NeRF or a synthetic NeRF scene, or
-            folder of a COLMAP project or model.
-        mesh: Mesh (PLY, OBJ, GLB); may be given several times.
+            folder of a COLMAP project or model, or of a FIPT room.
+        mesh: Mesh (PLY, OBJ, GLB), which only FIPT rooms have themselves; may be given several
+            times.
         out: Folder to write to, new or empty.
         images: Folder of the photographs, where it is not the one that the source names.
         exposures: Table (CSV) with the columns name and exposure, instead of EXIF.

@@ -34,9 +34,7 @@ OtherData = Annotated[Path | None, arg(metavar="DATA", help_behavior_hint="")]
 OutFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="", aliases=("-o",))]
 Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
 Source = Annotated[Path, arg(metavar="SOURCE")]
-Meshes = UseAppendAction[
-    Annotated[tuple[Path, ...], arg(metavar="MESH", help_behavior_hint="(required)")]
-]
+Meshes = UseAppendAction[Annotated[tuple[Path, ...], arg(metavar="MESH", help_behavior_hint="")]]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
 Preset = Annotated[

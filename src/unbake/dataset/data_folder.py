@@ -40,6 +40,7 @@ _FOREIGN = {
     "sparse": "COLMAP",
     "cameras.bin": "COLMAP",
     "cameras.txt": "COLMAP",
+    "K_list.txt": "FIPT",
 }
 _KIND = "data folder"
 

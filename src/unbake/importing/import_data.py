@@ -26,6 +26,7 @@ from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .meshes import Part, read_parts, write_scene
+from .rooms import is_room, read_room
 from .settings import ImportSettings
 from .source import Shot, Source, image_header
 
@@ -34,15 +35,15 @@ CLIPPED_CODE = 250 / 255
 #: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
 _RAYS = 64
 _KNOWN = (
-    f"It has a {TRANSFORMS} (nerfstudio), transforms_train.json (Blender), or cameras.bin or "
-    "cameras.txt (COLMAP), maybe in sparse/0"
+    f"It has a {TRANSFORMS} (nerfstudio), transforms_train.json (Blender), cam.txt and K_list.txt "
+    "(FIPT), or cameras.bin or cameras.txt (COLMAP), maybe in sparse/0"
 )
 
 
 def import_data(
     source: str | Path,
     out: str | Path,
-    meshes: Sequence[str | Path],
+    meshes: Sequence[str | Path] = (),
     settings: ImportSettings | None = None,
     *,
     images: str | Path | None = None,
@@ -57,9 +58,10 @@ def import_data(
     a pinhole with square pixels; others are resampled to one.
 
     Args:
-        source: a folder or file of nerfstudio, Blender-NeRF, a synthetic NeRF scene, or COLMAP.
+        source: a folder or file of nerfstudio, Blender-NeRF, a synthetic NeRF scene, COLMAP or
+            FIPT.
         out: folder to write, new or empty; it appears only when it is complete.
-        meshes: PLY, OBJ or GLB files.
+        meshes: PLY, OBJ or GLB files; none are needed where the source has its own (FIPT).
         settings: None: the defaults.
         images: folder of the images, where it is not the source's own.
         exposures: table of `name,exposure`; None: EXIF tells.
@@ -75,12 +77,13 @@ def import_data(
     require_new_folder(out)
     require_utf8(source, "source")
     faults = Faults()
-    if not meshes:
-        faults.add("no mesh was given (--mesh FILE)")
     found = _read_source(
         source, None if images is None else Path(images), settings, allow_outside, faults
     )
-    parts = read_parts([Path(mesh) for mesh in meshes], faults)
+    given = [Path(mesh) for mesh in meshes] or ([] if found.mesh is None else [found.mesh])
+    if not given:
+        faults.add("no mesh was given (--mesh FILE)")
+    parts = read_parts(given, faults)
     known, told = exposures_of(found.shots)
     if exposures is not None:
         with faults.collected():
@@ -134,6 +137,8 @@ def _read_source(
     if (folder / TRANSFORMS).is_file():
         file = folder / TRANSFORMS
         return read_one_file(file, images, settings.keep_applied_transform, allow_outside, faults)
+    if is_room(folder):
+        return read_room(folder, images, allow_outside, faults)
     model = find_model(folder)
     if model is not None:
         return read_colmap(model, images, allow_outside, faults)

@@ -54,11 +54,13 @@ class Source:
         kind: the program or layout, for people.
         shots: the photographs.
         notes: what the user should know of how it was read.
+        mesh: the file of the geometry, where it belongs to the layout.
     """
 
     kind: str
     shots: tuple[Shot, ...]
     notes: tuple[str, ...] = ()
+    mesh: Path | None = None
 
 
 def image_header(path: Path) -> ImageHeader:

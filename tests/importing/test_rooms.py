@@ -1,0 +1,138 @@
+"""Rooms in the layout of FIPT: a captured data set that is written in it comes back as it was."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from layouts import codes, quiet, save, write_json
+
+from unbake.dataset.views import Dataset, read_photograph
+from unbake.imaging.pictures import write_exr
+from unbake.importing.faults import ImportFaults
+from unbake.importing.import_data import import_data
+from unbake.importing.settings import ImportSettings
+
+DOCS = Path(__file__).parents[2] / "docs" / "import.md"
+
+
+def write_mesh(meshes, folder):
+    folder.mkdir()
+    parts = [trimesh.load_mesh(mesh) for mesh in meshes]
+    trimesh.util.concatenate(parts).export(folder / "scene.obj")
+
+
+@pytest.fixture
+def photographed(captured, meshes, tmp_path):
+    """A room with `cam.txt` and `K_list.txt`."""
+    room = tmp_path / "ClassRoom"
+    write_mesh(meshes, room)
+    poses, lenses = [str(len(captured.views))], [str(len(captured.views))]
+    for number, view in enumerate(captured.views):
+        camera = view.camera
+        _, up, back, origin = camera.to_world[:3].T
+        poses += [" ".join(map(repr, row.tolist())) for row in (origin, origin - 2 * back, up)]
+        lenses += [f"{camera.fl_x!r} 0 {camera.cx!r}", f"0 {camera.fl_y!r} {camera.cy!r}", "0 0 1"]
+        (room / "Image").mkdir(exist_ok=True)
+        write_exr(room / "Image" / f"{number:03d}_0001.exr", read_photograph(view))
+        save(codes(view), room / "ldr" / f"{number:03d}_0001.png")
+    (room / "cam.txt").write_text("\n".join(poses) + "\n")
+    (room / "K_list.txt").write_text("\n".join(lenses))
+    return room
+
+
+@pytest.fixture
+def rendered(captured, meshes, tmp_path):
+    """A room with `train` and `val`."""
+    room = tmp_path / "kitchen"
+    write_mesh(meshes, room)
+    for name, views in (("train", captured.train), ("val", captured.heldout)):
+        frames = []
+        (room / name / "Image").mkdir(parents=True)
+        for number, view in enumerate(views):
+            # x to the left, y up, z forwards
+            left, up, forwards = -view.camera.to_world[:, 0], *(view.camera.to_world[:, [1, 2]].T)
+            pose = np.stack([left, up, -forwards, view.camera.to_world[:, 3]], 1)
+            frames.append({"transform_matrix": pose.tolist()})
+            image = room / name / "Image" / f"{number:03d}_0001.exr"
+            write_exr(image, read_photograph(view)[..., :3])
+        camera = views[0].camera
+        angle = 2 * math.atan(0.5 * camera.width / camera.fl_x)
+        write_json(room / name / "transforms.json", {"camera_angle_x": angle, "frames": frames})
+    return room
+
+
+def require_same(found, views):
+    """The same poses, lenses and pictures as those of `views`, one after the other."""
+    for mine, known in zip(found, views, strict=True):
+        assert np.abs(mine.camera.to_world - known.camera.to_world).max() < 1e-5
+        for key in ("width", "height", "fl_x", "fl_y", "cx", "cy"):
+            assert getattr(mine.camera, key) == pytest.approx(getattr(known.camera, key))
+        assert mine.encoding == "linear" and mine.exposure == 1
+        assert np.array_equal(read_photograph(mine)[..., :3], read_photograph(known)[..., :3])
+
+
+def test_a_photographed_room_comes_back(captured, photographed, tmp_path):
+    told = []
+    settings = ImportSettings(holdout=0)
+    import_data(photographed, tmp_path / "data", settings=settings, tell=told.append)
+    found = Dataset.load(tmp_path / "data")
+    require_same(found.train, captured.views)
+    assert [view.name for view in found.views] == ["000_0001", "001_0001", "002_0001"]
+    assert told[0].startswith("FIPT: 3 training")
+    assert "100 % of the pixels see it" in told[-1]
+
+
+def test_other_images_of_a_room_hold_code_values(captured, photographed, tmp_path):
+    import_data(photographed, tmp_path / "data", images=photographed / "ldr", tell=quiet)
+    found = Dataset.load(tmp_path / "data")
+    assert {view.encoding for view in found.views} == {"srgb"}
+    for mine, known in zip(found.views, captured.views, strict=True):
+        assert np.abs(codes(mine).astype(int) - codes(known)).max() <= 1
+
+
+def test_a_rendered_room_comes_back(captured, rendered, tmp_path, unbake, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    block = re.search(
+        r"<!-- run by the tests: fipt -->\n```sh\nunbake (.*)\n", DOCS.read_text("utf-8")
+    )
+    outcome = unbake(*block[1].split())
+    assert outcome.status == 0 and outcome.err == ""
+    found = Dataset.load("data")
+    require_same(found.train, captured.train)
+    require_same(found.heldout, captured.heldout)
+    names = {view.name for view in found.views}
+    assert names == {"train_000_0001", "train_001_0001", "val_000_0001"}
+    assert [file.name for file in Path("data/scene/meshes").iterdir()] == ["scene.ply"]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "fault"),
+    [
+        ("cam.txt", "", "three rows of three"),
+        ("cam.txt", "1\n0 0 0\n0 0 1\n0 1 0\n", "1 cameras in cam.txt, 3 in K_list.txt"),
+        ("K_list.txt", "3\n" + "1 2\n" * 9, "three rows of three"),
+        ("K_list.txt", "3\n" + "9 1 8\n0 9 8\n0 0 1\n" * 3, "no pinhole without skew"),
+        ("cam.txt", "3\n" + "0 0 0\n0 0 1\n0 0 1\n" * 3, "not perpendicular"),
+        ("cam.txt", "3\n" + "0 0 0\n0 0 0\n0 0 1\n" * 3, "not perpendicular"),
+    ],
+)
+def test_what_is_wrong_with_cameras_is_told(photographed, tmp_path, file, content, fault):
+    (photographed / file).write_text(content)
+    with pytest.raises(ImportFaults, match=fault):
+        import_data(photographed, tmp_path / "data", tell=quiet)
+
+
+def test_images_that_are_missing_are_faults(rendered, photographed, tmp_path):
+    (photographed / "Image" / "001_0001.exr").unlink()
+    (rendered / "val" / "transforms.json").write_text('{"camera_angle_x": 4, "frames": [1]}')
+    (rendered / "scene.obj").unlink()
+    with pytest.raises(ImportFaults, match="the image does not exist: 001_0001"):
+        import_data(photographed, tmp_path / "data", tell=quiet)
+    with pytest.raises(ImportFaults) as caught:
+        import_data(rendered, tmp_path / "data", images=tmp_path, tell=quiet)
+    told = "; ".join(caught.value.faults)
+    for part in ("no other folder of images", "'camera_angle_x' is not", "no mesh was given"):
+        assert part in told
