@@ -189,9 +189,9 @@ def import_(
 ) -> None:
     """Make a data set of photographs, cameras and meshes of other programs.
 
-    Photographs may be PNG, JPEG, TIFF or OpenEXR. The mesh must be in the frame and unit of the
-    cameras. Lens distortion is taken out. Exposures come from EXIF. It needs more packages:
-    pip install 'unbake[import]'
+    Photographs may be PNG, JPEG, TIFF, OpenEXR or camera RAW. The mesh must be in the frame and
+    unit of the cameras. Lens distortion is taken out. Exposures come from EXIF. It needs more
+    packages: pip install 'unbake[import]', and for camera RAW 'unbake[raw]'
 
     Without --envmap or --lights the light is unknown, and is fitted with the materials.
 

@@ -12,7 +12,7 @@ from ..errors import UserError
 from ..io import inside
 from .faults import Faults
 from .lens import Lens
-from .source import Shot, Source, first_folder, image_header
+from .source import Shot, Source, first_folder, image_header, with_suffix
 
 #: Folders of a project that its model may lie in, and those that images lie in beside it.
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", "model")
@@ -85,7 +85,8 @@ def _is_binary(model: Path) -> bool:
 
 def _shot(image: Any, lens: Lens, folder: Path, allow_outside: bool) -> Shot:
     name = image.name
-    file = inside(folder, name, name, "folder of images", allow_outside=allow_outside)
+    said = inside(folder, name, name, "folder of images", allow_outside=allow_outside)
+    file = with_suffix(said)
     header = image_header(file)
     if (header.width, header.height) != (lens.width, lens.height):
         size = f"{header.width} x {header.height}"

@@ -14,6 +14,7 @@ from PIL import Image
 from ..errors import UserError
 from ..io import read_text
 from .faults import Faults
+from .raw import raw_exposure
 from .source import Shot
 
 #: The directory of EXIF that tells of the exposure, and its tags: seconds, ISO, f-number.
@@ -31,10 +32,10 @@ def exposures_of(shots: Sequence[Shot]) -> tuple[dict[str, float], str]:
     seconds and ISO, or where all are the same. An f-number that none of them tells, as with old
     lenses, is taken to be the same.
     """
-    coded = [shot for shot in shots if shot.coded]
-    if not coded:
+    taken = [shot for shot in shots if shot.coded or shot.raw]
+    if not taken:
         return {}, "exposures: not told, photographs are taken for radiance in one unit"
-    found = {shot.name: _exif(shot.image) for shot in coded}
+    found = {shot.name: (_of_raw if shot.raw else _exif)(shot.image) for shot in taken}
     told = [values for values in found.values() if values is not None]
     if len(told) < len(shots):
         missing = "no photograph tells" if not told else f"{len(told)} of {len(shots)} tell"
@@ -125,6 +126,15 @@ def _exif(image: Path) -> tuple[float, float | None] | None:
     if seconds is None or iso is None:
         return None
     return seconds * iso / 100, aperture
+
+
+def _of_raw(image: Path) -> tuple[float, float | None] | None:
+    """The same of camera RAW."""
+    try:
+        seconds, iso, aperture = map(_value, raw_exposure(image))
+    except UserError:  # that it cannot be read is told elsewhere
+        return None
+    return None if seconds is None or iso is None else (seconds * iso / 100, aperture)
 
 
 def _value(tag: Any) -> float | None:

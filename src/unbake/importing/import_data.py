@@ -26,6 +26,8 @@ from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .meshes import Part, read_parts, write_scene
+from .raw import CLIPPED as CLIPPED_RAW
+from .raw import read_raw
 from .rooms import is_room, read_room
 from .settings import ImportSettings
 from .source import Shot, Source, image_header
@@ -203,6 +205,9 @@ def _pixels(shot: Shot) -> np.ndarray:
     require_memory(need, "the image needs", "Use a smaller image", shot.name)
     if shot.coded:
         return decode(read_codes(shot.image))
+    if shot.raw:
+        linear = read_raw(shot.image)
+        return np.concatenate([linear, np.ones_like(linear[..., :1])], 2)
     pixels = read_image(shot.image, shot.lens.width, shot.lens.height)
     return pixels.reshape(shot.lens.height, shot.lens.width, 4)
 
@@ -290,13 +295,14 @@ def _write_view(
         on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
     """
     camera = shot.lens.camera(shot.to_world)
-    if shot.lens.straight:
+    if shot.lens.straight and not shot.raw:
         image = data.image(name, shot.image.suffix.lower())
         image.parent.mkdir(exist_ok=True)
         shutil.copyfile(shot.image, image)
     else:
-        image = data.image(name, ".png" if shot.coded else ".exr")
-        pixels = shot.lens.straightened(_pixels(shot), camera.fl_x)
+        image, pixels = data.image(name, ".png" if shot.coded else ".exr"), _pixels(shot)
+        if not shot.lens.straight:
+            pixels = shot.lens.straightened(pixels, camera.fl_x)
         _write_picture(image, pixels)
     frame: dict[str, Any] = {
         "file_path": data.relative(image),
@@ -311,6 +317,8 @@ def _write_view(
     }
     if shot.coded:
         frame["encoding"] = "srgb"
+    if shot.raw:
+        frame["clipped"] = CLIPPED_RAW
     if shot.name in exposures:
         frame["exposure"] = exposures[shot.name]
     counted = on_mesh

@@ -13,6 +13,8 @@ from ..errors import UserError
 from ..imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, ImageHeader, read_header
 from ..io import require_file
 from .lens import Lens
+from .raw import SUFFIXES as RAW_SUFFIXES
+from .raw import is_raw, raw_header
 
 #: Suffixes that are tried where the name of an image has none.
 _TRIED = tuple(s for suffix in (*CODED_SUFFIXES, ".exr") for s in (suffix, suffix.upper()))
@@ -44,6 +46,11 @@ class Shot:
         """Whether the image holds code values and not radiance."""
         return self.image.suffix.lower() in CODED_SUFFIXES
 
+    @property
+    def raw(self) -> bool:
+        """Whether the image is camera RAW."""
+        return is_raw(self.image)
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -70,8 +77,11 @@ def image_header(path: Path) -> ImageHeader:
         UserError: it does not exist, is damaged, or of a format that is not read.
     """
     require_file(path, "image")
+    if is_raw(path):
+        return raw_header(path)
     if path.suffix.lower() not in (*CODED_SUFFIXES, *SUFFIXES):
-        raise UserError("the image is of a format that is not read (PNG, JPEG, TIFF, EXR)", path)
+        told = "the image is of a format that is not read (PNG, JPEG, TIFF, EXR, camera RAW)"
+        raise UserError(told, path)
     try:
         return read_header(path)
     except HeaderError as error:
@@ -81,10 +91,14 @@ def image_header(path: Path) -> ImageHeader:
 
 
 def with_suffix(path: Path) -> Path:
-    """A file by its name, which may lack its suffix; the path as it is where there is none."""
+    """A file by its name, which may lack its suffix; the path as it is where there is none.
+
+    Camera RAW takes the place of the photograph that a program has posed, which was made of it.
+    """
     if path.is_file():
         return path
-    others = (path.with_name(path.name + suffix) for suffix in _TRIED)
+    others = [path.with_name(path.name + suffix) for suffix in _TRIED]
+    others += [path.with_suffix(case) for s in RAW_SUFFIXES for case in (s, s.upper())]
     return next((other for other in others if other.is_file()), path)
 
 

@@ -1,0 +1,118 @@
+"""Camera RAW: a DNG file written here comes back as the light that it was made of."""
+
+import struct
+
+import numpy as np
+import pytest
+import tifffile
+from layouts import APERTURE, ISO, SECONDS, quiet, write_json
+
+from unbake.dataset.views import Dataset, read_photograph
+from unbake.errors import UserError
+from unbake.importing.faults import ImportFaults
+from unbake.importing.import_data import import_data
+from unbake.importing.raw import CLIPPED, read_raw
+from unbake.importing.settings import ImportSettings
+
+pytest.importorskip("rawpy", reason="camera RAW needs rawpy")
+
+BLACK, WHITE, SIZE = 256, 16383, 32
+#: What the sensor counts of white light, of its largest count.
+NEUTRAL = (0.5, 1.0, 0.625)
+#: tifffile writes no EXIF: a private tag becomes the one of its directory.
+PRIVATE, EXIF_DIRECTORY, RATIONAL, SHORT, LONG = 65000, 34665, 5, 3, 4
+
+
+def write_dng(file, light, iso=None):
+    """Light (H, W, 3) in [0, 1] behind a Bayer mosaic, with 1/100 s and f/2 if an ISO is given."""
+    sensor = np.minimum(light * NEUTRAL, 1)
+    y, x = np.mgrid[: light.shape[0], : light.shape[1]]
+    channel = y % 2 + x % 2
+    counts = BLACK + (WHITE - BLACK) * np.take_along_axis(sensor, channel[..., None], 2)[..., 0]
+    parts = [value for share in NEUTRAL for value in (round(1000 * share), 1000)]
+    tags = [
+        (50706, "B", 4, (1, 4, 0, 0), True),  # version
+        (50708, "s", 0, "unbake", True),
+        (33421, "H", 2, (2, 2), True),  # the mosaic: red, green, green, blue
+        (33422, "B", 4, (0, 1, 1, 2), True),
+        (50714, "H", 1, BLACK, True),
+        (50717, "I", 1, WHITE, True),
+        (50728, "2I", 3, tuple(parts), True),
+        (PRIVATE, "I", 1, 0, True),
+    ]
+    options = {"photometric": 32803, "metadata": None, "software": False}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    tifffile.imwrite(file, np.round(counts).astype(np.uint16), extratags=tags, **options)
+    data = bytearray(file.read_bytes())
+    assert data[:2] == b"II"
+    place = data.index(struct.pack("<HHI", PRIVATE, LONG, 1))
+    start, entries = len(data), 3 if iso else 0
+    data[place : place + 12] = struct.pack("<HHII", EXIF_DIRECTORY, LONG, 1, start)
+    behind = start + 2 + 12 * entries + 4
+    data += struct.pack("<H", entries)
+    if iso:
+        data += struct.pack("<HHII", SECONDS, RATIONAL, 1, behind)
+        data += struct.pack("<HHII", APERTURE, RATIONAL, 1, behind + 8)
+        data += struct.pack("<HHIHH", ISO, SHORT, 1, iso, 0)
+    data += struct.pack("<I4I", 0, 1, 100, 2, 1)
+    file.write_bytes(data)
+
+
+def grey(*colour):
+    return np.broadcast_to(np.array(colour, float), (SIZE, SIZE, 3))
+
+
+@pytest.fixture
+def project(captured, tmp_path):
+    """Cameras of photographs that are not there, and camera RAW of the same names."""
+    camera, frames = captured.views[0].camera, []
+    for number, view in enumerate(captured.views):
+        pose = view.camera.to_world.tolist()
+        frames.append({"file_path": f"jpg/{number}.jpg", "transform_matrix": pose})
+        write_dng(tmp_path / "nerf" / "jpg" / f"{number}.DNG", grey(0.4, 0.2, 0.1), 100 << number)
+    focal = camera.fl_x * SIZE / camera.width
+    lens = {"fl_x": focal, "fl_y": focal, "w": SIZE, "h": SIZE}
+    write_json(tmp_path / "nerf" / "transforms.json", lens | {"frames": frames})
+    return tmp_path / "nerf"
+
+
+def test_light_comes_back(tmp_path):
+    light = grey(0.4, 0.2, 0.1).copy()
+    light[:, 16:] = 0.8
+    write_dng(tmp_path / "a.dng", light)
+    found = read_raw(tmp_path / "a.dng")
+    assert found.dtype == np.float32 and found.shape == (SIZE, SIZE, 3)
+    assert found[:, :12] == pytest.approx(light[:, :12], abs=1e-3)
+    assert found[:, 20:] == pytest.approx(light[:, 20:], abs=1e-3)
+    write_dng(tmp_path / "a.dng", 3 * light)
+    assert (read_raw(tmp_path / "a.dng")[:, 20:] >= CLIPPED).all()
+
+
+def test_camera_raw_takes_the_place_of_photographs(captured, project, meshes, tmp_path):
+    told = []
+    settings = ImportSettings(holdout=0)
+    import_data(project, tmp_path / "data", meshes, settings, tell=told.append)
+    views = Dataset.load(tmp_path / "data").views
+    assert [view.image.name for view in views] == ["0.exr", "1.exr", "2.exr"]
+    for view, known in zip(views, captured.views, strict=True):
+        assert view.encoding == "linear" and view.clipped == CLIPPED
+        assert np.array_equal(view.camera.to_world, known.camera.to_world)
+        pixels = read_photograph(view)[..., :3]
+        assert pixels == pytest.approx(grey(0.4, 0.2, 0.1), abs=1e-3)
+    exposures = [view.exposure for view in views]
+    assert exposures == pytest.approx([0.5, 1, 2], rel=1e-3)
+    assert any("(2.0 stops apart), by EXIF" in line for line in told)
+
+
+def test_damaged_camera_raw_is_a_fault(project, meshes, tmp_path):
+    whole = (project / "jpg" / "1.DNG").read_bytes()
+    (project / "jpg" / "0.DNG").write_bytes(b"no camera wrote this")
+    (project / "jpg" / "1.DNG").write_bytes(whole[: len(whole) // 2])
+    (project / "jpg" / "2.DNG").rename(project / "jpg" / "3.DNG")
+    with pytest.raises(ImportFaults) as caught:
+        import_data(project, tmp_path / "data", meshes, tell=quiet)
+    faults = "; ".join(caught.value.faults)
+    assert "cannot be read (Input/output error): jpg/0.jpg, jpg/1.jpg" in faults
+    assert "does not exist: jpg/2.jpg" in faults
+    with pytest.raises(UserError, match="cannot be read"):
+        read_raw(project / "jpg" / "1.DNG")
