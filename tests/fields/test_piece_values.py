@@ -1,6 +1,8 @@
-"""Points of a piece of surface with albedo of equal brightness share a value."""
+"""Points of a piece with albedo of equal brightness share a value, and points of one colour."""
 
 import re
+from dataclasses import replace
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +24,8 @@ from unbake.quantities import QUANTITIES
 
 LANES = 300
 SMALL = PieceConfig(most=5, brightnesses=4, gain=3.0)
-NETWORK = NetworkConfig(GridConfig(2, 2, 8), width=8, hidden=1, pieces=SMALL)
+COLOURED = replace(SMALL, colours=3)
+NETWORK = NetworkConfig(GridConfig(2, 2, 8), width=8, hidden=1, pieces=COLOURED)
 ENGINES = ("tensor", "coopvec", *(["fused"] if can_record_layout() else []))
 
 
@@ -86,9 +89,35 @@ def test_weak_pieces_count_less():
     np.testing.assert_allclose(half, full / 2, atol=1e-6)
 
 
+def test_colours_are_shared_by_all_pieces():
+    table = PieceValues(COLOURED, 1)
+    values = randomised(table)
+    values["pieces.0"] *= 0
+    table.assign(values)
+    red, blue = mi.Color3f(1, 0.1, 0.1), mi.Color3f(0.1, 0.1, 1)
+    one, other, third = (
+        np.array(table.evaluate(points(colour, number=n))[0])
+        for colour, n in ((red, 1), (red, 3), (blue, 1))
+    )
+    np.testing.assert_array_equal(one, other)
+    assert np.abs(one - third).min() > 0.05  # as bright, and yet another number
+
+
+def test_colours_between_corners_have_values_between():
+    table = PieceValues(COLOURED, 1)
+    values = randomised(table)
+    values["pieces.0"] *= 0
+    table.assign(values)
+    low, middle, high = (
+        np.array(table.evaluate(points(mi.Color3f(0, level**2, 0)))[0])
+        for level in (1 / 3, 0.5, 2 / 3)
+    )
+    np.testing.assert_allclose(middle, (low + high) / 2, atol=1e-4)
+
+
 @pytest.mark.parametrize("albedo", [-1.0, 2.0, float("nan")])
 def test_an_albedo_out_of_bounds_reads_no_other_memory(albedo):
-    table = PieceValues(SMALL, 1)
+    table = PieceValues(COLOURED, 1)
     randomised(table)
     bound = points(1.0 if albedo == 2.0 else 0.0)
     found, wanted = (np.array(table.evaluate(p)[0]) for p in (points(albedo), bound))
@@ -129,14 +158,14 @@ def test_roughness_alone_has_pieces():
 
 
 def test_sizes_tell_the_memory():
-    for outputs in (1, 3):
-        counted = sum(dr.width(v) for v in PieceValues(SMALL, outputs).parameters().values())
-        assert counted == SMALL.numbers(outputs)
+    for outputs, settings in product((1, 3), (SMALL, COLOURED)):
+        counted = sum(dr.width(v) for v in PieceValues(settings, outputs).parameters().values())
+        assert counted == settings.numbers(outputs)
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"most": -1}, {"brightnesses": 1}, {"gain": 0.0}, {"network": 0.0}],
+    [{"most": -1}, {"brightnesses": 1}, {"gain": 0.0}, {"network": 0.0}, {"colours": -1}],
 )
 def test_sizes_out_of_range_are_refused(wrong):
     with pytest.raises(UserError, match=next(iter(wrong))):
@@ -158,8 +187,11 @@ def surface(materials):
 
 
 def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
+    def pieces(text):
+        return from_toml(text).materials["roughness"]["neural"].pieces
+
     def most(text):
-        return from_toml(text).materials["roughness"]["neural"].pieces.most
+        return pieces(text).most
 
     now = to_toml(FitConfig())
     assert most(now) == FitConfig().materials["roughness"]["neural"].pieces.most > 0
@@ -169,3 +201,5 @@ def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
     assert before != now
     assert most(before) == 0
     assert most(before.replace("format = 2\n", "")) == 0
+    assert pieces("steps = 5").colours > 0
+    assert pieces(re.sub("colours = .+\n", "", now)) == replace(pieces(now), colours=0)

@@ -37,6 +37,7 @@ _GROUPS = ("grid", "bitmap")
 _AS_BEFORE = {
     "held_aside": 0.0,
     "materials.roughness.neural.pieces.most": 0,
+    "materials.roughness.neural.pieces.colours": 0,
     "regularization.albedo_smoothness": 0.0,
 }
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.

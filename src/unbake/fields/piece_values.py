@@ -1,4 +1,4 @@
-"""A table of values by piece of surface and brightness of the albedo, beside a network."""
+"""Tables of values by piece of surface and by colour of the albedo, beside a network."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .domain import SurfacePoint, bounded
-from .settings import PieceConfig
+from .field import FieldSpec
+from .grid import DenseGrid
+from .settings import DenseGridConfig, PieceConfig
 
 
 class PieceValues:
@@ -21,7 +23,10 @@ class PieceValues:
     constant: it is not pulled to where roughness would have it.
 
     Numbers of small pieces count less, by their `strength`, and so learn slower: Adam moves every
-    number at one pace, however little is known of it.
+    number at one pace, however little is known of it. What they have instead is a table by colour
+    that all pieces share: what is of one colour is often of one material, too. It is a grid over
+    the square roots of linear RGB albedo, linear between its corners. Numbers of pieces are added
+    to it, for what differs between pieces of one colour.
 
     Args:
         settings: sizes.
@@ -32,14 +37,22 @@ class PieceValues:
         self._settings = settings
         count = settings.most * settings.brightnesses
         self._values = [dr.opaque(mi.Float, 0, count) for _ in range(outputs)]
+        self._colours = None
+        if settings.colours:
+            self._colours = DenseGrid(DenseGridConfig(settings.colours), FieldSpec(outputs))
 
     def parameters(self) -> dict[str, mi.Float]:
-        """`pieces.0`, …: the numbers of each output."""
-        return {f"pieces.{i}": values for i, values in enumerate(self._values)}
+        """`pieces.0`, …: the numbers of each output; `colours`, if there are any."""
+        found = {f"pieces.{i}": values for i, values in enumerate(self._values)}
+        if self._colours is not None:
+            found["colours"] = self._colours.parameters()["corners"]
+        return found
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
         """Use these arrays from now on; others than those of `parameters` are ignored."""
-        self._values = [parameters[name] for name in self.parameters()]
+        self._values = [parameters[f"pieces.{i}"] for i in range(len(self._values))]
+        if self._colours is not None:
+            self._colours.assign({"corners": parameters["colours"]})
 
     def evaluate(self, point: SurfacePoint) -> list[mi.Float]:
         """One number for each output; where the albedo is not told, all are taken as mid-grey.
@@ -50,7 +63,8 @@ class PieceValues:
         if point.piece is None:
             raise ValueError("a field with values of pieces is asked at a point without its piece")
         bins = self._settings.brightnesses
-        mean = mi.Float(0.25) if point.albedo is None else dr.mean(dr.detach(point.albedo))
+        albedo = mi.Color3f(0.25) if point.albedo is None else dr.detach(point.albedo)
+        mean = dr.mean(albedo)
         at = dr.sqrt(bounded(mean, 0, 1)) * (bins - 1)
         below = dr.minimum(mi.UInt32(at), bins - 2)
         share = at - mi.Float(below)
@@ -61,9 +75,14 @@ class PieceValues:
         for values in self._values:
             low, high = (dr.gather(mi.Float, values, first + i) for i in (0, 1))
             found.append(gain * dr.fma(share, high - low, low))
-        return found
+        if self._colours is None:
+            return found
+        colour = mi.Point3f([dr.sqrt(bounded(channel, 0, 1)) for channel in albedo])
+        shared = self._colours.evaluate(SurfacePoint(colour))
+        return [dr.fma(self._settings.gain, x, y) for x, y in zip(shared, found, strict=True)]
 
     @property
     def features(self) -> int:
         """Numbers that are looked up at a point."""
-        return 2 * len(self._values)
+        outputs = len(self._values)
+        return (2 + (8 if self._colours is not None else 0)) * outputs

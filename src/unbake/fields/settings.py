@@ -88,14 +88,19 @@ class PieceConfig:
     brightnesses: int = 8  #: of the albedo, from black to white
     gain: float = 7.0  #: how much faster a large piece learns than the network would alone
     network: float = 0.2  #: how much slower the network learns beside pieces
+    #: Cells along each channel of a table by colour of the albedo, which all pieces share; 0: none
+    colours: int = 0
 
     def __post_init__(self) -> None:
-        sizes = {"most": (0, 1 << 20), "brightnesses": (2, 64)}
+        sizes = {"most": (0, 1 << 20), "brightnesses": (2, 64), "colours": (0, 64)}
         require_ranges(self, sizes | {"gain": (POSITIVE, 1e4), "network": (POSITIVE, 1.0)})
 
     def numbers(self, outputs: int) -> int:
         """How many numbers are learned."""
-        return outputs * self.brightnesses * self.most
+        if not self.most:
+            return 0
+        grid = features_of(outputs) * (self.colours + 1) ** 3 if self.colours else 0
+        return outputs * self.brightnesses * self.most + grid
 
 
 @dataclass(frozen=True)
