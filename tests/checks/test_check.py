@@ -181,11 +181,19 @@ def test_clipped_black_blurred_and_double_photographs_are_told(spoilt):
         (data.folder / frames[2]["file_path"]).read_bytes()
     )
     frames[5]["transform_matrix"] = frames[4]["transform_matrix"]
+    # A bracket is none: photographs of one pose whose exposures differ.
+    frames[6]["transform_matrix"] = frames[4]["transform_matrix"]
+    frames[6]["exposure"] = 2.0
+    (held,) = (f for f in data.content["frames"] if f["split"] == "heldout")
+    held["transform_matrix"], held["exposure"] = frames[4]["transform_matrix"], 0.5
     warnings = {f.check: f for f in found(data.save())}
     assert "train_000" in warnings["clipped"].where
     assert "train_001" in warnings["black"].where
-    pairs = {f.where: f.what for f in found(data.folder, "duplicates")}
-    assert pairs == {
+    doubles = found(data.folder, "duplicates")
+    split = [f for f in doubles if "held out" in f.what]
+    assert {f.where.split(" and ")[0] for f in split} == {"train_004", "train_005", "train_006"}
+    assert {f.remedy for f in split} == {"Give all of a bracket the same 'split'"}
+    assert {f.where: f.what for f in doubles if f not in split} == {
         "train_002 and train_003": "the photographs are the same, and their poses not",
         "train_004 and train_005": "two photographs have the same pose",
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -48,6 +49,8 @@ _FAR = 20.0
 #: Distance of cameras, in diagonals of the scene, and difference of the matrix of their axes, up to
 #: which poses are the same.
 _SAME = 1e-6
+#: Stops by which the exposures of a bracket differ at least.
+_BRACKET = 0.1
 
 
 @final
@@ -275,6 +278,11 @@ def _check_distance(result: DataCheck, scene: mi.Scene, train: list[CheckedView]
         result.warn("units", what, None, remedy)
 
 
+def _apart(a: float, b: float) -> bool:
+    """Whether two exposures that the data set tells differ, as those of a bracket do."""
+    return abs(math.log2(a / b)) > _BRACKET
+
+
 def _check_duplicates(result: DataCheck, diagonal: float) -> None:
     cameras = [v.view.camera for v in result.views]
     origins = np.array([c.origin for c in cameras]) / diagonal
@@ -293,10 +301,14 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
                 remedy = "Remove one of them" if posed[j] else "Correct 'file_path' of one of them"
                 result.warn("duplicates", what, pair, remedy)
             elif twice[j]:
+                bracket = _apart(one.view.exposure, other.view.exposure)
+                same_split = one.view.split == other.view.split
+                if bracket and same_split:
+                    continue
                 what = "two photographs have the same pose"
-                if one.view.split != other.view.split:
-                    what += ", one for training and one held out"
+                what += "" if same_split else ", one for training and one held out"
                 remedy = "Correct the pose of one, or leave one out"
+                remedy = "Give all of a bracket the same 'split'" if bracket else remedy
                 result.warn("duplicates", what, pair, remedy)
 
 
