@@ -89,7 +89,7 @@ def fit(data: Path, settings: Path, method: str, options: Sequence[object]) -> d
         # the evaluation.
         with contextlib.suppress(UserError):
             unbake(*words, log=log)
-        unbake("evaluate", run, log=log)
+        unbake("evaluate", run, "--train-views", 0, log=log)
         metrics = json.loads(RunFolder(run).metrics_file.read_text(encoding="utf-8"))
     scores = {key: metrics["heldout"][key] for key in SCORES}
     return scores | {key: metrics[key] for key in LENGTH}
