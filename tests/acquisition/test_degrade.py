@@ -3,15 +3,18 @@
 import json
 import shutil
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
+from unbake.acquisition.decimate import decimated
 from unbake.acquisition.degrade import _encoded, degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings
 from unbake.dataset.views import Dataset, read_masked
 from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.io import read_json
+from unbake.scene.parse import parse
 
 
 @pytest.fixture
@@ -121,8 +124,6 @@ def test_poses_are_off_by_pixels_and_the_true_ones_are_kept(cornell, degraded):
 
 
 def test_meshes_are_displaced_by_smooth_noise(cornell, degraded):
-    from unbake.scene.parse import parse
-
     dataset, truth = degraded(displace=0.01)
     assert truth["displaced"]["meshes"]
     old = parse(Dataset.load(cornell).scene).instantiate()
@@ -134,6 +135,29 @@ def test_meshes_are_displaced_by_smooth_noise(cornell, degraded):
     assert 0.5 < np.sqrt((moved**2).sum(1).mean()) / 0.02 < 2
     near = displacement(points + 1e-4, DegradeSettings(displace=0.01), 2.0)
     assert np.abs(near - moved).max() < 2e-3
+
+
+def test_large_meshes_lose_triangles(cornell, degraded, monkeypatch):
+    pytest.importorskip("pycolmap", reason="fewer triangles need pycolmap")
+    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.linspace(-1, 1, 17))
+    r = np.sqrt(1 - z**2)
+    globe = np.stack([r * np.cos(angle), r * np.sin(angle), z], -1).reshape(-1, 3)
+    corner = (np.arange(16)[:, None] * 33 + np.arange(32)).ravel()
+    quads = np.stack([corner, corner + 1, corner + 34, corner, corner + 34, corner + 33], 1)
+    few = mi.traverse(decimated(globe, quads.reshape(-1, 3), 0.1))
+    assert len(few["faces"]) // 3 == pytest.approx(102, abs=10)
+    points = np.array(few["vertex_positions"]).reshape(-1, 3)
+    assert np.linalg.norm(points, axis=1) == pytest.approx(1, abs=0.06)
+    # In a data set, whose boxes are otherwise too small
+    monkeypatch.setattr("unbake.acquisition.degrade.FEWEST", 10)
+    dataset, truth = degraded(decimate=0.5)
+    counts = [
+        sum(shape.face_count() for shape in parse(d.scene).instantiate().shapes())
+        for d in (Dataset.load(cornell), dataset)
+    ]
+    # Two boxes of ten triangles, beside walls
+    assert counts[0] - counts[1] == pytest.approx(10, abs=3)
+    assert truth["triangles"] == 0.5 and len(truth["displaced"]["meshes"]) == 6
 
 
 def test_the_command_says_where_it_wrote(cornell, unbake, tmp_path):

@@ -30,6 +30,7 @@ from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
 from ..scene import free_space
 from ..scene.parse import ParsedScene, parse, write
+from .decimate import FEWEST, decimated
 from .settings import DegradeSettings
 
 #: Entries of the table of a response.
@@ -94,7 +95,8 @@ def degrade(
     with filled_folder(out) as partial:
         folder = DataFolder(partial)
         folder.scene.mkdir()
-        displaced = _displace(parsed, folder, settings, diagonal) if settings.displace else []
+        changed = settings.displace or settings.decimate < 1
+        displaced = _change_meshes(parsed, folder, settings, diagonal) if changed else []
         path = write(parsed, folder.scene)
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
             pixels = _photograph(view, number, truth, settings)
@@ -281,10 +283,10 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-def _displace(
+def _change_meshes(
     parsed: ParsedScene, folder: DataFolder, settings: DegradeSettings, diagonal: float
 ) -> list[str]:
-    """Move the vertices of all meshes by smooth noise; the files that it wrote."""
+    """Move the vertices of all meshes by smooth noise, and leave out some; the files it wrote."""
     files = []
     for number, node in enumerate(parsed.state.nodes):
         plugin = node.props.plugin_name()
@@ -296,10 +298,14 @@ def _displace(
         params = mi.traverse(mesh)
         positions = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
         positions += displacement(positions, settings, diagonal)
-        params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
-        params.update()
-        dr.eval(params["vertex_positions"])
-        file = folder.scene / "meshes" / f"displaced-{number}.ply"
+        faces = np.array(params["faces"]).reshape(-1, 3)
+        if settings.decimate < 1 and len(faces) >= FEWEST:
+            mesh = decimated(positions, faces, settings.decimate)
+        else:
+            params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+            params.update()
+            dr.eval(params["vertex_positions"])
+        file = folder.scene / "meshes" / f"changed-{number}.ply"
         file.parent.mkdir(exist_ok=True)
         mesh.write_ply(str(file))
         for key in ("shape_index", "flip_tex_coords", "to_world"):
@@ -416,6 +422,7 @@ def _truth(
         },
         "vignetting": {"corner": 1 - settings.vignetting, "falls with": "square of the distance"},
         "displaced": {"meshes": displaced, "world_units": settings.displace * diagonal},
+        "triangles": settings.decimate,
         "views": {
             view.name: asdict(truth) | {"transform_matrix": view.camera.to_world.tolist()}
             for view, truth in zip(dataset.views, truths, strict=True)

@@ -103,6 +103,14 @@ class DegradeSettings:
     displace: Annotated[
         float, Flag("Meshes are off by so much, as a share of the scene's diagonal")
     ] = 0.0
+    #: Small meshes stay as they are: see `acquisition/decimate.py`.
+    decimate: Annotated[
+        float,
+        Flag(
+            "Share of the triangles that meshes keep; those of less than 64 keep all of them",
+            metavar="SHARE",
+        ),
+    ] = 1.0
     format: Annotated[
         Format,
         Flag(
@@ -127,10 +135,13 @@ class DegradeSettings:
                 "clip": (0, 0.9),
                 "pose_jitter": (0, 100),
                 "displace": (0, 0.1),
+                "decimate": (0, 1),
                 "quality": (1, 100),
                 "seed": (0, (1 << 31) - 1),
             },
         )
+        if self.decimate == 0:
+            raise UserError("must be more than 0", "decimate")
         if self.read_noise and not self.electrons:
             raise UserError(
                 "needs electrons", "read_noise", "Give electrons at white, such as 10000"
