@@ -28,7 +28,14 @@ from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_key
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from . import lighting, renderings, yardsticks
-from .renderings import METRICS, counted_pixels, exposure_of, render_camera, render_scores
+from .renderings import (
+    METRICS,
+    counted_pixels,
+    exposure_of,
+    render_camera,
+    render_psnr,
+    render_scores,
+)
 from .settings import EvaluationSettings
 from .yardsticks import find_yardsticks, seen_materials
 
@@ -249,8 +256,7 @@ def _evaluate_view(
         if true_scene is not None:
             limit = render_camera(true_scene, view.camera, settings, problem.hide_emitters)
             exposed = cameras.photographed(view, cameras.dimmed(view, limit), gain)
-            scores = render_scores(exposed, compared, mask, exposure)
-            row["true_render_psnr"] = scores["render_psnr"]
+            row["true_render_psnr"] = render_psnr(exposed, compared, mask)
     if seen is not None and truth is not None:
         row |= seen.psnr(truth)
     return row, seen, truth, gain

@@ -82,15 +82,18 @@ def render_scores(
             them, too.
         exposure: stops, of SSIM and FLIP alone.
     """
-    found = {
-        "render_psnr": finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)),
-        "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
-    }
     image, reference = (encoded(x, exposure) for x in (radiance, photograph))
-    return found | {
+    return {
+        "render_psnr": render_psnr(radiance, photograph, mask),
+        "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
         "render_ssim": float(perceptual.ssim(image, reference)[mask].mean()),
         "render_flip": float(perceptual.flip(image, reference)[mask].mean()),
     }
+
+
+def render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> float | None:
+    """The score `render_psnr` alone; arguments as of `render_scores`."""
+    return finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask))
 
 
 def exposure_of(photographs: Iterable[np.ndarray]) -> float:
