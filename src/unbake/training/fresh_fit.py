@@ -14,7 +14,7 @@ from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from .defaults import with_defaults
 from .first_gains import begin_cameras
-from .problem import Problem, make_problem, training_pixels
+from .problem import Problem, problem_of, training_pixels
 from .schedule import learning_rates
 from .state import State, initial_state
 from .step import TrainingStep
@@ -39,10 +39,7 @@ def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     config = with_defaults(config, dataset)
     smoothed = config.loss_reference == "smoothed"
     pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed)
-    mean = pixels.photographs.mean
-    problem = make_problem(
-        dataset.scene, dataset.background, config, mean, dataset.root, views=dataset.train
-    )
+    problem = problem_of(dataset, config, pixels.photographs.mean)
     begin_cameras(problem, dataset, pixels)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))

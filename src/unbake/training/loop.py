@@ -31,7 +31,7 @@ from .monitor import Monitor
 from .path_depth import told_depth, with_path_depth
 from .plausibility import data_warnings
 from .preview import Preview
-from .problem import Problem, make_problem, training_pixels
+from .problem import Problem, problem_of, training_pixels
 from .run_folder import Origin, RunFolder
 from .run_lock import RunLock
 from .saving import Saving
@@ -154,14 +154,7 @@ def _begin(
     )
     if before is not None:
         _require_same_data(folder, before, origin)
-    problem = make_problem(
-        dataset.scene,
-        dataset.background,
-        config,
-        origin.mean_radiance,
-        dataset.root,
-        views=dataset.train,
-    )
+    problem = problem_of(dataset, config, origin.mean_radiance)
     begin_cameras(problem, dataset, pixels)
     for warning in data_warnings(dataset, pixels, problem):
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)

@@ -178,6 +178,25 @@ def make_problem(
     )
 
 
+def problem_of(
+    dataset: Dataset,
+    config: FitConfig,
+    scale: float,
+    *,
+    change: Callable[[ParsedScene], object] | None = None,
+) -> Problem:
+    """The problem of a data set, with the cameras of its training views; see `make_problem`."""
+    return make_problem(
+        dataset.scene,
+        dataset.background,
+        config,
+        scale,
+        dataset.root,
+        views=dataset.train,
+        change=change,
+    )
+
+
 def _unknown_camera(config: CameraConfig, views: int) -> CameraModel | None:
     if not config.unknowns:
         return None

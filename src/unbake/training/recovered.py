@@ -11,7 +11,7 @@ from ..dataset.views import Dataset
 from ..errors import UserError
 from ..scene.parse import ParsedScene
 from .checkpoint import Progress, load_checkpoint
-from .problem import Problem, make_problem
+from .problem import Problem, problem_of
 from .run_folder import RunFolder
 from .state import State, initial_state
 
@@ -65,15 +65,7 @@ def open_run(
         moved = f"Put it back, or tell where it is now: unbake fit DATA --out {run} --resume"
         raise UserError(f"the data set of the run {run} is gone", data, moved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
-    problem = make_problem(
-        dataset.scene,
-        dataset.background,
-        config,
-        origin.mean_radiance,
-        dataset.root,
-        views=dataset.train,
-        change=change,
-    )
+    problem = problem_of(dataset, config, origin.mean_radiance, change=change)
     return OpenedRun(folder, problem, dataset, config, initial_state(problem), origin.clip_negative)
 
 

@@ -21,7 +21,7 @@ from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..quantities import channels_of
 from ..transport.vertex import find_vertex
-from .problem import Problem, make_problem
+from .problem import Problem, problem_of
 from .state import State
 from .step import without_garbage_collection
 from .validation import GroundTruth
@@ -129,9 +129,7 @@ class TruthFit:
         # The cheapest method: none of its light is computed here.
         config = replace(config, unknown="materials", precision="single", camera=CameraConfig())
         config = with_method(config, "direct")
-        self.problem: Problem = make_problem(
-            dataset.scene, dataset.background, config, 1.0, dataset.root
-        )
+        self.problem: Problem = problem_of(dataset, config, 1.0)
         assert self.problem.materials is not None
         # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
