@@ -356,6 +356,19 @@ def camera_from_frame(
         raise UserError(error.what, where, error.remedy) from None
 
 
+def frame_of(camera: Camera) -> dict[str, Any]:
+    """What `camera_from_frame` reads of a frame; numbers are not rounded."""
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "transform_matrix": camera.to_world.tolist(),
+    }
+
+
 def read_split(entry: dict[str, Any], where: str) -> str:
     """The split of a frame, "train" where it names none."""
     split = entry.get("split", "train")

@@ -12,7 +12,7 @@ from typing import Any, final
 import mitsuba as mi
 import numpy as np
 
-from unbake.dataset.camera import Camera, camera_from_frame, read_split
+from unbake.dataset.camera import Camera, camera_from_frame, frame_of, read_split
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError
@@ -484,17 +484,10 @@ def _check_size(size: tuple[int, int], width: int, height: int, path: Path) -> N
 
 
 def _frame(data: DataFolder, view: View) -> dict[str, Any]:
-    camera = view.camera
     return {
         "file_path": data.relative(view.image),
         "split": view.split,
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fl_x,
-        "fl_y": camera.fl_y,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "transform_matrix": camera.to_world.tolist(),
+        **frame_of(view.camera),
         **({} if view.encoding == "linear" else {"encoding": view.encoding}),
         **({} if view.mask is None else {"mask_path": data.relative(view.mask)}),
         **({} if view.exposure == 1 else {"exposure": view.exposure}),

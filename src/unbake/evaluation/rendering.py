@@ -20,7 +20,7 @@ import numpy as np
 from ..acquisition.new_light import change_light
 from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, frame_name, read_cameras
+from ..dataset.camera import Camera, frame_name, frame_of, read_cameras
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr
@@ -316,19 +316,8 @@ def _scores(
 
 def _frame(shot: _Shot) -> dict[str, Any]:
     """A picture in `render.json`, which is read as a camera file, too."""
-    camera = shot.camera
     split = {} if shot.split is None else {"split": shot.split}
-    return {
-        "name": shot.name,
-        "file_path": f"{shot.name}.exr",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fl_x,
-        "fl_y": camera.fl_y,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "transform_matrix": camera.to_world.tolist(),
-    } | split
+    return {"name": shot.name, "file_path": f"{shot.name}.exr", **frame_of(shot.camera), **split}
 
 
 def _told_light(light: LightConfig) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config.light import LightConfig
-from ..dataset.camera import LONGEST_SIDE, Camera
+from ..dataset.camera import LONGEST_SIDE, Camera, frame_of
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.views import PIXEL_BYTES, counted_by, read_image
 from ..errors import UserError
@@ -307,13 +307,7 @@ def _write_view(
     frame: dict[str, Any] = {
         "file_path": data.relative(image),
         "split": split,
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fl_x,
-        "fl_y": camera.fl_y,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "transform_matrix": camera.to_world.tolist(),
+        **frame_of(camera),
     }
     if shot.coded:
         frame["encoding"] = "srgb"
