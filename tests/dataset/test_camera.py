@@ -190,6 +190,19 @@ def test_rescaling_keeps_the_field_of_view():
     assert np.allclose(square.rays(px, py + 4)[1], camera.rays(px, py)[1])
 
 
+def test_projection_is_the_inverse_of_rays_and_numbers_pixels_by_rows():
+    camera = off_centre()
+    px, py = pixel_centres(camera)
+    origins, directions = camera.rays(px, py)
+    points = origins + directions * np.linspace(0.1, 50, len(px))[:, None]
+    assert np.allclose(camera.project(points), np.stack([px, py], axis=1), atol=1e-9)
+    assert np.array_equal(camera.pixel_of(points), np.arange(24 * 16))
+    behind, beside = 2 * origins - points, sum(camera.rays(np.array([-0.5]), np.array([3.5])))
+    assert np.isnan(camera.project(np.vstack([behind, camera.origin]))).all()
+    assert (camera.pixel_of(np.vstack([behind, beside])) == -1).all()
+    assert np.allclose(camera.project(beside), [[-0.5, 3.5]])
+
+
 def test_pixels_that_are_not_square_have_no_sensor():
     with pytest.raises(UserError, match="not square"):
         Camera(np.eye(4), 10.0, 11.0, 4.0, 4.0, 8, 8).sensor(1)

@@ -187,7 +187,7 @@ def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -
     points = free_space.sample_surface(scene, samples, 1)
     seen = np.zeros(len(points.position), dtype=bool)
     for camera in cameras:
-        framed = np.flatnonzero(~seen & _in_frame(camera, points.position))
+        framed = np.flatnonzero(~seen & (camera.pixel_of(points.position) >= 0))
         seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
     return float(seen.sum() / max(_reachable(scene, points, seen).sum(), 1))
 
@@ -204,7 +204,7 @@ def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000)
     points = free_space.sample_surface(scene, samples, 1)
     counts = np.zeros(len(points.position), dtype=int)
     for camera in cameras:
-        framed = np.flatnonzero(_in_frame(camera, points.position))
+        framed = np.flatnonzero(camera.pixel_of(points.position) >= 0)
         shown = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
         counts[framed] += shown
     return counts[_reachable(scene, points, counts > 0)]
@@ -359,17 +359,6 @@ def _axes(forwards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     right = np.cross(forwards, up)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     return right, np.cross(right, forwards)
-
-
-def _in_frame(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) project into the image, without regard to occlusion: (n,) bool."""
-    local = (points - camera.origin) @ camera.to_world[:3, :3]
-    depth = -local[:, 2]
-    front = depth > 0
-    depth = np.where(front, depth, 1.0)
-    x = camera.cx + camera.fl_x * local[:, 0] / depth
-    y = camera.cy - camera.fl_y * local[:, 1] / depth
-    return front & (0 <= x) & (x < camera.width) & (0 <= y) & (y < camera.height)
 
 
 def _standpoints(scene: mi.Scene) -> np.ndarray:

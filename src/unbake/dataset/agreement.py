@@ -202,19 +202,13 @@ def _matched(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of a view that see the points of another one, and which of the points these are."""
     camera = view.camera
-    offset = (here.position[chosen] - camera.origin) @ camera.to_world[:3, :3]
-    depth = -offset[:, 2]
-    safe = np.where(depth > 0, depth, 1)
-    column = np.floor(offset[:, 0] / safe * camera.fl_x + camera.cx)
-    row = np.floor(camera.cy - offset[:, 1] / safe * camera.fl_y)
-    inside = (depth > 0) & (column >= 0) & (column < camera.width)
-    inside &= (row >= 0) & (row < camera.height)
-    matched = np.flatnonzero(inside)
-    at = (row[matched] * camera.width + column[matched]).astype(int)
-    wanted = chosen[matched]
+    numbers = camera.pixel_of(here.position[chosen])
+    matched = np.flatnonzero(numbers >= 0)
+    at, wanted = numbers[matched], chosen[matched]
+    depth = (camera.origin - here.position[wanted]) @ camera.to_world[:3, 2]
     # The centre of the pixel is at most 0.71 pixels away, more on surfaces seen at an angle.
     away = np.linalg.norm(there.position[at] - here.position[wanted], axis=1)
-    near = away < 3 * depth[matched] / camera.fl_x
+    near = away < 3 * depth / camera.fl_x
     same = (there.normal[at] * here.normal[wanted]).sum(axis=1) > _SAME_NORMAL
     good = near & same & usable[at]
     return at[good], matched[good]

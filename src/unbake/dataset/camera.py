@@ -177,6 +177,34 @@ class Camera:
         directions = local @ self.to_world[:3, :3].T
         return np.broadcast_to(self.origin, directions.shape), directions
 
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Film positions of points, the inverse of `rays`: (n, 2), NaN where they lie behind.
+
+        They are in pixels from the left and the top edge, pixel centres at k + 0.5, and need not
+        be inside of the image.
+
+        Args:
+            points: (n, 3) in world space.
+        """
+        x, y, z = ((points - self.origin) @ self.to_world[:3, :3]).T
+        depth = np.where(z < 0, -z, np.nan)
+        return np.stack([self.cx + self.fl_x * x / depth, self.cy - self.fl_y * y / depth], axis=1)
+
+    def pixel_of(self, points: np.ndarray) -> np.ndarray:
+        """Numbers of the pixels that points project into, whether or not something hides them.
+
+        Args:
+            points: (n, 3) in world space.
+
+        Returns:
+            (n,) int64: column and row (i, j) have the number j * width + i; −1 is outside.
+        """
+        column, row = np.floor(self.project(points)).T
+        inside = (0 <= column) & (column < self.width) & (0 <= row) & (row < self.height)
+        numbers = np.full(len(points), -1, np.int64)
+        numbers[inside] = row[inside] * self.width + column[inside]
+        return numbers
+
     def sensor(self, spp: int) -> dict[str, Any]:
         """The Mitsuba `perspective` sensor that renders this camera, as a dictionary.
 

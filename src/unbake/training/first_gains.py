@@ -56,7 +56,8 @@ def first_gains(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> 
             others = sorted(rng.choice(others, _PARTNERS, replace=False))
         mine = np.flatnonzero(own == i)
         for j in others:
-            place, inside = _projected(views[j], points[mine])
+            place = views[j].camera.pixel_of(points[mine])
+            inside = place >= 0
             seen, place = mine[inside], place[inside]
             sources.append(seen)
             targets.append(np.full(len(seen), j))
@@ -151,17 +152,3 @@ def _visible(
         si.n = mi.Normal3f([from_numpy(mi.Float, x) for x in normals.T])
         towards = mi.Point3f([from_numpy(mi.Float, x) for x in origins.T])
         return ~np.array(scene.ray_test(si.spawn_ray_to(towards)))
-
-
-def _projected(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pixel of a view that points lie in, by number in it, and whether they do."""
-    camera = view.camera
-    local = (points - camera.to_world[:3, 3]) @ camera.to_world[:3, :3]
-    depth = -local[:, 2]
-    front = depth > 1e-6 * max(1.0, float(np.abs(points).max(initial=0)))
-    depth = np.where(front, depth, 1)
-    x = np.floor(camera.fl_x * local[:, 0] / depth + camera.cx)
-    y = np.floor(-camera.fl_y * local[:, 1] / depth + camera.cy)
-    inside = front & (0 <= x) & (x < camera.width) & (0 <= y) & (y < camera.height)
-    place = np.where(inside, y * camera.width + x, 0).astype(np.int64)
-    return place, inside
