@@ -248,25 +248,35 @@ def test_what_was_written_is_told(exported):
     assert not list(exported.folder.parent.glob(".*"))
 
 
-def test_gltf_has_the_recovered_materials(exported):
-    loaded = trimesh.load(exported.folder / "scene.glb")
-    textured = {n: g for n, g in loaded.geometry.items() if g.visual.material.baseColorTexture}
-    told = {part["name"]: part["material"] for part in exported.manifest["parts"]}
-    assert {name: g.visual.material.name for name, g in textured.items()} == {
-        name: material for name, material in told.items() if material
-    }
-    for name, geometry in textured.items():
+def gltf_near(exported, folder):
+    """Shares of points where a glTF file has the fields' albedo and roughness; metallic there."""
+    loaded, found = trimesh.load(folder / "scene.glb"), {}
+    for name, geometry in loaded.geometry.items():
+        material = geometry.visual.material
+        if not material.baseColorTexture:
+            continue
         points, faces = trimesh.sample.sample_surface(geometry, 500, seed=1)
         weights = trimesh.triangles.points_to_barycentric(geometry.triangles[faces], points)
         uv = np.einsum("nk,nkd->nd", weights, geometry.visual.uv[geometry.faces[faces]])
         uv[:, 1] = 1 - uv[:, 1]  # trimesh counts v from the last row
-        truth, material = material_at(exported.recovered, points), geometry.visual.material
+        truth = material_at(exported.recovered, points)
         colour = looked_up(material.baseColorTexture.convert("RGB"), uv)
         both = looked_up(material.metallicRoughnessTexture.convert("RGB"), uv)
         close = np.abs(colour - 255 * srgb(truth["albedo"])).max(1) <= 2
-        assert close.mean() > 0.98, name
-        assert (np.abs(both[:, 1] - 255 * truth["roughness"]) <= 2).mean() > 0.98, name
-        own = np.ptp(both[:, 2]) > 100 if told[name] == "floor/paint" else both[:, 2].max() == 0
+        rough = np.abs(both[:, 1] - 255 * truth["roughness"]) <= 2
+        found[name] = close.mean(), rough.mean(), both[:, 2], material
+    return found
+
+
+def test_gltf_has_the_recovered_materials(exported):
+    found = gltf_near(exported, exported.folder)
+    told = {part["name"]: part["material"] for part in exported.manifest["parts"]}
+    assert {name: material.name for name, (*_, material) in found.items()} == {
+        name: material for name, material in told.items() if material
+    }
+    for name, (albedo, roughness, metallic, material) in found.items():
+        assert albedo > 0.98 and roughness > 0.98, name
+        own = np.ptp(metallic) > 100 if told[name] == "floor/paint" else metallic.max() == 0
         assert own, "metallic is that of the scene"
         assert material.doubleSided == (name == "ground")
 
@@ -617,6 +627,25 @@ def test_the_command_tells_what_it_wrote(exported, tmp_path, unbake, monkeypatch
     assert sorted(p.name for p in out.iterdir()) == sorted(
         ["environment" + ".exr", "export.json", "scene.glb"]
     )
+
+
+def test_textures_are_as_dense_as_the_fields_ask(exported, tmp_path, monkeypatch):
+    exported.use(monkeypatch)
+    as_if_seen(monkeypatch)
+    monkeypatch.setattr("unbake.exports.unwrap.SMALLEST", 16)
+    lines, found = [], {}
+    for words in ({"texels": 0.5}, {}):
+        told = exporting.export(exported.run, tmp_path / f"{words}", **words, tell=lines.append)
+        found[len(words)] = {row["name"]: row for row in told["materials"]}
+    chosen, coarse = found[0], found[1]
+    assert all(row["near"]["albedo"] >= 0.95 for row in chosen.values())
+    assert coarse["floor/paint"]["near"]["albedo"] < 0.9
+    assert chosen["floor/paint"]["resolution"] > coarse["floor/paint"]["resolution"]
+    # A file that another program reads says the same.
+    assert gltf_near(exported, tmp_path / "{}")["ground"][0] >= 0.93
+    (note,) = [line for line in lines if line.startswith("note: less than 95 %")]
+    assert "floor/paint" in note and "without --texels" in note
+    assert sum("is within 2/255 of the recovered fields" in line for line in lines) == 2
 
 
 def test_a_failure_leaves_nothing(exported, tmp_path, monkeypatch):

@@ -471,7 +471,8 @@ def export(
             (OpenEXR and PNG), mitsuba (a scene that Mitsuba renders without unbake) and usd
             (OpenUSD; it needs pip install 'unbake[usd]').
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
-            surfaces). A texture has from 64 to 8192 along an edge.
+            surfaces, or more where what was recovered is finer). A texture has from 64 to 8192
+            along an edge.
         allow_outside: Read files that the data set or its scene names outside of its folder.
     """
     backend.activate()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,11 +13,12 @@ from ..errors import UserError
 from ..fields.domain import SurfacePoint
 from ..fields.materials import Materials
 from ..fields.pieces import ATTRIBUTE, Piece, decoded
-from ..memory import require_memory
+from ..imaging.pictures import encoded
+from ..memory import free_bytes, require_memory
 from ..quantities import QUANTITIES
 from ..scene.parse import ParsedScene, is_reference, reason
 from .observed import Views, filled
-from .unwrap import Atlas, Placed, joined, parameterized
+from .unwrap import LARGEST, Atlas, Placed, joined, parameterized, surface_points
 
 #: Texels that are looked up at once; bounds the memory.
 CHUNK = 1 << 17
@@ -25,6 +26,13 @@ CHUNK = 1 << 17
 _OFFSETS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
 #: Bytes a texel of the arrays here, with those of the pyramid.
 _TEXEL_BYTES = 120
+#: How near textures are to the fields: their largest error, as PNG files store them, and the share
+#: of the surface with no larger one that resolutions are chosen for.
+NEAR, WANTED = 2 / 255, 0.95
+#: Points of an atlas at which that is tried.
+_TRIED = 4096
+#: By how much the resolution of an atlas may rise for it, and to how many texels in all of them.
+_FINEST, _MOST = 8, 1 << 25
 
 #: Textures of a material that a scene gives: by its number, then by quantity.
 OwnTextures = dict[int, dict[str, "mi.Texture"]]
@@ -39,6 +47,14 @@ class Baked:
     covered: np.ndarray  #: (n, n) bool: there is surface
     observed: np.ndarray  #: (n, n) bool: and a training view saw it
     learned: tuple[str, ...]  #: quantities that were recovered; the others are the scene's own
+    #: By recovered quantity, the share of the surface that training views saw where the texture
+    #: has the field's value, to `NEAR`.
+    near: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_near(self) -> bool:
+        """Whether all textures are near to the fields where it counts."""
+        return min(self.near.values(), default=1.0) >= WANTED
 
     @property
     def unobserved_share(self) -> float:
@@ -58,22 +74,54 @@ class Baker:
     def __init__(self, materials: Materials | None, own: OwnTextures, views: Views) -> None:
         self._materials, self._own, self._views = materials, own, views
         self._learned = () if materials is None else tuple(materials)
+        self._texels = 0  # of all textures so far
 
-    def bake(self, atlas: Atlas, advance: Callable[[int], object] = lambda texels: None) -> Baked:
+    def bake(
+        self,
+        atlas: Atlas,
+        advance: Callable[[int, int], object] = lambda done, more: None,
+        *,
+        refine: bool = False,
+    ) -> Baked:
         """The textures of an atlas, averaged over four places a texel in linear space.
 
         Texels that no view saw, and those beside charts, are filled from those that were seen.
 
         Args:
             atlas: where parts lie.
-            advance: called with numbers of texels that are done.
+            advance: called with numbers of texels: that are done, and that there are more to do.
+            refine: double the resolution until the textures are near to the fields.
 
         Raises:
             UserError: the textures do not fit into the memory.
         """
-        n = atlas.resolution
+        n, mesh = atlas.resolution, _lookup(atlas)
         require_memory(_TEXEL_BYTES * n * n, "the textures need", "Lower --texels", atlas.name)
-        mesh = _lookup(atlas)
+        _, uv = surface_points(atlas.placed, _TRIED)
+        truth, hit, seen = self._at(mesh, uv)
+        finest = min(_FINEST * n, LARGEST)
+        while True:
+            baked = self._baked(mesh, atlas, advance)
+            near = {
+                name: _share_near(name, baked.values[name], uv, value, hit & seen)
+                for name, value in truth.items()
+            }
+            baked = replace(baked, near=near if (hit & seen).any() else {})
+            self._texels += atlas.resolution**2
+            n = 2 * atlas.resolution
+            if not refine or baked.is_near or n > finest or not self._has_room(n):
+                return baked
+            self._texels -= atlas.resolution**2
+            atlas = replace(atlas, resolution=n, wanted=n)
+            advance(0, n * n)
+
+    def _has_room(self, resolution: int) -> bool:
+        """Whether an atlas may become so large."""
+        texels, free = resolution**2, free_bytes()
+        return self._texels + texels <= _MOST and (free is None or _TEXEL_BYTES * texels < free)
+
+    def _baked(self, mesh: mi.Mesh, atlas: Atlas, advance: Callable[[int, int], object]) -> Baked:
+        n = atlas.resolution
         values = {k: np.zeros((n * n, q.channels), np.float32) for k, q in QUANTITIES.items()}
         covered, observed = np.zeros(n * n, bool), np.zeros(n * n, bool)
         for start in range(0, n * n, CHUNK):
@@ -83,7 +131,7 @@ class Baker:
             for name, mean in means.items():
                 values[name][part] = mean[:count]
             covered[part], observed[part] = hit[:count], seen[:count]
-            advance(count)
+            advance(count, 0)
         baked = {}
         for name, quantity in QUANTITIES.items():
             known = observed if name in self._learned else covered
@@ -106,6 +154,14 @@ class Baker:
             training view saw it, (n,) bool. Where there is no surface, values are zeros.
         """
         mesh = _lookup(Atlas(placed.part.name, (), [placed], "own", 1.0, 1, 1))
+        values, hit, seen = self._at(mesh, uv)
+        flat = {k: x if x.shape[1] == 3 else x[:, 0] for k, x in values.items()}
+        return flat, hit, seen
+
+    def _at(
+        self, mesh: mi.Mesh, uv: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """As `at`, on the mesh of an atlas; all values are (n, channels)."""
         values = {
             name: np.zeros((len(uv), QUANTITIES[name].channels), np.float32)
             for name in self._learned
@@ -124,8 +180,7 @@ class Baker:
             hit[part] = np.array(valid)
             two_sided = info.y > 0.5
             seen[part] = np.array(self._views.see(mi.Point3f(si.p), si.n, two_sided, valid))
-        flat = {k: x if x.shape[1] == 3 else x[:, 0] for k, x in values.items()}
-        return flat, hit, seen
+        return values, hit, seen
 
     def _chunk(
         self, mesh: mi.Mesh, atlas: Atlas, start: int, width: int
@@ -219,6 +274,34 @@ def look_up(
             value = dr.select(here, mi.Color3f(looked_up), value)
         found[name] = list(value)[: quantity.channels]
     return found
+
+
+def _share_near(
+    name: str, texture: np.ndarray, uv: np.ndarray, truth: np.ndarray, counted: np.ndarray
+) -> float:
+    """The share of points at which a texture, interpolated, has the true value, to `NEAR`.
+
+    Args:
+        name: of the quantity.
+        texture: (n, n, channels) float32, linear.
+        uv: (points, 2), where it is looked up.
+        truth: (points, channels), what should be there, linear.
+        counted: (points,) bool, the points that count.
+    """
+    last = len(texture) - 1
+    at = np.clip(uv * len(texture) - 0.5, 0, last)
+    low = at.astype(np.int64)
+    high = np.minimum(low + 1, last)
+    right, down = np.moveaxis(at - low, 1, 0)[..., None]
+    found = [
+        (1 - right) * texture[y, low[:, 0]] + right * texture[y, high[:, 0]]
+        for y in (low[:, 1], high[:, 1])
+    ]
+    value = (1 - down) * found[0] + down * found[1]
+    if QUANTITIES[name].display == "colour":
+        value, truth = encoded(value), encoded(truth)
+    off = np.abs(value - truth).max(1)
+    return float((off[counted] <= NEAR).mean()) if counted.any() else 1.0
 
 
 def bake_texture(baked: Baked, texture: mi.Texture) -> np.ndarray:

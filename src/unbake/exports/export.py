@@ -30,7 +30,7 @@ from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..version import VERSION
 from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
-from .bake import Baked, Baker, own_textures
+from .bake import WANTED, Baked, Baker, own_textures
 from .gltf import write_glb
 from .lights import Light, environment_picture, read_lights
 from .mitsuba import write_scene
@@ -44,8 +44,10 @@ from .usd import require_usd, write_usd
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
-#: Materials that are told one by one.
-_TOLD = 12
+#: Materials that are told one by one, and that are named in a note.
+_TOLD, _NAMED = 12, 4
+#: What to do where textures are coarser than what was recovered: if --texels was given, else.
+_COARSE = "without --texels, textures are as dense as it takes", "a larger --texels keeps more"
 
 _CONVENTIONS = {
     "axes": "those of the scene, unchanged; glTF takes +y as up, and lengths as metres",
@@ -63,6 +65,10 @@ _CONVENTIONS = {
     "environment": "latitude and longitude as Mitsuba's envmap reads them without to_world: +y is "
     "the first row, -y the last one, +z the middle column, -z the left and right border, +x at a "
     "quarter of the width; linear RGB",
+    "texels_per_unit": "at least, but for textures of the smallest and the largest size; where "
+    "nobody chose it, textures have more that need it",
+    "near": "by quantity, the share of the surface seen by training views where the texture "
+    "differs from the recovered field by 2/255 at most, albedo as sRGB",
     "unobserved": "white where no training view saw the surface: filled from those around it "
     "that were seen, or the quantity's default where a material has none; what is seen in mirrors "
     "or through glass alone counts as not seen",
@@ -85,7 +91,9 @@ def export(
         run: folder of a fit.
         out: folder to write; it must be new or empty, and is filled only when all is complete.
         formats: of `FORMATS`.
-        texels: along a scene unit; None: one for each pixel of the training views on the surfaces.
+        texels: along a scene unit; None: one for each pixel of the training views on the surfaces,
+            or more where the recovered fields hold finer detail, until 95 % of each surface differs
+            from them by 2/255 at most.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         console: where a progress bar is shown, if it is a terminal; None: nowhere.
         tell: called with lines of progress.
@@ -151,22 +159,24 @@ def _export(
     problem, dataset = recovered.problem, recovered.dataset
     cameras = [view.camera for view in dataset.train]
     scene = problem.scene_view.scene
-    if texels is None:
+    density = texels
+    if density is None:
         seen = surface_seen(scene, cameras)
-        texels = _BLIND / free_space.bounds(scene)[2] if seen is None else 1 / seen.footprint
+        density = _BLIND / free_space.bounds(scene)[2] if seen is None else 1 / seen.footprint
     found = read_parts(dataset.scene, dataset.root, problem.pieces)
     lights = read_lights(found.scene, problem)
     learned = () if problem.materials is None else tuple(problem.materials)
     own = own_textures(parsed_principled(dataset.scene, dataset.root), learned)
     wanted = [p for p in found.parts if "mitsuba" in formats or p.is_optimized]
     with _Bar(console) as bar:
-        atlases = make_atlases(found.scene, wanted, texels, bar.unwraps)
+        atlases = make_atlases(found.scene, wanted, density, bar.unwraps)
         bar.total(sum(atlas.resolution**2 for atlas in atlases))
         baker = Baker(problem.materials, own, Views(scene, cameras))
         baked = []
         for atlas in atlases:
             bar.bakes(atlas.name)
-            baked.append(baker.bake(atlas, bar.advance))
+            refine = texels is None and atlas.is_optimized
+            baked.append(baker.bake(atlas, bar.advance, refine=refine))
         bar.says("writing …")
         environment = environment_picture(problem)
         files, notes = _write(recovered, out, formats, found, baked, lights, environment, learned)
@@ -181,8 +191,9 @@ def _export(
         },
         "formats": list(formats),
         "learned": list(learned),
-        "texels_per_unit": texels,
+        "texels_per_unit": density,
         "unobserved_share": _unobserved(baked),
+        "near": _near(baked),
         "files": sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()),
         "materials": [
             _material(one, files.get(one.atlas.name, [])) for one in baked if one.atlas.is_optimized
@@ -201,7 +212,7 @@ def _export(
         "environment": None if environment is None else _ENVIRONMENT,
         "colour_spaces": COLOUR_SPACES,
         "conventions": _CONVENTIONS,
-        "notes": [*_notes(found, baked, lights), *notes],
+        "notes": [*_notes(found, baked, lights, _COARSE[texels is None]), *notes],
     }
     _report(manifest, tell)
     return manifest
@@ -270,6 +281,7 @@ def _material(baked: Baked, files: list[str]) -> dict[str, Any]:
         "unique_share": atlas.unique,
         "area": atlas.area(),
         "unobserved_share": baked.unobserved_share,
+        "near": dict(baked.near),
         "parts": [placed.part.name for placed in atlas.placed],
     }
 
@@ -290,8 +302,22 @@ def _unobserved(baked: Sequence[Baked]) -> float:
     return sum(a * s for a, s in shown) / max(sum(a for a, _ in shown), 1e-30)
 
 
-def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light]) -> list[str]:
-    """What is not as it should be."""
+def _near(baked: Sequence[Baked]) -> dict[str, float]:
+    """The share of the surface seen where textures have the fields' values, by quantity."""
+    shown = [one for one in baked if one.atlas.is_optimized and one.near]
+    seen = [one.atlas.area() * (1 - one.unobserved_share) + 1e-30 for one in shown]
+    names = shown[0].near if shown else ()
+    return {
+        name: float(np.average([one.near[name] for one in shown], weights=seen)) for name in names
+    }
+
+
+def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy: str) -> list[str]:
+    """What is not as it should be.
+
+    Args:
+        remedy: where textures are too coarse.
+    """
     notes = []
     if found.left_out:
         notes.append(f"no triangles, left out: {', '.join(found.left_out)}")
@@ -304,6 +330,13 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light]) -> lis
             notes.append(f"{atlas.name}: {overlap:.1f} % of its surface shares texels")
         if one.learned and not one.observed.any():
             notes.append(f"{atlas.name}: no training view saw it, its textures are the defaults")
+    far = [one.atlas.name for one in baked if one.atlas.is_optimized and not one.is_near]
+    if far:
+        named = ", ".join(far[:_NAMED]) + (" …" if len(far) > _NAMED else "")
+        notes.append(
+            f"less than {100 * WANTED:.0f} % of the surface is within 2/255 of the fields in "
+            f"{len(far)} of {len(baked)} materials ({named}); {remedy}"
+        )
     varying = [light.name for light in lights if light.strength is None]
     if varying:
         notes.append(f"lights of varying strength are dark in glTF and usd: {', '.join(varying)}")
@@ -322,6 +355,9 @@ def _report(manifest: dict[str, Any], tell: Callable[[str], None]) -> None:
         tell(f"{row['name']}: {size} x {size} texels, {own}, {unseen}")
     if len(materials) > _TOLD:
         tell(f"… and {len(materials) - _TOLD} materials more, all in export.json")
+    if manifest["near"]:
+        least = 100 * min(manifest["near"].values())
+        tell(f"{least:.1f} % of the surface seen is within 2/255 of the recovered fields")
     share = 100 * manifest["unobserved_share"]
     tell(f"{share:.1f} % of the surface was seen by no training view, and is filled in")
     for note in manifest["notes"]:
@@ -342,6 +378,7 @@ class _Bar:
             disable=not shown,
             transient=True,
         )
+        self._texels = 0
         self._task = self._bar.add_task("reading the scene …", total=None)
 
     def __enter__(self) -> _Bar:
@@ -365,8 +402,10 @@ class _Bar:
 
     def total(self, texels: int) -> None:
         """Set the number of texels there are."""
+        self._texels = texels
         self._bar.update(self._task, total=texels)
 
-    def advance(self, texels: int) -> None:
-        """Add texels that are done."""
-        self._bar.advance(self._task, texels)
+    def advance(self, done: int, more: int) -> None:
+        """Add texels that are done, and texels that there are as well."""
+        self.total(self._texels + more)
+        self._bar.advance(self._task, done)

@@ -170,18 +170,31 @@ def unique_share(placed: list[Placed], seed: int = 0) -> float:
     """The share of random surface points that texture coordinates lead back to."""
     positions, faces, uv = joined(placed)
     mesh = parameterized(positions, faces, uv)
-    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(faces), POINTS, p=areas / areas.sum())
-    weights = _barycentric(rng, POINTS)
-    points = np.einsum("nk,nkd->nd", weights, positions[faces[chosen]])
-    coordinates = np.einsum("nk,nkd->nd", weights, uv[faces[chosen]])
-    si = mesh.eval_parameterization(mi.Point2f(coordinates.T.astype(np.float32)))
+    points, coordinates = surface_points(placed, POINTS, seed)
+    si = mesh.eval_parameterization(mi.Point2f(np.ascontiguousarray(coordinates.T)))
     back, valid = np.array(si.p).T, np.array(si.is_valid())
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
     near = np.linalg.norm(np.where(valid[:, None], back, np.inf) - points, axis=1)
     return float((near < _NEAR * extent).mean())
+
+
+def surface_points(
+    placed: list[Placed], count: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random points of a surface, by area, none of them on an edge.
+
+    Returns:
+        Positions (count, 3), float64, and texture coordinates (count, 2), float32.
+    """
+    positions, faces, uv = joined(placed)
+    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(faces), count, p=areas / areas.sum())
+    weights = _barycentric(rng, count)
+    points = np.einsum("nk,nkd->nd", weights, positions[faces[chosen]])
+    coordinates = np.einsum("nk,nkd->nd", weights, uv[faces[chosen]])
+    return points, coordinates.astype(np.float32)
 
 
 def _barycentric(rng: np.random.Generator, count: int) -> np.ndarray:
