@@ -106,8 +106,10 @@ def functions_of_paths() -> dict[str, str]:
 def test_paths_may_be_texts(tmp_path):
     found = functions_of_paths()
     assert {name: notes for name, notes in found.items() if "str" not in notes} == {}
+    told = inspect.signature(unbake.LightConfig).parameters
+    assert all("str" in told[name].annotation for name in ("envmap", "lights"))
     here, none, cpu = str(tmp_path), str(tmp_path / "none"), unbake.preset("cpu")
-    light = unbake.LightConfig(envmap=none)  # pyright: ignore[reportArgumentType]
+    light = unbake.LightConfig(envmap=none)
     methods, settings = [unbake.MethodVariant("ours")], unbake.EvaluationSettings()
     refused = {
         "capture": lambda: unbake.capture(f"{none}.xml", none, unbake.CaptureSettings()),

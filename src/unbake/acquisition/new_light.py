@@ -26,10 +26,16 @@ def change_light(
     """
     if not light.keep_lights:
         tell(f"turned off {relight.turn_off(scene)} lights of the scene")
+    put_light(scene, light, allow_outside, tell)
+
+
+def put_light(
+    scene: ParsedScene, light: LightConfig, allow_outside: bool, tell: Callable[[str], None]
+) -> None:
+    """Add a light to those that a scene has; arguments and errors as of `change_light`."""
     if light.envmap is not None:
-        map_ = light.envmap
+        map_ = Path(light.envmap)
         relight.put_environment(scene, map_, light.envmap_scale, light.up, light.turn)
     if light.lights is not None:
-        root = Path(light.lights.resolve().anchor) if allow_outside else None
-        for line in relight.put_lights(scene, light.lights, root):
+        for line in relight.put_lights(scene, Path(light.lights), light.root(allow_outside)):
             tell(line)

@@ -27,8 +27,8 @@ class LightConfig:
         UserError: none of the two is given, or both are, or a number is out of range.
     """
 
-    envmap: Path | None = None
-    lights: Path | None = None
+    envmap: Path | str | None = None  #: kept as a `Path`
+    lights: Path | str | None = None  #: kept as a `Path`
     envmap_scale: Annotated[float, Flag("What the values of the environment map are times")] = 1.0
     #: Degrees.
     envmap_rotate: Annotated[
@@ -67,3 +67,9 @@ class LightConfig:
     def turn(self) -> float:
         """Radians to turn the map by, about its up axis."""
         return math.radians(self.envmap_rotate)
+
+    def root(self, allow_outside: bool) -> Path | None:
+        """The folder that the files which `lights` names must not leave; None: its own."""
+        if self.lights is None or not allow_outside:
+            return None
+        return Path(Path(self.lights).resolve().anchor)

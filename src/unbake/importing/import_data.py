@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..acquisition.new_light import put_light
 from ..config.light import LightConfig
 from ..dataset.camera import LONGEST_SIDE, Camera, frame_of
 from ..dataset.data_folder import TRANSFORMS, DataFolder
@@ -153,10 +154,10 @@ def _check_light(light: LightConfig | None, allow_outside: bool, faults: Faults)
         return
     if light.envmap is not None:
         with faults.collected():
-            relight.check_environment(light.envmap)
+            relight.check_environment(Path(light.envmap))
     if light.lights is not None:
         with faults.collected():
-            parse(light.lights, Path(light.lights.resolve().anchor) if allow_outside else None)
+            parse(Path(light.lights), light.root(allow_outside))
 
 
 def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
@@ -244,12 +245,7 @@ def _write_scene(
     file = write_scene(parts, data.scene, environment=light is None)
     if light is not None:
         parsed = parse(file)
-        if light.envmap is not None:
-            relight.put_environment(parsed, light.envmap, light.envmap_scale, light.up, light.turn)
-        if light.lights is not None:
-            root = Path(light.lights.resolve().anchor) if allow_outside else None
-            for line in relight.put_lights(parsed, light.lights, root):
-                tell(line)
+        put_light(parsed, light, allow_outside, tell)
         file = write(parsed, data.scene.resolve())
     return file, parse(file).instantiate()
 
