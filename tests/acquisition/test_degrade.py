@@ -87,9 +87,8 @@ def test_a_response_is_kept_as_a_table_and_ends_at_white(cornell, degraded):
         linear = np.minimum(clean[name][..., :3] * truth["gain"], 1)
         read = np.interp(linear, table["linear"], table["read"])
         np.testing.assert_allclose(pixels[..., :3], read, atol=2e-4)
-    content = json.loads((dataset.folder / "transforms.json").read_text())
-    assert content["clipped"] == 1
-    assert {frame["exposure"] for frame in content["frames"]} == {truth["gain"]}
+    assert {view.clipped for view in dataset.views} == {1}
+    assert {view.exposure for view in dataset.views} == {truth["gain"]}
 
 
 @pytest.mark.parametrize("kind", ["srgb", "gamma", "contrast"])

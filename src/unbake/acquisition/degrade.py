@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -35,6 +35,8 @@ from .settings import DegradeSettings
 
 #: Entries of the table of a response.
 _TABLE = 257
+#: Of files, by format.
+_SUFFIXES = {"exr": ".exr", "png": ".png", "jpeg": ".jpg"}
 #: Values of each kind of random numbers.
 _EXPOSURE, _BALANCE, _NOISE, _POSE, _MESH = range(5)
 #: Plugins of meshes in files, which can be displaced.
@@ -84,11 +86,14 @@ def degrade(
     out = Path(out)
     require_new_folder(out)
     dataset = Dataset.load(data, allow_outside=allow_outside)
+    cameras, diagonal = [view.camera for view in dataset.views], 0.0
+    if settings.pose_jitter or settings.displace:
+        scene = parse(dataset.scene, dataset.root).instantiate()
+        diagonal = free_space.bounds(scene)[2]
+        cameras = _moved(scene, cameras, settings)
+    # Once more: the nodes of a scene that was instantiated cannot be written.
     parsed = parse(dataset.scene, dataset.root)
-    scene = parse(dataset.scene, dataset.root).instantiate()
-    diagonal = free_space.bounds(scene)[2]
     gain = _gain(dataset, settings)
-    cameras = _moved(scene, dataset.views, settings)
     truths = _camera_truths(dataset.views, gain, settings)
     lost = settings.format == "jpeg" and dataset.background == "hidden"
     masked = lost or any(view.mask is not None for view in dataset.views)
@@ -98,18 +103,25 @@ def degrade(
         changed = settings.displace or settings.decimate < 1
         displaced = _change_meshes(parsed, folder, settings, diagonal) if changed else []
         path = write(parsed, folder.scene)
+        views = []
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
-            pixels = _photograph(view, number, truth, settings)
-            _write_photograph(_image(folder, view, settings), pixels, dataset.background, settings)
+            pixels, counted = _photograph(view, number, truth, settings)
+            degraded = replace(
+                view,
+                camera=cameras[number],
+                image=folder.image(view.name, _SUFFIXES[settings.format]),
+                encoding="linear" if settings.format == "exr" else "srgb",
+                mask=folder.mask(view.name) if masked else None,
+                exposure=truth.exposure if settings.tell_exposures else gain,
+                clipped=_clipped(settings),
+            )
+            _write_photograph(degraded.image, pixels, dataset.background, settings)
+            if degraded.mask is not None:
+                write_png(degraded.mask, to_bytes(counted))
             _copy_truth(view, folder)
-            _write_mask(view, pixels, folder, masked)
+            views.append(degraded)
         _copy_lighting(DataFolder(dataset.folder, allow_outside), folder)
-        content = DataFolder(dataset.folder, allow_outside).read_transforms()
-        files = {view.name: _image(folder, view, settings) for view in dataset.views}
-        masks = {view.name: _mask(folder, view) for view in dataset.views if masked}
-        _write_transforms(
-            folder, content, path, dataset, cameras, truths, gain, settings, files, masks
-        )
+        replace(dataset, scene=path, views=tuple(views)).save(partial)
         write_json(
             folder.degraded_file,
             _truth(dataset, truths, gain, settings, displaced, diagonal),
@@ -189,13 +201,12 @@ def _camera_truths(
 
 def _photograph(
     view: View, number: int, truth: CameraTruth, settings: DegradeSettings
-) -> np.ndarray:
-    """The degraded photograph, (height, width, 4)."""
-    camera = view.camera
-    pixels, _ = read_masked(view)
+) -> tuple[np.ndarray, np.ndarray]:
+    """The degraded photograph, (height, width, 4), and which of its pixels count."""
+    pixels, unmasked = read_masked(view)
     rgb = pixels[..., :3].astype(np.float64) / view.exposure
     rgb *= truth.exposure * np.array(truth.white_balance)
-    rgb *= vignetting(camera, settings.vignetting)[..., None]
+    rgb *= vignetting(view.camera, settings.vignetting)[..., None]
     if settings.electrons:
         rng = _random(settings, _NOISE, number)
         counted = rng.poisson(np.minimum(rgb, 1e3) * settings.electrons)
@@ -205,21 +216,15 @@ def _photograph(
     rgb = np.maximum(rgb, 0)
     if settings.white is not None:
         rgb = response(np.minimum(rgb, 1), settings.response)
-    return np.dstack([rgb, pixels[..., 3]])
+    seen = pixels[..., 3] > 0
+    return np.dstack([rgb, pixels[..., 3]]), seen if unmasked is None else seen & unmasked
 
 
-def _clipped(settings: DegradeSettings) -> float:
+def _clipped(settings: DegradeSettings) -> float | None:
     """The value from which on photographs are clipped: JPEG makes white a little darker."""
+    if settings.white is None:
+        return None
     return float(_decoded(np.array(_JPEG_WHITE / 255))) if settings.format == "jpeg" else 1.0
-
-
-def _image(folder: DataFolder, view: View, settings: DegradeSettings) -> Path:
-    suffix = {"exr": ".exr", "png": ".png", "jpeg": ".jpg"}[settings.format]
-    return folder.image(view.name).with_suffix(suffix)
-
-
-def _mask(folder: DataFolder, view: View) -> Path:
-    return folder.path / "masks" / f"{view.name}.png"
 
 
 def _write_photograph(
@@ -241,14 +246,13 @@ def _write_photograph(
 # --------------------------------------------------------------------------------- poses and meshes
 
 
-def _moved(scene: mi.Scene, views: tuple[View, ...], settings: DegradeSettings) -> list[Camera]:
+def _moved(scene: mi.Scene, cameras: list[Camera], settings: DegradeSettings) -> list[Camera]:
     """Cameras that are turned and moved at random, half of the error each."""
     if not settings.pose_jitter:
-        return [view.camera for view in views]
+        return cameras
     diagonal = free_space.bounds(scene)[2]
-    moved, every = [], seen_by(scene, [small_camera(view.camera) for view in views])
-    for number, (view, seen) in enumerate(zip(views, every, strict=True)):
-        camera = view.camera
+    moved, every = [], seen_by(scene, [small_camera(camera) for camera in cameras])
+    for number, (camera, seen) in enumerate(zip(cameras, every, strict=True)):
         rng = _random(settings, _POSE, number)
         # Two causes, which move a pixel along two axes each.
         part = settings.pose_jitter / 2
@@ -259,17 +263,7 @@ def _moved(scene: mi.Scene, views: tuple[View, ...], settings: DegradeSettings) 
         pose = camera.to_world.copy()
         pose[:3, 3] += pose[:3, :3] @ shift
         pose[:3, :3] = pose[:3, :3] @ turn
-        moved.append(
-            Camera(
-                pose,
-                camera.fl_x,
-                camera.fl_y,
-                camera.cx,
-                camera.cy,
-                camera.width,
-                camera.height,
-            )
-        )
+        moved.append(replace(camera, to_world=pose))
     return moved
 
 
@@ -297,7 +291,8 @@ def _change_meshes(
         mesh = mi.load_dict({"type": plugin, **made})
         params = mi.traverse(mesh)
         positions = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-        positions += displacement(positions, settings, diagonal)
+        if settings.displace:
+            positions += displacement(positions, settings, diagonal)
         faces = np.array(params["faces"]).reshape(-1, 3)
         if settings.decimate < 1 and len(faces) >= FEWEST:
             mesh = decimated(positions, faces, settings.decimate)
@@ -340,14 +335,6 @@ def displacement(positions: np.ndarray, settings: DegradeSettings, diagonal: flo
 # -------------------------------------------------------------------------------------------- files
 
 
-def _write_mask(view: View, pixels: np.ndarray, folder: DataFolder, masked: bool) -> None:
-    """Write what pixels of a view count, where not all do."""
-    if masked:
-        counted = read_masked(view)[1]
-        counted = np.ones(pixels.shape[:2], bool) if counted is None else counted
-        write_png(_mask(folder, view), to_bytes(counted & (pixels[..., 3] > 0)))
-
-
 def _copy_truth(view: View, folder: DataFolder) -> None:
     for quantity, file in view.truth.items():
         target = folder.truth(quantity, view.name)
@@ -366,43 +353,6 @@ def _copy_lighting(source: DataFolder, folder: DataFolder) -> None:
             shutil.copyfile(file, target)
 
 
-def _write_transforms(
-    folder: DataFolder,
-    content: dict[str, Any],
-    scene: Path,
-    dataset: Dataset,
-    cameras: list[Camera],
-    truths: list[CameraTruth],
-    gain: float,
-    settings: DegradeSettings,
-    files: dict[str, Path],
-    masks: dict[str, Path],
-) -> None:
-    """The frames with other poses, and with what a camera tells of its exposures."""
-    frames = []
-    for frame, view, camera, truth in zip(
-        content["frames"], dataset.views, cameras, truths, strict=True
-    ):
-        replaced = ("encoding", "exposure", "clipped", "mask_path")
-        new = {key: value for key, value in frame.items() if key not in replaced}
-        new["file_path"] = folder.relative(files[view.name])
-        if view.name in masks:
-            new["mask_path"] = folder.relative(masks[view.name])
-        new["transform_matrix"] = camera.to_world.tolist()
-        exposure = truth.exposure if settings.tell_exposures else gain
-        if exposure != 1:
-            new["exposure"] = exposure
-        frames.append(new)
-    for key in ("encoding", "clipped"):
-        content.pop(key, None)
-    if settings.format != "exr":
-        content["encoding"] = "srgb"
-    content |= {"scene": folder.relative(scene), "frames": frames}
-    if settings.white is not None:
-        content["clipped"] = _clipped(settings)
-    folder.write_transforms(content)
-
-
 def _truth(
     dataset: Dataset,
     truths: list[CameraTruth],
@@ -415,7 +365,7 @@ def _truth(
     return {
         "settings": asdict(settings),
         "gain": gain,
-        "clipped": None if settings.white is None else _clipped(settings),
+        "clipped": _clipped(settings),
         "response": {
             "linear": linear.tolist(),
             "read": response(linear, settings.response).tolist(),
