@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from unbake.acquisition.decimate import decimated
-from unbake.acquisition.degrade import _encoded, degrade, displacement, response
+from unbake.acquisition.degrade import degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings
 from unbake.dataset.views import Dataset, read_masked
 from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.imaging.srgb import to_srgb
 from unbake.io import read_json
 from unbake.scene.parse import parse
 
@@ -185,7 +186,7 @@ def test_photographs_of_8_bits_are_read_as_they_were(kind, error, degraded):
         assert one.exposure == other.exposure
         assert one.clipped == 1 if kind == "png" else 0.95 < one.clipped < 1
         read, linear = (read_masked(view)[0][..., :3] for view in (one, other))
-        codes = [255 * _encoded(np.asarray(x, np.float64)) for x in (read, linear)]
+        codes = [255 * to_srgb(np.asarray(x, np.float64)) for x in (read, linear)]
         assert np.abs(codes[0] - codes[1]).mean() < error
 
 

@@ -27,6 +27,7 @@ from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
 from ..dataset.views import Dataset, View, read_masked
 from ..imaging.pictures import to_bytes, write_exr, write_png
+from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
 from ..scene import free_space
 from ..scene.parse import ParsedScene, parse, write
@@ -138,10 +139,10 @@ def response(values: np.ndarray, kind: str) -> np.ndarray:
         kind: see `DegradeSettings.response`.
     """
     if kind == "gamma":
-        return _decoded(np.power(values, 1 / 2.2))
+        return from_srgb(np.power(values, 1 / 2.2))
     if kind == "contrast":
-        code = _encoded(values)
-        return _decoded(code + _CONTRAST * (code * code * (3 - 2 * code) - code))
+        code = to_srgb(values)
+        return from_srgb(code + _CONTRAST * (code * code * (3 - 2 * code) - code))
     return values
 
 
@@ -152,16 +153,6 @@ def vignetting(camera: Camera, lost: float) -> np.ndarray:
     scale = camera.width**2 + camera.height**2
     square = ((x * camera.width) ** 2 + ((y * camera.height) ** 2)[:, None]) / (scale / 4)
     return 1 - lost * square
-
-
-def _encoded(linear: np.ndarray) -> np.ndarray:
-    """The sRGB curve. Source: IEC 61966-2-1."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
-
-
-def _decoded(code: np.ndarray) -> np.ndarray:
-    """Its inverse."""
-    return np.where(code <= 0.04045, code / 12.92, np.power((code + 0.055) / 1.055, 2.4))
 
 
 def _random(settings: DegradeSettings, *which: int) -> np.random.Generator:
@@ -224,7 +215,7 @@ def _clipped(settings: DegradeSettings) -> float | None:
     """The value from which on photographs are clipped: JPEG makes white a little darker."""
     if settings.white is None:
         return None
-    return float(_decoded(np.array(_JPEG_WHITE / 255))) if settings.format == "jpeg" else 1.0
+    return float(from_srgb(np.array(_JPEG_WHITE / 255))) if settings.format == "jpeg" else 1.0
 
 
 def _write_photograph(
@@ -234,7 +225,7 @@ def _write_photograph(
     if settings.format == "exr":
         write_exr(file, pixels)
         return
-    codes = to_bytes(_encoded(pixels[..., :3]))
+    codes = to_bytes(to_srgb(pixels[..., :3]))
     if settings.format == "png":
         alpha = to_bytes(pixels[..., 3:])
         write_png(file, np.dstack([codes, alpha]) if background == "hidden" else codes)

@@ -13,6 +13,7 @@ from PIL import Image
 from ..errors import UserError
 from ..io import require_file
 from .headers import HeaderError, read_header
+from .srgb import from_srgb, to_srgb
 
 #: Formats that Pillow may try, by its names: it knows some that start other programs.
 _FORMATS = ("PNG", "JPEG", "TIFF")
@@ -64,8 +65,6 @@ def decode(codes: np.ndarray) -> np.ndarray:
     Returns:
         (H, W, 4) float32: values in [0, 1], the largest code being 1; alpha is 1 where there is
         none, and is not decoded by the curve.
-
-    Source: IEC 61966-2-1.
     """
     table = _table(np.iinfo(codes.dtype).max)
     colours = codes.shape[2] - (codes.shape[2] in (2, 4))
@@ -82,20 +81,15 @@ def encode(linear: np.ndarray) -> np.ndarray:
 
     Args:
         linear: of any shape, not premultiplied.
-
-    Source: IEC 61966-2-1.
     """
     value = np.clip(np.asarray(linear, np.float64), 0, 1)
-    curve = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.round(65535 * curve).astype(np.uint16)
+    return np.round(65535 * to_srgb(value)).astype(np.uint16)
 
 
 @cache
 def _table(most: int) -> np.ndarray:
     """Linear values of all codes up to `most`, float32."""
-    value = np.arange(most + 1) / most
-    curve = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return curve.astype(np.float32)
+    return from_srgb(np.arange(most + 1) / most).astype(np.float32)
 
 
 def _codes(path: Path) -> np.ndarray:

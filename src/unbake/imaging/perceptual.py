@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from .metrics import require_alike
+from .srgb import from_srgb
 
 #: Pixels per degree of visual angle: a display of 0.7 m and 3840 pixels, seen from 0.7 m.
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
@@ -87,7 +88,7 @@ def flip(
     Source: Andersson et al., FLIP: A Difference Evaluator for Alternating Images (2020).
     """
     require_alike(image, reference)
-    both = [_opponent(_linear(x.astype(np.float64))) for x in (image, reference)]
+    both = [_opponent(from_srgb(x.astype(np.float64))) for x in (image, reference)]
     seen = [_perceived(x, pixels_per_degree) for x in both]
     green, blue = (_uniform(_TO_XYZ @ np.eye(3)[i]) for i in (1, 2))
     largest = float(_distance(green, blue)) ** _QC
@@ -122,11 +123,6 @@ def _filtered(
         for number, weight in enumerate(kernel):
             values += weight * padded.take(range(number, number + size), axis)
     return values
-
-
-def _linear(encoded: np.ndarray) -> np.ndarray:
-    bright = ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4
-    return np.where(encoded <= 0.04045, encoded / 12.92, bright)
 
 
 def _opponent(linear: np.ndarray) -> np.ndarray:

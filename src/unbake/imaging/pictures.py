@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..io import require_file, write_atomically
+from .srgb import to_srgb
 
 #: How values become a picture: colours through the sRGB curve, other data without a curve.
 Display = Literal["colour", "data"]
@@ -112,16 +113,13 @@ def tonemap(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
 
     Returns:
         uint8 of the same shape. NaN becomes 0.
-
-    Source: IEC 61966-2-1.
     """
     return to_bytes(encoded(linear, exposure))
 
 
 def encoded(linear: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     """Linear RGB to sRGB values in [0, 1], float32, not rounded; else as `tonemap`."""
-    value = _unit(np.asarray(linear, dtype=np.float32) * np.float32(2.0**exposure))
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
+    return to_srgb(_unit(np.asarray(linear, dtype=np.float32) * np.float32(2.0**exposure)))
 
 
 def fitting_exposure(radiance: Sequence[np.ndarray]) -> float:

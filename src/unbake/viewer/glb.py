@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..exports.gltf import Document
+from ..imaging.srgb import from_srgb
 from .surface import Surface
 
 # Source: the curve of the Academy Color Encoding System as three.js has it, by S. Hill (2016).
@@ -51,9 +52,7 @@ def before_tone_mapping(colours: np.ndarray) -> np.ndarray:
     Returns:
         (n, 3) float32; they may be negative, and over 1.
     """
-    level = np.arange(256) / 255
-    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
-    y = linear[colours] @ np.linalg.inv(_AFTER).T
+    y = from_srgb(np.arange(256) / 255)[colours] @ np.linalg.inv(_AFTER).T
     # y = (v (v + 0.0245786) − 0.000090537) / (v (0.983729 v + 0.4329510) + 0.238081)
     a, b = 1 - 0.983729 * y, 0.0245786 - 0.4329510 * y
     c = -0.000090537 - 0.238081 * y
