@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..scene.triangles import write_mesh
 
 #: Meshes with fewer triangles stay as they are: a box has no tenth.
 FEWEST = 64
@@ -33,15 +34,10 @@ def decimated(positions: np.ndarray, faces: np.ndarray, share: float) -> mi.Mesh
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     # Vertices that differ in their normals or texture coordinates alone are one.
     joined, places = np.unique(positions.astype(np.float32), axis=0, return_inverse=True)
-    mesh = mi.Mesh("mesh", len(joined), len(faces))
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = joined.ravel()
-    params["faces"] = places.reshape(-1)[faces.ravel()].astype(np.uint32)
-    params.update()
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio, options.num_threads = share, 1
     with TemporaryDirectory() as folder:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
-        mesh.write_ply(str(before))
+        write_mesh(before, joined, places.reshape(-1)[faces])
         pycolmap.simplify_mesh(before, after, options)
         return mi.load_dict({"type": "ply", "filename": str(after)})

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..scene.parse import ParsedScene
+from ..scene.triangles import mesh_of
 from .parts import Part, unique_names
 from .tessellate import Triangles
 
@@ -217,13 +218,7 @@ def joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def parameterized(positions: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> mi.Mesh:
     """A mesh of Mitsuba whose surface is looked up by its texture coordinates."""
-    mesh = mi.Mesh("atlas", len(positions), len(faces), has_vertex_texcoords=True)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float(positions.ravel())
-    params["faces"] = mi.UInt32(faces.ravel())
-    params["vertex_texcoords"] = mi.Float(uv.ravel().astype(np.float32))
-    params.update()
-    return mesh
+    return mesh_of(positions, faces, uv=uv, name="atlas")
 
 
 def _uv(triangles: Triangles) -> np.ndarray:

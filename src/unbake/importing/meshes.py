@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import UserError
 from ..io import require_file
 from ..scene.meshes import HEADER, check_mesh
+from ..scene.triangles import write_mesh
 from .faults import Faults
 
 #: Suffixes of the meshes that are read.
@@ -47,23 +48,7 @@ class Part:
 
     def write(self, file: Path) -> None:
         """Write it as binary PLY."""
-        smooth, painted = self.normals is not None, self.uv is not None
-        mesh = mi.Mesh(
-            self.name,
-            len(self.positions),
-            len(self.faces),
-            has_vertex_normals=smooth,
-            has_vertex_texcoords=painted,
-        )
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = np.ravel(self.positions).astype(np.float32)
-        params["faces"] = np.ravel(self.faces).astype(np.uint32)
-        if self.normals is not None:
-            params["vertex_normals"] = np.ravel(self.normals).astype(np.float32)
-        if self.uv is not None:
-            params["vertex_texcoords"] = np.ravel(self.uv).astype(np.float32)
-        params.update()
-        mesh.write_ply(str(file))
+        write_mesh(file, self.positions, self.faces, self.normals, self.uv)
 
 
 def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-import mitsuba as mi
 import numpy as np
+
+from ...scene.triangles import write_mesh
 
 Vec3 = Sequence[float] | np.ndarray
 
@@ -29,22 +30,7 @@ class Mesh:
 
     def write(self, path: Path) -> None:
         """Write the mesh as binary PLY; needs a Mitsuba variant to be set."""
-        smooth = self.normals is not None
-        mesh = mi.Mesh(
-            path.stem,
-            len(self.positions),
-            len(self.faces),
-            has_vertex_normals=smooth,
-            has_vertex_texcoords=True,
-        )
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = np.ravel(self.positions).astype(np.float32)
-        params["vertex_texcoords"] = np.ravel(self.uv).astype(np.float32)
-        params["faces"] = np.ravel(self.faces).astype(np.uint32)
-        if self.normals is not None:
-            params["vertex_normals"] = np.ravel(self.normals).astype(np.float32)
-        params.update()
-        mesh.write_ply(str(path))
+        write_mesh(path, self.positions, self.faces, self.normals, self.uv)
 
 
 def merge(*meshes: Mesh) -> Mesh:

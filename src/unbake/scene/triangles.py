@@ -1,0 +1,54 @@
+"""Meshes of triangles, made by Mitsuba of arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+
+def mesh_of(
+    positions: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    *,
+    name: str = "mesh",
+) -> mi.Mesh:
+    """A mesh; needs a Mitsuba variant to be set.
+
+    Args:
+        positions: (n, 3).
+        faces: (m, 3) indices.
+        normals: (n, 3) of unit length; None: facets.
+        uv: (n, 2), v upwards; None: there are none.
+        name: its id.
+    """
+    mesh = mi.Mesh(
+        name,
+        len(positions),
+        len(faces),
+        has_vertex_normals=normals is not None,
+        has_vertex_texcoords=uv is not None,
+    )
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel(positions).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    if normals is not None:
+        params["vertex_normals"] = np.ravel(normals).astype(np.float32)
+    if uv is not None:
+        params["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    params.update()
+    return mesh
+
+
+def write_mesh(
+    file: Path,
+    positions: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+) -> None:
+    """Write a mesh as binary PLY; see `mesh_of`."""
+    mesh_of(positions, faces, normals, uv, name=file.stem).write_ply(str(file))
