@@ -223,28 +223,12 @@ class CameraModel:
     def photographed(self, exposed: np.ndarray) -> np.ndarray:
         """The photograph of light times gain, the inverse of f; shape (..., 3)."""
         curves = self.curves()
-        if curves is None:
-            return exposed
-        places, found = np.linspace(0, 1, PIECES + 1), []
-        for curve, channel in zip(curves, np.moveaxis(exposed, -1, 0), strict=True):
-            height = np.maximum(channel, 0) ** (1 / _GAMMA)
-            place = np.interp(height, curve, places)
-            last = (places[-1] - places[-2]) / (curve[-1] - curve[-2])
-            found.append(np.where(height > 1, 1 + (height - 1) * last, place) ** _GAMMA)
-        return np.stack(found, -1).astype(exposed.dtype)
+        return exposed if curves is None else _through(exposed, curves, _places())
 
     def light(self, photograph: np.ndarray) -> np.ndarray:
         """Photographs through f, in NumPy; shape (..., 3)."""
         curves = self.curves()
-        if curves is None:
-            return photograph
-        places, found = np.linspace(0, 1, PIECES + 1), []
-        for curve, channel in zip(curves, np.moveaxis(photograph, -1, 0), strict=True):
-            place = np.maximum(channel, 0) ** (1 / _GAMMA)
-            height = np.interp(place, places, curve)
-            last = (curve[-1] - curve[-2]) * PIECES
-            found.append(np.where(place > 1, 1 + (place - 1) * last, height) ** _GAMMA)
-        return np.stack(found, -1).astype(photograph.dtype)
+        return photograph if curves is None else _through(photograph, _places(), curves)
 
     def _array(self, key: str) -> np.ndarray:
         return np.array(dr.detach(self._arrays[key]), np.float64)
@@ -257,6 +241,26 @@ def _read(array: mi.Float, index: mi.UInt32) -> mi.Float:
     `Local` has none.
     """
     return dr.gather(mi.Float, array, index, mode=dr.ReduceMode.Local)
+
+
+def _places() -> np.ndarray:
+    """Where `curves` are told, shape (3, places)."""
+    return np.tile(np.linspace(0, 1, PIECES + 1), (3, 1))
+
+
+def _through(values: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Channels through curves of u, of which values are u^2.2; straight beyond the last piece.
+
+    Args:
+        values: linear RGB, shape (..., 3).
+        before, after: u at the ends of the pieces, shape (3, places), rising from 0 to 1.
+    """
+    found = []
+    for x, y, channel in zip(before, after, np.moveaxis(values, -1, 0), strict=True):
+        u = np.maximum(channel, 0) ** (1 / _GAMMA)
+        last = (y[-1] - y[-2]) / (x[-1] - x[-2])
+        found.append(np.where(u > 1, 1 + (u - 1) * last, np.interp(u, x, y)) ** _GAMMA)
+    return np.stack(found, -1).astype(values.dtype)
 
 
 def _exp(log: mi.Float) -> mi.Float:
