@@ -266,6 +266,23 @@ class Camera:
         return cls(matrix @ _FLIP, focal, focal, cx, cy, crop_width, crop_height)
 
 
+def spread_rays(cameras: Sequence[Camera], along: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays that are spread evenly over images, the same number in each, camera by camera.
+
+    Args:
+        cameras: one at least.
+        along: rays along an edge of an image; `along`² are in it.
+
+    Returns:
+        Origins and unit directions, (n, 3) each in world space.
+    """
+    film = (np.arange(along) + 0.5) / along
+    x, y = (axis.ravel() for axis in np.meshgrid(film, film))
+    rays = [camera.rays(x * camera.width, y * camera.height) for camera in cameras]
+    origins, directions = zip(*rays, strict=True)
+    return np.concatenate(origins), np.concatenate(directions)
+
+
 @final
 @dataclass(frozen=True)
 class LookAt:

@@ -12,7 +12,7 @@ from typing import Any, final
 import mitsuba as mi
 import numpy as np
 
-from unbake.dataset.camera import Camera, camera_from_frame, frame_of, read_split
+from unbake.dataset.camera import Camera, camera_from_frame, frame_of, read_split, spread_rays
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError
@@ -317,11 +317,7 @@ def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
         return []
     inside = free_space.inside_geometry(scene, np.array([c.origin for c in cameras.values()]))
     near = free_space.CONTACT * free_space.bounds(scene)[2]
-    film = (np.arange(16) + 0.5) / 16
-    x, y = (axis.ravel() for axis in np.meshgrid(film, film))
-    rays = [camera.rays(x * camera.width, y * camera.height) for camera in cameras.values()]
-    origins, directions = (np.concatenate(part) for part in zip(*rays, strict=True))
-    touching = free_space.trace(scene, origins, directions).distance < near
+    touching = free_space.trace(scene, *spread_rays([*cameras.values()], 16)).distance < near
     nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
     return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..acquisition.new_light import put_light
 from ..config.light import LightConfig
-from ..dataset.camera import LONGEST_SIDE, Camera, frame_of
+from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.views import PIXEL_BYTES, counted_by, read_image
 from ..errors import UserError
@@ -252,9 +252,8 @@ def _write_scene(
 
 def _shares_seen(scene: mi.Scene, shots: Sequence[Shot]) -> np.ndarray:
     """The share of each photograph's pixels that see the mesh."""
-    x, y = (axis.ravel() for axis in np.meshgrid(*[(np.arange(_RAYS) + 0.5) / _RAYS] * 2))
     cameras = [shot.lens.camera(shot.to_world) for shot in shots]
-    seen = np.array([_hits(scene, c, x * c.width, y * c.height).mean() for c in cameras])
+    seen = np.array([_hits(scene, *spread_rays([c], _RAYS)).mean() for c in cameras])
     if not seen.any():
         raise UserError(
             "no photograph sees the mesh",
@@ -268,13 +267,13 @@ def _shares_seen(scene: mi.Scene, shots: Sequence[Shot]) -> np.ndarray:
 def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:
     """Which pixels see nothing but the mesh, by their four corners: (H, W) bool."""
     x, y = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
-    hit = _hits(scene, camera, x.ravel(), y.ravel()).reshape(x.shape)
+    hit = _hits(scene, *camera.rays(x.ravel(), y.ravel())).reshape(x.shape)
     return hit[:-1, :-1] & hit[:-1, 1:] & hit[1:, :-1] & hit[1:, 1:]
 
 
-def _hits(scene: mi.Scene, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether rays through places (n,) of a picture hit something."""
-    return np.isfinite(free_space.trace(scene, *camera.rays(x, y)).distance)
+def _hits(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Whether rays (n, 3) hit something, (n,) bool."""
+    return np.isfinite(free_space.trace(scene, origins, directions).distance)
 
 
 def _write_view(

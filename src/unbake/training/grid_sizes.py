@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..dataset.camera import Camera
+from ..dataset.camera import Camera, spread_rays
 from ..dataset.views import Dataset
 from ..fields.domain import Domain
 from ..fields.grid_sizes import SurfaceSeen, is_open, sized
@@ -80,11 +80,8 @@ def surface_seen(scene: mi.Scene, cameras: Sequence[Camera]) -> SurfaceSeen | No
         factor of two.
     """
     along = math.ceil(math.sqrt(RAYS / len(cameras)))
-    film = (np.arange(along) + 0.5) / along
-    x, y = (axis.ravel() for axis in np.meshgrid(film, film))
-    rays = [camera.rays(x * camera.width, y * camera.height) for camera in cameras]
-    origins, directions = (np.concatenate(each) for each in zip(*rays, strict=True))
-    focal = np.repeat([math.sqrt(camera.fl_x * camera.fl_y) for camera in cameras], len(x))
+    origins, directions = spread_rays(cameras, along)
+    focal = np.repeat([math.sqrt(camera.fl_x * camera.fl_y) for camera in cameras], along**2)
     distance = free_space.trace(scene, origins, directions).distance
     hit = np.isfinite(distance) & (distance > 0)
     if not hit.any():
