@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..imaging.pictures import block_means
+from ..scene import free_space
 from .camera import Camera
 
 #: Pixels along the longer side of a small view, at most.
@@ -126,16 +127,14 @@ def seen_along(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> 
 
 
 def _seen(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-    o, d = (np.ascontiguousarray(a.T, dtype=np.float32) for a in (origins, directions))
-    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
-    hit = scene.ray_intersect(ray)
+    hit = scene.ray_intersect(free_space.as_ray(origins, directions))
     valid = hit.is_valid()
     normal = hit.sh_frame.n
     emits = valid & hit.shape.is_emitter()
     dr.eval(hit.t, normal, valid, emits)
     found = np.array(valid)
     distance = np.where(found, np.array(hit.t, dtype=np.float64), np.inf)
-    towards = np.array(normal, dtype=np.float64).reshape(3, -1).T
+    towards = free_space.as_rows(normal)
     towards = np.where(((towards * directions).sum(1) > 0)[:, None], -towards, towards)
     reach = np.where(found, distance, 0)[:, None]
     position = np.where(found[:, None], origins + reach * directions, np.nan)

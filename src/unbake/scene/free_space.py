@@ -100,7 +100,7 @@ def unoccluded(scene: mi.Scene, starts: np.ndarray, ends: np.ndarray) -> np.ndar
     for i in range(0, len(starts), _CHUNK):
         start, segment = starts[i : i + _CHUNK], (ends - starts)[i : i + _CHUNK]
         length = np.maximum(np.linalg.norm(segment, axis=1), 1e-12)
-        ray = _ray(start, segment / length[:, None])
+        ray = as_ray(start, segment / length[:, None])
         ray.maxt = mi.Float(np.maximum(length - offset, 0.0).astype(np.float32))
         free[i : i + _CHUNK] = ~np.array(scene.ray_test(ray))
     return free
@@ -135,7 +135,7 @@ def outgoing_radiance(
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, len(eyes))
     integrator = mi.load_dict({"type": path_integrator(scene), "max_depth": depth})
-    ray = mi.RayDifferential3f(_ray(eyes, segment / length))
+    ray = mi.RayDifferential3f(as_ray(eyes, segment / length))
     colour, _, _ = integrator.sample(scene, sampler, ray)
     return np.array(colour, dtype=np.float64).mean(axis=0)
 
@@ -160,7 +160,7 @@ def sample_surface(scene: mi.Scene, count: int, seed: int, power: float = 1.0) -
     # A symbolic call asks all shapes there are, and those called `Instance` cannot be sampled.
     with dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, False):
         sampled = shapes.sample_position(0.0, uv)
-        position, normal = _as_rows(sampled.p), _as_rows(sampled.n)
+        position, normal = as_rows(sampled.p), as_rows(sampled.n)
     for i in (i for i in np.unique(chosen) if surfaces[i].instanced):
         here = chosen == i
         position[here] = surfaces[i].moved(position[here])
@@ -225,7 +225,7 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
     for sensor in scene.sensors():
         film = mi.Point2f(rng.random((2, 64)).astype(np.float32))
         ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
-        origins, directions = _as_rows(ray.o), _as_rows(ray.d)
+        origins, directions = as_rows(ray.o), as_rows(ray.d)
         far = trace(scene, origins, directions).distance
         with np.errstate(divide="ignore", invalid="ignore"):
             walls = np.stack([(low - origins) / directions, (high - origins) / directions])
@@ -296,7 +296,7 @@ def _trace_spheres(scene: mi.Scene, positions: np.ndarray, directions: np.ndarra
 def _trace(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    ray = _ray(origins, directions)
+    ray = as_ray(origins, directions)
     hit = scene.ray_intersect(ray)
     valid = hit.is_valid()
     back = valid & (dr.dot(hit.n, ray.d) > 0)
@@ -305,12 +305,14 @@ def _trace(
     return np.array(distance, dtype=np.float64), np.array(back), np.array(back & ~two_sided)
 
 
-def _ray(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
+def as_ray(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
+    """Rays (n, 3) for Mitsuba."""
     o, d = (np.ascontiguousarray(a.T, dtype=np.float32) for a in (origins, directions))
     return mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
 
 
-def _as_rows(vector: mi.Vector3f) -> np.ndarray:
+def as_rows(vector: mi.Vector3f) -> np.ndarray:
+    """Points or vectors of Mitsuba, (n, 3) float64."""
     return np.array(vector, dtype=np.float64).reshape(3, -1).T
 
 
@@ -358,7 +360,7 @@ def _surfaces(scene: mi.Scene) -> list[_Surface]:
         surface = _Surface(number, placed.to_world, corners, area, instanced=True)
         if area and number not in normals:
             uv = mi.Point2f(np.random.default_rng(0).random((2, 256)).astype(np.float32))
-            normals[number] = _as_rows(shape.sample_position(0.0, uv).n)
+            normals[number] = as_rows(shape.sample_position(0.0, uv).n)
         if area:
             area *= float(np.linalg.norm(surface.turned(normals[number]), axis=1).mean())
         ends = surface.moved(
