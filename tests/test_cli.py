@@ -231,6 +231,7 @@ def test_the_help_breaks_lines_where_they_are_full(unbake, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     for command in COMMANDS:
         lines = unbake(command, "--help").out.splitlines()
+        assert max(map(len, lines)) <= 80
         texts = [line.strip("│ ") for line in lines if line.startswith("│  ")]
         full = max(map(len, texts), default=0)  # the column depends on the widths of all options
         for line, following in pairwise(texts):

@@ -33,6 +33,7 @@ from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
 from ..version import VERSION
 from .flags import flags, given, with_options
+from .help import NARROWEST, columns, wrapped_help
 from .options import (
     Count,
     Data,
@@ -63,8 +64,6 @@ from .options import (
     with_length,
 )
 
-#: Columns of a terminal that texts are wrapped for, at least.
-_NARROWEST = 40
 #: Characters of a line that is printed: more than a path can have.
 _LONGEST = 1 << 14
 
@@ -105,8 +104,8 @@ def main() -> None:
 
     2 on bad input; 130, 143, 129 or 141 if a signal or a closed pipe ended it (`signals.py`).
     """
-    if shutil.get_terminal_size().columns < _NARROWEST:
-        os.environ["COLUMNS"] = str(_NARROWEST)  # Tyro 1.0 wraps texts forever below 10
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)  # Tyro 1.0 wraps texts forever below 10
     words = sys.argv[1:]
     if words in ([], ["-h"], ["--help"]):
         print(_overview(), file=sys.stdout if words else sys.stderr)
@@ -118,9 +117,10 @@ def main() -> None:
         # Tyro 1.0 keeps the line breaks of some arguments' texts.
         command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
     try:
-        status = tyro.extras.subcommand_cli_from_dict(
-            dict(COMMANDS), prog="unbake", description=_DESCRIPTION
-        )
+        with wrapped_help(words):
+            status = tyro.extras.subcommand_cli_from_dict(
+                dict(COMMANDS), prog="unbake", description=_DESCRIPTION
+            )
     except UserError as error:
         _fail(str(error))
     except (MemoryError, RuntimeError, ImportError) as error:  # Dr.Jit raises the second
@@ -972,11 +972,10 @@ COMMANDS = {name: command for group in GROUPS.values() for name, command in grou
 
 def _overview() -> str:
     """The help of `unbake` alone: its commands, a line or two each."""
-    columns = min(max(shutil.get_terminal_size().columns, _NARROWEST), 100)
     indent = 4 + max(map(len, COMMANDS))
 
     def wrapped(text: str, first: str = "", further: str = "") -> list[str]:
-        return textwrap.wrap(text, columns, initial_indent=first, subsequent_indent=further)
+        return textwrap.wrap(text, columns(), initial_indent=first, subsequent_indent=further)
 
     lines = ["usage: unbake COMMAND ...", "", *wrapped(_DESCRIPTION)]
     for title, group in GROUPS.items():
