@@ -1,6 +1,7 @@
 """Capture from scene files: truth is what the scene says, and nothing is lost on the way."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,6 +166,13 @@ def test_a_folder_of_the_user_is_left_alone(scene, tmp_path):
     assert (mine / "work").read_text() == "years"
     left = {"data.partial", "data"} if scene == "cube" else {"data.partial"}
     assert {p.name for p in tmp_path.iterdir()} == left
+
+
+def test_samples_become_as_many_as_fill_a_grid(tmp_path, told, capfd):
+    found = capture("cube", tmp_path / "data", replace(TINY, spp=7), tell=told.append)
+    assert found.render["spp"] == 8
+    assert "8 samples per pixel instead of 7: they fill a grid" in told
+    assert "WARN" not in "".join(capfd.readouterr())  # of Mitsuba, with codes of colours
 
 
 def test_what_a_killed_capture_has_left_is_told(tmp_path, told):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import secrets
@@ -160,9 +161,11 @@ def _capture(
     )
     room = is_room(scene)
     rays = CameraRays.of([c for _, c in posed])
-    # Stratified samples have a third less variance than independent ones at the same cost. The
-    # sampler rounds their number up to a grid.
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": settings.spp})
+    # Stratified samples have a third less variance than independent ones at the same cost.
+    spp = samples_of_grid(settings.spp)
+    if spp != settings.spp:
+        tell(f"{spp} samples per pixel instead of {settings.spp}: they fill a grid")
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
     rgb, alpha = photographs(scene, rays, settings, sampler, room, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
@@ -194,7 +197,7 @@ def _capture(
             "integrator": path_integrator(scene),
             "max_depth": settings.max_depth,
             "rr_depth": settings.rr_depth,
-            "spp": sampler.sample_count(),
+            "spp": spp,
             "seed": settings.seed,
             "variant": mi.variant(),
             "mitsuba": mi.__version__,
@@ -202,6 +205,15 @@ def _capture(
         coverage=round(float(seen), 4),
         light_by_depth=shares,
     )
+
+
+def samples_of_grid(count: int) -> int:
+    """The samples of the grid, nearly a square, that has so many or a few more.
+
+    Mitsuba's stratified sampler rounds to it with a warning of its own.
+    """
+    rows = math.isqrt(count)
+    return rows * -(-count // rows)
 
 
 def _copy_scene(
