@@ -83,9 +83,11 @@ def shared_points(views: Sequence[SmallView], seen: Sequence[Seen], seed: int = 
         seen: what their pixels see.
     """
     rng = np.random.default_rng(seed)
-    usable = [_usable(view, found) for view, found in zip(views, seen, strict=True)]
+    logs = [np.log2(np.maximum(view.rgb.mean(axis=-1), 1e-30)) for view in views]
+    usable = [_usable(*each) for each in zip(views, logs, seen, strict=True)]
     rows = []
-    for i, (view, found) in enumerate(zip(views, seen, strict=True)):
+    axes = [view.camera.to_world[:3, :3] for view in views]
+    for i, found in enumerate(seen):
         chosen = np.flatnonzero(usable[i])
         chosen = rng.permutation(chosen)[:_POINTS]
         others = rng.permutation([j for j in range(len(views)) if j != i])[:_PARTNERS]
@@ -96,9 +98,9 @@ def shared_points(views: Sequence[SmallView], seen: Sequence[Seen], seed: int = 
                 (
                     np.full(len(here), i),
                     np.full(len(here), j),
-                    _log2(views[j]).ravel()[at] - _log2(view).ravel()[here],
-                    found.normal[here] @ view.camera.to_world[:3, :3],
-                    found.normal[here] @ views[j].camera.to_world[:3, :3],
+                    logs[j].ravel()[at] - logs[i].ravel()[here],
+                    found.normal[here] @ axes[i],
+                    found.normal[here] @ axes[j],
                 )
             )
     if not rows:
@@ -180,13 +182,8 @@ def _directional(normal: np.ndarray) -> np.ndarray:
     return np.stack([z, z * z, x, y, x * x - y * y, x * y], axis=1)
 
 
-def _log2(view: SmallView) -> np.ndarray:
-    return np.log2(np.maximum(view.rgb.mean(axis=-1), 1e-30))
-
-
-def _usable(view: SmallView, seen: Seen) -> np.ndarray:
-    """Pixels whose brightness is that of one surface point, (pixels,) bool."""
-    brightness = _log2(view)
+def _usable(view: SmallView, brightness: np.ndarray, seen: Seen) -> np.ndarray:
+    """Pixels whose brightness, a logarithm, is that of one surface point, (pixels,) bool."""
     steep = np.zeros(brightness.shape)
     for axis in (0, 1):
         line, out = np.moveaxis(brightness, axis, 0), np.moveaxis(steep, axis, 0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .camera import Camera
 from .mistakes import Mistake, all_mistakes
-from .small_views import SmallView, pixel_rays, seen_by, small_view
+from .small_views import SmallView, seen_by, small_view, view_rays
 
 #: Views that are compared, at most, and how many are needed to tell that others are better.
 MOST_VIEWS, FEWEST_VIEWS = 8, 3
@@ -163,9 +163,8 @@ def geometry_edges(
         blurred: over 3 x 3 pixels, to be compared with those of photographs.
     """
     shape = (camera.height, camera.width)
-    _, directions = pixel_rays([camera])
-    cosine = -(directions @ camera.to_world[:3, 2])
-    inverse = (1 / (distance * np.maximum(cosine, 1e-6))).reshape(shape)
+    cosine = -view_rays(camera)[:, 2]
+    inverse = (1 / (distance * cosine)).reshape(shape)
     facing = normal.reshape(*shape, 3)
     strength = np.zeros(shape)
     for axis in (0, 1):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 
 import drjit as dr
@@ -102,12 +103,24 @@ def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
 
 def pixel_rays(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions through the centres of all pixels, row by row, camera by camera."""
-    rays = []
-    for camera in cameras:
-        row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        rays.append(camera.rays(column + 0.5, row + 0.5))
-    origins, directions = zip(*rays, strict=True)
+    directions = [view_rays(camera) @ camera.to_world[:3, :3].T for camera in cameras]
+    origins = [np.broadcast_to(c.origin, d.shape) for c, d in zip(cameras, directions, strict=True)]
     return np.concatenate(origins), np.concatenate(directions)
+
+
+def view_rays(camera: Camera) -> np.ndarray:
+    """Directions through the centres of all pixels in the camera's own axes, (pixels, 3)."""
+    inside = camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height
+    return _view_rays(*inside)
+
+
+@lru_cache(maxsize=32)  # many poses of the same few cameras are tried
+def _view_rays(
+    fl_x: float, fl_y: float, cx: float, cy: float, width: int, height: int
+) -> np.ndarray:
+    row, column = np.divmod(np.arange(width * height), width)
+    camera = Camera(np.eye(4), fl_x, fl_y, cx, cy, width, height)
+    return camera.rays(column + 0.5, row + 0.5)[1]
 
 
 def seen_by(scene: mi.Scene, cameras: Sequence[Camera]) -> list[Seen]:
