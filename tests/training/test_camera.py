@@ -12,6 +12,7 @@ import pytest
 from safetensors.numpy import load_file
 from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
 
+from unbake.acquisition.degrade import response
 from unbake.config import CameraConfig, from_toml, read_toml, to_toml
 from unbake.dataset.fingerprint import changed, fingerprint
 from unbake.dataset.photographs import Photographs
@@ -24,7 +25,8 @@ from unbake.fields.camera import CameraModel
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.report.page import write_report
 from unbake.scene.parse import parse
-from unbake.training.first_gains import _solved, first_gains
+from unbake.training.first_gains import _solved, first_gains, shared_points
+from unbake.training.first_response import first_response
 from unbake.training.fresh_fit import begin_fit
 from unbake.training.held_aside import HeldAside, HeldOutPhotographs
 from unbake.training.loop import fit
@@ -274,8 +276,11 @@ def test_gains_and_responses_are_the_same_in_steps_and_in_evaluations():
     values = np.linspace(0, 1.5, 31, dtype=np.float32)[:, None].repeat(3, 1)
     light = np.array(model.exposed(mi.Color3f([mi.Float(x) for x in values.T]))).T
     np.testing.assert_allclose(light, model.light(values), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(light[[0, 20]], [[0] * 3, [1] * 3], atol=1e-6)
+    np.testing.assert_allclose(light[0], 0, atol=1e-6)
     assert (np.diff(light, axis=0) > 0).all()
+    middle = np.full((1, 3), 0.5**2.2)  # where f stays as it is, whatever it is for white
+    np.testing.assert_allclose(model.light(middle), middle, rtol=1e-6)
+    assert np.abs(model.light(np.ones((1, 3))) - 1).min() > 0.01
     np.testing.assert_allclose(model.photographed(light), values, rtol=1e-3, atol=1e-5)
     # Gradients reach all of it, but the anchor through exposures of its own
     loss = dr.sum(dr.sum(gain) + dr.sum(model.exposed(mi.Color3f(mi.Float(values[:12, 0])))))
@@ -377,9 +382,30 @@ def test_exposures_begin_at_what_photographs_say_of_the_same_points(unknown, exp
         dataset = Dataset.load(data)
         pixels = training_pixels(dataset, clip_negative=False)
         scene = parse(dataset.scene, dataset.root).instantiate()
-        gains = first_gains(scene, dataset.train, pixels)
+        gains = first_gains(shared_points(scene, dataset.train, pixels))
         assert gains.shape == (2, 3) and (gains[0] == 1).all()
         np.testing.assert_allclose(np.log2(gains[1]), np.log2(truth[1] / truth[0]), atol=0.15)
+
+
+def test_a_response_begins_at_what_exposures_that_differ_say():
+    rng, values = np.random.default_rng(0), np.linspace(0, 1, 2000)
+    light = np.exp(rng.normal(-2, 1, (8000, 1)))
+    stops = rng.uniform(-1.5, 1.5, (2, 8000, 1))
+    told = light * 2.0**stops * np.exp(rng.normal(0, 0.05, (2, 8000, 3)))
+    photographs = response(np.minimum(told, 1), "contrast")
+    photographs[:, :400] = rng.uniform(0.01, 0.9, (2, 400, 3))  # of other points
+    logs = np.log(np.where((told < 1) & (photographs > 1e-4), photographs, np.nan))
+    ratio = np.log(2) * (stops[1] - stops[0]) * np.ones(3)
+    curves = first_response(logs, ratio)
+    places = np.linspace(0, 1, curves.shape[1])
+    truth = np.interp(places**2.2, response(values, "contrast"), values)
+    assert np.sqrt(((curves**2.2 - truth) ** 2).mean(1)).max() < 0.02
+    assert np.sqrt(((places**2.2 - truth) ** 2).mean()) > 0.03
+    # With one exposure nothing is told, and a model takes the curves as they are.
+    np.testing.assert_array_equal(first_response(logs, 0 * ratio), np.tile(places, (3, 1)))
+    model = CameraModel(3, response=True)
+    model.start_response(curves)
+    np.testing.assert_allclose(model.curves(), curves, atol=1e-5)
 
 
 def test_gains_of_views_are_the_least_squares_ones():

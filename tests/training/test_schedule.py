@@ -7,6 +7,7 @@ from support import TINY_FIT
 
 from unbake.config import (
     BitmapConfig,
+    CameraConfig,
     DenseGridConfig,
     FitConfig,
     LightingConfig,
@@ -71,6 +72,12 @@ def test_rates_of_the_unknowns_are_multiples_of_the_fields_own():
     )
     for name, rate in plain.items():
         assert scaled[name] == pytest.approx(factors.get(name, 1.0) * rate), name
+
+
+def test_vignetting_is_found_faster_than_exposures_and_responses_slower():
+    camera = CameraConfig("per-image", vignetting="radial", response="monotone")
+    rates = learning_rates(changed(camera=camera), 9, 0.5)
+    assert rates["vignetting"] > rates["exposure"] > rates["response"] > 0
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,11 @@ Photographs alone leave some of it open, which conventions decide:
   view is as the data set tells, and so is its white balance where each image has one of its own.
 - A white balance that all images share is told from the colour of albedo by interreflection, and
   by lights that are seen, alone.
-- v is 1 at the centre, and f(0) = 0, f(1) = 1.
+- v is 1 at the centre, and f(0) = 0. f(P) = P at the middle of the code values of an 8-bit file,
+  which is where cameras put a surface of 18 % (ISO 12232: code 118 of 255). Photographs have most
+  of their pixels around there; where white is, 1, few of them say anything.
+- f is told by photographs of the same points with exposures that differ, and by next to nothing
+  else: with one exposure any f explains the photographs, each with another albedo.
 - A power of f, of all exposures and of all radiance explains the same differences between
   photographs. What lights and geometry say of radiance decides the exponent; where they say
   little, the smoothness of f does, whose optimum is f(P) = P.
@@ -38,10 +42,13 @@ Balance = Literal["known", "common", "per-image"]
 
 #: Of the log of exposures and white balances, so that nothing overflows single precision.
 BOUND = 20.0
+#: Weights of the terms of vignetting: steps of the optimizer move the lower orders more, as lenses
+#: have more of them.
+_ORDERS = (1.0, 1 / 4, 1 / 16)
 #: The least that vignetting leaves of the light.
 _DARKEST = 0.05
 #: Pieces of f, of equal length where photographs are as an 8-bit file has them.
-PIECES, _GAMMA = 16, 2.2
+PIECES, GAMMA = 16, 2.2
 #: `softplus` of it is 1.
 _UNIT = math.log(math.e - 1)
 
@@ -85,6 +92,11 @@ class CameraModel:
         """Whether the response is unknown."""
         return "response.log" in self._arrays
 
+    @property
+    def has_exposures(self) -> bool:
+        """Whether each image has an unknown exposure."""
+        return "exposure.log" in self._arrays
+
     def parameters(self) -> dict[str, mi.Float]:
         """The trainable arrays; `assign` takes them back."""
         return dict(self._arrays)
@@ -106,6 +118,16 @@ class CameraModel:
         if self.white_balance == "per-image":
             found = logs[:, [0, 2]] - logs[:, [1]]
             self._arrays["white_balance.log"] = from_numpy(mi.Float, found.astype(np.float32))
+
+    def start_response(self, curves: np.ndarray) -> None:
+        """Begin with another response than f(P) = P.
+
+        Args:
+            curves: as `curves` gives them.
+        """
+        slopes = PIECES * np.diff(curves)
+        logs = np.log(np.expm1(slopes)) - _UNIT
+        self._arrays["response.log"] = from_numpy(mi.Float, logs.astype(np.float32).ravel())
 
     # ---------------------------------------------------------------------------- in a step
 
@@ -129,7 +151,10 @@ class CameraModel:
             gain *= mi.Color3f(_exp(red), 1, _exp(blue))
         if "vignetting.terms" in self._arrays:
             array = self._arrays["vignetting.terms"]
-            a, b, c = (_read(array, dr.full(mi.UInt32, i, lanes)) for i in range(3))
+            a, b, c = (
+                order * _read(array, dr.full(mi.UInt32, i, lanes))
+                for i, order in enumerate(_ORDERS)
+            )
             falloff = dr.fma(radius2, dr.fma(radius2, dr.fma(radius2, c, b), a), 1)
             gain *= dr.maximum(falloff, _DARKEST)
         return gain
@@ -163,19 +188,20 @@ class CameraModel:
         logs = self._arrays["response.log"]
         slopes = _softplus(_read(logs, channel * PIECES + piece) + _UNIT)
         risen = dr.block_sum(dr.select(piece < place % row, slopes, 0), column)
-        whole = dr.block_sum(slopes, column)
-        heights = risen / whole
+        # The middle stays where it is: see above.
+        half = dr.block_sum(dr.select(piece < PIECES // 2, slopes, 0), column)
+        heights = 0.5 * risen / half
         dr.eval(heights)
         return heights
 
     def _inverse(self, value: mi.Float, heights: mi.Float, channel: int) -> mi.Float:
         """One channel through f: pieces of positive slope, equal ones for 8-bit files."""
-        place = dr.power(value, 1 / _GAMMA) * PIECES
+        place = dr.power(value, 1 / GAMMA) * PIECES
         piece = dr.minimum(mi.UInt32(place), PIECES - 1)
         index = piece + channel * (PIECES + 1)
         low, high = _read(heights, index), _read(heights, index + 1)
         height = dr.fma(high - low, place - mi.Float(piece), low)
-        return dr.power(dr.maximum(height, 1e-6), _GAMMA)
+        return dr.power(dr.maximum(height, 1e-6), GAMMA)
 
     # ----------------------------------------------------------------------------- as numbers
 
@@ -199,7 +225,7 @@ class CameraModel:
     def vignetting(self) -> np.ndarray | None:
         """The coefficients a, b, c; None where there are none."""
         known = "vignetting.terms" in self._arrays
-        return self._array("vignetting.terms") if known else None
+        return self._array("vignetting.terms") * _ORDERS if known else None
 
     def falloff(self, radius2: np.ndarray) -> np.ndarray:
         """Vignetting v at squared radii."""
@@ -218,7 +244,7 @@ class CameraModel:
             return None
         slopes = np.logaddexp(0, self._array("response.log").reshape(3, PIECES) + _UNIT)
         heights = np.concatenate([np.zeros((3, 1)), np.cumsum(slopes, 1)], 1)
-        return heights / heights[:, -1:]
+        return 0.5 * heights / heights[:, PIECES // 2, None]
 
     def photographed(self, exposed: np.ndarray) -> np.ndarray:
         """The photograph of light times gain, the inverse of f; shape (..., 3)."""
@@ -253,13 +279,13 @@ def _through(values: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.nd
 
     Args:
         values: linear RGB, shape (..., 3).
-        before, after: u at the ends of the pieces, shape (3, places), rising from 0 to 1.
+        before, after: u at the ends of the pieces, shape (3, places), rising from 0.
     """
     found = []
     for x, y, channel in zip(before, after, np.moveaxis(values, -1, 0), strict=True):
-        u = np.maximum(channel, 0) ** (1 / _GAMMA)
+        u = np.maximum(channel, 0) ** (1 / GAMMA)
         last = (y[-1] - y[-2]) / (x[-1] - x[-2])
-        found.append(np.where(u > 1, 1 + (u - 1) * last, np.interp(u, x, y)) ** _GAMMA)
+        found.append(np.where(u > x[-1], y[-1] + (u - x[-1]) * last, np.interp(u, x, y)) ** GAMMA)
     return np.stack(found, -1).astype(values.dtype)
 
 

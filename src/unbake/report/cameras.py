@@ -56,9 +56,13 @@ def _of(found: dict[str, Any]) -> list[str]:
         a, b, c = (_text(terms.get(key), "{:+.3f}") for key in "abc")
         told.append(f"vignetting: 1 {a} r² {b} r⁴ {c} r⁶")
     if curves := found.get("response"):
-        halves = [curve[len(curve) // 2] for curve in map(curves.get, _CHANNELS) if curve]
-        values = ", ".join(_text(value, "{:.3f}") for value in halves)
-        told.append(f"response: f(u^2.2)^(1/2.2) at u = 0.5 is {values} (red, green, blue)")
+        known = [curve for curve in map(curves.get, _CHANNELS) if curve]
+        dark, white = (
+            ", ".join(_text(curve[place * (len(curve) - 1) // 4], "{:.3f}") for curve in known)
+            for place in (1, 4)
+        )
+        what = "response: f(u^2.2)^(1/2.2) of red, green, blue"
+        told.append(f"{what} is {dark} at u = 0.25, and {white} at u = 1")
     return told
 
 

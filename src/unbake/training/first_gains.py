@@ -1,8 +1,10 @@
-"""Where unknown exposures begin: at what photographs of the same points say of each other."""
+"""Where unknown exposures and responses begin: at what photographs of the same points say."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +14,7 @@ from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset, View
 from ..fields.arrays import from_numpy
 from .cameras import Cameras
+from .first_response import first_response
 from .problem import Problem
 
 #: Pixels of a view that are looked for in other views, and the most of these.
@@ -24,20 +27,30 @@ _PRIOR = 0.1
 _DARK = 0.01
 
 
-def first_gains(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> np.ndarray:
-    """How much brighter each photograph is than the first one where both see the same points.
+@final
+@dataclass(frozen=True, eq=False)
+class SharedPoints:
+    """Light of the same points in two photographs each.
 
-    The ratio of two photographs is the median over the points that they share. It is that of their
-    exposures where surfaces are about as bright from both sides; shine and what the mesh lacks are
-    few of the points. The gains of all views then are the least squares ones.
+    Args:
+        first, second: training views that see a point, shape (n,).
+        logs: of its radiance in the two, linear RGB, shape (2, n, 3); NaN where dark or clipped.
+        whole: of each view as a whole, relative to the first one, shape (views, 3).
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    logs: np.ndarray
+    whole: np.ndarray
+
+
+def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> SharedPoints:
+    """Random points that photographs see, with their light in all other ones that do.
 
     Args:
         scene: of known geometry.
         views: the training views.
         pixels: of these.
-
-    Returns:
-        Linear RGB over what the data set tells of the exposures, shape (views, 3); the first is 1.
     """
     rng = np.random.default_rng(0)
     places = rng.integers(0, pixels.photographs.count, _PIXELS * len(views))
@@ -71,24 +84,50 @@ def first_gains(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> 
 
     start = own[source]
     logs = _logs(pixels, views, numbers, own)
-    ratios = _logs(pixels, views, firsts[target] + place, target) - logs[source]
+    there = _logs(pixels, views, firsts[target] + place, target)
     whole = [np.ma.median(np.ma.masked_invalid(logs[own == i]), 0) for i in range(len(views))]
     whole = np.ma.filled(np.ma.array(whole) - whole[0], 0.0)
+    return SharedPoints(start, target, np.stack([logs[source], there]), whole)
+
+
+def first_gains(shared: SharedPoints) -> np.ndarray:
+    """How much brighter each photograph is than the first one where both see the same points.
+
+    The ratio of two photographs is the median over the points that they share. It is that of their
+    exposures where surfaces are about as bright from both sides; shine and what the mesh lacks are
+    few of the points. The gains of all views then are the least squares ones.
+
+    Returns:
+        Linear RGB over what the data set tells of the exposures, shape (views, 3); the first is 1.
+    """
+    ratios = shared.logs[1] - shared.logs[0]
     known = []
-    for i, j in sorted(set(zip(start.tolist(), target.tolist(), strict=True))):
-        ratio = ratios[(start == i) & (target == j)]
+    for i, j in sorted(set(zip(shared.first.tolist(), shared.second.tolist(), strict=True))):
+        ratio = ratios[(shared.first == i) & (shared.second == j)]
         count = int(np.isfinite(ratio).sum(0).min())
         if count >= _FEWEST:
             known.append((i, j, float(count), np.nanmedian(ratio, 0)))
-    return np.exp(_solved(whole, known))
+    return np.exp(_solved(shared.whole, known))
 
 
 def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> None:
-    """Let unknown exposures of a fit begin where photographs say; nothing where all are known."""
-    camera = problem.camera
-    if camera is None or not Cameras(camera, dataset.train).solves:
+    """Let unknown exposures and responses begin where photographs say.
+
+    Exposures that are unknown beside a response are those of f(P) = P at first.
+    """
+    camera, views = problem.camera, dataset.train
+    solves = Cameras(camera, views).solves
+    if camera is None or not (solves or camera.has_response):
         return
-    camera.start(first_gains(problem.scene_view.scene, dataset.train, pixels))
+    shared = shared_points(problem.scene_view.scene, views, pixels)
+    gains = first_gains(shared) if solves else np.ones((len(views), 3))
+    if solves:
+        camera.start(gains)
+    if camera.has_response:
+        told = np.log([view.exposure for view in views])[:, None]
+        exposures, pair = np.log(gains) + told, [shared.first, shared.second]
+        ratios = exposures[shared.second] - exposures[shared.first]
+        camera.start_response(first_response(shared.logs + told[pair], ratios))
 
 
 def _solved(whole: np.ndarray, known: Sequence[tuple[int, int, float, np.ndarray]]) -> np.ndarray:

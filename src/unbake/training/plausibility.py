@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,8 +12,9 @@ from ..dataset.outliers import told_outliers
 from ..dataset.pixels import PixelSource
 from ..dataset.poses import pose_warnings
 from ..dataset.quick_check import quick_findings
-from ..dataset.views import Dataset, check_cameras
+from ..dataset.views import Dataset, View, check_cameras
 from ..fields.arrays import from_numpy
+from ..fields.camera import CameraModel
 from ..transport.render import RayGenerator, render_radiance
 from .problem import Problem
 
@@ -20,6 +23,8 @@ from .problem import Problem
 #: many reflections, there is less.
 FACTOR = 50.0
 _PIXELS, _SAMPLES, _DEPTH = 1024, 8, 8
+#: Stops by which exposures differ, at least, that tell a response.
+_SPREAD = 0.5
 _GREY = 0.5
 
 
@@ -41,10 +46,35 @@ def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> li
         found += pose_warnings(scene, dataset.train, pixels.photographs, dataset.folder)
         quick = [] if found else quick_findings(scene, dataset.train, pixels.photographs)
         # Exposures that are fitted may differ.
-        fitted = problem.camera is not None and "exposure.log" in problem.camera.parameters()
+        fitted = problem.camera is not None and problem.camera.has_exposures
         found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
         units = None if found else _other_units(pixels, problem)
-    return [line for line in (*found, units, told_outliers(pixels.photographs.outliers)) if line]
+    response = untold_response(dataset.train, problem.camera)
+    outliers = told_outliers(pixels.photographs.outliers)
+    return [line for line in (*found, units, response, outliers) if line]
+
+
+def untold_response(views: Sequence[View], camera: CameraModel | None) -> str | None:
+    """A line if a response is unknown that no two exposures tell.
+
+    Each point of a surface has an albedo of its own. Photographs of one exposure are explained by
+    any response, each with another albedo; two photographs of a point with exposures that differ
+    are not.
+
+    Args:
+        views: the training views.
+        camera: what is unknown of their cameras.
+    """
+    if camera is None or not camera.has_response or camera.has_exposures:
+        return None
+    stops = np.log2([view.exposure for view in views])
+    if np.ptp(stops) >= _SPREAD:
+        return None
+    return (
+        "the response of the camera is unknown, and all photographs have about the same exposure: "
+        "they can be explained by any response, each with another albedo. Take photographs of "
+        "several exposures, or leave out --response"
+    )
 
 
 def _other_units(pixels: PixelSource, problem: Problem) -> str | None:

@@ -7,6 +7,9 @@ from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 
 #: Fraction of a fit over which the rates of what is unknown of cameras rise, as its square.
 _CAMERA_WAITS = 0.2
+#: Rates over that of exposures. Vignetting begins far from where it belongs. A response begins
+#: where photographs of several exposures say; what else a fit knows of it is mixed with albedo.
+_CAMERA = {"vignetting": 4.0, "response": 0.2}
 
 
 def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float]:
@@ -33,5 +36,6 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     }
     # Exposures begin near where they belong: while albedo is not, they would only move away.
     late = min(1.0, done / _CAMERA_WAITS) ** 2
-    rates |= dict.fromkeys(config.camera.unknowns, config.camera.learning_rate * decay * late)
+    for name in config.camera.unknowns:
+        rates[name] = config.camera.learning_rate * _CAMERA.get(name, 1.0) * decay * late
     return rates | {"radiance": config.radiance_settings.learning_rate * decay}
