@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import os
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from ..errors import UserError, require_ranges
 from .flag import Flag
@@ -73,3 +74,8 @@ class LightConfig:
         if self.lights is None or not allow_outside:
             return None
         return Path(Path(self.lights).resolve().anchor)
+
+    def told(self) -> dict[str, Any]:
+        """All of it as JSON has it."""
+        paths = {"envmap": self.envmap, "lights": self.lights}
+        return asdict(self) | {k: None if v is None else os.fspath(v) for k, v in paths.items()}

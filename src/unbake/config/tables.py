@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from textwrap import shorten
 from typing import Any, Literal, TypeVar, cast
@@ -61,6 +61,15 @@ def update(
     except UserError as error:
         where = ".".join((*path, *([error.where] if error.where else [])))
         raise UserError(error.what, where, error.remedy) from None
+
+
+def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested tables by their dotted keys."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from flattened(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _known(key: str, names: list[str]) -> str:

@@ -208,7 +208,7 @@ def _render(
                 "steps": recovered.progress.step,
             }
             | description(recovered.config),
-            "light": None if light is None else _told_light(light),
+            "light": None if light is None else light.told(),
             "cameras": placed,
             "settings": asdict(settings),
             "variant": mi.variant(),
@@ -318,11 +318,6 @@ def _frame(shot: _Shot) -> dict[str, Any]:
     """A picture in `render.json`, which is read as a camera file, too."""
     split = {} if shot.split is None else {"split": shot.split}
     return {"name": shot.name, "file_path": f"{shot.name}.exr", **frame_of(shot.camera), **split}
-
-
-def _told_light(light: LightConfig) -> dict[str, Any]:
-    paths = {"envmap": light.envmap, "lights": light.lights}
-    return asdict(light) | {k: None if v is None else os.fspath(v) for k, v in paths.items()}
 
 
 def _means(frames: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
+from unbake.config.tables import flattened
 from unbake.dataset import views
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError, printable
@@ -101,7 +102,7 @@ def read_run(path: Path, label: str) -> Run:
         raise UserError("a light of `emission` has no name", metrics_file, evaluate)
     if metrics.get("unknown") == "emission" and not emitters:
         raise UserError("`emission` has no light", metrics_file, evaluate)
-    settings = dict(_flatten(folder.settings_table()))
+    settings = dict(flattened(folder.settings_table()))
     log = [] if metrics.get("steps") == 0 else folder.log()
     return Run(folder, label, metrics, settings, log)
 
@@ -176,11 +177,3 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
 
 def _view(view: views.View) -> View:
     return View(view.name, view.split, {"render": view.image, **view.truth})
-
-
-def _flatten(table: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
