@@ -13,7 +13,7 @@ FORBIDDEN = {
 }
 
 RUN, DATA = "training/run_folder.py", "dataset/data_folder.py"
-SOLVED = "solver/solve.py"  # has a folder of its own, with a field in it
+SOLVED = "training/solved.py"  # has a folder of its own, with a field in it
 #: The modules that own them, names of files in any text, and names of folders in paths.
 FILE_NAMES = {
     "run": (

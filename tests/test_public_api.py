@@ -121,6 +121,7 @@ def test_paths_may_be_texts(tmp_path):
         "relight": lambda: unbake.relight(none, f"{none}-pictures", light),
         "export": lambda: unbake.export(none, f"{none}-exported"),
         "solve": lambda: unbake.solve(f"{none}.xml", f"{none}-solved"),
+        "fine_tune": lambda: unbake.fine_tune(none, f"{none}-tuned"),
         "load_radiance": lambda: unbake.load_radiance(none),
         "compare": lambda: unbake.compare(none, methods, here, cpu, evaluation=settings),
         "write_report": lambda: unbake.write_report([none], f"{none}.html"),

@@ -79,7 +79,7 @@ if TYPE_CHECKING:
     from .report.page import write_report as write_report
     from .run import Run as Run
     from .solver.settings import SolveSettings as SolveSettings
-    from .solver.solve import load_radiance as load_radiance
+    from .solver.solve import fine_tune as fine_tune
     from .solver.solve import solve as solve
     from .training.checkpoint import Progress as Progress
     from .training.checkpoint import load_checkpoint as load_checkpoint
@@ -94,6 +94,7 @@ if TYPE_CHECKING:
     from .training.run_folder import Origin as Origin
     from .training.run_folder import RunFolder as RunFolder
     from .training.schedule import learning_rates as learning_rates
+    from .training.solved import load_radiance as load_radiance
     from .training.state import State as State
     from .training.state import initial_state as initial_state
     from .training.step import TrainingStep as TrainingStep
@@ -150,7 +151,8 @@ _GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "report.page": ("write_report",),
         "exports.export": ("export",),
         "solver.settings": ("SolveSettings",),
-        "solver.solve": ("load_radiance", "solve"),
+        "solver.solve": ("fine_tune", "solve"),
+        "training.solved": ("load_radiance",),
         "comparison.compare": ("compare",),
         "comparison.method_variant": ("MethodVariant",),
     },

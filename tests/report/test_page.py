@@ -252,11 +252,15 @@ def _words(text: str) -> str:
 
 
 def test_each_run_tells_what_it_works_with(made, tmp_path: Path):
-    _edit(made[1][0], lambda m: m.update(FACTS, bounces=3, prior="one-bounce"))
+    start = {"folder": "solved", "scene": "room", "steps": 9, "sha256": "0", "scale": 0.5}
+    solved = FACTS | {"warm_start": start}
+    _edit(made[1][0], lambda m: m.update(solved, bounces=3, prior="one-bounce"))
     other = {"representation": "bitmap", "radiance": None, "estimator": "two-pass"}
     _edit(made[1][1], lambda m: m.update(FACTS, method="prb", **other))
     text = _words(write_report(made[1], tmp_path / "report.html").read_text())
-    told = "φ network, Lθ network, 3 bounces, one bounce prior, split halves"
+    told = (
+        "φ network, Lθ network, Lθ solved before the fit, 3 bounces, one bounce prior, split halves"
+    )
     assert f"ours {told}" in text or f"ours{told}" in text
     assert "prbφ bitmaps, no Lθ, two passes" in text
     assert "Materials recovered in room" in text

@@ -7,19 +7,30 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from rich.console import Console
 from support import TINY, assert_only_replayed, seeded
 
+from unbake.config import FitConfig, read_toml
+from unbake.config.light import LightConfig
+from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.fields.domain import Domain
 from unbake.fields.radiance import make_radiance
 from unbake.fields.settings import GridConfig, NetworkConfig
-from unbake.imaging.pictures import read_exr
+from unbake.imaging.pictures import read_exr, write_exr
 from unbake.io import read_object
+from unbake.scene.geometry import differing, probe
+from unbake.solver.lit import matching_scale
 from unbake.solver.pictures import debiased_relative_mse, relative_mse
 from unbake.solver.points import SurfacePoints
 from unbake.solver.settings import SolveSettings
-from unbake.solver.solve import load_radiance, solve
+from unbake.solver.solve import fine_tune, solve
 from unbake.solver.step import SolverStep
+from unbake.training.loop import fit
+from unbake.training.recovered import load_run
+from unbake.training.run_folder import RunFolder
+from unbake.training.solved import load_radiance, read_solved
+from unbake.training.warm_start import with_solved_field
 from unbake.transport.vertex import SceneView, find_vertex
 
 SMALL = NetworkConfig(
@@ -97,6 +108,8 @@ def test_a_damaged_folder_is_refused(solved, tmp_path):
     (tmp_path / "radiance.safetensors").write_bytes(b"damaged")
     with pytest.raises(UserError, match="no field"):
         load_radiance(tmp_path)
+    with pytest.raises(UserError, match="no solved radiance field"):
+        load_radiance(tmp_path / "other")
 
 
 @pytest.mark.parametrize("attach", [False, True])
@@ -205,3 +218,126 @@ def test_options_that_make_no_sense_are_refused(unbake, tmp_path, words, said):
     done = unbake("solve", "furnace", "--out", tmp_path / "s", *words)
     assert done.status == 2 and said in done.err
     assert not (tmp_path / "s").exists()
+
+
+# ---------------------------------------------------------------------- with runs of fits
+
+
+@pytest.fixture(scope="module")
+def run(cornell, tiny, tmp_path_factory):
+    """A short fit of a captured data set."""
+    folder = tmp_path_factory.mktemp("fitted") / "run"
+    fit(cornell, folder, replace(read_toml(tiny), steps=20), console=Console(quiet=True))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory):
+    """A sky that no photograph showed, ten times as bright as the lights of the scene."""
+    file = tmp_path_factory.mktemp("sky") / "sky.exr"
+    write_exr(file, np.full((8, 16, 3), (30.0, 20.0, 10.0), np.float32))
+    return file
+
+
+@pytest.fixture(scope="module")
+def tuned(run, sky, tmp_path_factory):
+    """The field of the run, learned on under the sky; the folder and what was told."""
+    out, lines = tmp_path_factory.mktemp("tuned") / "out", []
+    settings = replace(SETTINGS, steps=100, reference_spp=128, final_spp=16)
+    fine_tune(run, out, settings, light=LightConfig(envmap=sky), tell=lines.append)
+    return out
+
+
+def test_the_field_of_a_run_is_learned_on_under_another_light(tuned, run, cornell):
+    told = read_object(tuned / "solve.json")
+    first, *_, last = told["measurements"]
+    assert last["step"] == 100 and last["skipped"] == 0
+    assert told["views"] == ["heldout_000"] and told["kind"] == "room"
+    assert told["run"] == {"folder": str(run.resolve()), "steps": 20}
+    assert told["light"]["envmap"].endswith("sky.exr")
+    for side in ("lhs", "rhs"):  # such a tiny network shows little more than the mean
+        assert last["relmse"][side] < 0.5 * first["relmse"][side]
+    seen = {side: read_exr(tuned / f"heldout_000-{side}.exr") for side in ("rhs", "reference")}
+    photograph = read_exr(Dataset.load(cornell).heldout[0].image)[..., :3]
+    assert seen["rhs"].mean() == pytest.approx(seen["reference"].mean(), rel=0.1)
+    assert seen["reference"].mean() > 3 * photograph.mean()
+
+
+def test_a_field_is_brightened_until_both_sides_have_the_same_mean(solved, built_in):
+    scene = mi.load_file(str(built_in("furnace")))
+    points, radiance = SurfacePoints.of(scene), load_radiance(solved)
+    radiance.scale /= 8
+    factor = matching_scale(SceneView.of(scene, None, 8), radiance, points, 0)
+    assert factor == pytest.approx(8, rel=0.03)
+
+
+def test_a_fit_starts_with_a_solved_field_and_goes_on(tuned, unbake, cornell, tiny, tmp_path):
+    words = ("fit", cornell, "--out", tmp_path / "warm")
+    done = unbake(*words, "--settings", tiny, "--steps", 0, "--radiance-from", tuned)
+    assert done.status == 0, done.err
+    assert "L starts as solved in 100 steps" in done.out
+    wanted, started = load_radiance(tuned), load_run(tmp_path / "warm").problem.radiance
+    origin = RunFolder(tmp_path / "warm").origin()
+    assert started.scale == wanted.scale == origin.warm_start.scale != origin.mean_radiance
+    assert origin.warm_start.folder == str(tuned.resolve()) and origin.warm_start.steps == 100
+    for key, value in wanted.parameters().items():
+        np.testing.assert_array_equal(np.array(value), np.array(started.parameters()[key]))
+    # Resumed, it keeps its scale; and it is not started a second time.
+    refused = unbake(*words, "--resume", "--steps", 2, "--radiance-from", tuned)
+    assert refused.status == 2 and "--resume" in refused.err
+    assert unbake(*words, "--resume", "--steps", 2).status == 0
+    resumed = load_run(tmp_path / "warm")
+    assert resumed.progress.step == 2 and resumed.problem.radiance.scale == wanted.scale
+    assert RunFolder(tmp_path / "warm").origin().warm_start == origin.warm_start
+
+
+def test_a_field_of_another_scene_starts_no_fit(solved, unbake, cornell, tmp_path):
+    done = unbake("fit", cornell, "--out", tmp_path / "run", "--radiance-from", solved)
+    assert done.status == 2 and "another scene (furnace)" in done.err, done.err
+    assert "Solve the scene of the data set" in done.err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"method": "prb"}, "prb has no radiance field"),
+        ({"radiance_representation": "grid"}, "--radiance neural"),
+        ({"radiance": {"neural": replace(SMALL, width=24)}}, "width is 16 there and 24 here"),
+        ({"radiance": {"neural": NetworkConfig(GridConfig(levels=3))}}, "levels is 2 there and 3"),
+    ],
+)
+def test_a_solved_field_of_another_size_or_kind_is_refused(solved, changes, said):
+    with pytest.raises(UserError) as refused:
+        with_solved_field(replace(FitConfig(), **changes), read_solved(solved))
+    assert said in str(refused.value)
+
+
+def test_settings_that_are_left_open_are_those_of_the_solved_field(solved):
+    own = NetworkConfig(GridConfig(footprints=2.0), learning_rate=0.003)
+    config = with_solved_field(FitConfig(radiance={"neural": own}), read_solved(solved))
+    assert config.radiance_settings == replace(SMALL, learning_rate=0.003)
+
+
+def test_scenes_are_told_apart_by_rays_through_them(built_in, cornell):
+    grey, white = (mi.load_file(str(built_in("furnace", albedo))) for albedo in (0.5, 0.8))
+    other = mi.load_file(str(Dataset.load(cornell).scene))
+    assert differing(probe(grey), probe(white)) == 0
+    assert differing(probe(grey), probe(other)) > 0.3  # the same box, and two more in it
+
+
+def test_a_run_without_a_field_and_words_that_exclude_each_other_are_refused(
+    unbake, cornell, tiny, tmp_path
+):
+    words = ("fit", cornell, "--out", tmp_path / "run", "--settings", tiny, "--method", "direct")
+    assert unbake(*words, "--steps", 0).status == 0
+    for words, said in (
+        (["--from", tmp_path / "run"], "no radiance field"),
+        (["--from", tmp_path / "none"], "no run in this folder"),
+        (["--from", tmp_path / "run", "--views", 3], "--views"),
+        (["furnace", "--from", tmp_path / "run"], "not both"),
+        ([], "give a scene"),
+    ):
+        done = unbake("solve", *words, "--out", tmp_path / "s")
+        assert done.status == 2 and said in done.err, done.err
+        assert not (tmp_path / "s").exists()

@@ -43,6 +43,7 @@ from .options import (
     Folder,
     Folders,
     Formats,
+    FromRun,
     Meshes,
     Methods,
     OtherData,
@@ -315,6 +316,7 @@ def fit(
     clip_negative: Flag = False,
     allow_outside: Flag = False,
     tensorboard: Flag = False,
+    radiance_from: Folder = None,
     *,
     fit: OmitArgPrefixes[FitFlags],
 ) -> int:
@@ -342,13 +344,17 @@ def fit(
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
         tensorboard: Write losses and scores to OUT/tensorboard, too, for tensorboard --logdir OUT.
+        radiance_from: Folder that `unbake solve` wrote for this scene: L starts as it was solved
+            there, with any materials, instead of untrained, and has its size.
         fit: Settings that differ from those of the preset or the file.
     """
     changes = given(fit)
     if resume:
         length = {"steps", "seconds"}
         others = {name: value for name, value in changes.items() if name not in length}
-        exclude("resume", {"preset": preset, "settings": settings, "quality": quality} | others)
+        others |= {"preset": preset, "settings": settings, "quality": quality}
+        others["radiance-from"] = radiance_from
+        exclude("resume", others)
         folder = RunFolder(out)
         folder.require_resumable()
         chosen = folder.settings()
@@ -367,6 +373,7 @@ def fit(
         clip_negative=clip_negative,
         allow_outside=allow_outside,
         tensorboard=tensorboard,
+        radiance_from=radiance_from,
         console=console,
     )
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
@@ -620,13 +627,17 @@ def view(
 
 
 def solve(
-    scene: Positional[Scene],
+    scene: Positional[Annotated[str | None, arg(metavar="[SCENE]", help_behavior_hint="")]] = None,
     /,
+    *,
     out: Out,
+    from_: FromRun = None,
+    envmap: File = None,
+    lights: File = None,
     cameras: File = None,
     allow_outside: Flag = False,
-    *,
     solve: OmitArgPrefixes[SolveFlags],
+    light: OmitArgPrefixes[LightFlags],
 ) -> int:
     """Learn the radiance of a scene whose materials and lights are known, without tracing paths.
 
@@ -635,24 +646,44 @@ def solve(
     that ends in L. relMSE is the mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of
     the pictures, b being path traced.
 
+    With --from RUN the materials are those that a fit recovered, and L goes on from where the fit
+    left it, also under another light: `unbake relight` without paths.
+
     Writes L (radiance.safetensors), pictures of both sides and of the reference, and relMSE over
-    time (solve.json). Ctrl-C ends it early, with what was learned.
+    time (solve.json). Ctrl-C ends it early, with what was learned. `unbake fit --radiance-from`
+    starts with such an L.
 
     Args:
         scene: A Mitsuba 3 XML file, or a built-in scene: demo, annex, still, cornell, cube,
             furnace.
         out: Folder to write to, new or empty.
+        from_: Folder that `unbake fit` wrote, instead of a scene: pictures are of its held-out
+            views.
+        envmap: Environment map (OpenEXR, HDR) to light the scene by, instead of its own light.
+        lights: Mitsuba XML file with lights to use instead of the scene's own.
         cameras: Camera file (or transforms.json) of the pictures, instead of --views.
-        allow_outside: Read files that the scene names outside of its folder.
+        allow_outside: Read files that the scene or --lights names outside of its folder.
         solve: How L is learned and measured.
+        light: How the other light is put into the scene.
     """
     settings = with_options(SolveSettings(), given(solve))
+    other = any_light(envmap, lights, given(light))
+    if (scene is None) == (from_ is None):
+        raise UserError("give a scene, or a run with --from, and not both", "solve")
+    if from_ is not None:
+        usual = {name: getattr(SolveSettings, name) for name in ("views", "resolution")}
+        exclude("from", {k: v for k, v in given(solve).items() if usual.get(k, v) != v})
     backend.activate()
+    from ..solver.solve import fine_tune
     from ..solver.solve import solve as run
 
     console = Console(highlight=False)
     options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
-    made = run(scene, out, settings, cameras=cameras, **options)
+    options |= {"cameras": cameras, "light": other}
+    if from_ is not None:
+        made = fine_tune(from_, out, settings, **options)
+    else:
+        made = run(str(scene), out, settings, **options)
     last = made["measurements"][-1]
     _say(f"{last['step']} steps in {last['seconds']:.0f} s; wrote {out}")
     return 0 if made["finished"] else signals.status()

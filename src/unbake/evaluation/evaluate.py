@@ -150,6 +150,7 @@ def _evaluate(
         "samples": recovered.progress.step * recovered.config.samples_per_step,
         "seconds": round(recovered.progress.seconds, 2),
         "convergence": _convergence(recovered, folder),
+        "warm_start": None if origin.warm_start is None else asdict(origin.warm_start),
         "heldout": _summary(rows, "heldout"),
         "train": _summary(rows, "train"),
         **measures,

@@ -386,6 +386,8 @@ def _described(run: Run) -> list[tuple[str, str, str]]:
     if run.untrained:
         return [*details, ("initial values, the same for all methods", "", "")]
     details.append((_form(metrics.get("radiance")) or "no", "L", "θ"))
+    if metrics.get("warm_start"):
+        details.append(("solved before the fit", "L", "θ"))
     if _unknown(metrics) != "materials":
         details.append(
             (f"{OPTIMIZED.get(_unknown(metrics), 'something').lower()} optimized", "", "")

@@ -12,9 +12,10 @@ from ..acquisition.capture import photographs
 from ..acquisition.settings import CaptureSettings
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
+from ..fields.materials import carrying
 from ..fields.radiance import RadianceField
 from ..transport.path_sample import Requirements, lhs, rhs, trace
-from ..transport.render import parts_of
+from ..transport.render import parts_of, render_radiance
 from ..transport.vertex import SceneView
 from .settings import SolveSettings
 
@@ -26,6 +27,7 @@ _BOTH_SIDES = Requirements(bounces=1, constant=frozenset({1, 2}))
 _PICTURES = 0x5049
 
 
+@carrying()
 def both_sides(
     scene_view: SceneView,
     radiance: RadianceField,
@@ -62,14 +64,17 @@ def both_sides(
 
 
 def path_traced_halves(
-    scene: mi.Scene,
+    scene_view: SceneView,
     cameras: Sequence[Camera],
     settings: SolveSettings,
     *,
     room: bool,
     tell: Callable[[str], None],
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The reference by Mitsuba's path tracer, twice, of half of its samples each.
+    """The reference by path tracing, twice, of half of its samples each.
+
+    Mitsuba's path tracer makes it, or where materials are fields our own, as `relight` does: it
+    asks them once a vertex.
 
     Args:
         room: whether emitters are seen.
@@ -78,18 +83,21 @@ def path_traced_halves(
     Returns:
         Pictures of each camera, linear RGB, float32, (H, W, 3).
     """
-    rays, halves = CameraRays.of(cameras), []
-    for half in (0, 1):
-        sampler = mi.load_dict({"type": "independent", "sample_count": settings.reference_spp // 2})
-        how = CaptureSettings(
-            max_depth=settings.max_depth,
-            rr_depth=settings.rr_depth,
-            seed=(2 * settings.seed + half) & 0x7FFFFFFF,
-        )
-        part = "first" if half == 0 else "second"
-        rgb, _ = photographs(
-            scene, rays, how, sampler, room, lambda line, part=part: tell(f"{part} half: {line}")
-        )
+    rays, halves, spp = CameraRays.of(cameras), [], settings.reference_spp // 2
+    depths = {"max_depth": settings.max_depth, "rr_depth": settings.rr_depth}
+    for half, part in enumerate(("first", "second")):
+        seed = (2 * settings.seed + half) & 0x7FFFFFFF
+        if scene_view.materials is None:
+            sampler = mi.load_dict({"type": "independent", "sample_count": spp})
+            how = CaptureSettings(**depths, seed=seed)
+            rgb, _ = photographs(
+                scene_view.scene, rays, how, sampler, room,
+                lambda line, part=part: tell(f"{part} half: {line}"),
+            )  # fmt: skip
+        else:
+            paths = {**depths, "seed": seed, "hide_emitters": not room}
+            rgb = render_radiance(scene_view, rays.through, rays.pixels, spp, **paths)
+            tell(f"{part} half: rendered")
         halves.append(_parted(rgb, cameras))
     return halves[0], halves[1]
 

@@ -9,10 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..fields.materials import carrying
 from ..fields.radiance import RadianceField
+from ..training.problem import Parameters, Problem
 from ..training.step import drop_broken_gradients, without_garbage_collection
 from ..transport.loss import pixel_means
-from ..transport.operator import attach_albedo, bounce, transported
+from ..transport.operator import attach_albedo, attach_material, bounce, transported
 from ..transport.path_sample import reflected_radiance
 from ..transport.prior import residual_norm
 from ..transport.vertex import SceneView, find_vertex
@@ -29,12 +31,16 @@ class Inputs:
     sampler: mi.Sampler  # of points
     bounces: mi.Sampler  # of their samples of the right-hand side
     seed: mi.UInt32
+    recovered: Parameters  # of fields of materials and lights
 
 
 class SolverStep:
     """A step of Adam on the residual at random points and directions.
 
     The right-hand side is a constant (semi-gradients) unless the settings attach it.
+
+    Args:
+        problem: whose fields materials or lights are; None: they are the scene's own.
 
     Paper: Eq. 3, Eq. 4, Sec. 3.1.
     """
@@ -45,6 +51,7 @@ class SolverStep:
         radiance: RadianceField,
         points: SurfacePoints,
         settings: SolveSettings,
+        problem: Problem | None = None,
     ) -> None:
         # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
@@ -52,16 +59,24 @@ class SolverStep:
         self._radiance = radiance
         self._points = points
         self._settings = settings
+        self._problem = problem
         self._samplers = [mi.load_dict({"type": "independent"}) for _ in range(2)]
         self._frozen = dr.freeze(self._step)
 
-    def __call__(self, optimizer: mi.ad.Adam, number: int, rate: float) -> dict[str, mi.Float]:
+    def __call__(
+        self,
+        optimizer: mi.ad.Adam,
+        number: int,
+        rate: float,
+        recovered: Parameters | None = None,
+    ) -> dict[str, mi.Float]:
         """Take a step.
 
         Args:
             optimizer: owns θ.
             number: of the step; with the seed of the settings it decides all random numbers.
             rate: Adam's learning rate.
+            recovered: the arrays of the problem's fields, if there is one.
 
         Returns:
             `residual`, the relative squared residual, and `skipped`, 1 if it was not finite.
@@ -69,9 +84,9 @@ class SolverStep:
         # An array for each parameter: a changed Python number would be traced anew.
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, rate) for key in optimizer})
         with without_garbage_collection():
-            return self._frozen(self.inputs(number), optimizer)
+            return self._frozen(self.inputs(number, recovered), optimizer)
 
-    def inputs(self, number: int) -> Inputs:
+    def inputs(self, number: int, recovered: Parameters | None = None) -> Inputs:
         """The arguments of a step."""
         seed = np.random.SeedSequence([self._settings.seed, number]).generate_state(1)[0]
         return Inputs(
@@ -80,6 +95,7 @@ class SolverStep:
             sampler=self._samplers[0],
             bounces=self._samplers[1],
             seed=dr.opaque(mi.UInt32, int(seed)),
+            recovered=recovered or {},
         )
 
     def recordings(self) -> int:
@@ -97,8 +113,11 @@ class SolverStep:
         dr.eval(optimizer, terms)
         return terms
 
+    @carrying()
     def loss(self, inputs: Inputs) -> mi.Float:
         """The relative squared residual at the points of a step, with gradients to θ."""
+        if self._problem is not None:
+            self._problem.assign(inputs.recovered)
         settings, samples = self._settings, self._settings.samples
         lanes = settings.batch * samples
         inputs.sampler.seed(inputs.seed, settings.batch)
@@ -108,7 +127,7 @@ class SolverStep:
             ray = inputs.points.rays(inputs.sampler)
             dr.eval(ray)
             x = find_vertex(scene_view, ray, mi.Bool(True), inputs.sampler)
-            x = attach_albedo(scene_view, x)
+            x = attach_material(scene_view, x)
             # Evaluated, because a replayed kernel takes its size from arrays that it reads.
             lane = dr.arange(mi.UInt32, lanes) // samples
             dr.eval(lane)

@@ -36,9 +36,11 @@ from .run_folder import Origin, RunFolder
 from .run_lock import RunLock
 from .saving import Saving
 from .schedule import learning_rates
+from .solved import Solved, read_solved
 from .state import State, initial_state
 from .step import TrainingStep
 from .validation import Score
+from .warm_start import OPTION, start_radiance, told_start, warm_start, with_solved_field
 from .watchdog import Watchdog
 
 #: Steps between readings of the loss; reading waits for the machine.
@@ -57,6 +59,7 @@ def fit(
     clip_negative: bool = False,
     allow_outside: bool = False,
     tensorboard: bool = False,
+    radiance_from: Path | str | None = None,
     console: Console | None = None,
 ) -> Progress:
     """Recover materials or lighting of a scene from its photographs.
@@ -70,6 +73,9 @@ def fit(
         clip_negative: take negative pixels as zero.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         tensorboard: write the numbers of the log for TensorBoard, too.
+        radiance_from: a folder that `solve` or `fine_tune` wrote: L_θ starts as that field instead
+            of untrained, with its settings; not when resuming. The materials that it was solved
+            with do not count.
 
     Returns:
         How far the fit came, and what is wrong with it. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it
@@ -77,7 +83,8 @@ def fit(
 
     Raises:
         UserError: the data set or the run's folder cannot be used, what was learned cannot be
-            saved, the loss does not stay finite, or the fit diverges twice.
+            saved, the loss does not stay finite, the fit diverges twice, or the solved field is of
+            another scene or other settings.
 
     Paper: Sec. 4, 5.4.
     """
@@ -85,6 +92,9 @@ def fit(
     folder = RunFolder(Path(run))
     with ExitStack() as held:
         if resume:
+            if radiance_from is not None:
+                remedy = "A run that goes on has a radiance field already"
+                raise UserError("cannot be given together with --resume", OPTION, remedy)
             folder.require_resumable()
             lock = held.enter_context(folder.lock())
             begun = _begin(
@@ -97,8 +107,9 @@ def fit(
             )
         else:
             folder.require_new()
+            solved = None if radiance_from is None else read_solved(radiance_from)
             begun = _begin(
-                Path(data), folder, config, console, resume, clip_negative, allow_outside
+                Path(data), folder, config, console, resume, clip_negative, allow_outside, solved
             )
             # Here all input is known to be good, and the folder is made.
             lock = held.enter_context(folder.lock())
@@ -135,8 +146,11 @@ def _begin(
     resume: bool,
     clip_negative: bool = False,
     allow_outside: bool = False,
+    solved: Solved | None = None,
 ) -> _Begun:
     """Read all input, and check it; nothing is written but the cache of the data set."""
+    if solved is not None:
+        config = with_solved_field(config, solved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     before = folder.origin() if resume else None
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
@@ -151,14 +165,21 @@ def _begin(
         clip_negative=clip_negative,
         run=uuid.uuid4().hex if before is None else before.run,
         fingerprint=fingerprint(dataset),
+        warm_start=None if solved is None else warm_start(solved),
     )
     if before is not None:
         _require_same_data(folder, before, origin)
+        origin = dataclasses.replace(origin, warm_start=before.warm_start)
     problem = problem_of(dataset, config, origin.mean_radiance)
     begin_cameras(problem, dataset, pixels)
-    for warning in data_warnings(dataset, pixels, problem):
+    if problem.radiance is not None:
+        problem.radiance.scale = origin.radiance_scale
+    odd = [] if solved is None else start_radiance(problem, solved)
+    for warning in [*odd, *data_warnings(dataset, pixels, problem)]:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
+    if solved is not None:
+        console.print(told_start(solved, config), highlight=False, soft_wrap=True)
     if config.follows_paths:
         console.print(told_depth(config, dataset), highlight=False, soft_wrap=True)
     state = initial_state(problem)

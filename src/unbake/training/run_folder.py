@@ -22,6 +22,7 @@ import math
 import re
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
@@ -35,7 +36,7 @@ from .event_log import EventLog
 from .run_lock import RunLock
 
 #: The newest formats of `origin.json` and `metrics.json` that can be read, and those written.
-ORIGIN_FORMAT = 1
+ORIGIN_FORMAT = 2
 METRICS_FORMAT = 1
 #: Checkpoints kept in a run folder.
 KEEP = 3
@@ -49,16 +50,54 @@ _GIVE_RUN = "Give the folder of a run"
 
 @final
 @dataclass(frozen=True)
+class WarmStart:
+    """The solved radiance field that a run started with (`solved.py`)."""
+
+    folder: str
+    scene: str  #: that was solved, for people
+    steps: int  #: of the solve
+    sha256: str  #: of the file with its parameters
+    scale: float  #: of the field, which the parameters of the run belong to; see `RadianceField`
+
+    @staticmethod
+    def read(facts: Any) -> WarmStart | None:
+        """What an origin tells; None where there was none.
+
+        Raises:
+            ValueError: it is damaged.
+        """
+        match facts:
+            case None:
+                return None
+            case {
+                "folder": str(folder),
+                "scene": str(scene),
+                "steps": int(steps),
+                "sha256": str(sha256),
+                "scale": float(scale),
+            } if 0 < scale < math.inf:
+                return WarmStart(folder, scene, steps, sha256, scale)
+        raise ValueError("no warm start")
+
+
+@final
+@dataclass(frozen=True)
 class Origin:
     """The input of a run, beside its settings."""
 
     data: str  #: the data set's folder; a relative path starts at the run folder
-    mean_radiance: float  #: of its training pixels; the scale of the radiance field
+    mean_radiance: float  #: of its training pixels; the scale of a radiance field that is untrained
     clip_negative: bool
     #: Chosen at the start of a run; its checkpoints name it, too. None: begun by version 0.1.
     run: str | None = None
     #: Of the data set (`dataset/fingerprint.py`); empty: begun by version 0.1.
     fingerprint: Mapping[str, str] = field(default_factory=dict)
+    warm_start: WarmStart | None = None  #: None: the radiance field started untrained
+
+    @property
+    def radiance_scale(self) -> float:
+        """The scale of the radiance field."""
+        return self.mean_radiance if self.warm_start is None else self.warm_start.scale
 
 
 @final
@@ -229,7 +268,9 @@ class RunFolder:
                 run, fingerprint = facts.get("run"), facts.get("fingerprint", {})
                 texts = fingerprint.values() if isinstance(fingerprint, dict) else (None,)
                 if isinstance(run, str | None) and all(isinstance(x, str) for x in texts):
-                    return Origin(data, radiance, clip, run, fingerprint)
+                    with suppress(ValueError):
+                        start = WarmStart.read(facts.get("warm_start"))
+                        return Origin(data, radiance, clip, run, fingerprint, start)
         raise UserError("cannot be read", self.origin_file, again)
 
     def write_origin(self, origin: Origin) -> None:

@@ -124,6 +124,7 @@ _METRICS: Mapping[str, Check] = {
     **dict.fromkeys(("heldout", "train"), _or_none(_SCORES)),
     "yardsticks": _yardsticks,
     "convergence": _or_none(_object_of(_score, trend=_text)),
+    "warm_start": _or_none(_object_of(_text, steps=_count, scale=_count)),
     "display_exposure": _score,
     "per_view": _list_of(_object_of(_score, name=_text, split=_text)),
     "environment": _or_none(_SCORES),

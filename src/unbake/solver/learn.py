@@ -1,0 +1,298 @@
+"""The radiance of a scene whose materials and lights are known: learned, measured, written."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from rich.console import Console
+
+from ..dataset.camera import Camera
+from ..errors import UserError
+from ..fields.radiance import RadianceField
+from ..fields.settings import FieldSettings
+from ..imaging.pictures import tonemap, write_exr, write_png
+from ..machine import machine
+from ..signals import deferred
+from ..training.memory import memory_mb
+from ..training.monitor import Monitor
+from ..training.problem import Parameters, Problem
+from ..training.solved import FORMAT, description, write_solved
+from ..transport.vertex import SceneView
+from ..version import VERSION
+from .pictures import both_sides, debiased_relative_mse, path_traced_halves, relative_mse
+from .points import SurfacePoints
+from .settings import SolveSettings
+from .step import SolverStep
+
+LOG = "progress.jsonl"
+#: Shares of the length after which both sides are measured.
+MEASURED = (0.0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
+#: Steps between looks at the clock, and between lines of the log.
+_TIMED, _READ = 8, 32
+_DEFINITIONS = {
+    "relmse": "mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of all pictures; "
+    "a: lhs or rhs, b: the path traced reference",
+    "relmse_debiased": "the same without the noise of the reference: (a - b) (a - c) in the place "
+    "of the square, b and c independent halves of the reference; the noise of a is in it",
+    "spp": "samples per pixel of a",
+    "lhs": "E + L_theta at the first surface that is not specular",
+    "rhs": "one bounce, and L_theta at its end",
+    "reference_noise": "expected relMSE of the reference against itself without noise, from two "
+    "independent halves of its samples; every relmse has it in it",
+    "residual": "mean of (L_theta - T)^2 / (L_theta^2 + epsilon), T a mean of M samples; it keeps "
+    "their variance",
+    "seconds": "of training, without measurements and without the reference",
+    "cpu_seconds": "the same of all cores that were at work for it; on a machine that does nothing "
+    "else, at most the seconds times its cores",
+    "pictures_cpu_seconds": "of the pictures of both sides, all views, with spp samples a pixel",
+}
+
+
+@dataclass(frozen=True)
+class Known:
+    """A scene whose materials and lights are known, and the cameras of its pictures by name.
+
+    Args:
+        room: whether the scene encloses its cameras, which then see emitters.
+        points: of its surfaces.
+        told: what `solve.json` tells of it.
+        problem: whose fields materials or lights are, of a run; None: they are the scene's own.
+    """
+
+    scene_view: SceneView
+    cameras: dict[str, Camera]
+    room: bool
+    points: SurfacePoints
+    told: dict[str, Any]
+    problem: Problem | None = None
+
+    @property
+    def recovered(self) -> Parameters:
+        """The arrays of the problem's fields."""
+        found = {} if self.problem is None else self.problem.parameters()
+        return {key: dr.detach(value) for key, value in found.items()}
+
+
+@dataclass(frozen=True)
+class Start:
+    """The radiance field before its first step.
+
+    Args:
+        form: name of its representation.
+        settings: of that representation.
+    """
+
+    radiance: RadianceField
+    form: str
+    settings: FieldSettings
+
+
+def learn(
+    known: Known,
+    start: Start,
+    settings: SolveSettings,
+    out: Path,
+    console: Console | None,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    """Train a field by the residual alone, and write it with pictures and measurements.
+
+    Args:
+        known: the scene.
+        start: the field, which is changed.
+        settings: how it is learned and measured.
+        out: folder to write; made where it does not exist.
+        console: shows progress; None: none is shown.
+        tell: called with measurements.
+
+    Returns:
+        The contents of `solve.json`.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    told = asdict(settings)
+    del told["radiance"]
+    manifest: dict[str, Any] = {
+        "format": FORMAT,
+        "unbake": VERSION,
+        **known.told,
+        "kind": "room" if known.room else "object",
+        "settings": told,
+        "radiance": description(start.radiance, start.form, start.settings, known.scene_view.scene),
+        "machine": machine(),
+        "views": list(known.cameras),
+        "definitions": _DEFINITIONS,
+    }
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"the folder cannot be made ({error.strerror})", out) from None
+    learning = _Learning(known, start, settings, out, manifest, tell, known.recovered)
+    learning.make_reference()
+    learning.train(console or Console(quiet=True))
+    learning.write_pictures()
+    return manifest
+
+
+@dataclass
+class _Learning:
+    """A field that is learned, and what is written of it."""
+
+    known: Known
+    start: Start
+    settings: SolveSettings
+    out: Path
+    manifest: dict[str, Any]
+    tell: Callable[[str], None]
+    recovered: Parameters  #: of the fields of materials and lights
+    pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    halves: list[list[np.ndarray]] = field(default_factory=list)  #: of the reference
+
+    def make_reference(self) -> None:
+        """Path trace the reference, if it is wanted."""
+        self.manifest |= {"reference_noise": None, "measurements": [], "finished": False}
+        if not self.settings.reference_spp:
+            return
+        known, cameras = self.known, list(self.known.cameras.values())
+        self.tell(f"path tracing the reference, {self.settings.reference_spp} samples a pixel …")
+        halves = path_traced_halves(
+            known.scene_view, cameras, self.settings, room=known.room, tell=self.tell
+        )
+        self.halves = [list(half) for half in halves]
+        pairs = list(zip(*halves, strict=True))
+        reference = [(a + b) / 2 for a, b in pairs]
+        self.pictures["reference"] = reference
+        # The mean of two halves has the variance of half of their difference.
+        noise = relative_mse([(a - b) / 2 + r for (a, b), r in zip(pairs, reference, strict=True)],
+                             reference)  # fmt: skip
+        self.manifest["reference_noise"] = noise
+
+    def train(self, console: Console) -> None:
+        """Take all steps, and measure at `MEASURED`; a signal ends it early."""
+        settings, rate = self.settings, self.start.settings.learning_rate
+        radiance, known = self.start.radiance, self.known
+        optimizer = mi.ad.Adam(rate, radiance.parameters(), mask_updates=True)
+        step = SolverStep(known.scene_view, radiance, known.points, settings, known.problem)
+        total = settings.seconds or settings.steps
+        number, seconds, cpu, skipped, due = 0, 0.0, 0.0, 0, list(MEASURED)
+        recent: list[dict[str, mi.Float]] = []
+
+        def done() -> float:
+            return (seconds if settings.seconds else number) / total
+
+        with deferred() as stop, Monitor(self.out / LOG, console, total) as monitor:
+            self._measure(optimizer, _entry(0, 0.0, 0.0, 0, settings.spp), monitor.say)
+            due.pop(0)
+            clock, cpu_clock = time.perf_counter(), time.process_time()
+            while done() < 1 and not stop:
+                now = rate * settings.final_learning_rate ** min(done(), 1.0)
+                recent.append(step(optimizer, number, now, self.recovered))
+                number += 1
+                last = done() >= 1 or bool(stop)
+                if not (last or number % _TIMED == 0):
+                    continue
+                dr.sync_thread()
+                seconds, cpu = time.perf_counter() - clock, time.process_time() - cpu_clock
+                last = last or done() >= 1
+                reached = done() >= due[0]
+                if not (last or reached or len(recent) >= _READ):
+                    continue
+                skipped += _record(monitor, recent, done() * total, number, seconds, settings)
+                recent.clear()
+                if last or reached:
+                    while len(due) > 1 and done() >= due[0]:
+                        due.pop(0)
+                    spp = settings.final_spp if last else settings.spp
+                    entry = _entry(number, seconds, cpu, skipped, spp)
+                    self._measure(optimizer, entry, monitor.say)
+                    clock, cpu_clock = time.perf_counter() - seconds, time.process_time() - cpu
+            for failure in monitor.failures:
+                raise failure
+        self.manifest["finished"] = not stop
+        self._write()
+
+    def write_pictures(self) -> None:
+        """Write both sides and the reference as OpenEXR and PNG."""
+        for kind, pictures in self.pictures.items():
+            for name, picture in zip(self.known.cameras, pictures, strict=True):
+                write_exr(self.out / f"{name}-{kind}.exr", picture)
+                write_png(self.out / f"{name}-{kind}.png", tonemap(picture))
+
+    def _measure(
+        self,
+        optimizer: mi.ad.Adam,
+        entry: dict[str, Any],
+        say: Callable[[str], None],
+    ) -> None:
+        """Measure both sides now, tell it, and write it with the field.
+
+        Args:
+            entry: when this is; it gets what is measured.
+        """
+        self.start.radiance.assign(dict(optimizer.items()))
+        if self.known.problem is not None:  # a step that was replayed leaves other arrays there
+            self.known.problem.assign(self.recovered)
+        cameras = list(self.known.cameras.values())
+        begun = time.process_time()
+        sides = both_sides(
+            self.known.scene_view,
+            self.start.radiance,
+            cameras,
+            entry["spp"],
+            self.settings.seed,
+            hide_emitters=not self.known.room,
+        )
+        entry["pictures_cpu_seconds"] = round(time.process_time() - begun, 3)
+        reference = self.pictures.get("reference")
+        if reference is not None:
+            found = {side: relative_mse(images, reference) for side, images in sides.items()}
+            entry["relmse"] = found
+            entry["relmse_debiased"] = {
+                side: debiased_relative_mse(images, self.halves) for side, images in sides.items()
+            }
+            told = ", ".join(f"{side.upper()} {value:.4f}" for side, value in found.items())
+            say(f"step {entry['step']}, {entry['seconds']:.0f} s: relMSE of {told}")
+        self.manifest["measurements"].append(entry)
+        self.pictures |= sides
+        self._write()
+
+    def _write(self) -> None:
+        write_solved(self.out, self.start.radiance, self.manifest)
+
+
+def _entry(number: int, seconds: float, cpu: float, skipped: int, spp: int) -> dict[str, Any]:
+    """The beginning of a measurement in `solve.json`."""
+    times = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu, 3)}
+    return {"step": number, **times, "skipped": skipped, "spp": spp}
+
+
+def _record(
+    monitor: Monitor,
+    recent: list[dict[str, mi.Float]],
+    done: float,
+    number: int,
+    seconds: float,
+    settings: SolveSettings,
+) -> int:
+    """Log and show the steps since the last line; returns how many of them were skipped."""
+    skipped = sum(int(terms["skipped"][0]) for terms in recent)
+    finite = [v for v in (float(terms["residual"][0]) for terms in recent) if np.isfinite(v)]
+    samples = number * settings.batch * settings.samples
+    entry = {
+        "step": number,
+        "seconds": seconds,
+        "residual": float(np.mean(finite)) if finite else float("nan"),
+        "skipped": skipped,
+        "samples_per_second": samples / max(seconds, 1e-9),
+        "memory_mb": memory_mb(),
+    }
+    monitor.record(done, entry)
+    return skipped
