@@ -12,6 +12,7 @@ Exposures = Literal["known", "per-image"]
 WhiteBalance = Literal["known", "common", "per-image"]
 Vignetting = Literal["known", "radial"]
 Response = Literal["known", "monotone"]
+Refinement = Literal["given", "refined"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class CameraConfig:
     """What is unknown of the cameras that took the photographs (ours).
 
     `known` is as the data set tells: `exposure` of its frames, and else a linear camera without
-    vignetting and with one white balance. See `fields/camera.py`.
+    vignetting and with one white balance. See `fields/camera.py`, and `training/poses.py`.
     """
 
     exposure: Annotated[
@@ -48,14 +49,51 @@ class CameraConfig:
             "channel between the values 0 and 1"
         ),
     ] = "known"
+    poses: Annotated[
+        Refinement,
+        Flag(
+            "Where cameras stood: given, as the data set tells, or refined, where each training "
+            "view gets a small correction"
+        ),
+    ] = "given"
+    intrinsics: Annotated[
+        Refinement,
+        Flag(
+            "Focal lengths and principal points: given, as the data set tells, or refined, by "
+            "corrections that views of the same intrinsics share"
+        ),
+    ] = "given"
+    pose_sigma: Annotated[
+        float,
+        Flag("Uncertainty of what is refined: standard deviation of its corrections in pixels"),
+    ] = 1.0
     learning_rate: float = 0.005  #: Adam; of logs of gains and slopes, and of coefficients
     smoothness: float = 1e-3  #: weight of differences along the response
+    pose_learning_rate: float = 0.05  #: Adam; of corrections of poses and intrinsics, in pixels
 
     def __post_init__(self) -> None:
-        require_ranges(self, {"learning_rate": (0, 1e3), "smoothness": (0, 1e6)})
+        require_ranges(
+            self,
+            {
+                "learning_rate": (0, 1e3),
+                "smoothness": (0, 1e6),
+                "pose_learning_rate": (0, 1e3),
+                "pose_sigma": (1e-3, 1e3),
+            },
+        )
 
     @property
     def unknowns(self) -> tuple[str, ...]:
         """What is fitted, each with parameters of its own."""
+        return self.of_light + self.of_places
+
+    @property
+    def of_light(self) -> tuple[str, ...]:
+        """What is fitted of how cameras turn light into photographs."""
         names = ("exposure", "white_balance", "vignetting", "response")
         return tuple(name for name in names if getattr(self, name) != "known")
+
+    @property
+    def of_places(self) -> tuple[str, ...]:
+        """What is fitted of where cameras stood and looked."""
+        return tuple(name for name in ("poses", "intrinsics") if getattr(self, name) != "given")

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..fields.arrays import from_numpy
+from ..fields.arrays import from_numpy, read_small
 from .camera import Camera
 from .photographs import Photographs
 
@@ -38,8 +38,8 @@ class CameraRays:
     pixels: int
     _first: mi.UInt32  # number of each view's first pixel, and of all pixels
     _width: mi.UInt32  # of each view
-    _lens: mi.Float  # fl_x, fl_y, cx, cy of each view
-    _pose: mi.Float  # upper three rows of `to_world` of each view
+    lens: mi.Float  # fl_x, fl_y, cx, cy of each view
+    pose: mi.Float  # upper three rows of `to_world` of each view
 
     @staticmethod
     def of(cameras: Sequence[Camera]) -> CameraRays:
@@ -52,8 +52,8 @@ class CameraRays:
             # One entry more than there are views: the search below looks there too.
             _first=from_numpy(mi.UInt32, np.cumsum([0, *sizes])),
             _width=from_numpy(mi.UInt32, np.array([c.width for c in cameras])),
-            _lens=from_numpy(mi.Float, np.array(lens)),
-            _pose=from_numpy(mi.Float, np.array([c.to_world[:3, :4] for c in cameras])),
+            lens=from_numpy(mi.Float, np.array(lens)),
+            pose=from_numpy(mi.Float, np.array([c.to_world[:3, :4] for c in cameras])),
         )
 
     def through(self, pixel: mi.UInt32, offset: mi.Point2f) -> mi.Ray3f:
@@ -68,14 +68,29 @@ class CameraRays:
         pixel = pixel - dr.gather(mi.UInt32, self._first, view)
         # Lanes that only fill up a vector divide as well, by the zero that they gather.
         width = dr.maximum(dr.gather(mi.UInt32, self._width, view), 1)
-        fx, fy, cx, cy = dr.gather(mi.ArrayXf, self._lens, view, shape=(4, n))
-        m = dr.gather(mi.ArrayXf, self._pose, view, shape=(12, n))
+        fx, fy, cx, cy = dr.gather(mi.ArrayXf, self.lens, view, shape=(4, n))
+        m = dr.gather(mi.ArrayXf, self.pose, view, shape=(12, n))
         x = (mi.Float(pixel % width) + offset.x - cx) / fx
         y = (mi.Float(pixel // width) + offset.y - cy) / fy
         local = dr.normalize(mi.Vector3f(x, -y, -1))
         rows = [mi.Vector3f(m[4 * r], m[4 * r + 1], m[4 * r + 2]) for r in range(3)]
         direction = mi.Vector3f([dr.dot(row, local) for row in rows])
         return mi.Ray3f(mi.Point3f(m[3], m[7], m[11]), direction)
+
+    def project(self, pixel: mi.UInt32, point: mi.Point3f) -> mi.Point2f:
+        """Where points lie in the images of pixels, in pixels from the top left corner.
+
+        Args:
+            pixel: numbers of pixels, each of a view.
+            point: world space, in front of the view's camera.
+        """
+        view = self.view_of(pixel)
+        fx, fy, cx, cy = (read_small(self.lens, 4 * view + i) for i in range(4))
+        m = [read_small(self.pose, 12 * view + i) for i in range(12)]
+        offset = point - mi.Point3f(m[3], m[7], m[11])
+        columns = [mi.Vector3f(m[i], m[4 + i], m[8 + i]) for i in range(3)]
+        x, y, z = (dr.dot(column, offset) for column in columns)
+        return mi.Point2f(cx - fx * x / z, cy + fy * y / z)
 
     def radius2(self, pixel: mi.UInt32, view: mi.UInt32) -> mi.Float:
         """Squared distances of the centres of pixels from the principal point.
@@ -88,7 +103,7 @@ class CameraRays:
         first = dr.gather(mi.UInt32, self._first, view)
         width = dr.maximum(dr.gather(mi.UInt32, self._width, view), 1)
         height = (dr.gather(mi.UInt32, self._first, view + 1) - first) // width
-        _, _, cx, cy = dr.gather(mi.ArrayXf, self._lens, view, shape=(4, dr.width(pixel)))
+        _, _, cx, cy = dr.gather(mi.ArrayXf, self.lens, view, shape=(4, dr.width(pixel)))
         place = pixel - first
         x, y = mi.Float(place % width) + 0.5 - cx, mi.Float(place // width) + 0.5 - cy
         half = dr.square(mi.Float(width)) + dr.square(mi.Float(height))
@@ -110,11 +125,15 @@ class PixelBatch:
     count: int
     smoothed: bool  # whether blurred photographs are with them
     clipped: bool  # whether the radiance from which on photographs are clipped is with them
+    slopes: bool  # whether slopes of the photographs are with them
     _packed: mi.UInt32  # numbers, then bits of colours: one array, so that a step copies one
 
     @staticmethod
     def of(
-        numbers: np.ndarray, colours: np.ndarray, limits: np.ndarray | None = None
+        numbers: np.ndarray,
+        colours: np.ndarray,
+        limits: np.ndarray | None = None,
+        slopes: np.ndarray | None = None,
     ) -> PixelBatch:
         """Pixels by number.
 
@@ -123,13 +142,20 @@ class PixelBatch:
             colours: rows of `Photographs.table`.
             limits: radiance from which on the photograph of each is clipped, float32, shape (n,);
                 None: none is.
+            slopes: of the photographs across and down, linear RGB a pixel, shape (n, 6); None: not
+                asked for.
         """
-        columns = colours if limits is None else np.c_[colours, limits].astype(np.float32)
+        known = [part for part in (colours, limits, slopes) if part is not None]
+        columns = np.column_stack(known).astype(np.float32, copy=False)
         packed = np.empty((1 + columns.shape[1], len(numbers)), np.uint32)
         packed[0] = numbers
         packed[1:] = np.ascontiguousarray(columns.T).view(np.uint32)
         return PixelBatch(
-            len(numbers), colours.shape[1] > 3, limits is not None, from_numpy(mi.UInt32, packed)
+            len(numbers),
+            colours.shape[1] > 3,
+            limits is not None,
+            slopes is not None,
+            from_numpy(mi.UInt32, packed),
         )
 
     def batch(self, rays: CameraRays, sampler: mi.Sampler, spp: int) -> RayBatch:
@@ -146,7 +172,11 @@ class PixelBatch:
         target = mi.Color3f(rgb[:3])
         clipped = target >= self._float(columns, pixel) if self.clipped else None
         smoothed = mi.Color3f(rgb[3:]) if self.smoothed else None
-        return RayBatch(target, smoothed, ray, clipped)
+        slopes = None
+        if self.slopes:
+            found = [self._float(columns + self.clipped + i, pixel) for i in range(6)]
+            slopes = mi.Color3f(found[:3]), mi.Color3f(found[3:])
+        return RayBatch(target, smoothed, ray, clipped, slopes)
 
     def numbers(self) -> mi.UInt32:
         """The numbers of the pixels, one lane a pixel."""
@@ -162,7 +192,8 @@ class PixelBatch:
         if not self.clipped:
             return None
         _, colours = self.read()
-        limits = np.array(self._packed).reshape(-1, self.count)[-1].view(np.float32)
+        row = 7 if self.smoothed else 4
+        limits = np.array(self._packed).reshape(-1, self.count)[row].view(np.float32)
         return colours[:, :3] >= limits[:, None]
 
     def _float(self, column: int, pixel: mi.UInt32) -> mi.Float:
@@ -180,6 +211,7 @@ class RayBatch:
     smoothed: mi.Color3f | None  # the same from photographs blurred over 5 x 5 pixels, if kept
     ray: mi.Ray3f  # `spp` consecutive lanes a pixel, world space
     clipped: mi.Bool | None = None  # channels that say "at least that much", as a colour has them
+    slopes: tuple[mi.Color3f, mi.Color3f] | None = None  # of `target`, a pixel across and down
 
 
 @final
@@ -196,6 +228,7 @@ class PixelSource:
             (n,); None: all are drawn.
         limits: radiance from which on each view is clipped, float32, shape (views,); None: none is.
         exposures: of each view, by which its photograph was divided, shape (views,); None: 1.
+        slopes: whether batches have the slopes of the photographs.
     """
 
     rays: CameraRays
@@ -203,6 +236,7 @@ class PixelSource:
     held: np.ndarray | None = None
     limits: np.ndarray | None = None
     exposures: np.ndarray | None = None
+    slopes: bool = False
 
     @staticmethod
     def of(
@@ -318,7 +352,38 @@ class PixelSource:
 
     def _batch(self, numbers: np.ndarray) -> PixelBatch:
         limits = None if self.limits is None else self.limits[self.views_of(numbers)]
-        return PixelBatch.of(numbers, self.photographs.table[numbers], limits)
+        slopes = self._slopes(numbers) if self.slopes else None
+        return PixelBatch.of(numbers, self.photographs.table[numbers], limits, slopes)
+
+    def _slopes(self, numbers: np.ndarray) -> np.ndarray:
+        """How photographs change across and down, linear RGB a pixel, shape (n, 6).
+
+        They are half the differences of both neighbours, which have no noise of the pixel itself;
+        0 beside pixels that do not count and at the edges of the image.
+        """
+        view = self.views_of(numbers)
+        first, width, height = np.array(self._layout)[view].T
+        row, column = np.divmod(np.asarray(numbers, np.int64) - first, width)
+        found = np.empty((len(numbers), 6), np.float32)
+        for axis, (place, size, step) in enumerate([(column, width, 1), (row, height, width)]):
+            inside = (0 < place) & (place < size - 1)
+            before, after = (numbers + np.where(inside, s * step, 0) for s in (-1, 1))
+            if self._counted is not None:
+                inside &= self._counted[before] & self._counted[after]
+            pair = (self.photographs.table[side, :3] for side in (after, before))
+            slope = 0.5 * np.subtract(*pair)
+            found[:, 3 * axis : 3 * axis + 3] = np.where(inside[:, None], slope, 0)
+        return found
+
+    @cached_property
+    def _counted(self) -> np.ndarray | None:
+        """Whether pixels count, by number; None: all do."""
+        chosen = self.photographs.chosen
+        if chosen is None:
+            return None
+        counted = np.zeros(len(self.photographs.table), bool)
+        counted[chosen] = True
+        return counted
 
     def views_of(self, numbers: np.ndarray) -> np.ndarray:
         """The views of pixels, from 0."""

@@ -21,6 +21,7 @@ from ..scene import edit
 from ..scene.parse import parse
 from ..training.cameras import Cameras
 from ..training.held_aside import convergence
+from ..training.poses import refined_view
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.run_lock import RunLock
@@ -28,6 +29,7 @@ from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_key
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from . import lighting, renderings, yardsticks
+from .placing import placed_view, told_of_place
 from .renderings import (
     METRICS,
     counted_pixels,
@@ -65,7 +67,11 @@ CAMERA_DEFINITIONS = {
     "view is the anchor, 0. Red and blue are gains relative to green. Nothing is learned from "
     "other views: theirs are the median ratio of photograph and rendering, and their render_psnr "
     "is that of photographs after their own exposure. vignetting: v = 1 + a r² + b r⁴ + c r⁶, r is "
-    "1 in a corner. response: f(u^2.2)^(1/2.2) at equal steps of u from 0 to 1",
+    "1 in a corner. response: f(u^2.2)^(1/2.2) at equal steps of u from 0 to 1. pixels: how far "
+    "the corrected camera moves what it sees in the image, root mean square, moved_pixels: of all "
+    "training views; degrees and shift: how far it was turned, and moved in world units; "
+    "transform_matrix: where it then stands. Other views are moved to where the rendering is most "
+    "like their photograph, and then compared",
 }
 
 
@@ -123,9 +129,11 @@ def _evaluate(
     clip = settings.clip_negative or recovered.clip_negative
     exposure = exposure_of(read_photograph(view, clip) for view in views)
     cameras = Cameras(recovered.problem.camera, dataset.train)
-    rows, materials, gains = [], [], []
-    for view in views:
+    rows, materials, gains, placed = [], [], [], []
+    for given in views:
         lock.require_held()
+        view = placed_view(recovered, cameras, given, settings)
+        placed.append(view)
         row, seen, truth, gain = _evaluate_view(
             recovered, cameras, view, folder, settings, true_scene, exposure
         )
@@ -142,7 +150,7 @@ def _evaluate(
     if recovered.config.learns_materials:
         heldout = materials[: len(dataset.heldout)]
         measures["yardsticks"] = asdict(find_yardsticks(dataset, recovered.config, heldout))
-    found = _evaluate_cameras(recovered, cameras, views, gains, tell)
+    found = _evaluate_cameras(recovered, cameras, placed, gains, tell)
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
         "steps": recovered.progress.step,
@@ -273,23 +281,45 @@ def _evaluate_cameras(
     """What was fitted of the cameras; empty if all is known.
 
     Args:
-        views: that were evaluated.
+        views: that were evaluated, with the cameras that were found for them.
         gains: of these.
     """
-    model = recovered.problem.camera
-    if model is None:
+    model, poses, dataset = recovered.problem.camera, recovered.problem.poses, recovered.dataset
+    unknown = recovered.config.camera.unknowns
+    if not unknown:
         return {}
-    train = recovered.dataset.train
-    found = {"unknown": list(recovered.config.camera.unknowns)} | cameras.told()
+    train = dataset.train
+    found = {"unknown": list(unknown)} | cameras.told()
+    fitted = np.ones((len(train), 3)) if model is None else model.gains()
+    pairs = list(zip((refined_view(poses, train, v) for v in train), fitted, strict=True))
+    pairs += [(v, gain) for v, gain in zip(views, gains, strict=True) if v.split != "train"]
+    rows = [{"name": view.name, "split": view.split} for view, _ in pairs]
     if cameras.solves:
         found["anchor"] = train[0].name
-        others = [(v, gain) for v, gain in zip(views, gains, strict=True) if v.split != "train"]
-        pairs = [*zip(train, model.gains(), strict=True), *others]
-        found["images"] = rows = [cameras.told_of(view, gain) for view, gain in pairs]
+        rows = [r | cameras.told_of(*pair) for r, pair in zip(rows, pairs, strict=True)]
         stops = [row["stops"] for row in rows if row["split"] == "train"]
         tell(
             f"exposures: {min(stops):+.2f} to {max(stops):+.2f} stops over what the data set tells"
         )
+    if poses is not None:
+        given = {view.name: view.camera for view in dataset.views}
+        scene = recovered.problem.scene_view.scene
+        places = [told_of_place(scene, given[view.name], view.camera) for view, _ in pairs]
+        found_at = [{"transform_matrix": view.camera.to_world.tolist()} for view, _ in pairs]
+        rows = [r | p | at for r, p, at in zip(rows, places, found_at, strict=True)]
+        pixels = [row["pixels"] for row in rows if row["split"] == "train"]
+        rms = float(np.sqrt(np.mean(np.square(pixels))))
+        tell(f"poses: corrected by {rms:.2f} pixels, {max(pixels):.2f} at most")
+        found["moved_pixels"] = rms
+        keys = ("fl_x", "fl_y", "cx", "cy")
+        if "intrinsics" in unknown:
+            found["intrinsics"] = [
+                {key: getattr(camera, key) for key in keys}
+                | {f"told_{key}": getattr(told, key) for key in keys}
+                for told, camera in poses.intrinsics()
+            ]
+    if cameras.solves or poses is not None:
+        found["images"] = rows
     return {"camera": found}
 
 

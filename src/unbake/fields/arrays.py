@@ -31,3 +31,12 @@ def from_numpy(array_type: type, values: np.ndarray) -> mi.Float | mi.UInt32:
     own = mapped * dr.opaque(array_type, 1)
     dr.eval(own)
     return own
+
+
+def read_small(array: mi.Float, index: mi.UInt32, active: bool | mi.Bool = True) -> mi.Float:
+    """Entries of a small array, an index a lane; 0 where a lane is not active.
+
+    Dr.Jit 1.5 on LLVM now and then loses gradients in the buffers by which it adds to small arrays;
+    `Local` has none.
+    """
+    return dr.gather(mi.Float, array, index, active, mode=dr.ReduceMode.Local)

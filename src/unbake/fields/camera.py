@@ -35,7 +35,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import from_numpy
+from .arrays import from_numpy, read_small
 
 #: Which images share a white balance.
 Balance = Literal["known", "common", "per-image"]
@@ -144,7 +144,7 @@ class CameraModel:
             gain *= _exp(self._relative("exposure.log", view, 0, 1))
         if self.white_balance == "common":
             array = self._arrays["white_balance.log"]
-            red, blue = (_read(array, dr.full(mi.UInt32, i, lanes)) for i in range(2))
+            red, blue = (read_small(array, dr.full(mi.UInt32, i, lanes)) for i in range(2))
             gain *= mi.Color3f(_exp(red), 1, _exp(blue))
         elif self.white_balance == "per-image":
             red, blue = (self._relative("white_balance.log", view, i, 2) for i in range(2))
@@ -152,7 +152,7 @@ class CameraModel:
         if "vignetting.terms" in self._arrays:
             array = self._arrays["vignetting.terms"]
             a, b, c = (
-                order * _read(array, dr.full(mi.UInt32, i, lanes))
+                order * read_small(array, dr.full(mi.UInt32, i, lanes))
                 for i, order in enumerate(_ORDERS)
             )
             falloff = dr.fma(radius2, dr.fma(radius2, dr.fma(radius2, c, b), a), 1)
@@ -171,13 +171,13 @@ class CameraModel:
         logs = self._arrays["response.log"]
         piece = dr.arange(mi.UInt32, 3 * (PIECES - 1))
         index = piece // (PIECES - 1) * PIECES + piece % (PIECES - 1)
-        return dr.mean(dr.square(_read(logs, index + 1) - _read(logs, index)))
+        return dr.mean(dr.square(read_small(logs, index + 1) - read_small(logs, index)))
 
     def _relative(self, key: str, view: mi.UInt32, offset: int, stride: int) -> mi.Float:
         """Entries of views less that of the first view, which is the anchor."""
         array = self._arrays[key]
-        anchor = _read(array, dr.full(mi.UInt32, offset, dr.width(view)))
-        return _read(array, stride * view + offset) - anchor
+        anchor = read_small(array, dr.full(mi.UInt32, offset, dr.width(view)))
+        return read_small(array, stride * view + offset) - anchor
 
     def _heights(self) -> mi.Float:
         """The curve f at `PIECES` + 1 places of each channel, as `curves`."""
@@ -186,7 +186,7 @@ class CameraModel:
         place, piece = lane // column, lane % column
         channel = place // row
         logs = self._arrays["response.log"]
-        slopes = _softplus(_read(logs, channel * PIECES + piece) + _UNIT)
+        slopes = _softplus(read_small(logs, channel * PIECES + piece) + _UNIT)
         risen = dr.block_sum(dr.select(piece < place % row, slopes, 0), column)
         # The middle stays where it is: see above.
         half = dr.block_sum(dr.select(piece < PIECES // 2, slopes, 0), column)
@@ -199,7 +199,7 @@ class CameraModel:
         place = dr.power(value, 1 / GAMMA) * PIECES
         piece = dr.minimum(mi.UInt32(place), PIECES - 1)
         index = piece + channel * (PIECES + 1)
-        low, high = _read(heights, index), _read(heights, index + 1)
+        low, high = read_small(heights, index), read_small(heights, index + 1)
         height = dr.fma(high - low, place - mi.Float(piece), low)
         return dr.power(dr.maximum(height, 1e-6), GAMMA)
 
@@ -258,15 +258,6 @@ class CameraModel:
 
     def _array(self, key: str) -> np.ndarray:
         return np.array(dr.detach(self._arrays[key]), np.float64)
-
-
-def _read(array: mi.Float, index: mi.UInt32) -> mi.Float:
-    """Entries of a small array, an index a lane.
-
-    Dr.Jit 1.5 on LLVM now and then loses gradients in the buffers by which it adds to small arrays;
-    `Local` has none.
-    """
-    return dr.gather(mi.Float, array, index, mode=dr.ReduceMode.Local)
 
 
 def _places() -> np.ndarray:

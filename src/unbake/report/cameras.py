@@ -1,4 +1,4 @@
-"""The page's section on cameras: exposures and white balances that were fitted."""
+"""The page's section on cameras: exposures, white balances and places that were fitted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ _COLUMNS = {
     "stops": ("Exposure, stops", "{:+.2f}"),
     "red": ("Red", "{:.3f}"),
     "blue": ("Blue", "{:.3f}"),
+    "pixels": ("Moved, pixels", "{:.2f}"),
+    "degrees": ("Turned, degrees", "{:.3f}"),
+    "shift": ("Shifted, world units", "{:.4f}"),
 }
+_LENS = {"fl_x": "focal length", "cx": "cx", "cy": "cy"}
 _CHANNELS = ("red", "green", "blue")
 
 
@@ -63,6 +67,15 @@ def _of(found: dict[str, Any]) -> list[str]:
         )
         what = "response: f(u^2.2)^(1/2.2) of red, green, blue"
         told.append(f"{what} is {dark} at u = 0.25, and {white} at u = 1")
+    if found.get("moved_pixels") is not None:
+        told.append(f"poses: corrected by {_text(found['moved_pixels'], '{:.2f}')} pixels")
+    for lens in found.get("intrinsics") or ():
+        pairs = {title: [lens.get(k) for k in (key, f"told_{key}")] for key, title in _LENS.items()}
+        values = (
+            f"{title} {_text(now, '{:.3f}')} (told {_text(told_, '{:.3f}')})"
+            for title, (now, told_) in pairs.items()
+        )
+        told.append(f"intrinsics: {', '.join(values)}")
     return told
 
 

@@ -123,8 +123,6 @@ class Cameras:
         own = self._model.white_balance == "per-image"
         scale = float(gain[1] if own else gain[1] / self._model.common_gain()[1])
         row: dict[str, Any] = {
-            "name": view.name,
-            "split": view.split,
             "told": view.exposure,
             "exposure": view.exposure * scale,
             "stops": float(np.log2(scale)),

@@ -38,7 +38,8 @@ def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     """A fit of a data set that writes nothing."""
     config = with_defaults(config, dataset)
     smoothed = config.loss_reference == "smoothed"
-    pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed)
+    slopes = bool(config.camera.of_places)
+    pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed, slopes=slopes)
     problem = problem_of(dataset, config, pixels.photographs.mean)
     begin_cameras(problem, dataset, pixels)
     step = TrainingStep(problem, pixels, config)

@@ -156,7 +156,10 @@ def _begin(
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = clip_negative or (before is not None and before.clip_negative)
     pixels = training_pixels(
-        dataset, clip_negative=clip_negative, smoothed=config.loss_reference == "smoothed"
+        dataset,
+        clip_negative=clip_negative,
+        smoothed=config.loss_reference == "smoothed",
+        slopes=bool(config.camera.of_places),
     )
     pixels = pixels.holding_aside(config.held_aside, config.seed)
     origin = Origin(

@@ -31,6 +31,7 @@ from ..scene.parse import ParsedScene, parse
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from .limits import require_room
+from .poses import PoseModel
 
 Parameters = Mapping[str, mi.Float | mi.TensorXf]
 
@@ -51,6 +52,7 @@ class Problem:
     hide_emitters: bool
     half_precision: bool  #: in products of its networks
     camera: CameraModel | None = None  #: of the training views; None: all is as the data set tells
+    poses: PoseModel | None = None  #: corrections of the training views' cameras; None: as given
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -69,7 +71,9 @@ class Problem:
             named |= self.materials.parameters()
         for word, light in self._lighting():
             named |= {f"{word}.{key}": value for key, value in light.parameters().items()}
-        return named if self.camera is None else named | self.camera.parameters()
+        for model in (self.camera, self.poses):
+            named |= {} if model is None else model.parameters()
+        return named
 
     def assign(self, parameters: Parameters) -> None:
         """Use these arrays, and update the tables that are derived from them."""
@@ -78,8 +82,9 @@ class Problem:
         for word, light in self._lighting():
             light.assign({key: parameters[f"{word}.{key}"] for key in light.parameters()})
             light.prepare()
-        if self.camera is not None:
-            self.camera.assign(parameters)
+        for model in (self.camera, self.poses):
+            if model is not None:
+                model.assign(parameters)
 
     def read_by_scene(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The arrays that the scene's textures and emitters look into."""
@@ -175,6 +180,7 @@ def make_problem(
         background == "hidden",
         config.half_precision,
         _unknown_camera(config.camera, len(views)),
+        _unknown_poses(config.camera, unchanged, views),
     )
 
 
@@ -198,16 +204,28 @@ def problem_of(
 
 
 def _unknown_camera(config: CameraConfig, views: int) -> CameraModel | None:
-    if not config.unknowns:
-        return None
-    if not views:
+    if config.unknowns and not views:
         raise ValueError("something of the cameras is unknown: give the training views")
+    if not config.of_light:
+        return None
     return CameraModel(
         views,
         exposure=config.exposure == "per-image",
         white_balance=config.white_balance,
         vignetting=config.vignetting == "radial",
         response=config.response == "monotone",
+    )
+
+
+def _unknown_poses(
+    config: CameraConfig, scene: mi.Scene, views: Sequence[View]
+) -> PoseModel | None:
+    unknown = config.of_places
+    if not unknown:
+        return None
+    cameras = [view.camera for view in views]
+    return PoseModel.of(
+        scene, cameras, poses="poses" in unknown, intrinsics="intrinsics" in unknown
     )
 
 
@@ -246,13 +264,16 @@ def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list
     return made[0], [emitter.name for emitter in named]
 
 
-def training_pixels(dataset: Dataset, *, clip_negative: bool, smoothed: bool = True) -> PixelSource:
+def training_pixels(
+    dataset: Dataset, *, clip_negative: bool, smoothed: bool = True, slopes: bool = False
+) -> PixelSource:
     """The pixels of the training views.
 
     Args:
         clip_negative: take negative pixels as zero.
         smoothed: keep a blurred copy of the photographs, which `loss_reference = "smoothed"` needs
             and which takes as much memory again.
+        slopes: give batches the slopes of the photographs, which corrections of poses need.
 
     Raises:
         UserError: there is no training view, an image is bad, or all pixels are black.
@@ -272,4 +293,4 @@ def training_pixels(dataset: Dataset, *, clip_negative: bool, smoothed: bool = T
         limits = np.array([view.limit for view in views], np.float32)
     exposures = np.array([view.exposure for view in views], np.float32)
     rays = CameraRays.of([view.camera for view in views])
-    return PixelSource(rays, photographs, limits=limits, exposures=exposures)
+    return PixelSource(rays, photographs, limits=limits, exposures=exposures, slopes=slopes)

@@ -96,7 +96,11 @@ def _camera(value: Any) -> bool:
     checks = {
         "unknown": _list_of(_text),
         "anchor": _text,
-        "images": _list_of(_object_of(_number, name=_text, split=_text)),
+        "moved_pixels": _number,
+        "intrinsics": _list_of(_object_of(_number)),
+        "images": _list_of(
+            _object_of(_number, name=_text, split=_text, transform_matrix=_list_of(_NUMBERS))
+        ),
         "white_balance": _object_of(_number),
         "vignetting": _object_of(_number),
         "response": _object_of(_list_of(_number)),

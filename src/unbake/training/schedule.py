@@ -36,6 +36,8 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     }
     # Exposures begin near where they belong: while albedo is not, they would only move away.
     late = min(1.0, done / _CAMERA_WAITS) ** 2
-    for name in config.camera.unknowns:
-        rates[name] = config.camera.learning_rate * _CAMERA.get(name, 1.0) * decay * late
+    camera = config.camera
+    for name in camera.of_light:
+        rates[name] = camera.learning_rate * _CAMERA.get(name, 1.0) * decay * late
+    rates |= dict.fromkeys(camera.of_places, camera.pose_learning_rate * decay * late)
     return rates | {"radiance": config.radiance_settings.learning_rate * decay}

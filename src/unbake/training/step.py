@@ -29,6 +29,7 @@ from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
 from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
+from .poses import PoseUnits
 from .problem import Problem
 from .regularizers import has_terms, regularization_terms
 from .state import State
@@ -51,6 +52,7 @@ class Inputs:
     single: mi.Sampler  # of one camera sample a pixel, for regularizers
     seed: mi.UInt32
     told: mi.Float | None = None  # exposures of the views as the data set tells, if they are read
+    units: PoseUnits | None = None  # of corrections of poses, if there are any
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class TrainingStep:
             self._told = from_numpy(
                 mi.Float, np.ones(problem.camera.views) if exposures is None else exposures
             )
+        self._units = None if problem.poses is None else problem.poses.units
         self._sampler = mi.load_dict({"type": "independent"})
         self._second = mi.load_dict({"type": "independent"})
         self._single = mi.load_dict({"type": "independent"})
@@ -143,7 +146,7 @@ class TrainingStep:
             inputs = self._inputs(0, min(config.pixels, max(1, _PLANNED_PATHS // config.spp)))
             state.publish(self._problem)
             inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
-            batch = inputs.pixels.batch(inputs.rays, inputs.sampler, config.spp)
+            batch = inputs.pixels.batch(self._rays(inputs), inputs.sampler, config.spp)
             path_sampler.plan(inputs.scene, batch.ray, inputs.sampler)
         self._planned = True
 
@@ -223,7 +226,7 @@ class TrainingStep:
             dr.clear_grad(dict(optimizer.items()))
         with dr.suspend_grad(), self._path_sampler.prepared():
             inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
-            batch = inputs.pixels.batch(inputs.rays, inputs.sampler, config.spp)
+            batch = inputs.pixels.batch(self._rays(inputs), inputs.sampler, config.spp)
             image = self._path_sampler.image(inputs.scene, batch.ray, inputs.sampler)
             image = np.array(pixel_means(image, config.spp)).T
         numbers, colours = inputs.pixels.read()
@@ -260,6 +263,7 @@ class TrainingStep:
             second=self._second,
             single=self._single,
             seed=dr.opaque(mi.UInt32, seed),
+            units=self._units,
         )
         probe = self._probe if self._frozen_probe is None else self._frozen_probe
         with without_garbage_collection():
@@ -272,7 +276,7 @@ class TrainingStep:
         with dr.suspend_grad(), self._path_sampler.prepared():
             state.publish(self._problem)
             sampler.seed(inputs.seed, pixels.count * config.spp)
-            batch = pixels.batch(inputs.rays, sampler, config.spp)
+            batch = pixels.batch(self._rays(inputs), sampler, config.spp)
             image = self._path_sampler.image(inputs.scene, batch.ray, sampler)
             halves = pixel_means(image, config.spp // 2)
             dr.eval(halves)
@@ -327,6 +331,7 @@ class TrainingStep:
             single=self._single,
             seed=dr.opaque(mi.UInt32, int(seeds[1])),
             told=self._told,
+            units=self._units,
         )
 
     def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
@@ -356,16 +361,20 @@ class TrainingStep:
         scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
         state.publish(self._problem)
         sampler.seed(inputs.seed, pixels.count * config.spp)
-        batch = pixels.batch(inputs.rays, sampler, config.spp)
+        poses, placed = self._problem.poses, self._placed(inputs)
+        rays = inputs.rays if poses is None else dr.detach(placed)
+        batch = pixels.batch(rays, sampler, config.spp)
         with path_sampler.prepared():
             primal = None
             if not config.halves:
                 with dr.suspend_grad():
-                    again = pixels.batch(inputs.rays, sampler, config.spp)
+                    again = pixels.batch(rays, sampler, config.spp)
                     image = path_sampler.image(scene, again.ray, sampler)
                     primal = pixel_means(image, config.spp)
             smoothed = config.loss_reference == "smoothed"
             reference, target = batch.smoothed if smoothed else None, batch.target
+            if poses is not None:
+                target = poses.target(scene, placed, pixels, batch)
             gain = None
             camera = self._problem.camera
             if camera is not None:
@@ -377,6 +386,9 @@ class TrainingStep:
             if camera is not None and camera.has_response and config.camera.smoothness:
                 value = camera.roughness_of_response()
                 terms["response_smoothness"] = config.camera.smoothness * value
+            if poses is not None:
+                count, loss = self._pixels.photographs.count, terms.get(PHOTOMETRIC)
+                terms["pose_prior"] = poses.prior(config.camera.pose_sigma, loss, count)
             total = sum(terms.values())
             dr.backward(total if state.scale is None else total * state.scale)
         return terms
@@ -392,6 +404,15 @@ class TrainingStep:
         inputs.single.seed(inputs.seed + 2, inputs.pixels.count)
         ray = dr.gather(mi.Ray3f, ray, chosen)
         return regularization_terms(problem, config, inputs.scene, ray, inputs.single, photometric)
+
+    def _rays(self, inputs: Inputs) -> CameraRays:
+        """The camera rays, by what is known of the cameras by now."""
+        return dr.detach(self._placed(inputs))
+
+    def _placed(self, inputs: Inputs) -> CameraRays:
+        """The same, which pass gradients to corrections of poses."""
+        poses, units = self._problem.poses, inputs.units
+        return inputs.rays if poses is None else poses.placed(inputs.rays, units)
 
     def _through_camera(
         self,

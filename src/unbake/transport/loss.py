@@ -52,9 +52,10 @@ class RelativeL2:
     def weight(self, target: mi.Color3f) -> mi.Color3f:
         """1 / (reference² + ε) of each pixel, a constant."""
         reference = target if self.reference is None else self.reference
+        reference = dr.detach(reference)
         if self.gain is None:
             return dr.rcp(dr.square(reference) + self.epsilon)
-        reference, gain = dr.detach(reference), dr.detach(self.gain)
+        gain = dr.detach(self.gain)
         return dr.rcp(dr.square(reference) + self.epsilon * dr.square(gain))
 
 

@@ -28,6 +28,7 @@ from ..imaging.pictures import absolute_error, block_means, false_colour, shown,
 from ..quantities import QUANTITIES
 from ..training.cameras import Cameras
 from ..training.checkpoint import Progress, load_written
+from ..training.poses import refined_view
 from ..training.recovered import open_run
 from ..training.validation import MaterialBuffers, read_view
 from ..transport.path_sample import Requirements, rhs, trace
@@ -309,6 +310,7 @@ class ViewedRun(ViewedData):
 
         See `ViewedData.pictures`. What is rendered is at most `LONGEST` pixels wide and high.
         """
+        view = refined_view(self._problem.poses, self._run.dataset.train, view)
         photograph, camera = _small(_photograph(view), view.camera)
         first = [Picture("photograph", tonemap(photograph, exposure))]
         if self.progress is None:

@@ -1,0 +1,126 @@
+"""What poses that are off cost, and what refining them gives back.
+
+    python benchmarks/poses.py --data DATA --runs FOLDER --out FILE.json [--pixels 0.3 1 3]
+        [--seed 0] [--steps 600]
+
+`unbake degrade` moves the cameras of a rendered data set. Fits follow: of the data set as it was,
+and for each size of the error, with poses taken as given and refined. Scores `true_*` are at the
+true cameras: the recovered materials as the held-out views of the data set as it was see them. The
+others are by `unbake evaluate`, at the cameras that are given, or to which held-out views were
+moved by their photographs. Errors of poses are distances in the image between a point as the true
+camera and as the other one sees it, root mean square over pixels and views.
+
+What FOLDER has already is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+SRC = str(ROOT / "src")
+sys.path.insert(0, SRC)
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+
+from unbake import backend  # noqa: E402
+
+backend.activate()  # before modules with types of Dr.Jit
+
+from unbake.acquisition.degrade import degrade  # noqa: E402
+from unbake.acquisition.settings import DegradeSettings  # noqa: E402
+from unbake.dataset.views import Dataset, View  # noqa: E402
+from unbake.evaluation.placing import told_of_place  # noqa: E402
+from unbake.experiments.commands import unbake  # noqa: E402
+from unbake.imaging.metrics import mean_psnr  # noqa: E402
+from unbake.io import write_json  # noqa: E402
+from unbake.machine import machine  # noqa: E402
+from unbake.training.recovered import load_run  # noqa: E402
+from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake.training.validation import GroundTruth, MaterialBuffers  # noqa: E402
+
+SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
+#: What is made of poses.
+POSES = ("given", "refined")
+#: Samples a pixel of materials at the true cameras.
+SAMPLES = 64
+
+
+def main() -> None:
+    """Fit, print every score, and write the result."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="data set")
+    parser.add_argument("--runs", type=Path, required=True, help="folder for data sets and runs")
+    parser.add_argument("--pixels", type=float, nargs="+", default=[0.3, 1.0, 3.0])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    args = parser.parse_args()
+    args.runs.mkdir(parents=True, exist_ok=True)
+    clean, rows = Dataset.load(args.data), []
+    for pixels, poses in [(0.0, "given"), *((x, p) for x in args.pixels for p in POSES)]:
+        data = args.data
+        if pixels:
+            data = args.runs / f"data-{pixels:g}"
+            if not data.is_dir():
+                degrade(args.data, data, DegradeSettings(pose_jitter=pixels, seed=args.seed))
+        run = args.runs / f"{poses}-{pixels:g}"
+        fit(data, run, ["--seed", args.seed, "--steps", args.steps, "--poses", poses])
+        rows.append({"pixels": pixels, "poses": poses} | scores(run, clean))
+        told = ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items() if isinstance(v, float))
+        print(f"{poses}: {told}", flush=True)
+    camera = clean.train[0].camera
+    about = {
+        "machine": machine(),
+        "data": args.data.name,
+        "seed": args.seed,
+        "steps": args.steps,
+        "train": len(clean.train),
+        "heldout": len(clean.heldout),
+        "width": camera.width,
+        "height": camera.height,
+    }
+    write_json(args.out, about | {"rows": rows})
+
+
+def fit(data: Path, run: Path, words: Sequence[object]) -> None:
+    """A fit and its evaluation, as far as they are not there already."""
+    log, folder = run.with_suffix(".log"), RunFolder(run)
+    if not run.is_dir():
+        unbake("fit", data, "--out", run, *words, log=log)
+    if not folder.metrics_file.is_file():
+        unbake("evaluate", run, "--train-views", 0, log=log)
+
+
+def scores(run: Path, clean: Dataset) -> dict[str, Any]:
+    """The scores of a run, and the errors of its poses in pixels."""
+    recovered, metrics = load_run(run), RunFolder(run).metrics()
+    found = {key: metrics["heldout"][key] for key in SCORES} | {"seconds": metrics["seconds"]}
+    seen = MaterialBuffers.of(recovered.problem, clean.heldout, SAMPLES, 0)
+    truths = [GroundTruth.of(view) for view in clean.heldout]
+    each = [s.psnr(t) for s, t in zip(seen, truths, strict=True) if t is not None]
+    found |= {f"true_{key}": mean_psnr(row[key] for row in each) for key in each[0]}
+    images = metrics.get("camera", {}).get("images", ())
+    poses = {row["name"]: np.array(row["transform_matrix"]) for row in images}
+    scene = recovered.problem.scene_view.scene
+    given = {view.name: view for view in recovered.dataset.views}
+    for split in ("train", "heldout"):
+        views: list[View] = [view for view in clean.views if view.split == split]
+        squares = []
+        for view in views:
+            camera = given[view.name].camera
+            camera = replace(camera, to_world=poses.get(view.name, camera.to_world))
+            squares.append(told_of_place(scene, camera, view.camera)["pixels"] ** 2)
+        found[f"{split}_pixels"] = float(np.sqrt(np.mean(squares)))
+    return found
+
+
+if __name__ == "__main__":
+    main()
