@@ -51,7 +51,7 @@ def _curve(photographs: np.ndarray, exposures: np.ndarray) -> np.ndarray:
     middle = np.zeros(PIECES + 1)
     middle[PIECES // 2] = 1
     prior += len(ratio) * np.outer(middle, middle)
-    weight = np.ones(len(ratio))
+    weight, found = np.ones(len(ratio)), np.zeros(PIECES + 1)
     for _ in range(_STEPS):
         normal = matrix.T @ (weight[:, None] * matrix) + prior * weight.mean()
         found = np.linalg.solve(normal, matrix.T @ (weight * right))
