@@ -49,6 +49,8 @@ from unbake.training.validation import GroundTruth, MaterialBuffers  # noqa: E40
 SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
 #: What is made of poses.
 POSES = ("given", "refined")
+#: What matters here is material: pictures have few samples, which costs all rows the same.
+EVALUATION = ("--spp", 16, "--train-views", 0)
 #: Samples a pixel of materials at the true cameras.
 SAMPLES = 64
 
@@ -96,7 +98,7 @@ def fit(data: Path, run: Path, words: Sequence[object]) -> None:
     if not run.is_dir():
         unbake("fit", data, "--out", run, *words, log=log)
     if not folder.metrics_file.is_file():
-        unbake("evaluate", run, "--train-views", 0, log=log)
+        unbake("evaluate", run, *EVALUATION, log=log)
 
 
 def scores(run: Path, clean: Dataset) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from .fit import (
     Unknown,
 )
 from .flag import Flag
+from .objective import ObjectiveConfig
 from .presets import QUALITIES, preset, with_method, with_quality
 from .tables import update
 from .toml import from_toml, read_toml, to_tables, to_toml
@@ -44,6 +45,7 @@ __all__ = [
     "GridConfig",
     "LightingConfig",
     "NetworkConfig",
+    "ObjectiveConfig",
     "PathConfig",
     "Precision",
     "PresetName",

@@ -17,6 +17,7 @@ from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
 from ..transport.methods import METHODS, PATH_REPLAY, Method
 from .camera import CameraConfig
 from .flag import Flag
+from .objective import ObjectiveConfig
 from .tables import update
 
 Estimator = Literal["auto", "split-halves", "two-pass"]
@@ -287,6 +288,7 @@ class FitConfig:
     transport: TransportConfig = field(default_factory=TransportConfig)
     path: PathConfig = field(default_factory=PathConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
 
     checkpoint_seconds: float = 60.0  #: time between checkpoints
     preview_seconds: float = 30.0  #: time between preview pictures

@@ -104,10 +104,20 @@ class CameraRays:
         width = dr.maximum(dr.gather(mi.UInt32, self._width, view), 1)
         height = (dr.gather(mi.UInt32, self._first, view + 1) - first) // width
         _, _, cx, cy = dr.gather(mi.ArrayXf, self.lens, view, shape=(4, dr.width(pixel)))
-        place = pixel - first
-        x, y = mi.Float(place % width) + 0.5 - cx, mi.Float(place // width) + 0.5 - cy
+        column, row = self.place_of(pixel, view)
+        x, y = mi.Float(column) + 0.5 - cx, mi.Float(row) + 0.5 - cy
         half = dr.square(mi.Float(width)) + dr.square(mi.Float(height))
         return 4 * (dr.square(x) + dr.square(y)) / dr.maximum(half, 1)
+
+    def place_of(self, pixel: mi.UInt32, view: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """Columns and rows of pixels in their views.
+
+        Args:
+            view: of each pixel.
+        """
+        place = pixel - dr.gather(mi.UInt32, self._first, view)
+        width = dr.maximum(dr.gather(mi.UInt32, self._width, view), 1)
+        return place % width, place // width
 
     def view_of(self, pixel: mi.UInt32) -> mi.UInt32:
         """The views of pixels, from 0."""

@@ -28,7 +28,8 @@ from ..training.run_lock import RunLock
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
-from . import lighting, renderings, yardsticks
+from . import lighting, outliers, renderings, yardsticks
+from .outliers import evaluate_outliers
 from .placing import placed_view, told_of_place
 from .renderings import (
     METRICS,
@@ -151,6 +152,7 @@ def _evaluate(
         heldout = materials[: len(dataset.heldout)]
         measures["yardsticks"] = asdict(find_yardsticks(dataset, recovered.config, heldout))
     found = _evaluate_cameras(recovered, cameras, placed, gains, tell)
+    lacking = evaluate_outliers(recovered, folder, tell)
     metrics = {"format": METRICS_FORMAT} | description(recovered.config)
     metrics |= {
         "steps": recovered.progress.step,
@@ -165,12 +167,14 @@ def _evaluate(
         **recovered_lighting,
         "display_exposure": exposure,
         **found,
+        **lacking,
         "per_view": rows,
         "definitions": DEFINITIONS
         | renderings.DEFINITIONS
         | (yardsticks.DEFINITIONS if measures else {})
         | (lighting.DEFINITIONS if recovered_lighting else {})
-        | (CAMERA_DEFINITIONS if found else {}),
+        | (CAMERA_DEFINITIONS if found else {})
+        | (outliers.DEFINITIONS if lacking else {}),
         "data": origin.data,
         "data_changed": data_changed,
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},

@@ -21,6 +21,7 @@ from unbake.quantities import QUANTITIES
 from unbake.report import charts, display
 from unbake.report.cameras import camera_section
 from unbake.report.lighting import lighting_section
+from unbake.report.outliers import outlier_section
 from unbake.report.relit import relit_sections
 from unbake.report.runs import Run, View, data_folder, labels, read_run, read_views
 from unbake.report.sheets import texture_sections
@@ -157,6 +158,7 @@ def write_report(
             textures=textures,
             strips=strips,
             cameras=camera_section(loaded),
+            outliers=outlier_section(loaded),
             optimized=_optimized(loaded),
             materials=bool(materials),
             known=any(name in view.truth for view in views for name in QUANTITIES),
@@ -462,7 +464,8 @@ def _definitions(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
         for kind, words in LIGHT_DEFINED.items()
     }
     cameras = [_told(run, {"camera": "Cameras"}) for run in runs]
-    parts = {"numbers": numbers, "camera": cameras} | lighting
+    lacking = [_told(run, {"outliers": "Outliers"}) for run in runs]
+    parts = {"numbers": numbers, "camera": cameras, "outliers": lacking} | lighting
     return {part: _grouped(runs, said) for part, said in parts.items()}
 
 

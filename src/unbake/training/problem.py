@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..config import CameraConfig, FitConfig
+from ..config import CameraConfig, FitConfig, ObjectiveConfig
 from ..dataset.data_folder import TRANSFORMS
 from ..dataset.photographs import Photographs
 from ..dataset.pixels import CameraRays, PixelSource
@@ -31,6 +31,7 @@ from ..scene.parse import ParsedScene, parse
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from .limits import require_room
+from .outliers import OutlierModel
 from .poses import PoseModel
 
 Parameters = Mapping[str, mi.Float | mi.TensorXf]
@@ -53,6 +54,7 @@ class Problem:
     half_precision: bool  #: in products of its networks
     camera: CameraModel | None = None  #: of the training views; None: all is as the data set tells
     poses: PoseModel | None = None  #: corrections of the training views' cameras; None: as given
+    outliers: OutlierModel | None = None  #: of the training views; None: all pixels count alike
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -71,8 +73,8 @@ class Problem:
             named |= self.materials.parameters()
         for word, light in self._lighting():
             named |= {f"{word}.{key}": value for key, value in light.parameters().items()}
-        for model in (self.camera, self.poses):
-            named |= {} if model is None else model.parameters()
+        for model in self._of_photographs():
+            named |= model.parameters()
         return named
 
     def assign(self, parameters: Parameters) -> None:
@@ -82,9 +84,8 @@ class Problem:
         for word, light in self._lighting():
             light.assign({key: parameters[f"{word}.{key}"] for key in light.parameters()})
             light.prepare()
-        for model in (self.camera, self.poses):
-            if model is not None:
-                model.assign(parameters)
+        for model in self._of_photographs():
+            model.assign(parameters)
 
     def read_by_scene(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The arrays that the scene's textures and emitters look into."""
@@ -96,6 +97,10 @@ class Problem:
         if self.emission is not None:
             arrays |= {f"emission.{i}": c for i, c in enumerate(self.emission.values)}
         return arrays
+
+    def _of_photographs(self) -> list[CameraModel | PoseModel | OutlierModel]:
+        found = (self.camera, self.poses, self.outliers)
+        return [model for model in found if model is not None]
 
     def _lighting(self) -> list[tuple[str, EnvironmentMap | Emission]]:
         both = [("environment", self.environment), ("emission", self.emission)]
@@ -181,6 +186,7 @@ def make_problem(
         config.half_precision,
         _unknown_camera(config.camera, len(views)),
         _unknown_poses(config.camera, unchanged, views),
+        _unknown_outliers(config.objective, views),
     )
 
 
@@ -227,6 +233,14 @@ def _unknown_poses(
     return PoseModel.of(
         scene, cameras, poses="poses" in unknown, intrinsics="intrinsics" in unknown
     )
+
+
+def _unknown_outliers(config: ObjectiveConfig, views: Sequence[View]) -> OutlierModel | None:
+    if config.outliers == "kept":
+        return None
+    if not views:
+        raise ValueError("outliers are to be found: give the training views")
+    return OutlierModel([view.camera for view in views], config.block, config.tolerance)
 
 
 def _unknown_materials(parsed: ParsedScene, config: FitConfig, seed: int) -> Materials:

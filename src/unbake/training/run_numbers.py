@@ -110,6 +110,21 @@ def _camera(value: Any) -> bool:
     )
 
 
+def _outliers(value: Any) -> bool:
+    checks = {
+        "share": _number,
+        "images": _list_of(
+            lambda row: (
+                isinstance(row, dict) and _text(row.get("name")) and _number(row.get("share"))
+            )
+        ),
+        "shown": _list_of(_text),
+    }
+    return isinstance(value, dict) and all(
+        key in value and check(value[key]) for key, check in checks.items()
+    )
+
+
 _LOG: Mapping[str, Check] = {
     **dict.fromkeys(("step", "seconds", "samples", "skipped"), _count),
     **dict.fromkeys(("samples_per_second", "memory_mb", "learning_rate"), _number),
@@ -139,6 +154,7 @@ _METRICS: Mapping[str, Check] = {
     ),
     "albedo_scale": _or_none(_NUMBERS),
     "camera": _or_none(_camera),
+    "outliers": _or_none(_outliers),
     "definitions": _or_none(_object_of(_text)),
     **dict.fromkeys(("render", "evaluation"), _or_none(_object)),
     "rate_factors": _or_none(_SCORES),

@@ -29,6 +29,7 @@ from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
 from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
+from .outliers import Blocks
 from .poses import PoseUnits
 from .problem import Problem
 from .regularizers import has_terms, regularization_terms
@@ -53,6 +54,7 @@ class Inputs:
     seed: mi.UInt32
     told: mi.Float | None = None  # exposures of the views as the data set tells, if they are read
     units: PoseUnits | None = None  # of corrections of poses, if there are any
+    blocks: Blocks | None = None  # of pixels that lose their weight together, if they are to
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,9 @@ class TrainingStep:
     @property
     def rate_names(self) -> tuple[str, ...]:
         """The names of learning rates that a step takes."""
-        return (*self._config.unknowns, *self._config.camera.unknowns, "radiance")
+        config = self._config
+        outliers = ("outliers",) if self._problem.outliers is not None else ()
+        return (*config.unknowns, *config.camera.unknowns, *outliers, "radiance")
 
     def loss_of_black(self) -> float:
         """About the photometric loss of black pictures."""
@@ -332,6 +336,7 @@ class TrainingStep:
             seed=dr.opaque(mi.UInt32, int(seeds[1])),
             told=self._told,
             units=self._units,
+            blocks=None if self._problem.outliers is None else self._problem.outliers.blocks,
         )
 
     def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
@@ -379,7 +384,11 @@ class TrainingStep:
             camera = self._problem.camera
             if camera is not None:
                 target, reference, gain = self._through_camera(camera, inputs, target, reference)
-            loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain)
+            outliers, roots, trust = self._problem.outliers, None, None
+            if outliers is not None:
+                roots = outliers.roots(inputs.rays, pixels.numbers(), inputs.blocks)
+                trust = dr.square(roots)
+            loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain, trust)
             subset = _subset(config, inputs)
             terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
             terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))
@@ -389,6 +398,8 @@ class TrainingStep:
             if poses is not None:
                 count, loss = self._pixels.photographs.count, terms.get(PHOTOMETRIC)
                 terms["pose_prior"] = poses.prior(config.camera.pose_sigma, loss, count)
+            if outliers is not None and PHOTOMETRIC in terms:
+                terms["outliers"] = outliers.cost(roots, terms[PHOTOMETRIC])
             total = sum(terms.values())
             dr.backward(total if state.scale is None else total * state.scale)
         return terms

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import CameraConfig, FitConfig, with_method
+from ..config import CameraConfig, FitConfig, ObjectiveConfig, with_method
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
@@ -127,7 +127,13 @@ class TruthFit:
             raise UserError(what, "unknown", "Set it to materials")
         self.maps = TrueMaps.load(dataset, config.quantities)
         # The cheapest method: none of its light is computed here.
-        config = replace(config, unknown="materials", precision="single", camera=CameraConfig())
+        config = replace(
+            config,
+            unknown="materials",
+            precision="single",
+            camera=CameraConfig(),
+            objective=ObjectiveConfig(),
+        )
         config = with_method(config, "direct")
         self.problem: Problem = problem_of(dataset, config, 1.0)
         assert self.problem.materials is not None

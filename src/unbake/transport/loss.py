@@ -25,6 +25,7 @@ class RelativeL2:
         gain: by which renderings are multiplied before they are compared, linear RGB, one lane a
             pixel; None: 1. ε is of radiance, so that it is multiplied by the squared gain: with the
             true gains errors are the same as if photographs had been divided by them.
+        trust: by which errors are multiplied, one lane a pixel; it may pass gradients; None: 1.
 
     Paper: Sec. 5.4.
     """
@@ -33,10 +34,14 @@ class RelativeL2:
     reference: mi.Color3f | None = None
     clipped: mi.Bool | None = None
     gain: mi.Color3f | None = None
+    trust: mi.Float | None = None
 
     def of_known_camera(self) -> RelativeL2:
-        """The same loss without gradients to the gain."""
-        return self if self.gain is None else replace(self, gain=dr.detach(self.gain))
+        """The same loss without gradients to the gain and to what errors are multiplied by."""
+        if self.gain is None and self.trust is None:
+            return self
+        gain, trust = (None if x is None else dr.detach(x) for x in (self.gain, self.trust))
+        return replace(self, gain=gain, trust=trust)
 
     def error(
         self,
@@ -47,6 +52,8 @@ class RelativeL2:
     ) -> mi.Float:
         """The relative squared error of pixels; arguments as of `squared_error`."""
         weight = self.weight(target)
+        if self.trust is not None:
+            weight *= self.trust
         return squared_error(samples, target, spp, weight, primal, self.clipped, self.gain)
 
     def weight(self, target: mi.Color3f) -> mi.Color3f:

@@ -1,0 +1,50 @@
+"""What a fit took for things that the mesh lacks: shares of photographs, and pictures of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..dataset.views import read_photograph
+from ..imaging.pictures import tonemap, write_png
+from ..training.recovered import Recovered
+from ..training.run_folder import RunFolder
+
+#: Pictures of views with outliers, at most: of those with the largest share.
+_PICTURES = 12
+#: Outliers are as bright as the photograph, half in this colour.
+_TINT = np.array([255, 0, 255])
+
+DEFINITIONS = {
+    "outliers": "share of the pixels of training photographs in blocks that lost over half of "
+    "their weight in the fit, because they stayed unexplained. Scores count all pixels alike",
+}
+
+
+def evaluate_outliers(
+    recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Numbers for `metrics.json`, and pictures beside it; empty where all pixels count alike.
+
+    Raises:
+        UserError: a photograph cannot be read.
+    """
+    model, views = recovered.problem.outliers, recovered.dataset.train
+    if model is None:
+        return {}
+    masks = model.masks()
+    shares = [float(mask.mean()) for mask in masks]
+    whole = sum(int(mask.sum()) for mask in masks) / sum(mask.size for mask in masks)
+    most = sorted(range(len(views)), key=lambda i: -shares[i])[:_PICTURES]
+    shown = sorted(i for i in most if shares[i] > 0)
+    for i in shown:
+        picture = tonemap(read_photograph(views[i], recovered.clip_negative)[..., :3])
+        picture[masks[i]] = (picture[masks[i]] // 2 + _TINT // 2).astype(np.uint8)
+        write_png(folder.picture("train", views[i].name, "outliers", ".png"), picture)
+    tell(
+        f"outliers: {100 * whole:.1f} % of the pixels, {100 * max(shares):.1f} % of a view at most"
+    )
+    images = [{"name": view.name, "share": s} for view, s in zip(views, shares, strict=True)]
+    return {"outliers": {"share": whole, "images": images, "shown": [views[i].name for i in shown]}}
