@@ -22,8 +22,8 @@ from .unwrap import LARGEST, Atlas, Placed, joined, parameterized, surface_point
 
 #: Texels that are looked up at once; bounds the memory.
 CHUNK = 1 << 17
-#: Places in a texel that are looked up, in texels.
-_OFFSETS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+#: Places in a texel that are looked up: the middles of its quarters.
+_PLACES = 4
 #: Bytes a texel of the arrays here, with those of the pyramid.
 _TEXEL_BYTES = 120
 #: How near textures are to the fields: their largest error, as PNG files store them, and the share
@@ -187,27 +187,30 @@ class Baker:
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         """Means of quantities, whether there is surface, and whether it was seen."""
         n = atlas.resolution
-        lane = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+        lane = dr.arange(mi.UInt32, _PLACES * width)
+        texel, place = lane // _PLACES + dr.opaque(mi.UInt32, start), lane % _PLACES
         edge = dr.opaque(mi.UInt32, n)
-        column, row = mi.Float(lane % edge), mi.Float(lane // edge)
-        sums = {name: [dr.zeros(mi.Float, width)] * q.channels for name, q in QUANTITIES.items()}
-        count = dr.zeros(mi.Float, width)
-        p, normal, two_sided = mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Bool(False)
-        for x, y in _OFFSETS:
-            dx, dy = dr.opaque(mi.Float, x), dr.opaque(mi.Float, y)
-            uv = mi.Point2f(column + dx, row + dy) / mi.Float(edge)
-            si = mesh.eval_parameterization(uv, active=lane < edge * edge)
-            valid = si.is_valid()
-            # The number of the material and whether it has two sides.
-            info = mesh.eval_attribute_3("face_info", si, valid)
-            for name, value in self._values(mesh, atlas.materials, si, info, valid).items():
-                sums[name] = [
-                    s + dr.select(valid, v, 0) for s, v in zip(sums[name], value, strict=True)
-                ]
-            count += dr.select(valid, 1.0, 0.0)
-            p, normal = dr.select(valid, si.p, p), dr.select(valid, si.n, normal)
-            two_sided = dr.select(valid, info.y > 0.5, two_sided)
-            dr.eval(sums, count, p, normal, two_sided)
+        offset = mi.Point2f(place % 2, place // 2) / 2 + 0.25
+        uv = (mi.Point2f(texel % edge, texel // edge) + offset) / mi.Float(edge)
+        si = mesh.eval_parameterization(uv, active=texel < edge * edge)
+        valid = si.is_valid()
+        # The number of the material and whether it has two sides.
+        info = mesh.eval_attribute_3("face_info", si, valid)
+        found = {
+            name: [dr.select(valid, v, 0) for v in value]
+            for name, value in self._values(mesh, atlas.materials, si, info, valid).items()
+        }
+        p, normal = mi.Point3f(si.p), mi.Normal3f(si.n)
+        dr.eval(found, valid, p, normal, info)
+        count = dr.block_sum(dr.select(valid, mi.Float(1), 0), _PLACES)
+        sums = {
+            name: [dr.block_sum(v, _PLACES) for v in channels] for name, channels in found.items()
+        }
+        # One place of each texel tells whether it was seen.
+        last = dr.block_reduce(dr.ReduceOp.Max, dr.select(valid, place, 0), _PLACES)
+        chosen = dr.arange(mi.UInt32, width) * _PLACES + last
+        p, normal = dr.gather(mi.Point3f, p, chosen), dr.gather(mi.Normal3f, normal, chosen)
+        two_sided = dr.gather(mi.Float, info.y, chosen) > 0.5
         hit = count > 0
         seen = self._views.see(p, normal, two_sided, hit)
         scale = dr.rcp(dr.maximum(count, 1))
