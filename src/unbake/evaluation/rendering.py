@@ -35,8 +35,8 @@ from . import renderings
 from .evaluate import DEFINITIONS, description
 from .renderings import METRICS, counted_pixels, render_camera, render_scores
 from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
+from .turntable import axis_of, up_of
 from .turntable import turntable as make_turntable
-from .turntable import up_of
 from .yardsticks import seen_materials
 
 #: Memory in bytes that a pixel of a picture takes, its copies included.
@@ -341,8 +341,7 @@ def _tell_tilt(light: LightConfig, dataset: Dataset, tell: Callable[[str], None]
     up = up_of([view.camera for view in dataset.train])
     if up @ np.array(light.up) >= _UPRIGHT:
         return
-    axis = int(np.argmax(np.abs(up)))
-    wanted = ("-" if up[axis] < 0 else "+") + "xyz"[axis]
+    wanted = axis_of(up)
     tell(
         f"the map's first row lies at {light.envmap_up}, while the cameras' up is {wanted}: "
         f"--envmap-up {wanted} turns it"

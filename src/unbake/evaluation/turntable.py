@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -10,6 +11,7 @@ from typing import Literal
 import mitsuba as mi
 import numpy as np
 
+from ..config.light import Axis
 from ..dataset.camera import Camera
 from ..errors import UserError
 from ..scene import free_space
@@ -97,6 +99,12 @@ def turntable(
         for a in angles
     ]
     return Turntable(made, "pan", eye, 0.0, up)
+
+
+def axis_of(up: np.ndarray) -> Axis:
+    """The world axis that is nearest to a direction (3,), with its sign."""
+    axis = int(np.argmax(np.abs(up)))
+    return typing.get_args(Axis)[2 * axis + int(up[axis] < 0)]
 
 
 def up_of(cameras: Sequence[Camera]) -> np.ndarray:
