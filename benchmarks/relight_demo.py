@@ -1,10 +1,13 @@
 """How well recovered materials look under light that no photograph showed, by method.
 
     python benchmarks/relight_demo.py --work FOLDER --out FILE.json [--scenes demo still]
-        [--methods ours direct prb] [--steps 1200] [--seed 0] [--spp 128]
+        [--data NAME=FOLDER ...] [--methods ours direct prb] [--steps 1200] [--batch PIXELS]
+        [--seed 0] [--spp 128] [--resolution 128]
 
 `demo`, a room, is lit by two lamps in other places and colours than its own; `still`, a few
-objects, by a sunny sky from another side than the hazy one of its photographs. Each method is
+objects, by a sunny sky from another side than the hazy one of its photographs. --data takes
+captures of other scenes: rooms are lit by a warm and a cold ball where two of the training cameras
+stood, objects by the sunny sky. Each method is
 fitted to the photographs, with default settings and the same number of steps. Its materials are
 rendered from the held-out cameras under the new light, and compared with a capture of the true
 scene under it. So are materials before the first step, `untrained`. What is done in the folder is
@@ -18,6 +21,7 @@ import math
 import os
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +35,14 @@ from unbake import backend  # noqa: E402
 backend.activate()
 
 import numpy as np  # noqa: E402
+from views import of_size  # noqa: E402
 
 from unbake.config.light import LightConfig  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402
 from unbake.evaluation.evaluate import evaluate  # noqa: E402
 from unbake.evaluation.rendering import relight  # noqa: E402
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings  # noqa: E402
+from unbake.evaluation.turntable import axis_of, up_of  # noqa: E402
 from unbake.experiments.commands import unbake  # noqa: E402
 from unbake.imaging.pictures import write_exr  # noqa: E402
 from unbake.io import read_object, write_json, write_text  # noqa: E402
@@ -45,16 +51,13 @@ from unbake.machine import machine  # noqa: E402
 #: Samples per pixel of the true pictures.
 TRUE_SAMPLES = 576
 UNTRAINED = "untrained"
-#: Two balls of light below the ceiling of `demo`, a warm and a cold one; its own lamp is off.
-LAMPS = """<scene version="3.0.0">
-  <shape type="sphere" id="warm"><point name="center" x="3.5" y="0.6" z="1.9"/>
-    <float name="radius" value="0.12"/>
-    <emitter type="area"><rgb name="radiance" value="30 20 11"/></emitter></shape>
-  <shape type="sphere" id="cold"><point name="center" x="0.5" y="0.3" z="2.3"/>
-    <float name="radius" value="0.1"/>
-    <emitter type="area"><rgb name="radiance" value="10 17 30"/></emitter></shape>
-</scene>
-"""
+#: Two balls of light, a warm and a cold one: centres and radii.
+Balls = tuple[tuple[Sequence[float], float], tuple[Sequence[float], float]]
+#: Below the ceiling of `demo`, whose own lamp is off.
+LAMPS: Balls = ((3.5, 0.6, 1.9), 0.12), ((0.5, 0.3, 2.3), 0.1)
+COLOURS = {"warm": "30 20 11", "cold": "10 17 30"}
+#: Radius of balls in other rooms, over the distance between them.
+RADIUS = 0.03
 
 
 def main() -> None:
@@ -62,9 +65,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--work", type=Path, required=True, help="folder of data sets and runs")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    parser.add_argument("--scenes", nargs="+", choices=("demo", "still"), default=["demo", "still"])
+    parser.add_argument("--scenes", nargs="*", choices=("demo", "still"), default=["demo", "still"])
+    parser.add_argument("--data", nargs="+", default=[], help="NAME=FOLDER, captured data sets")
     parser.add_argument("--methods", nargs="+", default=["ours", "direct", "prb"])
     parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--batch", type=int, help="pixels of a step (default: that of fits)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--spp", type=int, default=128, help="samples per pixel of relit pictures")
     parser.add_argument("--true-spp", type=int, default=TRUE_SAMPLES)
@@ -75,14 +80,17 @@ def main() -> None:
         "machine": machine(),
         "steps": args.steps,
         "seeds": [args.seed],
+        "batch": args.batch,
         "spp": args.spp,
         "scenes": {},
     }
-    for scene in args.scenes:
-        light = light_of(scene, args.work)
-        data, truth = args.work / scene, args.work / f"{scene}-truth"
-        if not data.exists():
+    given = {name: Path(folder) for name, _, folder in (x.partition("=") for x in args.data)}
+    for scene in [*args.scenes, *given]:
+        data = given.get(scene, args.work / scene)
+        truth = args.work / f"{scene}-truth"
+        if scene not in given and not data.exists():
             unbake("capture", scene, "--out", data, "--resolution", args.resolution)
+        light = light_of(scene, data, args.work)
         if not truth.exists():
             capture_truth(scene, data, truth, light, args.true_spp, args.resolution)
         rows: dict[str, Any] = {}
@@ -93,6 +101,7 @@ def main() -> None:
                 chosen = "ours" if method == UNTRAINED else method
                 steps = 0 if method == UNTRAINED else args.steps
                 options = ["--method", chosen, "--steps", steps, "--seed", args.seed]
+                options += [] if args.batch is None else ["--batch", args.batch]
                 unbake("fit", data, "--out", run, *options)
             kept = args.work / f"{run.name}-scores-{args.spp}.json"
             if not kept.exists():
@@ -103,13 +112,36 @@ def main() -> None:
             print(f"{scene}, {method}: {told}", flush=True)
 
 
-def light_of(scene: str, work: Path) -> LightConfig:
+def light_of(scene: str, data: Path, work: Path) -> LightConfig:
     """The light that no photograph of a scene showed; its file is written anew."""
-    if scene == "demo":
-        write_text(work / "lamps.xml", LAMPS)
-        return LightConfig(lights=work / "lamps.xml")
+    dataset = Dataset.load(data)
+    if dataset.kind == "room":
+        file = work / f"{scene}-lamps.xml"
+        write_text(file, lamps(LAMPS if scene == "demo" else balls_in(dataset)))
+        return LightConfig(lights=file)
     write_exr(work / "sunny.exr", sunny_sky(64))
-    return LightConfig(envmap=work / "sunny.exr", envmap_up="+z")
+    up = up_of([view.camera for view in dataset.train])
+    return LightConfig(envmap=work / "sunny.exr", envmap_up=axis_of(up))
+
+
+def balls_in(dataset: Dataset) -> Balls:
+    """Balls of light where the first training camera stands, and the one farthest from it."""
+    places = np.array([view.camera.origin for view in dataset.train])
+    distance = np.linalg.norm(places - places[0], axis=1)
+    other = int(np.argmax(distance))
+    radius = RADIUS * float(distance[other])
+    return (places[0].tolist(), radius), (places[other].tolist(), radius)
+
+
+def lamps(balls: Balls) -> str:
+    """A scene of two balls of light."""
+    shapes = [
+        f'  <shape type="sphere" id="{name}"><point name="center" x="{x}" y="{y}" z="{z}"/>\n'
+        f'    <float name="radius" value="{radius}"/>\n'
+        f'    <emitter type="area"><rgb name="radiance" value="{colour}"/></emitter></shape>\n'
+        for (name, colour), ((x, y, z), radius) in zip(COLOURS.items(), balls, strict=True)
+    ]
+    return f'<scene version="3.0.0">\n{"".join(shapes)}</scene>\n'
 
 
 def sunny_sky(rows: int) -> np.ndarray:
@@ -133,28 +165,30 @@ def sunny_sky(rows: int) -> np.ndarray:
 def capture_truth(
     scene: str, data: Path, truth: Path, light: LightConfig, spp: int, resolution: int
 ) -> None:
-    """Render the true scene under the new light, from the held-out cameras."""
+    """Render the true scene under the new light, from the held-out cameras.
+
+    Args:
+        resolution: pixels along the longer edge.
+    """
     dataset = Dataset.load(data)
     # A data set needs a training view; it is not compared.
     views = (dataset.train[0], *dataset.heldout)
-    cameras = data.parent / f"{scene}-cameras.json"
-    frames = [
-        {
-            "split": view.split,
-            "w": view.camera.width,
-            "h": view.camera.height,
-            "fl_x": view.camera.fl_x,
-            "transform_matrix": view.camera.to_world.tolist(),
-        }
-        for view in views
-    ]
+    cameras = truth.with_name(f"{scene}-cameras.json")
+    frames = []
+    for view in views:
+        camera = of_size(view.camera, resolution)
+        size = {"w": camera.width, "h": camera.height, "fl_x": camera.fl_x}
+        pose = {"transform_matrix": camera.to_world.tolist()}
+        frames.append({"split": view.split, **size, **pose})
     write_json(cameras, {"frames": frames})
     words = ["--cameras", cameras, "--spp", spp, "--resolution", resolution]
     if light.lights is not None:
         words += ["--lights", light.lights]
     else:
         words += ["--envmap", light.envmap, "--envmap-up", light.envmap_up]
-    unbake("capture", scene, "--out", truth, *words)
+    unbake(
+        "capture", scene if scene in ("demo", "still") else dataset.scene, "--out", truth, *words
+    )
 
 
 def described(truth: Path) -> dict[str, int]:
