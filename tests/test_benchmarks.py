@@ -460,6 +460,48 @@ def test_a_soak_writes_what_it_has_seen(repository, ended, tmp_path):
 
 
 @pytest.mark.slow
+def test_exports_are_compared_with_the_fields(repository, cornell, tmp_path):
+    run, out = tmp_path / "run", tmp_path / "trip.json"
+    fit = ["fit", cornell, "--out", run, "--steps", 2, "--method", "direct", "--batch", 64]
+    command = [sys.executable, "-m", "unbake", *map(str, fit)]
+    assert subprocess.run(command, capture_output=True, timeout=280).returncode == 0
+    words = ["--runs", f"box={run}", "--work", tmp_path / "work", "--out", out]
+    small = ["--points", 2000, "--views", 1, "--resolution", 8, "--spp", 16]
+    done = call(repository, "round_trip.py", *words, *small)
+    assert done.returncode == 0, done.stderr[-3000:]
+    row = read(out)["runs"]["box"]
+    assert row["steps"] == 2 and row["points"] > 500 and row["megatexels"] > 0
+    for found in (row["mitsuba"], row["gltf"]):
+        assert found["albedo"] > 0.95 and found["roughness"] > 0.95
+    (view,) = row["renderings"]
+    assert view["psnr"] > view["same_fields_psnr"] - 6
+    assert "errors" in row["validator"] or "not_run" in row["validator"]
+
+
+@pytest.mark.slow
+def test_the_export_of_a_large_room_is_measured(repository, tmp_path):
+    words = ["--meshes", 7, "--triangles", 2000, "--resolution", 16, "--steps", 2]
+    out = tmp_path / "large.json"
+    done = call(repository, "large_export.py", *words, "--work", tmp_path / "work", "--out", out)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = read(out)
+    assert found["parts"] == 7 + 2 and 1500 < found["triangles"] < 2500
+    assert found["own_coordinates"] >= 4 and found["cost"]["peak_mb"] > 50
+
+
+@pytest.mark.slow
+def test_other_scenes_are_compared_under_other_light(repository, cornell, tmp_path):
+    words = ["--steps", 2, "--spp", 2, "--true-spp", 4, "--resolution", 8, "--batch", 64]
+    words += ["--methods", "direct", "--scenes", "--data", f"box={cornell}"]
+    out = tmp_path / "relit.json"
+    done = call(repository, "relight_demo.py", *words, "--work", tmp_path, "--out", out)
+    assert done.returncode == 0, done.stderr[-3000:]
+    (scene,) = read(out)["scenes"].values()
+    assert scene["methods"].keys() == {"direct", "untrained"}
+    assert all(np.isfinite(row["relit_render_psnr"]) for row in scene["methods"].values())
+
+
+@pytest.mark.slow
 def test_materials_are_compared_under_other_light(repository, tmp_path):
     words = ["--steps", 2, "--spp", 2, "--true-spp", 4, "--resolution", 8, "--methods", "direct"]
     work = tmp_path / "work"
