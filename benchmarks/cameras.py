@@ -1,13 +1,19 @@
-"""What unknown exposures cost, and what fitting them gives back.
+"""What faults of cameras cost, and what fitting the cameras gives back.
 
-    python benchmarks/cameras.py --data DATA --out FILE.json [--stops 1.5] [--seeds 0]
-        [--steps 2400] [--settings FILE]
+    python benchmarks/cameras.py --data DATA --out FILE.json [--faults NAME ...]
+        [--cameras known fitted] [--seeds 0] [--steps 2400] [--batch 1024] [--spp 8]
 
-The photographs of a data set of known exposures are multiplied by random ones, uniform in stops up
-to ±`--stops`, each view by its own, but for the first training view: it is the anchor. Three fits
-follow: of the photographs as they were, of the new ones taken for known, and of the new ones with
-`--exposures per-image`. Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
-held-out views; errors of exposures are of the other training views, in stops.
+A rendered data set is fitted as it is, and then after `unbake degrade`, fault by fault: taken for
+known, and with what is unknown of the cameras fitted. `FAULTS` says what each one is. Scores are
+PSNRs in dB of linear RGB by `unbake evaluate`, mean over held-out views. Errors of what was found
+of the cameras, against the truth that `degrade` keeps:
+
+- `stops_error_*`: of the exposures of training views but the first, which is the anchor;
+- `balance_error_*`: of red and blue relative to green, of the same views, in stops;
+- `vignetting_error_most`: over the picture, as a share of the light;
+- `response_error_*`: of what the curve makes of code values, as a share of white.
+
+Rows that FILE has of the same data and options are kept: a run that was stopped goes on.
 """
 
 from __future__ import annotations
@@ -15,10 +21,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,90 +36,187 @@ sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
 from unbake import backend  # noqa: E402
+from unbake.acquisition.degrade import degrade  # noqa: E402
+from unbake.acquisition.settings import DegradeSettings  # noqa: E402
 from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402
+from unbake.evaluation.settings import EvaluationSettings  # noqa: E402
 from unbake.experiments.commands import unbake  # noqa: E402
 from unbake.experiments.seeds import across_seeds  # noqa: E402
-from unbake.imaging.pictures import read_exr, write_exr  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
 
 SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
-LENGTH = ("steps", "samples", "seconds")
-FITS = {"clean": "known", "taken for known": "known", "fitted": "per-image"}
+LENGTH = ("samples", "seconds")
+#: Of a measurement, all of which rows have in common.
+OPTIONS = ("seeds", "steps", "batch", "fit_spp")
+#: How faults are fitted.
+CAMERAS = ("known", "fitted")
+#: What matters here is material: pictures have few samples, which costs all rows the same.
+EVALUATION = EvaluationSettings(spp=4, train_views=0)
+#: Curves of responses are even in code values of this power, as `fields/camera.py` has them.
+GAMMA = 2.2
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What `degrade` does, and the options of a fit that knows of it."""
+
+    settings: Mapping[str, Any]
+    words: tuple[str, ...] = ()
+
+
+EXPOSURE = Fault({"exposure": 1.5}, ("--exposures", "per-image"))
+BALANCE = Fault({"white_balance": 1.0}, ("--white-balance", "per-image"))
+VIGNETTING = Fault({"vignetting": 0.4}, ("--vignetting", "radial"))
+JPEG = Fault({"format": "jpeg", "electrons": 10000.0, "read_noise": 5.0})
+MESH = Fault({"decimate": 0.1})
+CONTRAST = Fault({"response": "contrast"}, ("--response", "monotone"))
+
+
+def together(*faults: Fault) -> Fault:
+    """Several faults at once."""
+    settings = {key: value for fault in faults for key, value in fault.settings.items()}
+    return Fault(settings, tuple(word for fault in faults for word in fault.words))
+
+
+#: As EXIF does.
+TOLD = Fault({"exposure": 1.5, "tell_exposures": True})
+
+FAULTS = {
+    "exposure": EXPOSURE,
+    "white balance": BALANCE,
+    "vignetting": VIGNETTING,
+    "response": CONTRAST,
+    "response, exposures told": together(CONTRAST, TOLD),
+    "response and exposure": together(CONTRAST, EXPOSURE),
+    "jpeg": JPEG,
+    "mesh": MESH,
+    "all, exposures told": together(BALANCE, VIGNETTING, CONTRAST, JPEG, MESH, TOLD),
+    "all": together(BALANCE, VIGNETTING, CONTRAST, JPEG, MESH, EXPOSURE),
+}
 
 
 def main() -> None:
     """Fit, print every score, and write the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="data set")
-    parser.add_argument("--stops", type=float, default=1.5, help="the most that exposures differ")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
+    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=list(CAMERAS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--steps", type=int, default=2400)
-    parser.add_argument("--settings", type=Path, help="settings file")
+    parser.add_argument("--batch", type=int, default=1024, help="pixels in a step")
+    parser.add_argument(
+        "--spp", type=int, default=8, dest="fit_spp", help="samples a pixel in a step"
+    )
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
     backend.activate()
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in FITS}
-    options = [] if args.settings is None else ["--settings", args.settings]
-    for number, seed in enumerate(args.seeds, 1):
-        with tempfile.TemporaryDirectory() as folder:
-            exposed, stops = with_exposures(args.data, Path(folder) / "data", args.stops, seed)
-            for name, exposures in FITS.items():
-                data = args.data if name == "clean" else exposed
-                words = ["--seed", seed, "--steps", args.steps, "--exposures", exposures, *options]
-                scores = fit(data, Path(folder) / name.replace(" ", "-"), words, stops)
-                found[name].append(scores)
-                told = ", ".join(f"{key} {value:.3f}" for key, value in scores.items())
-                print(f"{name}, seed {seed}: {told}", flush=True)
-        rows = [{"exposures": name} | across_seeds(runs, runs[0]) for name, runs in found.items()]
-        dataset = Dataset.load(args.data)
-        camera = dataset.train[0].camera
-        about = {
-            "train": len(dataset.train),
-            "heldout": len(dataset.heldout),
-            "width": camera.width,
-            "height": camera.height,
-            "spp": dataset.render.get("spp", 0),
-            "stops": args.stops,
-        }
-        result = {"machine": machine(), "seeds": args.seeds[:number], "data": args.data.name}
-        write_json(args.out, result | about | {"rows": rows})
+    result = about(args)
+    rows: list[dict[str, Any]] = kept(args.out, result)
+    options = ["--steps", args.steps, "--batch", args.batch, "--spp", args.fit_spp]
+    known = {(row["fault"], row["cameras"]) for row in rows}
+    for fault, fit in [("none", "known")] + [(f, c) for f in args.faults for c in args.cameras]:
+        if (fault, fit) in known or (fit == "fitted" and not FAULTS[fault].words):
+            continue
+        found = [scores(args.data, fault, fit, seed, options) for seed in args.seeds]
+        rows.append({"fault": fault, "cameras": fit} | across_seeds(found, found[0]))
+        told = ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items() if isinstance(v, float))
+        print(f"{fault}, {fit}: {told}", flush=True)
+        write_json(args.out, result | {"rows": rows})
 
 
-def with_exposures(data: Path, out: Path, most: float, seed: int) -> tuple[Path, dict[str, float]]:
-    """A copy of a data set that does not tell its new exposures, and these, in stops by view."""
-    shutil.copytree(data, out, ignore=shutil.ignore_patterns(DataFolder(data).cache.name))
-    rng, found, dataset = np.random.default_rng(seed), {}, Dataset.load(out)
-    for view in dataset.views:
-        found[view.name] = 0.0 if view is dataset.train[0] else float(rng.uniform(-most, most))
-        pixels = read_exr(view.image)
-        pixels[..., :3] *= 2.0 ** found[view.name]
-        write_exr(view.image, pixels)
-    return out, found
+def about(args: argparse.Namespace) -> dict[str, Any]:
+    """What the rows of a result have in common."""
+    dataset = Dataset.load(args.data)
+    camera = dataset.train[0].camera
+    return {
+        "machine": machine(),
+        "data": args.data.name,
+        "train": len(dataset.train),
+        "heldout": len(dataset.heldout),
+        "width": camera.width,
+        "height": camera.height,
+        "spp": dataset.render.get("spp", 0),
+        **{key: getattr(args, key) for key in OPTIONS},
+        "faults": {name: dict(fault.settings) for name, fault in FAULTS.items()},
+    }
 
 
-def fit(
-    data: Path, run: Path, words: Sequence[object], stops: dict[str, float]
+def kept(file: Path, result: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a file that measured the same."""
+    if not file.is_file():
+        return []
+    old = json.loads(file.read_text(encoding="utf-8"))
+    same = all(old.get(key) == result[key] for key in ("data", "machine", *OPTIONS))
+    faults = old.get("faults", {})
+    return [
+        row
+        for row in old["rows"]
+        if same and faults.get(row["fault"]) == result["faults"].get(row["fault"])
+    ]
+
+
+def scores(
+    data: Path, fault: str, cameras: str, seed: int, options: Sequence[object]
 ) -> dict[str, float]:
-    """Scores of a fit, and errors of its exposures where it has any."""
-    log = run.with_suffix(".log")
-    unbake("fit", data, "--out", run, *words, log=log)
-    unbake("evaluate", run, log=log)
-    metrics: dict[str, Any] = json.loads(RunFolder(run).metrics_file.read_text(encoding="utf-8"))
-    scores = {key: metrics["heldout"][key] for key in SCORES}
-    camera = metrics.get("camera")
-    if camera is not None:
-        errors = [
-            row["stops"] - stops[row["name"]]
-            for row in camera["images"]
-            if row["split"] == "train" and row["name"] != camera["anchor"]
+    """Scores of a fit, and errors of what it found of the cameras."""
+    with tempfile.TemporaryDirectory() as folder:
+        run, words = Path(folder) / "run", ["--seed", seed, *options]
+        if fault != "none":
+            worse = Path(folder) / "data"
+            degrade(data, worse, DegradeSettings(**FAULTS[fault].settings, seed=seed))
+            words += FAULTS[fault].words if cameras == "fitted" else ()
+            data = worse
+        log = Path(folder) / "log.txt"
+        unbake("fit", data, "--out", run, *words, log=log)
+        from unbake.evaluation.evaluate import evaluate  # needs the variant
+
+        metrics = evaluate(run, EVALUATION, tell=lambda line: None)
+        found = {key: metrics["heldout"][key] for key in SCORES}
+        if metrics.get("camera"):
+            truth = json.loads(DataFolder(data).degraded_file.read_text(encoding="utf-8"))
+            found |= errors(metrics["camera"], truth)
+        return found | {key: metrics[key] for key in LENGTH}
+
+
+def errors(camera: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, float]:
+    """Errors of what was found of the cameras."""
+    found: dict[str, float] = {}
+    images = [row for row in camera.get("images", ()) if row["split"] == "train"]
+    images = [row for row in images if row["name"] != camera["anchor"]]
+    true = [truth["views"][row["name"]] for row in images]
+    if images and truth["settings"]["exposure"] and not truth["settings"]["tell_exposures"]:
+        ratios = [
+            row["exposure"] / view["exposure"] for row, view in zip(images, true, strict=True)
         ]
-        scores["stops_error_rms"] = float(np.sqrt(np.mean(np.square(errors))))
-        scores["stops_error_mean"] = float(np.mean(errors))
-        scores["stops_error_most"] = float(np.abs(errors).max())
-    return scores | {key: metrics[key] for key in LENGTH}
+        found |= spread("stops_error", np.log2(ratios))
+    if images and "red" in images[0]:
+        ratios = np.array([[row["red"], row["blue"]] for row in images])
+        balance = np.array([view["white_balance"] for view in true])
+        balance = balance[:, [0, 2]] / balance[:, [1]]
+        found |= spread("balance_error", np.log2(ratios / balance))
+    if terms := camera.get("vignetting"):
+        square = np.linspace(0, 1, 65)
+        falloff = 1 + square * (terms["a"] + square * (terms["b"] + square * terms["c"]))
+        wrong = falloff - (1 - truth["settings"]["vignetting"] * square)
+        found["vignetting_error_most"] = float(np.abs(wrong).max())
+    if curves := camera.get("response"):
+        curve = np.array([curves[channel] for channel in ("red", "green", "blue")])
+        read, linear = (np.array(truth["response"][key]) for key in ("read", "linear"))
+        photograph = np.linspace(0, 1, curve.shape[1])
+        light = np.interp(photograph**GAMMA, read, linear)
+        found |= spread("response_error", curve**GAMMA - light)
+    return found
+
+
+def spread(name: str, wrong: np.ndarray) -> dict[str, float]:
+    """Root mean square, mean and greatest size of errors."""
+    return {
+        f"{name}_rms": float(np.sqrt(np.mean(np.square(wrong)))),
+        f"{name}_mean": float(np.mean(wrong)),
+        f"{name}_most": float(np.abs(wrong).max()),
+    }
 
 
 if __name__ == "__main__":
