@@ -294,7 +294,43 @@ PRIOR = {
     "half": "12 of one half of the demo",
     "annex": "16 of the first room of the annex",
 }
+
+
+def cameras(result: dict) -> str:
+    """Albedo with each fault of cameras taken for known and fitted, and what was found of it."""
+    rows = {(row["fault"], row["cameras"]): row for row in result["rows"]}
+    table = []
+    for fault in dict.fromkeys(fault for fault, _ in rows):
+        known, fitted = (rows.get((fault, cameras), {}) for cameras in ("known", "fitted"))
+        scores = [plus_minus(row, "albedo_psnr") or "" for row in (known, fitted)]
+        found = [form.format(fitted[key]) for key, form in CAMERAS.items() if key in fitted]
+        table.append([fault, *scores, ", ".join(found)])
+    return markdown(["fault", "known", "fitted", "error of what was found"], table)
+
+
+CAMERAS = {
+    "stops_error_rms": "exposures {:.2f} stops",
+    "balance_error_rms": "white balance {:.2f} stops",
+    "vignetting_error_most": "vignetting {:.2f} of the light",
+    "response_error_rms": "response {:.3f} of white",
+}
+
+
+def photographs(result: dict) -> str:
+    """What fits of real photographs reach, with exposures as EXIF tells them and fitted."""
+    table = []
+    for row in result["rows"]:
+        stops = plus_minus(row, "stops_error_rms", 2) or ""
+        albedo = sum(row["albedo_mean"]) / 3
+        cells = [row["cameras"], f"{row['render_psnr']:.1f}", stops]
+        table.append([*cells, f"{albedo:.2f}", f"{100 * row['albedo_white']:.0f} %"])
+    titles = ["cameras", "held-out photographs, dB", "exposures against EXIF, stops"]
+    return markdown([*titles, "mean albedo", "albedo above 0.9"], table)
+
+
 TABLES = (
+    ("Faults of cameras", ("cameras-demo",), cameras),
+    ("Real photographs", ("sceaux",), photographs),
     ("Time of a step", ("methods-demo", "methods-staircase"), steps),
     ("Demo", ("demo",), demo),
     ("Equal time, demo", ("rivals-demo",), quality),
