@@ -92,7 +92,9 @@ def _solved(moved: Callable[[np.ndarray], Camera], pixels: _Pixels, sigma: float
             (moved(move + unit).project(points) - here) / _STEP for unit in _STEP * np.eye(POSE)
         ]
         # What a pixel of the photograph shows changes by its slope times how far the point moves.
-        jacobian = np.einsum("nca,kna->nck", slopes, np.stack(columns)).reshape(-1, POSE)
+        # Points that a step would bring behind the camera tell nothing.
+        known = np.nan_to_num(np.stack(columns))
+        jacobian = np.einsum("nca,kna->nck", slopes, known).reshape(-1, POSE)
         matrix = jacobian.T @ jacobian + variance / sigma**2 * np.eye(POSE)
         right = jacobian.T @ error.ravel() - variance / sigma**2 * move
         step = np.linalg.solve(matrix, right)
