@@ -35,6 +35,8 @@ SRC = str(ROOT / "src")
 sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
+from variants import SCORES  # noqa: E402
+
 from unbake import backend  # noqa: E402
 from unbake.acquisition.degrade import degrade  # noqa: E402
 from unbake.acquisition.settings import DegradeSettings  # noqa: E402
@@ -46,7 +48,6 @@ from unbake.experiments.seeds import across_seeds  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 
-SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
 LENGTH = ("samples", "seconds")
 #: Of a measurement, all of which rows have in common.
 OPTIONS = ("seeds", "steps", "batch", "fit_spp")

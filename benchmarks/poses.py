@@ -30,6 +30,8 @@ SRC = str(ROOT / "src")
 sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
+from variants import SCORES  # noqa: E402
+
 from unbake import backend  # noqa: E402
 
 backend.activate()  # before modules with types of Dr.Jit
@@ -46,7 +48,6 @@ from unbake.training.recovered import load_run  # noqa: E402
 from unbake.training.run_folder import RunFolder  # noqa: E402
 from unbake.training.validation import GroundTruth, MaterialBuffers  # noqa: E402
 
-SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
 #: What is made of poses.
 POSES = ("given", "refined")
 #: What matters here is material: pictures have few samples, which costs all rows the same.
