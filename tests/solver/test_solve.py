@@ -225,9 +225,9 @@ def test_options_that_make_no_sense_are_refused(unbake, tmp_path, words, said):
 
 @pytest.fixture(scope="module")
 def run(cornell, tiny, tmp_path_factory):
-    """A short fit of a captured data set."""
+    """A fit of a captured data set, of no steps: its fields are untrained."""
     folder = tmp_path_factory.mktemp("fitted") / "run"
-    fit(cornell, folder, replace(read_toml(tiny), steps=20), console=Console(quiet=True))
+    fit(cornell, folder, replace(read_toml(tiny), steps=0), console=Console(quiet=True))
     return folder
 
 
@@ -253,13 +253,13 @@ def test_the_field_of_a_run_is_learned_on_under_another_light(tuned, run, cornel
     first, *_, last = told["measurements"]
     assert last["step"] == 100 and last["skipped"] == 0
     assert told["views"] == ["heldout_000"] and told["kind"] == "room"
-    assert told["run"] == {"folder": str(run.resolve()), "steps": 20}
+    assert told["run"] == {"folder": str(run.resolve()), "steps": 0}
     assert told["light"]["envmap"].endswith("sky.exr")
     for side in ("lhs", "rhs"):  # such a tiny network shows little more than the mean
         assert last["relmse"][side] < 0.5 * first["relmse"][side]
     seen = {side: read_exr(tuned / f"heldout_000-{side}.exr") for side in ("rhs", "reference")}
     photograph = read_exr(Dataset.load(cornell).heldout[0].image)[..., :3]
-    assert seen["rhs"].mean() == pytest.approx(seen["reference"].mean(), rel=0.1)
+    assert seen["rhs"].mean() == pytest.approx(seen["reference"].mean(), rel=0.2)
     assert seen["reference"].mean() > 3 * photograph.mean()
 
 
@@ -271,7 +271,7 @@ def test_a_field_is_brightened_until_both_sides_have_the_same_mean(solved, built
     assert factor == pytest.approx(8, rel=0.03)
 
 
-def test_a_fit_starts_with_a_solved_field_and_goes_on(tuned, unbake, cornell, tiny, tmp_path):
+def test_a_fit_starts_with_a_solved_field(tuned, unbake, cornell, tiny, tmp_path):
     words = ("fit", cornell, "--out", tmp_path / "warm")
     done = unbake(*words, "--settings", tiny, "--steps", 0, "--radiance-from", tuned)
     assert done.status == 0, done.err
@@ -282,13 +282,20 @@ def test_a_fit_starts_with_a_solved_field_and_goes_on(tuned, unbake, cornell, ti
     assert origin.warm_start.folder == str(tuned.resolve()) and origin.warm_start.steps == 100
     for key, value in wanted.parameters().items():
         np.testing.assert_array_equal(np.array(value), np.array(started.parameters()[key]))
-    # Resumed, it keeps its scale; and it is not started a second time.
     refused = unbake(*words, "--resume", "--steps", 2, "--radiance-from", tuned)
     assert refused.status == 2 and "--resume" in refused.err
+
+
+@pytest.mark.slow
+def test_a_fit_that_started_with_a_solved_field_goes_on(tuned, unbake, cornell, tiny, tmp_path):
+    words = ("fit", cornell, "--out", tmp_path / "warm")
+    start = ("--settings", tiny, "--steps", 1, "--radiance-from", tuned)
+    assert unbake(*words, *start).status == 0
+    begun = RunFolder(tmp_path / "warm").origin().warm_start
     assert unbake(*words, "--resume", "--steps", 2).status == 0
     resumed = load_run(tmp_path / "warm")
-    assert resumed.progress.step == 2 and resumed.problem.radiance.scale == wanted.scale
-    assert RunFolder(tmp_path / "warm").origin().warm_start == origin.warm_start
+    assert resumed.progress.step == 2 and resumed.problem.radiance.scale == begun.scale
+    assert RunFolder(tmp_path / "warm").origin().warm_start == begun
 
 
 def test_a_field_of_another_scene_starts_no_fit(solved, unbake, cornell, tmp_path):
