@@ -106,7 +106,9 @@ def fine_tune(
 
     Args:
         run: folder of a fit by a method with L_θ.
-        out, console, tell: as of `solve`.
+        out: folder of the results, as of `solve`.
+        console: as of `solve`.
+        tell: as of `solve`.
         settings: how L_θ is learned and measured; `views`, `resolution` and the field's settings do
             not count.
         cameras: a camera file; None: the held-out views of the run's data set.
