@@ -60,7 +60,7 @@ def main() -> None:
     args = parser.parse_args()
     data, run, out = (args.work / name for name in ("data", "run", "export"))
     if not data.exists():
-        scene = write_room(args.work / "scene", args.meshes, args.triangles)
+        scene = write_room(args.work / "room", args.meshes, args.triangles)
         size = ["--views", 12, "--held-out", 0, "--resolution", args.resolution, "--spp", 4]
         unbake("capture", scene, "--out", data, *size, "--max-depth", 4)
     if not run.exists():
