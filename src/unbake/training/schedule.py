@@ -40,5 +40,6 @@ def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float
     for name in camera.of_light:
         rates[name] = camera.learning_rate * _CAMERA.get(name, 1.0) * decay * late
     rates |= dict.fromkeys(camera.of_places, camera.pose_learning_rate * decay * late)
-    rates["outliers"] = config.objective.learning_rate * late
+    if config.objective.outliers == "found":
+        rates["outliers"] = config.objective.learning_rate * late
     return rates | {"radiance": config.radiance_settings.learning_rate * decay}
