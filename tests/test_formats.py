@@ -92,7 +92,7 @@ def test_a_run_of_the_first_version_goes_on(first, run, unbake):
     assert [line["step"] for line in run.log()][-1] == 64
     assert load_run(run.path).progress.step == 64
     assert run.settings().steps == 64 and run.settings().pixels == settings.pixels
-    assert json.loads(run.origin_file.read_text())["format"] == 1
+    assert json.loads(run.origin_file.read_text())["format"] == 2  # as this version writes it
 
 
 def test_settings_of_the_first_version_are_told_beside_new_ones(run, tmp_path):
@@ -133,17 +133,17 @@ NEWER = r"{file}: was written by a newer unbake \(format {version}; .* up to {kn
 
 
 @pytest.mark.parametrize(
-    ("name", "use"),
+    ("name", "known", "use"),
     [
-        ("transforms.json", lambda first, run: Dataset.load(first / "data")),
-        ("origin.json", lambda first, run: load_run(run.path)),
-        ("metrics.json", lambda first, run: write_report([run.path], run.path / "page.html")),
+        ("transforms.json", 1, lambda first, run: Dataset.load(first / "data")),
+        ("origin.json", 2, lambda first, run: load_run(run.path)),
+        ("metrics.json", 1, lambda first, run: write_report([run.path], run.path / "page.html")),
     ],
 )
-def test_a_newer_file_is_refused_in_one_line_that_says_so(name, use, first, run):
+def test_a_newer_file_is_refused_in_one_line_that_says_so(name, known, use, first, run):
     (file,) = first.rglob(name)
     set_format(file, 9)
-    with pytest.raises(UserError, match=NEWER.format(file=name, version=9, known=1)) as caught:
+    with pytest.raises(UserError, match=NEWER.format(file=name, version=9, known=known)) as caught:
         use(first, run)
     assert "\n" not in str(caught.value)
     for wrong in ("1", 0, 1.0, True, None):
