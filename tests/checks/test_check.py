@@ -28,7 +28,7 @@ def found(folder, check=None):
     "name",
     [
         "cornell",
-        "still",
+        pytest.param("still", marks=pytest.mark.slow),
         pytest.param("cube", marks=pytest.mark.slow),
         pytest.param("demo", marks=pytest.mark.slow),
     ],
@@ -90,6 +90,7 @@ def test_a_fit_looks_for_the_same_on_its_views(turned, spoilt):
     assert told in str(finding)
 
 
+@pytest.mark.slow
 def test_a_fit_does_not_doubt_good_data(captured):
     for name in ("cornell", "still"):
         dataset = Dataset.load(captured(name))

@@ -51,6 +51,7 @@ def column(rows, key):
     return [row[key] for row in rows]
 
 
+@pytest.mark.slow
 def test_table2_knows_how_long_paths_are(rows):
     found = rows("table2", figure=False)
     assert column(found, "albedo") == [0.3, 0.5, 0.7, 0.9, 0.95, 0.97]

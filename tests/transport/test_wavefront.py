@@ -133,7 +133,7 @@ def test_the_image_is_that_of_mitsubas_path(built_in, name, tight):
     assert_same_expectation(found, theirs, spp)
 
 
-@pytest.mark.parametrize("tight", [False, True])
+@pytest.mark.parametrize("tight", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_gradient_is_that_of_all_bounces(built_in, tight):
     """Of the albedo in each pixel's colour, channel by channel, and of the roughness."""
     scene_view, materials = view(built_in, "cornell")
