@@ -20,7 +20,7 @@ from ..fields.materials import Materials
 from ..fields.network import Network
 from ..io import write_json
 from ..machine import machine
-from ..training.problem import Problem, training_pixels
+from ..training.problem import Problem, pixels_of
 from ..training.recovered import load_run
 from ..training.run_folder import RunFolder
 from ..training.schedule import learning_rates
@@ -139,8 +139,7 @@ def bench_gradients(
     if data_changed:
         told = f"warning: other {', '.join(data_changed)} than the run was fit to"
         console.print(told, style="yellow", soft_wrap=True)
-    smoothed = config.loss_reference == "smoothed"
-    pixels = training_pixels(dataset, clip_negative=recovered.clip_negative, smoothed=smoothed)
+    pixels = pixels_of(dataset, config, clip_negative=recovered.clip_negative)
     problem = towards_truth(recovered)
     assert problem.materials is not None
     step = TrainingStep(problem, pixels, config)

@@ -14,7 +14,7 @@ from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from .defaults import with_defaults
 from .first_gains import begin_cameras
-from .problem import Problem, problem_of, training_pixels
+from .problem import Problem, pixels_of, problem_of
 from .schedule import learning_rates
 from .state import State, initial_state
 from .step import TrainingStep
@@ -37,9 +37,7 @@ class FreshFit:
 def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     """A fit of a data set that writes nothing."""
     config = with_defaults(config, dataset)
-    smoothed = config.loss_reference == "smoothed"
-    slopes = bool(config.camera.of_places)
-    pixels = training_pixels(dataset, clip_negative=False, smoothed=smoothed, slopes=slopes)
+    pixels = pixels_of(dataset, config, clip_negative=False)
     problem = problem_of(dataset, config, pixels.photographs.mean)
     begin_cameras(problem, dataset, pixels)
     step = TrainingStep(problem, pixels, config)

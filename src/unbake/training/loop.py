@@ -31,7 +31,7 @@ from .monitor import Monitor
 from .path_depth import told_depth, with_path_depth
 from .plausibility import data_warnings
 from .preview import Preview
-from .problem import Problem, problem_of, training_pixels
+from .problem import Problem, pixels_of, problem_of
 from .run_folder import Origin, RunFolder
 from .run_lock import RunLock
 from .saving import Saving
@@ -155,12 +155,7 @@ def _begin(
     before = folder.origin() if resume else None
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = clip_negative or (before is not None and before.clip_negative)
-    pixels = training_pixels(
-        dataset,
-        clip_negative=clip_negative,
-        smoothed=config.loss_reference == "smoothed",
-        slopes=bool(config.camera.of_places),
-    )
+    pixels = pixels_of(dataset, config, clip_negative=clip_negative)
     pixels = pixels.holding_aside(config.held_aside, config.seed)
     origin = Origin(
         data=str(data.resolve()),

@@ -209,6 +209,16 @@ def problem_of(
     )
 
 
+def pixels_of(dataset: Dataset, config: FitConfig, *, clip_negative: bool) -> PixelSource:
+    """The training pixels with what the settings ask of them; see `training_pixels`."""
+    return training_pixels(
+        dataset,
+        clip_negative=clip_negative,
+        smoothed=config.loss_reference == "smoothed",
+        slopes=bool(config.camera.of_places),
+    )
+
+
 def _unknown_camera(config: CameraConfig, views: int) -> CameraModel | None:
     if config.unknowns and not views:
         raise ValueError("something of the cameras is unknown: give the training views")
