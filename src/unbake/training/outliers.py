@@ -26,6 +26,7 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
 from ..fields.arrays import from_numpy, read_small, sigmoid
+from ..transport.loss import as_weight
 
 #: Log odds of √w before it is learned: w is 0.9.
 _TRUSTED = 3.0
@@ -96,8 +97,7 @@ class OutlierModel:
             photometric: their photometric loss, with these weights.
         """
         kept = dr.mean(dr.square(dr.detach(roots)))
-        error = dr.detach(photometric) / dr.maximum(kept, 1e-3)
-        error = dr.select(dr.isfinite(error), dr.clip(error, _LEAST_ERROR, _LARGEST_ERROR), 0)
+        error = as_weight(photometric / dr.maximum(kept, 1e-3), _LEAST_ERROR, _LARGEST_ERROR)
         return self._tolerance * error * dr.mean(dr.square(roots - 1))
 
     def masks(self) -> list[np.ndarray]:

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..config import FitConfig
 from ..fields.grid_sizes import USUAL
+from ..transport.loss import as_weight
 from ..transport.regularizers import (
     albedo_smoothness,
     albedo_ties_roughness,
@@ -72,9 +73,7 @@ def regularization_terms(
     if photometric is not None and smooths_albedo(problem, config):
         radius = r.albedo_radius or USUAL.footprint
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), radius)
-        loss = dr.detach(photometric)
-        # A loss that is not finite is told by itself.
-        unexplained = dr.select(dr.isfinite(loss), dr.clip(loss, 0, _LARGEST_LOSS), 0)
+        unexplained = as_weight(photometric, 0, _LARGEST_LOSS)
         value = albedo_smoothness(here, near, valid)
         terms["albedo_smoothness"] = r.albedo_smoothness * unexplained * value
     if r.albedo_ties_roughness:

@@ -396,8 +396,8 @@ class TrainingStep:
                 value = camera.roughness_of_response()
                 terms["response_smoothness"] = config.camera.smoothness * value
             if poses is not None:
-                count, loss = self._pixels.photographs.count, terms.get(PHOTOMETRIC)
-                terms["pose_prior"] = poses.prior(config.camera.pose_sigma, loss, count)
+                sigma, count = config.camera.pose_sigma, self._pixels.photographs.count
+                terms["pose_prior"] = poses.prior(sigma, terms.get(PHOTOMETRIC), count)
             if outliers is not None and PHOTOMETRIC in terms:
                 terms["outliers"] = outliers.cost(roots, terms[PHOTOMETRIC])
             total = sum(terms.values())

@@ -8,6 +8,15 @@ import drjit as dr
 import mitsuba as mi
 
 
+def as_weight(loss: mi.Float, least: float, largest: float) -> mi.Float:
+    """A loss between bounds, to multiply a term by: no gradients, and 0 where it is not finite.
+
+    A loss that is not finite is told by itself.
+    """
+    loss = dr.detach(loss)
+    return dr.select(dr.isfinite(loss), dr.clip(loss, least, largest), 0)
+
+
 @dataclass(frozen=True)
 class RelativeL2:
     """The relative L2 loss: squared errors divided by a squared reference plus ε.
