@@ -5,13 +5,17 @@ Import it from test modules alone, which are read once the Mitsuba variant is se
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from pathlib import Path
 from statistics import NormalDist
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
+from safetensors.numpy import load_file
 
 from unbake.acquisition import built_in
 from unbake.config import FitConfig, GridConfig, NetworkConfig, RegularizationConfig, update
@@ -19,6 +23,8 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
 from unbake.quantities import QUANTITIES
+from unbake.training.loop import fit
+from unbake.training.step import TrainingStep
 from unbake.transport.methods import method_named
 from unbake.transport.operator import attach_material, bounce
 from unbake.transport.path_sample import Requirements
@@ -399,3 +405,36 @@ def assert_same_mean(
     print(report)
     assert np.abs(z).max() < limit, f"a |z| exceeds {limit:.2f}\n{report}"
     return seen
+
+
+def whole_and_in_parts(
+    data: Path, folder: Path, settings: FitConfig, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], TrainingStep]:
+    """What a fit of one thread ends with, and one that is stopped after five steps and resumed.
+
+    Their runs are `whole` and `parts` in the folder. The step is that of the whole one.
+    """
+    threads, call, stop_at, steps = dr.thread_count(), TrainingStep.__call__, [], []
+
+    def one_thread(self, state, number, learning_rates):
+        # From the first step on: Mitsuba reads no OpenEXR without a second thread.
+        dr.set_thread_count(1)
+        steps.append(self)
+        if number in stop_at:
+            signal.raise_signal(signal.SIGINT)
+        return call(self, state, number, learning_rates)
+
+    def train(name, **more):
+        try:
+            fit(data, folder / name, settings, **more)
+        finally:
+            dr.set_thread_count(threads)
+        last = sorted((folder / name / "checkpoints").glob("step-*"))[-1]
+        return load_file(last / "state.safetensors")
+
+    monkeypatch.setattr(TrainingStep, "__call__", one_thread)
+    whole = train("whole")
+    stop_at.append(4)
+    train("parts")
+    stop_at.clear()
+    return whole, train("parts", resume=True), steps[0]

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import signal
 from dataclasses import replace
 
 import drjit as dr
@@ -10,7 +9,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
+from support import (
+    TINY_FIT,
+    assert_only_replayed,
+    built_in_cameras,
+    grey_photographs,
+    whole_and_in_parts,
+)
 
 from unbake.acquisition.degrade import response
 from unbake.config import CameraConfig, from_toml, read_toml, to_toml
@@ -450,30 +455,8 @@ def test_a_fit_finds_exposures_and_tells_them(fitted, tmp_path):
 
 
 def test_a_resumed_fit_goes_on_bit_for_bit(unknown, tiny, tmp_path, monkeypatch):
-    threads, call, stop_at = dr.thread_count(), TrainingStep.__call__, []
     settings = replace(read_toml(tiny), method="direct", steps=8, camera=EVERYTHING)
-
-    def one_thread(self, state, number, learning_rates):
-        # From the first step on: Mitsuba reads no OpenEXR without a second thread.
-        dr.set_thread_count(1)
-        if number in stop_at:
-            signal.raise_signal(signal.SIGINT)
-        return call(self, state, number, learning_rates)
-
-    def train(name, **more):
-        try:
-            fit(unknown, tmp_path / name, settings, **more)
-        finally:
-            dr.set_thread_count(threads)
-        last = sorted((tmp_path / name / "checkpoints").glob("step-*"))[-1]
-        return load_file(last / "state.safetensors")
-
-    monkeypatch.setattr(TrainingStep, "__call__", one_thread)
-    whole = train("whole")
-    stop_at.append(4)
-    train("parts")
-    stop_at.clear()
-    parts = train("parts", resume=True)
+    whole, parts, _ = whole_and_in_parts(unknown, tmp_path, settings, monkeypatch)
     assert whole.keys() == parts.keys() and len(whole["phi.exposure.log"]) == 2
     for key, value in whole.items():
         assert np.array_equal(value, parts[key]), key

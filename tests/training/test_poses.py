@@ -1,6 +1,5 @@
 """Poses and intrinsics that are refined: how rays, photographs and views follow corrections."""
 
-import signal
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from safetensors.numpy import load_file
-from support import built_in_cameras
+from support import built_in_cameras, whole_and_in_parts
 
 from unbake.config import CameraConfig, from_toml, read_toml, to_toml
 from unbake.dataset.camera import Camera
@@ -27,11 +25,9 @@ from unbake.report.page import write_report
 from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.cameras import Cameras
-from unbake.training.loop import fit
-from unbake.training.poses import PoseModel, moved_camera
+from unbake.training.poses import PoseModel
 from unbake.training.recovered import load_run
 from unbake.training.run_folder import RunFolder
-from unbake.training.step import TrainingStep
 from unbake.transport.vertex import SceneView
 
 SIZE = 12
@@ -93,7 +89,7 @@ def test_a_correction_of_one_pixel_moves_what_is_seen_by_one(scene):
         told = told_of_place(scene, camera, model.cameras()[0])
         assert told["pixels"] == pytest.approx(1, rel=0.6 if entry < 3 else 1e-6)
         assert (told["degrees"] > 0) == (entry < 2) and (told["shift"] > 0) == (entry == 2)
-    turned = moved_camera(camera, np.array([0, 0.02, 0]), np.array([0, 0, 0.3]))
+    turned = camera.moved(np.array([0, 0.02, 0]), np.array([0, 0, 0.3]))
     told = told_of_place(scene, camera, turned)
     assert told["degrees"] == pytest.approx(np.degrees(0.02), rel=1e-4)
     assert told["shift"] == pytest.approx(0.3)
@@ -200,7 +196,7 @@ def test_a_view_is_moved_to_where_its_photograph_was_taken(cornell, tmp_path):
     train = [v.camera for v in dataset.train]
     model = PoseModel.of(own.scene, train, poses=True, intrinsics=False)
     turn, shift = model.units_of(own.scene, camera)
-    off = moved_camera(camera, turn * np.array([0.6, -0.5, 0.4]), shift * np.array([0.3, 0, 0]))
+    off = camera.moved(turn * np.array([0.6, -0.5, 0.4]), shift * np.array([0.3, 0, 0]))
     recovered: Any = SimpleNamespace(
         problem=SimpleNamespace(poses=model, scene_view=own, hide_emitters=False),
         dataset=dataset,
@@ -222,33 +218,10 @@ def test_a_view_is_moved_to_where_its_photograph_was_taken(cornell, tmp_path):
 def test_a_fit_corrects_poses_tells_them_and_goes_on_bit_for_bit(
     cornell, tiny, tmp_path, monkeypatch
 ):
-    threads, call, stop_at, steps = dr.thread_count(), TrainingStep.__call__, [], []
     camera = CameraConfig(poses="refined", intrinsics="refined")
     settings = replace(read_toml(tiny), method="direct", steps=8, camera=camera)
-
-    def one_thread(self, state, number, learning_rates):
-        # From the first step on: Mitsuba reads no OpenEXR without a second thread.
-        dr.set_thread_count(1)
-        steps.append(self)
-        if number in stop_at:
-            signal.raise_signal(signal.SIGINT)
-        return call(self, state, number, learning_rates)
-
-    def train(name, **more):
-        try:
-            fit(cornell, tmp_path / name, settings, **more)
-        finally:
-            dr.set_thread_count(threads)
-        last = sorted((tmp_path / name / "checkpoints").glob("step-*"))[-1]
-        return load_file(last / "state.safetensors")
-
-    monkeypatch.setattr(TrainingStep, "__call__", one_thread)
-    whole = train("whole")
-    assert steps[0].recordings() <= 3
-    stop_at.append(4)
-    train("parts")
-    stop_at.clear()
-    parts = train("parts", resume=True)
+    whole, parts, step = whole_and_in_parts(cornell, tmp_path, settings, monkeypatch)
+    assert step.recordings() <= 3
     assert len(whole["phi.poses.moves"]) == 12 and len(whole["phi.intrinsics.moves"]) == 3
     for key, value in whole.items():
         assert np.array_equal(value, parts[key]), key

@@ -249,23 +249,10 @@ def _moved(scene: mi.Scene, cameras: list[Camera], settings: DegradeSettings) ->
         part = settings.pose_jitter / 2
         known = seen.distance[np.isfinite(seen.distance)]
         depth = float(np.median(known)) if len(known) else diagonal
-        turn = _rotation(rng.normal(0, part / camera.fl_x, 3))
+        turn = rng.normal(0, part / camera.fl_x, 3)
         shift = rng.normal(0, part * depth / camera.fl_x, 3)
-        pose = camera.to_world.copy()
-        pose[:3, 3] += pose[:3, :3] @ shift
-        pose[:3, :3] = pose[:3, :3] @ turn
-        moved.append(replace(camera, to_world=pose))
+        moved.append(camera.moved(turn, shift))
     return moved
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """The rotation about a vector by its length (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-15:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
 def _change_meshes(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -90,6 +90,21 @@ class Camera:
                 f"the principal point ({self.cx:g}, {self.cy:g}) is far outside of the image",
                 remedy="cx and cy are in pixels from the top left corner",
             )
+
+    def moved(self, turn: np.ndarray, shift: np.ndarray) -> Camera:
+        """The camera turned and shifted in its own axes.
+
+        Args:
+            turn: rotation vector of a small turn, radians, (3,).
+            shift: world units, (3,).
+        """
+        x, y, z = turn / 2
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        scale = 2 / (1 + (turn / 2) @ (turn / 2))
+        pose = self.to_world.copy()
+        pose[:3, 3] += pose[:3, :3] @ shift
+        pose[:3, :3] = pose[:3, :3] @ (np.eye(3) + scale * (cross + cross @ cross))
+        return replace(self, to_world=pose)
 
     @classmethod
     def look_at(

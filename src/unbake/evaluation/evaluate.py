@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from ..scene import edit
 from ..scene.parse import parse
 from ..training.cameras import Cameras
 from ..training.held_aside import convergence
-from ..training.poses import refined_view
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, RunFolder
 from ..training.run_lock import RunLock
@@ -295,7 +294,11 @@ def _evaluate_cameras(
     train = dataset.train
     found = {"unknown": list(unknown)} | cameras.told()
     fitted = np.ones((len(train), 3)) if model is None else model.gains()
-    pairs = list(zip((refined_view(poses, train, v) for v in train), fitted, strict=True))
+    refined = train
+    if poses is not None:
+        both = zip(train, poses.cameras(), strict=True)
+        refined = tuple(replace(view, camera=camera) for view, camera in both)
+    pairs = list(zip(refined, fitted, strict=True))
     pairs += [(v, gain) for v, gain in zip(views, gains, strict=True) if v.split != "train"]
     rows = [{"name": view.name, "split": view.split} for view, _ in pairs]
     if cameras.solves:

@@ -16,7 +16,7 @@ from ..dataset.small_views import seen_along, seen_by, small_camera
 from ..dataset.views import View, read_photograph
 from ..fields.arrays import from_numpy
 from ..training.cameras import Cameras
-from ..training.poses import POSE, moved_camera, refined_view
+from ..training.poses import POSE, refined_view
 from ..training.recovered import Recovered
 from ..transport.render import render_radiance
 from .settings import EvaluationSettings
@@ -54,7 +54,7 @@ def placed_view(
     turn, shift = model.units_of(recovered.problem.scene_view.scene, view.camera)
 
     def moved(move: np.ndarray) -> Camera:
-        return moved_camera(view.camera, turn * move[:3], shift * move[3:])
+        return view.camera.moved(turn * move[:3], shift * move[3:])
 
     sigma = recovered.config.camera.pose_sigma
     return replace(view, camera=moved(_solved(moved, pixels, sigma)))

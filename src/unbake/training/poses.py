@@ -36,6 +36,7 @@ from ..dataset.small_views import seen_by, small_camera
 from ..dataset.views import View
 from ..fields.arrays import from_numpy, read_small
 from ..scene.free_space import bounds
+from ..transport.loss import as_weight
 
 #: Numbers of a pose and of intrinsics: turn and shift along x, y and z; focal length, cx, cy.
 POSE, LENS = 6, 3
@@ -188,8 +189,7 @@ class PoseModel:
                 the method has none, and the variance is that of black pictures, 1.
             pixels: that there are to train on.
         """
-        loss = mi.Float(1) if photometric is None else dr.detach(photometric)
-        variance = dr.select(dr.isfinite(loss), dr.clip(loss, 0, 1), 0)
+        variance = mi.Float(1) if photometric is None else as_weight(photometric, 0, 1)
         squares = [dr.sum(dr.square(array)) for array in self._arrays.values()]
         return variance / (pixels * sigma**2) * sum(squares)
 
@@ -197,7 +197,12 @@ class PoseModel:
 
     def cameras(self) -> list[Camera]:
         """The corrected cameras of the training views."""
-        return [self._corrected(i, move) for i, move in enumerate(self._moves())]
+        moves, lenses = self._moves(), self._lens_moves()
+        return [self._corrected(i, move, lenses) for i, move in enumerate(moves)]
+
+    def camera(self, number: int) -> Camera:
+        """The corrected camera of one training view."""
+        return self._corrected(number, self._moves()[number], self._lens_moves())
 
     def intrinsics(self) -> list[tuple[Camera, Camera]]:
         """A camera as the data set tells and as it was found, for each of the intrinsics."""
@@ -217,11 +222,11 @@ class PoseModel:
         turns, shifts = _units([camera], _distances(scene, [camera]))
         return float(turns[0]), float(shifts[0])
 
-    def _corrected(self, number: int, move: np.ndarray) -> Camera:
+    def _corrected(self, number: int, move: np.ndarray, lenses: np.ndarray) -> Camera:
         camera = self.given[number]
         turn, shift = self._turns[number], self._shifts[number]
-        moved = moved_camera(camera, turn * move[:3], shift * move[3:])
-        return _with_lens(moved, self._lens_moves()[self._lens_of[number]])
+        moved = camera.moved(turn * move[:3], shift * move[3:])
+        return _with_lens(moved, lenses[self._lens_of[number]])
 
     def _moves(self) -> np.ndarray:
         if not self.has_poses:
@@ -250,7 +255,7 @@ def refined_view(model: PoseModel | None, train: Sequence[View], view: View) -> 
     if model is None:
         return view
     found = next((i for i, other in enumerate(train) if other.name == view.name), None)
-    camera = model.lens(view.camera) if found is None else model.cameras()[found]
+    camera = model.lens(view.camera) if found is None else model.camera(found)
     return replace(view, camera=camera)
 
 
@@ -267,22 +272,6 @@ def _units(cameras: Sequence[Camera], distances: np.ndarray) -> tuple[np.ndarray
     """Radians, and world units, that move what cameras see by a pixel."""
     turns = np.array([1 / camera.fl_x for camera in cameras])
     return turns, distances * turns
-
-
-def moved_camera(camera: Camera, turn: np.ndarray, shift: np.ndarray) -> Camera:
-    """A camera that is turned and shifted in its own axes.
-
-    Args:
-        turn: rotation vector of a small turn, radians, (3,).
-        shift: world units, (3,).
-    """
-    x, y, z = turn / 2
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    scale = 2 / (1 + (turn / 2) @ (turn / 2))
-    pose = camera.to_world.copy()
-    pose[:3, 3] += pose[:3, :3] @ shift
-    pose[:3, :3] = pose[:3, :3] @ (np.eye(3) + scale * (cross + cross @ cross))
-    return replace(camera, to_world=pose)
 
 
 def _with_lens(camera: Camera, move: np.ndarray) -> Camera:
