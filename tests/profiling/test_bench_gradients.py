@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from support import built_in_cameras, grey_photographs, tiny_fields
 
-from unbake.config import CameraConfig, PathConfig
+from unbake.config import CameraConfig, PathConfig, update
 from unbake.profiling.bench_gradients import Spread, bench_gradients
 from unbake.profiling.towards_truth import WAY, towards_truth
 from unbake.training.loop import fit
@@ -88,6 +88,18 @@ def test_the_slope_of_roughness_is_a_difference_of_losses_in_the_mean(cornell, t
     error = apart.std(ddof=1) / len(apart) ** 0.5
     assert abs(apart.mean()) < 4 * error
     assert abs(slopes.mean()) > 8 * error
+
+
+def test_runs_with_values_of_pieces_are_measured(cornell, tmp_path):
+    pieces = {"most": 4, "brightnesses": 2, "colours": 1}
+    fields = {"materials": {"roughness": {"neural": {"pieces": pieces}}}}
+    config = replace(update(tiny_fields(), fields), method="direct")
+    run = untrained(cornell, tmp_path / "run", config)
+    found = bench_gradients(run, load_run(run).config, 3, None, QUIET)["quantities"]
+    parts = {part["part"]: part for part in found["roughness"]["parts"]}
+    assert abs(found["roughness"]["slope"]) > 1e-4
+    assert (parts["pieces"]["entries"], parts["colours"]["entries"]) == (4 * 2, 2 * 2**3)
+    assert parts["pieces"]["signal_to_noise"] > 0
 
 
 def test_what_is_true_already_has_no_slope(cornell, tmp_path):

@@ -188,7 +188,7 @@ def _gradients(
 
 
 def _parts(name: str, materials: Materials) -> Iterator[Part]:
-    """The parts of the field of a quantity: levels of a hash grid, a network, or its arrays."""
+    """The parts of a quantity's field: levels of a grid, a network, what is shared, or arrays."""
     towards = materials[name]
     assert isinstance(towards, TowardsTruth)
     inner, everything = towards.field, slice(None)
@@ -202,8 +202,15 @@ def _parts(name: str, materials: Materials) -> Iterator[Part]:
         cells = round(grid.base_resolution * grid.per_level_scale**level)
         title = f"grid, {cells} cells"
         yield Part(title, ((f"{name}.grid", slice(*ends)),))
-    layers = (key for key in keys if key != "grid")
-    yield Part("network", tuple((f"{name}.{key}", everything) for key in layers))
+    layers = tuple((f"{name}.{key}", everything) for key in inner.perceptron.parameters())
+    yield Part("network", layers)
+    if inner.pieces is None:
+        return
+    own = [(f"{name}.{key}", everything) for key in inner.pieces.parameters()]
+    shared = [piece for piece in own if piece[0].endswith(".colours")]
+    yield Part("pieces", tuple(piece for piece in own if piece not in shared))
+    if shared:
+        yield Part("colours", tuple(shared))
 
 
 def _row(name: str, measured: _Measured) -> dict:

@@ -92,6 +92,9 @@ def towards_truth(recovered: Recovered) -> Problem:
     scene = _scene(dataset, problem, materials, fields)
     if representation(recovered.config.representation).unwrapped:
         materials.numbers = material_numbers(scene)
+    materials.pieces = problem.materials.pieces
+    if materials.pieces is not None:
+        materials.pieces.attach(scene)
     specular = recovered.config.transport.max_specular
     return replace(
         problem, scene_view=SceneView.of(scene, materials, specular), materials=materials
