@@ -29,6 +29,7 @@ from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
 from ..memory import lacks_memory
+from ..ranks import Ranks
 from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
 from ..version import VERSION
@@ -325,6 +326,8 @@ def fit(
     Ctrl-C, SIGTERM, SIGHUP and a closed pipe stop it after the present step, with a checkpoint from
     which --resume continues. A second Ctrl-C ends it at once.
 
+    `mpiexec -n N unbake fit` shares one fit among N processes: see docs/machines.md.
+
     While it runs it tells the terms of its loss, smaller is better. photo: the photographs against
     the pictures of the unknowns; what remains in the end is mostly noise. prior: where L, the
     network that stands for all further light, breaks the rendering equation, at the first point
@@ -365,17 +368,22 @@ def fit(
     from ..training.loop import fit as run
 
     console = Console(highlight=False)
-    progress = run(
-        data,
-        out,
-        chosen,
-        resume=resume,
-        clip_negative=clip_negative,
-        allow_outside=allow_outside,
-        tensorboard=tensorboard,
-        radiance_from=radiance_from,
-        console=console,
-    )
+    ranks = Ranks.of_environment()
+    with ranks.guarded(lambda line: print(printable(line, _LONGEST), file=sys.stderr)):
+        progress = run(
+            data,
+            out,
+            chosen,
+            resume=resume,
+            clip_negative=clip_negative,
+            allow_outside=allow_outside,
+            tensorboard=tensorboard,
+            radiance_from=radiance_from,
+            console=console,
+            ranks=ranks,
+        )
+    if not ranks.leads:
+        return 0
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
         return signals.status()
     if not progress.step:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import os
 import time
 import uuid
 from contextlib import ExitStack
@@ -21,9 +23,12 @@ from ..dataset.pixels import CameraRays, PixelSource
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..fields.camera import CameraModel
+from ..ranks import Ranks
 from ..signals import deferred
+from ..version import VERSION
 from .checkpoint import Progress, load_checkpoint
 from .defaults import with_defaults
+from .event_log import EventLog
 from .first_gains import begin_cameras
 from .held_aside import ERROR, ErrorCurve, HeldAside, HeldOutPhotographs
 from .memory import memory_mb
@@ -61,6 +66,7 @@ def fit(
     tensorboard: bool = False,
     radiance_from: Path | str | None = None,
     console: Console | None = None,
+    ranks: Ranks | None = None,
 ) -> Progress:
     """Recover materials or lighting of a scene from its photographs.
 
@@ -76,6 +82,8 @@ def fit(
         radiance_from: a folder that `solve` or `fine_tune` wrote: L_θ starts as that field instead
             of untrained, with its settings; not when resuming. The materials that it was solved
             with do not count.
+        ranks: of MPI, which fit together and all call this; None: this process is alone. Rank 0
+            alone writes; the others read data set and run.
 
     Returns:
         How far the fit came, and what is wrong with it. SIGINT (Ctrl-C), SIGTERM and SIGHUP end it
@@ -88,35 +96,55 @@ def fit(
 
     Paper: Sec. 4, 5.4.
     """
+    ranks = ranks or Ranks()
     console = console or Console()
+    if not ranks.leads:
+        console = Console(quiet=True)
     folder = RunFolder(Path(run))
     with ExitStack() as held:
-        if resume:
-            if radiance_from is not None:
-                remedy = "A run that goes on has a radiance field already"
-                raise UserError("cannot be given together with --resume", OPTION, remedy)
-            folder.require_resumable()
-            lock = held.enter_context(folder.lock())
+
+        def locked() -> RunLock | None:
+            return held.enter_context(folder.lock()) if ranks.leads else None
+
+        def begin() -> tuple[_Begun, RunLock | None]:
+            lock = None
+            if resume:
+                if radiance_from is not None:
+                    remedy = "A run that goes on has a radiance field already"
+                    raise UserError("cannot be given together with --resume", OPTION, remedy)
+                folder.require_resumable()
+                lock = locked()
+                settings, solved = _resumed_config(folder, config), None
+            else:
+                folder.require_new()
+                settings = config
+                solved = None if radiance_from is None else read_solved(radiance_from)
+            negative = clip_negative and not resume
             begun = _begin(
                 Path(data),
                 folder,
-                _resumed_config(folder, config),
+                settings,
                 console,
                 resume,
-                allow_outside=allow_outside,
+                negative,
+                allow_outside,
+                solved,
+                ranks,
             )
-        else:
+            return begun, lock
+
+        def make() -> RunLock | None:
+            lock = locked()
             folder.require_new()
-            solved = None if radiance_from is None else read_solved(radiance_from)
-            begun = _begin(
-                Path(data), folder, config, console, resume, clip_negative, allow_outside, solved
-            )
-            # Here all input is known to be good, and the folder is made.
-            lock = held.enter_context(folder.lock())
-            folder.require_new()
+            return lock
+
+        begun, lock = ranks.together(begin)
+        _agree(begun, ranks)
+        if not resume:  # here all input is known to be good, and the folder is made
+            lock = ranks.together(make)
         stop = held.enter_context(deferred())
-        progress = _train(begun, folder, lock, stop, console, tensorboard)
-    if stop:
+        progress, stopped = _train(begun, folder, lock, stop, console, tensorboard, ranks)
+    if stopped:
         console.print(f"stopped at step {progress.step}; go on with --resume", highlight=False)
     return progress
 
@@ -147,6 +175,7 @@ def _begin(
     clip_negative: bool = False,
     allow_outside: bool = False,
     solved: Solved | None = None,
+    ranks: Ranks | None = None,
 ) -> _Begun:
     """Read all input, and check it; nothing is written but the cache of the data set."""
     if solved is not None:
@@ -182,7 +211,7 @@ def _begin(
         console.print(told_depth(config, dataset), highlight=False, soft_wrap=True)
     state = initial_state(problem)
     # A resumed fit plans with the first state, too, and so goes on as if it had not stopped.
-    step = TrainingStep(problem, pixels, config)
+    step = TrainingStep(problem, pixels, config, ranks)
     step.plan(state)
     restored = load_checkpoint(folder, state) if resume else None
     preview = Preview(problem, dataset, folder)
@@ -196,6 +225,34 @@ def _begin(
     return _Begun(
         config, origin, problem, step, state, restored, preview, score, aside, photographs, names
     )
+
+
+def _agree(begun: _Begun, ranks: Ranks) -> None:
+    """Check that all ranks work on the same, from the same state.
+
+    Raises:
+        Agreed: they do not.
+    """
+    if ranks.size == 1:
+        return
+    origin, progress = begun.origin, begun.restored or Progress()
+    ranks.require_same(
+        {
+            "version": f"{VERSION}, Mitsuba {mi.__version__}, {mi.variant()}",
+            "settings": to_toml(begun.config),
+            "data set": json.dumps(origin.fingerprint, sort_keys=True),
+            "length so far": json.dumps(progress.counted()),
+        }
+    )
+    _require_same_state(begun.state, ranks)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    dr.set_thread_count(max(1, (cores or 1) // ranks.here))
+
+
+def _require_same_state(state: State, ranks: Ranks) -> None:
+    """Check that the states of all ranks are equal, bit for bit."""
+    if ranks.size > 1:
+        ranks.require_same({"state": state.digest()})
 
 
 def _probes(
@@ -228,25 +285,28 @@ def _probes(
 def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     begun: _Begun,
     folder: RunFolder,
-    lock: RunLock,
+    lock: RunLock | None,
     stop: list[int],
     console: Console,
     tensorboard: bool,
-) -> Progress:
+    ranks: Ranks,
+) -> tuple[Progress, bool]:
     """Take the steps that are left.
 
     Args:
+        lock: of the folder; None on ranks that write nothing.
         stop: fills at any moment, when the fit should end.
         tensorboard: whether numbers are written for it.
+        ranks: that take the steps together.
+
+    Returns:
+        How far the fit came, and whether it was stopped.
     """
     config, problem, state, score = begun.config, begun.problem, begun.state, begun.score
     progress = begun.restored or Progress()
     if begun.restored is not None:
         console.print(f"going on after step {progress.step}", highlight=False)
-    folder.sweep()
-    folder.forget_after(progress.step)
-    folder.write_origin(begun.origin)
-    folder.write_settings(config)  # from here on there is a run, which can be resumed
+    log, events = _open(begun, folder, lock, progress, tensorboard)
     errors = ErrorCurve(begun.aside, config, _measured_before(folder), progress)
 
     unknown = next(iter(state.phi)).partition(".")[0]  # the first one, whose rate is logged
@@ -258,15 +318,15 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     recent: list[dict[str, mi.Float]] = []
     watchdog = Watchdog(state, begun.step, progress, begun.views)
     failures: list[UserError] = []  # to write what was due last
-    events = folder.events(progress.step + 1) if tensorboard else None
-    with Monitor(folder.log_file, console, total, events) as monitor:
+    stopped = False
+    with Monitor(log, console, total, events) as monitor:
         if score is not None and not progress.step:
             monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
         clock = time.perf_counter() - progress.seconds
         # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
         last = _done(config, progress) >= total
         if last and begun.restored is None:  # nothing to learn: the untrained fields are the result
-            failures = [*saving.save(state, progress), *_show(begun, monitor, progress)]
+            failures = [*saving.save(state, progress), *_show(begun, monitor, progress, lock)]
         while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
             done = _done(config, progress) / total
@@ -274,16 +334,17 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             recent.append(begun.step(state, progress.step, rates))
             progress.step += 1
             progress.samples = progress.step * config.samples_per_step
-            last = _done(config, progress) >= total or bool(stop)
-
-            tell = errors.due(progress)
-            full = len(recent) >= READ_EVERY
-            timed = config.seconds or score is not None
             # This clock does not wait for the machine, so that slow steps are saved in time, too.
             save = saving.due(time.perf_counter() - clock)
+            # What depends on a clock is the same on all ranks from here on: as rank 0 says.
+            tell = ranks.leads and errors.due(progress)
+            stopped, save, tell = ranks.any(bool(stop), save, tell)
+            last = _done(config, progress) >= total or stopped
+            full = len(recent) >= READ_EVERY
+            timed = config.seconds or score is not None
             if full or last or save or tell or (timed and progress.step % TIME_EVERY == 0):
                 dr.sync_thread()
-                progress.seconds = time.perf_counter() - clock
+                progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
             if not (full or last or due or save or tell):
@@ -297,24 +358,42 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 state.publish(problem)
                 entry["score"] = score.measure()
                 scored_at = progress.seconds
-            if tell or (last and not stop):
+            if tell or (last and not stopped):
                 errors.measure(state, entry, progress)
-            lock.require_held()
+            saving.require_held()
             monitor.record(_done(config, progress), entry)
-            ended = last and not stop  # one that was stopped is not judged by its few steps
+            ended = last and not stopped  # one that was stopped is not judged by its few steps
             _watch(watchdog, readings, monitor, saving, begun, progress, ended)
             failures = saving.save(state, progress) if last or (save and watchdog.trusts) else []
             if last or progress.seconds - shown_at >= config.preview_seconds:
-                failures += _show(begun, monitor, progress)
+                failures += _show(begun, monitor, progress, lock)
                 shown_at = progress.seconds
             for failure in () if last else failures:
                 monitor.say(f"warning: {failure}; the fit goes on, and tries again later")
             clock = time.perf_counter() - progress.seconds
-        if not stop and not failures:
+            _require_same_state(state, ranks)
+        if ranks.of_first(not stopped and not failures):
             _judge(watchdog, monitor, progress, config, errors)
     for failure in [*failures, *monitor.failures]:
         raise failure
-    return progress
+    return progress, stopped
+
+
+def _open(
+    begun: _Begun, folder: RunFolder, lock: RunLock | None, progress: Progress, tensorboard: bool
+) -> tuple[Path, EventLog | None]:
+    """Make the folder that of the run, without what is of steps that will be taken again.
+
+    Returns:
+        The files of the log and for TensorBoard; without a lock what is logged goes nowhere.
+    """
+    if lock is None:
+        return Path(os.devnull), None
+    folder.sweep()
+    folder.forget_after(progress.step)
+    folder.write_origin(begun.origin)
+    folder.write_settings(begun.config)  # from here on there is a run, which can be resumed
+    return folder.log_file, folder.events(progress.step + 1) if tensorboard else None
 
 
 def _watch(
@@ -352,8 +431,12 @@ def _judge(
         monitor.say(line)
 
 
-def _show(begun: _Begun, monitor: Monitor, progress: Progress) -> list[UserError]:
-    """Show a preview, or return why it cannot be written."""
+def _show(
+    begun: _Begun, monitor: Monitor, progress: Progress, lock: RunLock | None
+) -> list[UserError]:
+    """Show a preview, or return why it cannot be written; nothing without a lock."""
+    if lock is None:
+        return []
     begun.state.publish(begun.problem)
     try:
         lines = begun.preview.show(progress)

@@ -27,7 +27,7 @@ class Saving:
 
     Args:
         run: the run.
-        lock: the lock of its folder, held.
+        lock: the lock of its folder, held; None: nothing is saved, as on ranks that do not lead.
         about: what manifests say of the run; see `save_checkpoint`.
         every: training time between checkpoints in seconds; it is longer where a checkpoint would
             cost more than `SHARE` of it. 0: as often as possible, whatever it costs.
@@ -35,7 +35,12 @@ class Saving:
     """
 
     def __init__(
-        self, run: RunFolder, lock: RunLock, about: Mapping[str, Any], every: float, seconds: float
+        self,
+        run: RunFolder,
+        lock: RunLock | None,
+        about: Mapping[str, Any],
+        every: float,
+        seconds: float,
     ) -> None:
         self._run, self._lock, self._about = run, lock, about
         self._every = every
@@ -43,7 +48,16 @@ class Saving:
 
     def due(self, seconds: float) -> bool:
         """Whether it is time for a checkpoint, after so much training time."""
-        return seconds >= self._next
+        return self._lock is not None and seconds >= self._next
+
+    def require_held(self) -> None:
+        """Check that the folder is still the one that was locked, if anything is saved in it.
+
+        Raises:
+            UserError: it is not.
+        """
+        if self._lock is not None:
+            self._lock.require_held()
 
     def save(self, state: State, progress: Progress) -> list[UserError]:
         """Write a checkpoint, or return why it cannot be written.
@@ -51,6 +65,8 @@ class Saving:
         Raises:
             UserError: the folder of the run is gone, and nothing more can be saved in it.
         """
+        if self._lock is None:
+            return []
         self._lock.require_held()
         start, failures = time.perf_counter(), []
         try:

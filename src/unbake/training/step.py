@@ -10,7 +10,8 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,7 @@ from ..fields.arrays import from_numpy
 from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
+from ..ranks import Ranks
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
@@ -72,10 +74,30 @@ class Replay:
 class TrainingStep:
     """The training step of a method on a problem.
 
+    With several ranks each takes an equal share of the batch, with random numbers of its own.
+    Gradients and loss terms are averaged, so that all take the same step.
+
+    Args:
+        problem: what is learned; the same on all ranks.
+        pixels: to draw batches from.
+        config: says the batch of all ranks together.
+        ranks: that take the step together; None: there is one.
+
+    Raises:
+        UserError: the batch cannot be shared equally, or is no square where crops are drawn.
+
     Paper: Eq. 11, Eq. 14, Sec. 4, 5.4, 6.
     """
 
-    def __init__(self, problem: Problem, pixels: PixelSource, config: FitConfig) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        pixels: PixelSource,
+        config: FitConfig,
+        ranks: Ranks | None = None,
+    ) -> None:
+        self._ranks = ranks or Ranks()
+        config = with_share(config, self._ranks.size)
         smoothed = config.loss_reference == "smoothed"
         if smoothed and not pixels.photographs.smoothed:
             raise ValueError("the loss is relative to smoothed photographs, which were not made")
@@ -103,6 +125,9 @@ class TrainingStep:
             field.recordable for field in problem.fields()
         )
         self._frozen = dr.freeze(self._step) if recordable else None
+        self._own = dr.freeze(self._own_gradients) if recordable else self._own_gradients
+        self._common = dr.freeze(self._step_by) if recordable else self._step_by
+        self._terms: list[str] = []  # names of the loss terms, once a step was traced
         self._probed = mi.load_dict({"type": "independent"})
         self._frozen_probe = dr.freeze(self._probe) if recordable else None
         self._fits_memory = False  # as far as is known
@@ -123,6 +148,8 @@ class TrainingStep:
         self.plan(state)
         self.require_memory(state)
         step = self._step if self._frozen is None else self._frozen
+        if self._ranks.size > 1:
+            step = self._shared_step
         try:
             with without_garbage_collection():
                 return step(self.prepare(state, number, rates), state)
@@ -297,7 +324,10 @@ class TrainingStep:
 
     def recordings(self) -> int:
         """How often the step was traced to be replayed; 0 if it is traced each time."""
-        return 0 if self._frozen is None else self._frozen.n_recordings
+        if self._frozen is None:
+            return 0
+        frozen: Any = (self._frozen, self._own, self._common)
+        return max(function.n_recordings for function in frozen)
 
     def unfrozen(self, state: State, number: int) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
@@ -325,7 +355,9 @@ class TrainingStep:
 
     def _inputs(self, number: int, probe: int | None = None) -> Inputs:
         """The inputs of a step, or of so many pixels of all views, which stand for one."""
-        seeds = np.random.SeedSequence([self._config.seed, number]).generate_state(2)
+        entropy = [self._config.seed, number]
+        entropy += [self._ranks.rank] if self._ranks.rank else []
+        seeds = np.random.SeedSequence(entropy).generate_state(2)
         return Inputs(
             scene=self._problem.scene_view.scene,
             rays=self._pixels.rays,
@@ -344,8 +376,43 @@ class TrainingStep:
             return self._pixels.draw_crop(seed, self._config.pixels)
         return self._pixels.draw(seed, probe or self._config.pixels)
 
-    def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
+    def _shared_step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
+        """The same step on all ranks, with the mean of their gradients."""
+        own = self._own(inputs, state)
+        return self._common(from_numpy(mi.Float, self._ranks.mean(own.numpy())), state)
+
+    def _own_gradients(self, inputs: Inputs, state: State) -> mi.Float:
+        """This rank's loss terms, then its gradients, in one array."""
         terms = self._gradients(inputs, state)
+        self._terms = list(terms)
+        parts = [mi.Float(value) for value in terms.values()]
+        for _, optimizer in state.optimizers():
+            parts += [mi.Float(dr.grad(value).array) for value in optimizer.values()]
+            dr.clear_grad(dict(optimizer.items()))
+        found = dr.concat(parts)
+        dr.eval(found)
+        return found
+
+    def _step_by(self, mean: mi.Float, state: State) -> dict[str, mi.Float]:
+        """Take a step with loss terms and gradients as `_own_gradients` gives them."""
+        terms, first = {}, len(self._terms)
+        for number, name in enumerate(self._terms):
+            terms[name] = dr.gather(mi.Float, mean, mi.UInt32(number))
+        for _, optimizer in state.optimizers():
+            for value in optimizer.values():
+                count = dr.width(value.array)
+                gradient = dr.gather(mi.Float, mean, first + dr.arange(mi.UInt32, count))
+                if dr.is_tensor_v(value):
+                    gradient = mi.TensorXf(gradient, value.shape)
+                dr.set_grad(value, gradient)
+                first += count
+        return self._move(terms, state)
+
+    def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
+        return self._move(self._gradients(inputs, state), state)
+
+    def _move(self, terms: dict[str, mi.Float], state: State) -> dict[str, mi.Float]:
+        """Move the parameters by their gradients, where all loss terms are finite."""
         finite = dr.isfinite(sum(terms.values()))
         factor = None
         if state.scale is not None:
@@ -444,6 +511,19 @@ class TrainingStep:
                 reference = dr.detach(camera.exposed(reference * told) / told)
             target = camera.exposed(target * told) / told
         return target, reference, gain
+
+
+def with_share(config: FitConfig, ranks: int) -> FitConfig:
+    """Settings of one of several ranks, which takes an equal share of each batch.
+
+    Raises:
+        UserError: the pixels cannot be shared equally.
+    """
+    if config.pixels % ranks:
+        fewer = max(config.pixels // ranks, 1) * ranks
+        what = f"a batch of {config.pixels} pixels cannot be shared equally by {ranks} ranks"
+        raise UserError(what, "--batch", f"Use --batch {fewer}, or another number of ranks")
+    return replace(config, pixels=config.pixels // ranks)
 
 
 def _context(problem: Problem, config: FitConfig) -> SamplerContext:

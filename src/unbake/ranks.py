@@ -1,0 +1,258 @@
+"""The processes of one fit, by MPI: what they tell each other, and how they end together.
+
+`mpiexec -n 4 unbake fit …` starts four processes, which MPI calls ranks. Each takes its share of
+every batch. Rank 0 leads: it alone writes, prints and decides what depends on a clock. Without
+`mpiexec` there is one rank, MPI is not loaded, and nothing here does anything.
+
+The library waits for ever, and at full load, where another rank hangs or a network is cut. So all
+waiting is done here, with a limit, and leaves the processor to others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from .errors import UserError
+
+Result = TypeVar("Result")
+
+#: What `mpiexec` and Slurm tell a process: how many there are.
+SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
+#: Seconds that a rank waits for the others. Kernels are compiled in the first steps, and rank 0
+#: writes checkpoints and previews while the others wait.
+PATIENCE = 120.0
+#: Seconds that a rank other than the first waits before it ends all for what happened to it, so
+#: that what happened to all is told once, by rank 0.
+_AFTER_YOU = 0.5
+#: Bytes of an error that other ranks are told.
+_LONGEST = 4096
+#: Waiting: this long without sleep, then with naps.
+_AWAKE, _NAP = 2e-4, 5e-5
+
+
+class Communicator(Protocol):
+    """The part of mpi4py's communicators that is used here."""
+
+    rank: int
+    size: int
+
+    def Iallreduce(self, sendbuf: Any, recvbuf: Any, /) -> Any:
+        """Sum up arrays."""
+        ...
+
+    def Iallgather(self, sendbuf: Any, recvbuf: Any, /) -> Any:
+        """Collect arrays."""
+        ...
+
+    def Ibcast(self, buf: Any, /, root: int = ...) -> Any:
+        """Copy an array of one rank to all."""
+        ...
+
+    def Abort(self, status: int, /) -> Any:
+        """End all processes."""
+        ...
+
+
+class Agreed(UserError):
+    """An error that all ranks know of: rank 0 tells it, and each ends by itself."""
+
+    @staticmethod
+    def of(error: UserError, rank: int | None = None) -> Agreed:
+        """The error of one rank, or the same one of all."""
+        what = error.what if rank is None else f"rank {rank}: {error.what}"
+        return Agreed(what, error.where, error.remedy)
+
+
+class Ranks:
+    """The ranks of a fit; without a communicator there is one.
+
+    Args:
+        communicator: of mpi4py; None: this process is alone.
+        here: how many of them are on this machine.
+        patience: seconds to wait for the others.
+    """
+
+    def __init__(
+        self,
+        communicator: Communicator | None = None,
+        here: int = 1,
+        patience: float = PATIENCE,
+    ) -> None:
+        self._communicator, self.here, self._patience = communicator, here, patience
+        self.rank = 0 if communicator is None else communicator.rank
+        self.size = 1 if communicator is None else communicator.size
+
+    @staticmethod
+    def of_environment() -> Ranks:
+        """The ranks that `mpiexec` or Slurm started.
+
+        Raises:
+            UserError: there are several, and mpi4py is missing.
+        """
+        sizes = (os.environ.get(name, "") for name in SIZES)
+        if max((int(size) for size in sizes if size.isdecimal()), default=1) < 2:
+            return Ranks()
+        try:
+            from mpi4py import MPI
+        except (ImportError, RuntimeError) as error:
+            what = f"several processes were started, and mpi4py cannot be loaded ({error})"
+            raise UserError(what, remedy="Install it: pip install unbake[mpi]") from None
+        here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size
+        return Ranks(MPI.COMM_WORLD, here)
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the rank that writes and prints."""
+        return self.rank == 0
+
+    # ---------------------------------------------------------------------- what all come to know
+
+    def mean(self, numbers: np.ndarray) -> np.ndarray:
+        """The mean over all ranks, the same bits on each.
+
+        Args:
+            numbers: float32, as many on each rank.
+        """
+        if self._communicator is None:
+            return numbers
+        total = np.empty_like(numbers)
+        self._wait(self._communicator.Iallreduce(np.ascontiguousarray(numbers), total))
+        return total / np.float32(self.size)
+
+    def any(self, *told: bool) -> tuple[bool, ...]:
+        """For each answer, whether any rank says so."""
+        if self._communicator is None:
+            return told
+        total = np.empty(len(told), np.int32)
+        self._wait(self._communicator.Iallreduce(np.array(told, np.int32), total))
+        return tuple(bool(count) for count in total)
+
+    def of_first(self, number: float) -> float:
+        """The number that rank 0 has."""
+        if self._communicator is None:
+            return number
+        array = np.array([number], np.float64)
+        self._wait(self._communicator.Ibcast(array, root=0))
+        return float(array[0])
+
+    def copy_of_first(self, array: np.ndarray) -> np.ndarray:
+        """The array that rank 0 has; the others have one of its shape and type."""
+        if self._communicator is None:
+            return array
+        array = np.array(array)  # contiguous, and not that of a field
+        self._wait(self._communicator.Ibcast(array, root=0))
+        return array
+
+    def require_same(self, told: Mapping[str, str]) -> None:
+        """Check that all ranks have the same.
+
+        Args:
+            told: texts by what they are of, with the same names on each rank.
+
+        Raises:
+            Agreed: some rank has another one; all are named.
+        """
+        if self._communicator is None:
+            return
+        digests = [hashlib.sha256(text.encode()).digest() for text in told.values()]
+        rows = self._gathered(np.frombuffer(b"".join(digests), np.uint8))
+        rows = rows.reshape(self.size, len(told), -1)
+        faults = []
+        for number, name in enumerate(told):
+            others = np.flatnonzero((rows[:, number] != rows[0, number]).any(-1))
+            if len(others):
+                faults.append(f"other {name} on rank {', '.join(map(str, others))}")
+        if faults:
+            what = f"the ranks do not work on the same: {'; '.join(faults)} than on rank 0"
+            raise Agreed(what, remedy="Start all with the same version, options and data set")
+
+    def together(self, work: Callable[[], Result]) -> Result:
+        """Do something on each rank that may fail on some of them.
+
+        Raises:
+            Agreed: it failed on some rank; the message is that of the first one.
+        """
+        if self._communicator is None:
+            return work()
+        error, result = None, None
+        try:
+            result = work()
+        except UserError as failed:
+            error = failed
+        failures = np.flatnonzero(self._gathered(np.array([error is not None], np.uint8))[:, 0])
+        if not len(failures):
+            return result  # pyright: ignore[reportReturnType]
+        parts = [] if error is None else [error.what, error.where or "", error.remedy or ""]
+        text = "\0".join(parts).encode()[:_LONGEST].ljust(_LONGEST, b"\0")
+        texts = self._gathered(np.frombuffer(text, np.uint8))
+        what, where, remedy = (*_text(texts[failures[0]]).split("\0"), "", "")[:3]
+        alone = None if len(failures) == self.size else int(failures[0])
+        raise Agreed.of(UserError(what, where or None, remedy or None), alone)
+
+    def _gathered(self, array: np.ndarray) -> np.ndarray:
+        """The arrays of all ranks, one a row."""
+        assert self._communicator is not None
+        rows = np.empty((self.size, *array.shape), array.dtype)
+        self._wait(self._communicator.Iallgather(np.ascontiguousarray(array), rows))
+        return rows
+
+    def _wait(self, request: Any) -> None:
+        """Wait for the others.
+
+        Raises:
+            UserError: they do not answer.
+        """
+        start = time.monotonic()
+        while not request.Test():
+            waited = time.monotonic() - start
+            if waited > self._patience:
+                what = f"the other ranks have not answered for {self._patience:.0f} s"
+                remedy = "See whether one of them hangs or its network is cut; go on with --resume"
+                raise UserError(what, remedy=remedy)
+            if waited > _AWAKE:
+                time.sleep(_NAP)
+
+    # --------------------------------------------------------------------------- how all are ended
+
+    @contextmanager
+    def guarded(self, say: Callable[[str], object]) -> Iterator[None]:
+        """A block in which all ranks end where one fails.
+
+        What all know of is raised on rank 0, and ends the others with status 2.
+
+        Args:
+            say: prints the error of one rank.
+        """
+        if self._communicator is None:
+            yield
+            return
+        try:
+            yield
+        except Agreed:
+            if self.leads:
+                raise
+            sys.exit(2)
+        except BaseException as error:
+            if isinstance(error, SystemExit) and not error.code:
+                raise
+            if not self.leads:
+                time.sleep(_AFTER_YOU)
+            told = str(error) or type(error).__name__
+            if not isinstance(error, UserError):
+                told = f"{type(error).__name__}: {told}"
+            say(f"rank {self.rank}: {told}")
+            sys.stderr.flush()
+            self._communicator.Abort(2)
+            raise  # not reached with MPI
+
+
+def _text(row: np.ndarray) -> str:
+    return row.tobytes().rstrip(b"\0").decode("utf-8", "replace")

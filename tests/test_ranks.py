@@ -1,0 +1,127 @@
+"""What the ranks of a fit tell each other, and how they end together."""
+
+import time
+
+import numpy as np
+import pytest
+
+from unbake.errors import UserError
+from unbake.ranks import SIZES, Agreed, Ranks
+
+
+class Request:
+    """One that is done after some looks; never without a number."""
+
+    def __init__(self, looks=3):
+        self.looks = looks
+
+    def Test(self):
+        if self.looks is None:
+            return False
+        self.looks -= 1
+        return self.looks < 0
+
+
+class Two:
+    """A communicator of two ranks, whose other rank says what the test lets it say."""
+
+    size = 2
+
+    def __init__(self, rank=0, others=(), looks=3):
+        self.rank, self.others, self.looks, self.status = rank, list(others), looks, None
+
+    def Iallreduce(self, send, total):
+        total[:] = send + self.others.pop(0)
+        return Request(self.looks)
+
+    def Iallgather(self, send, rows):
+        other = self.others.pop(0)
+        rows[self.rank], rows[1 - self.rank] = send, send if other is None else other
+        return Request(self.looks)
+
+    def Ibcast(self, array, root):
+        assert root == 0
+        if self.rank:
+            array[:] = self.others.pop(0)
+        return Request(self.looks)
+
+    def Abort(self, status):
+        self.status = status
+
+
+def error_of(what, where="", remedy=""):
+    """An error as `together` sends it."""
+    text = "\0".join((what, where, remedy)).encode()
+    return np.frombuffer(text.ljust(4096, b"\0"), np.uint8)
+
+
+def test_one_process_tells_itself_what_it_knows(monkeypatch):
+    for name in SIZES:
+        monkeypatch.delenv(name, raising=False)
+    alone, numbers = Ranks.of_environment(), np.ones(3, np.float32)
+    assert (alone.rank, alone.size, alone.here, alone.leads) == (0, 1, 1, True)
+    assert alone.mean(numbers) is numbers and alone.of_first(2.5) == 2.5
+    assert alone.any(True, False) == (True, False)
+    alone.require_same({"seed": "0"})
+    with pytest.raises(UserError, match="bad"):
+        alone.together(lambda: fail("bad"))
+    with pytest.raises(UserError, match="bad"), alone.guarded(print):
+        fail("bad")
+
+
+def fail(what):
+    raise UserError(what, "a file", "Mend it")
+
+
+def test_means_sums_and_copies_are_those_of_all():
+    ranks = Ranks(Two(others=[np.float32([3, 5]), np.array([0, 1, 0])]))
+    np.testing.assert_array_equal(ranks.mean(np.float32([1, 2])), [2, 3.5])
+    assert ranks.any(True, False, False) == (True, True, False)
+    assert ranks.of_first(4.0) == 4
+    follower = Ranks(Two(1, [[7.5], [[1, 2]]]))
+    assert not follower.leads and follower.of_first(4.0) == 7.5
+    np.testing.assert_array_equal(follower.copy_of_first(np.zeros((1, 2))), [[1, 2]])
+
+
+def test_ranks_with_other_input_are_named():
+    Ranks(Two(others=[None])).require_same({"settings": "a", "data set": "b"})
+    other = np.zeros(64, np.uint8)
+    with pytest.raises(Agreed, match="other settings on rank 1; other data set on rank 1"):
+        Ranks(Two(others=[other])).require_same({"settings": "a", "data set": "b"})
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_an_error_of_one_rank_is_told_on_all(rank):
+    gathered = [np.uint8([rank == 0]), error_of("no memory", "a file", "Mend it")]
+    work = int if rank == 0 else lambda: fail("no memory")
+    with pytest.raises(Agreed, match=r"^a file: rank 1: no memory\. Mend it$"):
+        Ranks(Two(rank, gathered)).together(work)
+
+
+def test_an_error_of_all_ranks_is_that_of_each():
+    with pytest.raises(Agreed, match=r"^a file: bad\. Mend it$"):
+        Ranks(Two(others=[np.uint8([1]), None])).together(lambda: fail("bad"))
+    assert Ranks(Two(others=[np.uint8([0])])).together(lambda: 5) == 5
+
+
+def test_waiting_has_a_limit():
+    ranks, start = Ranks(Two(others=[1], looks=None), patience=0.05), time.monotonic()
+    with pytest.raises(UserError, match="have not answered for 0 s"):
+        ranks.any(True)
+    assert 0.05 <= time.monotonic() - start < 1
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_what_fails_on_one_rank_alone_ends_all(rank):
+    world, told = Two(rank), []
+    with pytest.raises(UserError), Ranks(world).guarded(told.append):
+        fail("disk full")
+    assert told == [f"rank {rank}: a file: disk full. Mend it"] and world.status == 2
+
+
+def test_what_all_know_of_is_told_by_the_first_and_ends_the_others():
+    for rank, kind in ((0, Agreed), (1, SystemExit)):
+        world, told = Two(rank), []
+        with pytest.raises(kind), Ranks(world).guarded(told.append):
+            raise Agreed("bad")
+        assert not told and world.status is None

@@ -1,0 +1,146 @@
+"""Fits of several ranks: the same step on all, and runs that do not tell how many there were."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from support import tiny_fields
+
+from unbake.config import to_toml
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.ranks import Ranks
+from unbake.training.problem import pixels_of, problem_of
+from unbake.training.run_folder import RunFolder
+from unbake.training.schedule import learning_rates
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep, with_share
+
+MPIEXEC = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+needs_mpi = pytest.mark.skipif(
+    MPIEXEC is None or find_spec("mpi4py") is None, reason="mpiexec and mpi4py are not installed"
+)
+
+
+class Fake(Ranks):
+    """A rank of two in this process, with a mean of its own."""
+
+    def __init__(self, rank, mean):
+        super().__init__()
+        self.rank, self.size, self.mean = rank, 2, mean
+
+
+def steps_of(data, config, ranks, take):
+    """The digest of the state after some steps, the terms of the last one, and the step."""
+    dataset = Dataset.load(data)
+    pixels = pixels_of(dataset, config, clip_negative=False)
+    problem = problem_of(dataset, config, pixels.photographs.mean)
+    step, state = TrainingStep(problem, pixels, config, ranks), initial_state(problem)
+    terms = {}
+    for number in range(take):
+        terms = step(state, number, learning_rates(config, number, 0.0))
+    return state.digest(), {name: float(value[0]) for name, value in terms.items()}, step
+
+
+def test_a_step_by_the_mean_is_that_of_all_its_gradients(cornell):
+    config = replace(tiny_fields(), pixels=64)
+    shared, terms, step = steps_of(cornell, config, Fake(0, lambda own: own), 5)
+    half = replace(config, pixels=32)
+    alone, expected, _ = steps_of(cornell, half, None, 5)
+    assert shared == alone and terms == expected
+    assert 1 <= step.recordings() <= 3
+
+
+def test_ranks_draw_different_pixels_and_take_the_same_step(cornell):
+    config, drawn = replace(tiny_fields(), pixels=64, method="direct"), {}
+
+    def noted(rank):
+        return lambda own: drawn.setdefault(rank, own.copy())
+
+    for rank in (0, 1):
+        steps_of(cornell, config, Fake(rank, noted(rank)), 1)
+    assert (drawn[0] != drawn[1]).any()
+    mean = (drawn[0] + drawn[1]) / np.float32(2)
+    digests = {steps_of(cornell, config, Fake(rank, lambda own: mean), 1)[0] for rank in (0, 1)}
+    assert len(digests) == 1
+
+
+def test_batches_that_cannot_be_shared_equally_are_refused():
+    config = tiny_fields()
+    assert with_share(replace(config, pixels=96), 3).pixels == 32
+    with pytest.raises(UserError, match="--batch 99"):
+        with_share(replace(config, pixels=100), 3)
+
+
+def command(*words, ranks=2):
+    return [MPIEXEC, "-n", str(ranks), sys.executable, "-m", "unbake", "fit", *map(str, words)]
+
+
+def run(words, **more):
+    return subprocess.run(words, capture_output=True, text=True, timeout=200, **more)
+
+
+@pytest.fixture
+def settings(tmp_path):
+    file = tmp_path / "settings.toml"
+    file.write_text(to_toml(replace(tiny_fields(), method="direct", pixels=64)))
+    return file
+
+
+@needs_mpi
+def test_a_run_of_two_ranks_goes_on_with_one(cornell, settings, tmp_path, unbake):
+    out = tmp_path / "run"
+    done = run(command(cornell, "--out", out, "--settings", settings, "--steps", 24))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("24 steps, 0.0 M samples") == 1
+    assert [line["step"] for line in RunFolder(out).log() if "photometric" in line] == [20, 24]
+    samples = RunFolder(out).log()[-1]["samples"]
+    assert samples == 24 * 64 * tiny_fields().spp
+    more = unbake("fit", cornell, "--out", out, "--resume", "--steps", 30)
+    assert more.status == 0, more.err
+    log = [line["step"] for line in RunFolder(out).log() if "photometric" in line]
+    assert log == [20, 24, 30]
+    wrong = [*command(cornell, "--out", tmp_path / "other", "--settings", settings, ranks=1)]
+    wrong += ["--seed", "1", ":", *wrong[1:]]
+    refused = run(wrong)
+    assert refused.returncode == 2
+    assert "do not work on the same: other settings on rank 1" in refused.stderr
+    assert not (tmp_path / "other").exists() and refused.stderr.count("\n") == 1
+
+
+@needs_mpi
+@pytest.mark.slow
+def test_all_end_with_one_that_is_killed(cornell, settings, tmp_path):
+    out = tmp_path / "run"
+    words = command(cornell, "--out", out, "--settings", settings, "--steps", 200_000)
+    program = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        checkpoints = out / "checkpoints"
+        while not list(checkpoints.glob("step-*")) and program.poll() is None:
+            time.sleep(0.1)
+        ranks = [
+            child
+            for child in psutil.Process(program.pid).children(recursive=True)
+            if "unbake" in child.cmdline()
+        ]
+        assert len(ranks) == 2
+        ranks[1].send_signal(signal.SIGKILL)
+        _, left = psutil.wait_procs(ranks, timeout=2)
+        assert not left
+        assert program.wait(timeout=5) != 0
+    finally:
+        program.kill()
+    done = run([*command("--resume", cornell, "--out", out, "--steps", 1, ranks=2)])
+    assert done.returncode in (0, 130), done.stderr
+    manifest = max(checkpoints.glob("step-*")) / "manifest.json"
+    assert json.loads(manifest.read_text())["step"] > 0
