@@ -326,7 +326,7 @@ def fit(
     Ctrl-C, SIGTERM, SIGHUP and a closed pipe stop it after the present step, with a checkpoint from
     which --resume continues. A second Ctrl-C ends it at once.
 
-    `mpiexec -n N unbake fit` shares one fit among N processes: see docs/machines.md.
+    Several processes share one fit with mpiexec -n 4 unbake fit DATA --out RUN (docs/machines.md).
 
     While it runs it tells the terms of its loss, smaller is better. photo: the photographs against
     the pictures of the unknowns; what remains in the end is mostly noise. prior: where L, the
