@@ -106,7 +106,7 @@ def rms(values):
         (0.5, EXTRA_BOUNCE, 3.0, 500, 0.03, 5e-4),
         (0.8, EXTRA_BOUNCE, 1.0, 500, 0.03, 5e-4),
         (0.8, ONE_BOUNCE, 1.0, 500, 0.03, 5e-4),
-        (0.97, EXTRA_BOUNCE, 4.0, 1400, 0.02, 2e-3),
+        pytest.param(0.97, EXTRA_BOUNCE, 4.0, 1400, 0.02, 2e-3, marks=pytest.mark.slow),
     ],
 )
 def test_the_residual_alone_finds_the_radiance(

@@ -144,6 +144,7 @@ def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, mon
     assert {estimator for estimator, _ in made} == {"split-halves"}
 
 
+@pytest.mark.slow
 def test_the_schedule_is_searched_where_that_is_asked_for(rates, tmp_path, monkeypatch):
     """Its values are recorded, those of all methods first, and become the method's own."""
     made = []

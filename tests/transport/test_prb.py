@@ -171,7 +171,11 @@ def test_cut_outs_are_those_of_mitsubas_volumetric_path_tracer(tmp_path, instanc
     assert_same_expectation(ours, theirs, 1024)
 
 
-@pytest.mark.parametrize("instanced", [False, True], ids=["shape", "instance"])
+@pytest.mark.parametrize(
+    "instanced",
+    [pytest.param(False, marks=pytest.mark.slow), True],
+    ids=["shape", "instance"],
+)
 def test_gradients_through_cut_outs_are_finite_differences(tmp_path, instanced):
     """Neither the material nor the cut-out samples by albedo: the same paths show its effect."""
     path, camera = leaves(tmp_path, instanced=instanced)
