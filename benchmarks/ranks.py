@@ -16,7 +16,6 @@ import itertools
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from statistics import median
@@ -26,13 +25,14 @@ SRC = str(ROOT / "src")
 sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
+from variants import SCORES  # noqa: E402
+
 from unbake import backend  # noqa: E402
+from unbake.experiments.commands import command, unbake  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 from unbake.training.run_folder import RunFolder  # noqa: E402
 
-#: What is kept of a fit's scores.
-SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")
 #: Steps that compile and warm up, which are not timed.
 WARM_UP = 100
 
@@ -60,18 +60,17 @@ def main() -> None:
 
 def fit(data: Path, run: Path, ranks: int, seed: int, steps: int) -> dict[str, float]:
     """Scores, and milliseconds a step after the first ones, of a fit with one core a rank."""
-    unbake = [sys.executable, "-m", "unbake"]
-    words = [*unbake, "fit", str(data), "--out", str(run), "--seed", str(seed)]
-    words += ["--steps", str(steps)]
+    words = (sys.executable, "-m", "unbake", "fit", data, "--out", run)
     folder = Path(sys.executable).parent
     mpiexec = shutil.which("mpiexec", path=os.pathsep.join((str(folder), os.environ["PATH"])))
     if mpiexec is None:
         sys.exit("mpiexec is missing: pip install unbake[mpi]")
     cores = ",".join(map(str, range(ranks)))
-    start = ["taskset", "-c", cores] + ([mpiexec, "-n", str(ranks)] if ranks > 1 else [])
-    subprocess.run([*start, *words], check=True, stdout=subprocess.DEVNULL)
-    evaluated = ["evaluate", str(run), "--train-views", "0"]
-    subprocess.run([*unbake, *evaluated], check=True, stdout=subprocess.DEVNULL)
+    start = ["taskset", "-c", cores] + ([mpiexec, "-n", ranks] if ranks > 1 else [])
+    run.parent.mkdir(parents=True, exist_ok=True)
+    log = run.parent / "log.txt"
+    command([*start, *words, "--seed", seed, "--steps", steps], log=log)
+    unbake("evaluate", run, "--train-views", 0, log=log)
     heldout = json.loads(RunFolder(run).metrics_file.read_text(encoding="utf-8"))["heldout"]
     return {key: heldout[key] for key in SCORES} | {"ms_per_step": ms_per_step(run)}
 

@@ -5,8 +5,8 @@
 
 Fits of one seed start with the roughness of each number, or with the true maps (`true`), and learn
 L_θ or keep one that was solved for the true materials. Scores are PSNRs in dB of linear RGB, mean
-over held-out views. Then the way from the last fit with a solved L_θ and the usual start to the
-true roughness: at each part of it albedo adapts while roughness stays, and the photometric loss of
+over held-out views. Then the way from a fit with the solved L_θ and the usual start to the true
+roughness: at each part of it albedo adapts while roughness stays, and the photometric loss of
 the same batches is compared with that at the start of the way. Rows that the file has already are
 kept.
 """

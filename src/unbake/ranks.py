@@ -143,14 +143,6 @@ class Ranks:
         self._wait(self._communicator.Ibcast(array, root=0))
         return float(array[0])
 
-    def copy_of_first(self, array: np.ndarray) -> np.ndarray:
-        """The array that rank 0 has; the others have one of its shape and type."""
-        if self._communicator is None:
-            return array
-        array = np.array(array)  # contiguous, and not that of a field
-        self._wait(self._communicator.Ibcast(array, root=0))
-        return array
-
     def require_same(self, told: Mapping[str, str]) -> None:
         """Check that all ranks have the same.
 

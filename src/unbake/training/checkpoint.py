@@ -204,6 +204,15 @@ def _most(expected: Mapping[str, np.ndarray]) -> int:
     return 2 * sum(array.nbytes for array in expected.values()) + _MOST_TEXT
 
 
+def state_digest(state: State) -> str:
+    """SHA-256 of all numbers of a state, the moments among them: equal for the same bits."""
+    digest = hashlib.sha256()
+    for name, array in _arrays(state).items():
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
 # ------------------------------------------------------------------------------------------ writing
 
 

@@ -26,7 +26,7 @@ from ..fields.camera import CameraModel
 from ..ranks import Ranks
 from ..signals import deferred
 from ..version import VERSION
-from .checkpoint import Progress, load_checkpoint
+from .checkpoint import Progress, load_checkpoint, state_digest
 from .defaults import with_defaults
 from .event_log import EventLog
 from .first_gains import begin_cameras
@@ -252,7 +252,7 @@ def _agree(begun: _Begun, ranks: Ranks) -> None:
 def _require_same_state(state: State, ranks: Ranks) -> None:
     """Check that the states of all ranks are equal, bit for bit."""
     if ranks.size > 1:
-        ranks.require_same({"state": state.digest()})
+        ranks.require_same({"state": state_digest(state)})
 
 
 def _probes(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .loss_scaling import first_scale
 from .problem import Problem
@@ -75,18 +73,6 @@ class State:
                 value = _same(value)
                 dr.enable_grad(value)
                 optimizer.state[key] = (value, promoted, rate, (*map(_same, extra), None))
-
-    def digest(self) -> str:
-        """SHA-256 of all numbers, the moments among them; the same bits give the same digest."""
-        digest = hashlib.sha256()
-        for _, optimizer in self.optimizers():
-            for key, (value, _, _, (_, first, second, _)) in optimizer.state.items():
-                digest.update(key.encode())
-                for numbers in (dr.detach(value), first, second):
-                    digest.update(np.ascontiguousarray(numbers.numpy()).data)
-        if self.scale is not None:
-            digest.update(np.array(self.scale).data)
-        return digest.hexdigest()
 
     def moved(self) -> bool:
         """Whether any gradient has reached the unknowns, as Adam's moments tell."""
