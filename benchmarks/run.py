@@ -194,7 +194,7 @@ STEP_METHODS = (
 )  # fmt: skip
 #: The estimator of PRB and AD-PT that is not their default in rooms.
 _OF_PRB = method_defaults.method_defaults("prb", "room").estimator
-OTHER_ESTIMATOR = "two-pass" if _OF_PRB == "split-halves" else "split-halves"
+OTHER_ESTIMATOR = "split-halves" if _OF_PRB == "two-pass" else "two-pass"
 ROOM_RIVALS = (
     "ours", "prb", f"prb:neural:{OTHER_ESTIMATOR}", "ad-pt", f"ad-pt:neural:{OTHER_ESTIMATOR}",
     "direct", "no-prior",

@@ -139,8 +139,9 @@ class Facts:
         return "one seed" if count == 1 else f"{count} seeds"
 
     def best_of(self, name: str, method: str, quantity: str) -> str:
-        """The run of a method with networks, with either estimator, that comes nearest."""
-        runs = {method, *(f"{method}-neural-{e}" for e in ("two-pass", "split-halves"))}
+        """The run of a method with networks, with any estimator, that comes nearest."""
+        estimators = ("two-pass", "split-halves", "all-pairs")
+        runs = {method, *(f"{method}-neural-{e}" for e in estimators)}
         found = [run for run in self.known(name) if run in runs]
         if not found:
             raise Unfounded(f"{name}.json has no {method}")

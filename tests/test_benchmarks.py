@@ -70,7 +70,7 @@ def test_quick_methods_get_the_samples_of_the_slow_one(repository, tmp_path):
     assert result["seeds"] == [0, 1] and rows.keys() == {"ours", "prb"}
     assert result["untrained"]["albedo_psnr"] > 0
     assert rows["prb"]["steps"] == 4 and "albedo_psnr_sd" in rows["ours"]
-    passes = {"split-halves": 1, "two-pass": 2}[rows["prb"]["estimator"]]
+    passes = {"all-pairs": 1, "split-halves": 1, "two-pass": 2}[rows["prb"]["estimator"]]
     assert rows["ours"]["steps"] == 4 * passes
     assert rows["ours"]["samples"] == rows["prb"]["samples"] == 4 * passes * 256
     config = (tmp_path / "smoke" / "runs" / "equal-demo-1" / "ours" / "config.toml").read_text()

@@ -50,6 +50,8 @@ def test_a_preset_survives_toml(name):
         {"radiance": {"grid": DenseGridConfig(7)}, "radiance_representation": "grid"},
         {"quantities": ("roughness",), "representation": "bitmap"},
         {"transport": TransportConfig(0), "estimator": "two-pass"},
+        {"estimator": "all-pairs"},
+        {"estimator": "split-halves"},
     ],
 )
 def test_any_settings_survive_toml(changes):
@@ -80,13 +82,22 @@ def test_absent_keys_come_from_the_named_preset():
     assert config == expected
 
 
+def test_all_pairs_need_samples_that_are_independent():
+    """A wavefront that narrows by systematic sampling has two independent halves of them."""
+    assert FitConfig(method="prb", estimator="all-pairs").one_pass == "all-pairs"
+    message = "^estimator: must be split-halves or two-pass for the method ad-pt, whose samples"
+    with pytest.raises(UserError, match=message):
+        FitConfig(method="ad-pt", estimator="all-pairs")
+    assert FitConfig(method="ad-pt", estimator="split-halves").one_pass == "split-halves"
+
+
 def test_presets_hold_the_published_values():
     """Sec. 5.3, 5.4, Table 1 (STAIRCASE), and what the public release says beside that."""
     paper, release = preset("paper"), preset("release")
     for config in (paper, release):
         assert (config.steps, config.pixels, config.spp) == (18_000, 2**14, 16)
         assert (config.radiance_samples, config.pixel_sampling) == (16, "one-view-crop")
-        assert not config.halves and config.loss_reference == "photograph"
+        assert config.two_passes and config.loss_reference == "photograph"
         assert (config.loss_epsilon, config.final_learning_rate, config.warm_up) == (0.01, 1.0, 0)
         fields = [*config.materials.values(), config.radiance]
         networks = [settings["neural"] for settings in fields]

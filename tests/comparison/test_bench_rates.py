@@ -50,7 +50,7 @@ def test_each_rate_is_tried_and_the_best_is_noted(rates, tmp_path):
     assert len({trial["score"] for trial in trials}) == len(trials)
     fits = [fit for trial in trials for fit in trial["per_seed"]]
     assert all(f["steps"] == 2 and f["seconds"] > 0 and f["machine"]["cores"] for f in fits)
-    assert {t["estimator"] for t in trials} == {"split-halves"}
+    assert {t["estimator"] for t in trials} == {"all-pairs"}
     kept = {key: search["best"][key] for key in ("factors", "estimator", "score")}
     assert any(kept.items() <= trial.items() for trial in trials)
     found = found_defaults({"searches": [search]})
@@ -118,14 +118,14 @@ def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, mon
 
     def scores(fit, dataset):
         made.append((fit.config.estimator, fit.config.rate_factors["albedo"]))
-        return {"score": 20.0 + (fit.config.estimator == "split-halves")}
+        return {"score": 20.0 + (fit.config.estimator == "all-pairs")}
 
     monkeypatch.setattr(module, "_scores", scores)
     monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
     # Two passes trace more samples in as many steps: such a choice would be no fair one.
     outcome = rates("prb")
     assert outcome.status == 2 and "compared at equal time" in outcome.err
-    assert "prb:neural:split-halves" in outcome.err and outcome.err.count("\n") == 1
+    assert "prb:neural:all-pairs" in outcome.err and outcome.err.count("\n") == 1
     compiled = []
     monkeypatch.setattr(
         module,
@@ -133,15 +133,15 @@ def test_the_estimator_is_searched_where_paths_are_followed(rates, tmp_path, mon
         lambda _, configs: compiled.append([c.estimator for c in configs]),
     )
     assert rates("prb", seconds=5).status == 0
-    assert compiled == [["two-pass", "split-halves"]], "before the first trial's clock starts"
+    assert compiled == [["two-pass", "all-pairs"]], "before the first trial's clock starts"
     (search,) = searches(tmp_path)
     assert search["trials"][0]["estimator"] == "two-pass"
-    assert search["best"]["estimator"] == "split-halves"
+    assert search["best"]["estimator"] == "all-pairs"
     found = found_defaults({"searches": [search]})["prb"]["room"]
-    assert found == MethodDefaults({"roughness": 1.0, "albedo": 1.0}, "split-halves")
+    assert found == MethodDefaults({"roughness": 1.0, "albedo": 1.0}, "all-pairs")
     made.clear()
-    assert rates("prb:neural:split-halves").status == 0
-    assert {estimator for estimator, _ in made} == {"split-halves"}
+    assert rates("prb:neural:all-pairs").status == 0
+    assert {estimator for estimator, _ in made} == {"all-pairs"}
 
 
 @pytest.mark.slow
@@ -190,16 +190,16 @@ def test_ties_keep_the_published_estimator_and_the_own_rates():
     """The seeds of each trial differ by 0.4 dB, which is a deviation of 0.4 of a difference."""
     own = trial(1.0, "two-pass", 20.0, 20.4)
     for gain, taken in ((0.3, False), (0.5, True)):
-        other = trial(1.0, "split-halves", 20.0 + gain, 20.4 + gain)
+        other = trial(1.0, "all-pairs", 20.0 + gain, 20.4 + gain)
         assert settled([own, other], other) == (other if taken else own)
         higher = trial(2.5, "two-pass", 20.0 + gain, 20.4 + gain)
         assert settled([own, higher], higher) == (higher if taken else own)
     # The best trial has both; its rates matter, its estimator does not.
-    higher, both = (trial(2.5, e, 22.0, 22.4) for e in ("two-pass", "split-halves"))
+    higher, both = (trial(2.5, e, 22.0, 22.4) for e in ("two-pass", "all-pairs"))
     assert settled([own, higher, both], both) == higher
     # Methods that follow no paths have one estimator.
-    halves = [trial(factor, "split-halves", 20.0 + factor) for factor in (1.0, 2.5)]
-    assert settled(halves, halves[1]) == halves[1]
+    pairs = [trial(factor, "all-pairs", 20.0 + factor) for factor in (1.0, 2.5)]
+    assert settled(pairs, pairs[1]) == pairs[1]
     failed = trial(2.5, "two-pass", 1.0) | {"score": None, "per_seed": [{"score": None}]}
     assert settled([failed, own], own) == own
 

@@ -67,7 +67,7 @@ def test_two_methods_side_by_side(compare, tmp_path):
         assert row["start_up_seconds"] >= 0 and row["memory_mb"] > 10
         assert row["rate_factors"].keys() == {"albedo", "roughness"}
         assert row["rate_factors"] == {k: config.rate_factors[k] for k in row["rate_factors"]}
-        assert row["estimator"] == "split-halves" and row["representation"] == "neural"
+        assert row["estimator"] == "all-pairs" and row["representation"] == "neural"
         assert row["radiance"] == {"ours": "neural", "direct": None}[name]
         metrics = json.loads((out / name / "evaluation" / "metrics.json").read_text())
         assert row["heldout"] == metrics["heldout"] and row["train"] == metrics["train"]
@@ -88,7 +88,7 @@ def test_two_methods_side_by_side(compare, tmp_path):
     assert "ms/step" in outcome.out and "Seconds to roughness PSNR" in outcome.out
     page = (out / "report.html").read_text()
     assert "Time to quality" in page and "Held-out albedo PSNR" in page
-    assert "split halves" in page and "Validation during training" not in page
+    assert "all pairs" in page and "Validation during training" not in page
 
 
 def test_only_the_method_differs(compare, tmp_path):
@@ -365,10 +365,10 @@ def test_a_contender_is_a_method_and_maybe_a_representation():
 
 
 def test_samples_of_both_passes_count(compare, tmp_path):
-    assert compare("direct", "prb:neural:two-pass", "prb:neural:split-halves").status == 0
+    assert compare("direct", "prb:neural:two-pass", "prb:neural:all-pairs").status == 0
     rows = result(tmp_path)["methods"]
     samples = {row["estimator"]: row["samples"] for name, row in rows.items() if "prb" in name}
-    assert samples == {"split-halves": 8 * 256, "two-pass": 2 * 8 * 256}
+    assert samples == {"all-pairs": 8 * 256, "two-pass": 2 * 8 * 256}
     assert rows["direct"]["samples"] == 8 * 256
     for name, row in rows.items():
         log = (tmp_path / "out" / name / "log.jsonl").read_text().splitlines()

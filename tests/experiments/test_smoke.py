@@ -104,7 +104,7 @@ def test_fig3_measures_every_method(rows, scenes_dir):
     found = rows("fig3", "--scenes", scenes_dir)
     followed = ["PRB", "PRB, split halves", "AD-PT", "AD-PT, split halves"]
     assert column(found, "method") == ["ours", "no prior", "direct", *followed]
-    assert column(found, "estimator") == ["split-halves"] * 3 + ["two-pass", "split-halves"] * 2
+    assert column(found, "estimator") == ["all-pairs"] * 3 + ["two-pass", "split-halves"] * 2
     assert column(found, "path_depth") == [None] * 3 + [found[-1]["path_depth"]] * 4
     assert found[-1]["path_depth"] >= 15
     assert min(column(found, "milliseconds")) > 0 and not any(column(found, "error"))
@@ -181,7 +181,7 @@ def test_every_method_is_fitted_and_shown(rows, out, scenes_dir, figure, methods
         assert (
             slow
             == at["PRB"]["samples"]
-            == 6 * 256 * {"split-halves": 1, "two-pass": 2}[at["PRB"]["estimator"]]
+            == 6 * 256 * {"all-pairs": 1, "two-pass": 2}[at["PRB"]["estimator"]]
         )
         for method in ("direct", "ours", "no prior"):
             assert at[method]["samples_at_equal_samples"] == slow

@@ -88,7 +88,7 @@ def test_permuted_views_have_the_same_loss_and_gradient(tmp_path):
         dr.disable_grad(θ)
         dr.enable_grad(θ)
         problem.radiance.assign(θ)
-        # Split in halves, a pixel has two samples or more: here they are equal.
+        # Squared errors take different samples of a pixel: of two or more, which here are equal.
         twice = dr.gather(mi.Ray3f, ray, dr.arange(mi.UInt32, 2 * dr.width(ray)) // 2)
         sampler = seeded(0, dr.width(twice))
         sample = trace(problem.scene_view, problem.radiance, twice, sampler, requirements(row))

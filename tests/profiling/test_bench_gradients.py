@@ -70,7 +70,7 @@ def test_the_slope_of_albedo_is_a_difference_of_losses(
 ):
     # How BSDFs are sampled does not depend on albedo: both losses are of the very same paths.
     if method != "ours":
-        config = replace(tiny_fields(representation), method=method, estimator="split-halves")
+        config = replace(tiny_fields(representation), method=method, estimator="all-pairs")
         config = replace(config, path=PathConfig(max_depth=3, rr_depth=10))
         run = untrained(cornell, tmp_path / "run", config)
     measured = stepping(run, pixels=128)
@@ -141,7 +141,7 @@ def test_the_table_is_that_of_the_batches(unbake, run, tmp_path):
     settings = result["settings"]
     assert (settings["pixels"], settings["spp"], settings["radiance_spp"]) == (128, 8, 2)
     assert (result["batches"], result["left_out"], result["steps"]) == (4, 0, 0)
-    assert "ours after 0 steps: 4 batches of 128 pixels x 8 samples, split-halves" in done.out
+    assert "ours after 0 steps: 4 batches of 128 pixels x 8 samples, all-pairs" in done.out
     measured = stepping(run, pixels=128, spp=8)
     for name, row in result["quantities"].items():
         slopes = [slope(measured, name, number) for number in range(4)]

@@ -18,7 +18,7 @@ def bench(unbake, what, data, tiny, out, *methods):
 @pytest.mark.slow
 def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
     out = tmp_path / "deep" / "methods.json"
-    named = ("ours", "prb:grid:split-halves", "prb:grid:two-pass", "ad-pt", "direct:bitmap")
+    named = ("ours", "prb:grid:all-pairs", "prb:grid:two-pass", "ad-pt", "direct:bitmap")
     done = bench(unbake, "methods", cornell, tiny, out, *named)
     assert done.status == 0, done.err
     written = json.loads(out.read_text())
@@ -26,16 +26,16 @@ def test_methods_are_measured_side_by_side(unbake, cornell, tiny, tmp_path):
     assert written["unbake"] == VERSION
     said = [(r["method"], r["representation"], r["radiance"], r["estimator"]) for r in rows]
     assert said == [
-        ("ours", "neural", "neural", "split-halves"),
-        ("prb", "grid", None, "split-halves"),
+        ("ours", "neural", "neural", "all-pairs"),
+        ("prb", "grid", None, "all-pairs"),
         ("prb", "grid", None, "two-pass"),
         ("ad-pt", "neural", None, "two-pass"),
-        ("direct", "bitmap", None, "split-halves"),
+        ("direct", "bitmap", None, "all-pairs"),
     ]
     first = rows[0]["milliseconds_per_step"]
     for row in rows:
         assert row["times_the_first"] == pytest.approx(row["milliseconds_per_step"] / first)
-        passes = {"split-halves": 1, "two-pass": 2}[row["estimator"]]
+        passes = {"all-pairs": 1, "two-pass": 2}[row["estimator"]]
         rate = row["samples_per_second"] * row["milliseconds_per_step"]
         assert rate == pytest.approx(passes * 256e3)
         assert f"{row['milliseconds_per_step']:.1f}" in done.out
@@ -141,7 +141,7 @@ def test_options_that_make_no_sense_are_told_in_one_line(unbake, words, message)
         ("step", ["ours", "prb"], "--methods: step takes one method. Or: unbake bench methods"),
         ("methods", ["best"], "--methods: no method named 'best'. There are ours, no-prior"),
         ("methods", ["prb:paint"], "no representation named 'paint'. There are neural, grid"),
-        ("methods", ["prb:grid:both"], "no estimator named 'both'. There are auto, split-halves"),
+        ("methods", ["prb:grid:both"], "no estimator named 'both'. There are auto, all-pairs"),
         ("methods", ["prb:grid:auto:x"], "has too many parts"),
     ],
 )

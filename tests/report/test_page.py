@@ -242,7 +242,7 @@ def test_runs_of_the_same_name_are_told_apart(made, tmp_path: Path):
 
 FACTS: dict[str, object] = {
     "unknown": "materials", "bounces": 1, "prior": "extra-bounce", "representation": "neural",
-    "radiance": "neural", "estimator": "split-halves",
+    "radiance": "neural", "estimator": "all-pairs",
 }  # fmt: skip
 
 
@@ -258,9 +258,7 @@ def test_each_run_tells_what_it_works_with(made, tmp_path: Path):
     other = {"representation": "bitmap", "radiance": None, "estimator": "two-pass"}
     _edit(made[1][1], lambda m: m.update(FACTS, method="prb", **other))
     text = _words(write_report(made[1], tmp_path / "report.html").read_text())
-    told = (
-        "φ network, Lθ network, Lθ solved before the fit, 3 bounces, one bounce prior, split halves"
-    )
+    told = "φ network, Lθ network, Lθ solved before the fit, 3 bounces, one bounce prior, all pairs"
     assert f"ours {told}" in text or f"ours{told}" in text
     assert "prbφ bitmaps, no Lθ, two passes" in text
     assert "Materials recovered in room" in text

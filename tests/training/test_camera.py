@@ -39,7 +39,7 @@ from unbake.training.problem import make_problem, training_pixels
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
-from unbake.transport.loss import RelativeL2, pixel_means
+from unbake.transport.loss import RelativeL2, pixel_means, squared_error
 
 #: Powers of two, so that dividing by them gives back the very numbers.
 EXPOSURES = (4.0, 0.5, 2.0)
@@ -193,6 +193,26 @@ def test_what_is_clipped_has_neither_loss_nor_gradient_above(primal):
     np.testing.assert_allclose(gradient[1:], weight * 2 / 3 * np.array([-0.2, 0.4]), rtol=1e-5)
 
 
+def test_of_all_pairs_clipped_channels_have_halves_and_others_pairs():
+    rng = np.random.default_rng(6)
+    samples = mi.Color3f([mi.Float(rng.uniform(0, 1, 24).astype(np.float32)) for _ in range(3)])
+    target = mi.Color3f([mi.Float(rng.uniform(0, 1, 6).astype(np.float32)) for _ in range(3)])
+    some = mi.Bool([True, False, True, False, False, True])
+    for clipped in (mi.Bool([True] * 6), some):
+        mask = dr.mask_t(mi.Color3f)(clipped, clipped & False, clipped)
+        found, halves, plain = (
+            squared_error(samples, target, 4, mi.Color3f(1), None, told, pairs=pairs)
+            for told, pairs in ((mask, True), (mask, False), (None, True))
+        )
+        assert len({float(x[0]) for x in (found, halves, plain)}) == 3
+        # By channel and pixel, of NumPy
+        s = np.array(samples).reshape(3, 6, 4) - np.array(target)[..., None]
+        of_pairs = (s.sum(-1) ** 2 - (s**2).sum(-1)) / 12
+        of_halves = np.minimum(s[..., :2].mean(-1), 0) * np.minimum(s[..., 2:].mean(-1), 0)
+        expected = np.where(np.array(mask), of_halves, of_pairs).mean()
+        assert float(found[0]) == pytest.approx(expected, rel=1e-5)
+
+
 def test_pixels_know_which_of_their_channels_are_clipped(exposed, config):
     data = Dataset.load(exposed)
     first, second, heldout = data.views
@@ -295,17 +315,18 @@ def test_gains_and_responses_are_the_same_in_steps_and_in_evaluations():
         assert np.isfinite(gradient).all() and (gradient != 0).any(), key
 
 
-def test_a_gain_that_is_right_is_as_good_as_a_divided_photograph():
+@pytest.mark.parametrize("pairs", [True, False], ids=["all pairs", "split halves"])
+def test_a_gain_that_is_right_is_as_good_as_a_divided_photograph(pairs):
     """Also in the denominator, with its ε; and gradients of the gain are those of a square."""
     rng = np.random.default_rng(5)
     samples = mi.Color3f([mi.Float(rng.uniform(0, 1, 16).astype(np.float32)) for _ in range(3)])
     target = mi.Color3f([mi.Float(rng.uniform(0, 1, 4).astype(np.float32)) for _ in range(3)])
     reference = target * 0.9
     for primal in (None, pixel_means(samples * 1.1, 4)):
-        plain = RelativeL2(0.1, reference).error(samples, target, 4, primal)
+        plain = RelativeL2(0.1, reference, pairs=pairs).error(samples, target, 4, primal)
         gain = mi.Color3f(4, 2, 0.5) * dr.ones(mi.Float, 4)
         dr.enable_grad(gain)
-        found = RelativeL2(0.1, reference * gain, gain=gain)
+        found = RelativeL2(0.1, reference * gain, gain=gain, pairs=pairs)
         error = found.error(samples, target * dr.detach(gain), 4, primal)
         assert float(error[0]) == pytest.approx(float(plain[0]), rel=1e-5)
         dr.backward(error)
@@ -344,17 +365,21 @@ def test_what_is_off_costs_nothing(built_in, one_thread, monkeypatch):
 
     def as_before(self, samples, target, spp, primal=None):
         assert (self.clipped, self.gain, primal) == (None, None, None)
-        halves = pixel_means(samples, spp // 2)
-        even = 2 * dr.arange(mi.UInt32, dr.width(target))
-        a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
+        pixel = dr.arange(mi.UInt32, dr.width(samples)) // spp
+        errors = samples - dr.gather(mi.Color3f, target, pixel)
+        dr.eval(samples, errors)
+        products = [
+            dr.square(dr.block_sum(c, spp)) - dr.block_sum(dr.square(c), spp) for c in errors
+        ]
+        products = mi.Color3f([c / (spp * (spp - 1)) for c in products])
         weight = dr.rcp(dr.square(self.reference) + self.epsilon)
-        return dr.mean(dr.mean((a - target) * (b - target) * weight))
+        return dr.mean(dr.mean(products * weight))
 
     found = []
     for number in range(2):
         if number:
             monkeypatch.setattr(RelativeL2, "error", as_before)
-        step, state = start(built_in, CameraConfig())
+        step, state = start(built_in, CameraConfig(), estimator="all-pairs")
         assert step._inputs(0).told is None and step._problem.camera is None
         terms = [step(state, i, rates(i)) for i in range(2)]
         arrays = {k: np.array(v) for _, o in state.optimizers() for k, v in o.items()}

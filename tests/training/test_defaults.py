@@ -68,7 +68,7 @@ def test_a_fit_without_a_radiance_field_logs_its_whole_rate(unbake, cornell, tin
     assert rates["direct"] == pytest.approx(101 * rates["no-prior"], rel=1e-3)
 
 
-def test_a_method_has_the_rates_that_were_found_for_it(table):
+def test_a_method_has_the_rates_that_were_found_for_it(table, monkeypatch):
     found = defaults("prb")
     assert {name: found.rate_factors[name] for name in ("albedo", "roughness")} == {
         "albedo": 2.0,
@@ -81,10 +81,15 @@ def test_a_method_has_the_rates_that_were_found_for_it(table):
     assert found.estimator == "split-halves"
     assert defaults("prb", "object").estimator == "two-pass"
     assert defaults("prb", "object").rate_factors["albedo"] == 1.0
-    assert defaults("direct").estimator == defaults("ours").estimator == "split-halves"
+    assert defaults("direct").estimator == defaults("ours").estimator == "all-pairs"
     # Of the same paths it estimates the same gradient.
     assert defaults("ad-pt").rate_factors == found.rate_factors
     assert defaults("ad-pt").estimator == "split-halves"
+    # Only its halves are independent.
+    pairs = {"prb": {"room": MethodDefaults(estimator="all-pairs")}}
+    monkeypatch.setattr(module, "METHOD_DEFAULTS", pairs)
+    assert (defaults("prb").estimator, defaults("ad-pt").estimator) == ("all-pairs", "split-halves")
+    monkeypatch.setattr(module, "METHOD_DEFAULTS", TABLE)
     assert set(defaults("ours").rate_factors.values()) == {1.0}
 
 
@@ -164,8 +169,11 @@ def test_a_run_goes_on_with_the_rates_that_it_was_started_with(
     assert logged == pytest.approx([0.5 * rate * 0.05**0.5, 0.5 * rate * 0.05**0.75], rel=1e-4)
 
 
-def test_a_run_of_an_earlier_version_goes_on_as_it_was(table, unbake, cornell, tiny, tmp_path):
-    """Its settings have no factors, and a warm-up whatever the method."""
+@pytest.mark.parametrize("estimator", ["auto", "split-halves"])
+def test_a_run_of_an_earlier_version_goes_on_as_it_was(
+    table, unbake, cornell, tiny, tmp_path, estimator
+):
+    """Its settings have no factors, a warm-up whatever the method, and errors of split halves."""
     folder = RunFolder(tmp_path / "run")
     words = ("fit", cornell, "--out", folder.path)
     start = ("--settings", tiny, "--method", "direct", "--steps", 1)
@@ -174,11 +182,12 @@ def test_a_run_of_an_earlier_version_goes_on_as_it_was(table, unbake, cornell, t
     before, _, after = text.partition("[rate_factors]\n")
     after = after[after.index("[") :]
     old = (before + after).replace("warm_up = 0", "warm_up = 9")
-    old = old.replace('estimator = "split-halves"', 'estimator = "auto"')
+    old = old.replace('estimator = "all-pairs"', f'estimator = "{estimator}"')
     folder.config_file.write_text(old)
     assert unbake(*words, "--resume", "--steps", 2).status == 0
     config = folder.settings()
-    assert config.warm_up == 9 and config.estimator == "auto" and config.halves
+    assert config.warm_up == 9 and config.estimator == estimator
+    assert config.chosen_estimator == "split-halves"
     assert set(config.rate_factors.values()) == {None}
     rate = config.material_settings["albedo"].learning_rate
     last = [line["learning_rate"] for line in folder.log() if "validation" not in line][-1]
@@ -204,7 +213,7 @@ def test_settings_of_a_started_run_do_not_leak_into_another_method(
     words = ("--settings", RunFolder(tmp_path / "prb").config_file, "--method", "ours")
     assert unbake("fit", cornell, "--out", tmp_path / "again", *words, "--steps", 0).status == 0
     again = RunFolder(tmp_path / "again").settings()
-    assert again.rate_factors == of_ours.rate_factors and again.estimator == "split-halves"
+    assert again.rate_factors == of_ours.rate_factors and again.estimator == "all-pairs"
 
 
 def test_factors_that_a_user_gives_are_those_of_all_methods(table):

@@ -142,7 +142,7 @@ def test_live_edges_add_up(problem, rays):
 
 @pytest.mark.parametrize(("method", "term"), [(m, t) for m, row in ROWS.items() for t in row])
 @pytest.mark.parametrize("reference", LOSSES)
-@pytest.mark.parametrize("two_pass", [False, True], ids=["split-halves", "two-pass"])
+@pytest.mark.parametrize("two_pass", [False, True], ids=["one-pass", "two-pass"])
 def test_a_term_of_a_method_trains_what_the_table_says(
     problem, rays, method, term, reference, two_pass
 ):

@@ -202,11 +202,11 @@ def test_gradients_through_cut_outs_are_finite_differences(tmp_path, instanced):
     assert gradient == pytest.approx(difference, rel=2e-3)
 
 
-# ----------------------------------------------------------------- split halves and two passes
+# ----------------------------------------------------------------- one pass and two
 
 
 @pytest.mark.slow
-def test_split_halves_and_two_passes_have_one_expectation(built_in):
+def test_one_pass_and_two_have_one_expectation(built_in):
     materials = ConstantMaterials(0.6, 0.4)
     parsed = parse(built_in("cornell"))
     edit.to_principled(parsed)
@@ -217,7 +217,7 @@ def test_split_halves_and_two_passes_have_one_expectation(built_in):
     target, weight = mi.Color3f(0.1), mi.Color3f(1)
     target += dr.zeros(mi.Float, 16 * 16)
 
-    def gradient(seed, halves):
+    def gradient(seed, one_pass):
         materials.albedo = mi.Color3f(0.6)
         dr.enable_grad(materials.albedo)
         sampler, phi = seeded(seed, 16 * 16 * spp), {"albedo": materials.albedo}
@@ -225,7 +225,7 @@ def test_split_halves_and_two_passes_have_one_expectation(built_in):
         ray, other = (pixel_rays(cameras, spp, seed + offset) for offset in (1000, 2000))
         with materials_along_paths(materials):
             primal = None
-            if not halves:
+            if not one_pass:
                 with dr.suspend_grad():
                     again = path_radiance(integrator, scene, sampler, other, phi)
                     primal = pixel_means(again, spp)
@@ -233,7 +233,7 @@ def test_split_halves_and_two_passes_have_one_expectation(built_in):
             dr.backward(squared_error(image, target, spp, weight, primal))
         return float(dr.grad(materials.albedo).x[0])
 
-    estimates = [np.array([gradient(s, halves) for s in range(60)]) for halves in (True, False)]
+    estimates = [np.array([gradient(s, one) for s in range(60)]) for one in (True, False)]
     a, b = (x.mean() for x in estimates)
     error = np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in estimates))
     print(f"{a:.5f} and {b:.5f}, standard error {error:.5f}")

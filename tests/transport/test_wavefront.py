@@ -73,7 +73,8 @@ def test_roulette_is_unbiased_whether_or_not_there_is_room(factor):
         z = (totals.mean() - value[half].sum()) / (totals.std(ddof=1) / np.sqrt(repeats))
         print(f"{totals.mean():.3f}, {value[half].sum():.3f}, z {z:.2f}")
         assert abs(z) < 3.5
-    # The estimator of split halves multiplies them.
+    # The estimator of split halves, the only one of one pass that these paths can have, multiplies
+    # them.
     first, second = ((weights * value)[:, half].sum(1) for half in (slice(48), slice(48, None)))
     z = np.corrcoef(first, second)[0, 1] * np.sqrt(repeats)
     print(f"correlation z {z:.2f}")

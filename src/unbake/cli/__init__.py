@@ -809,7 +809,7 @@ def bench(
         data: Folder of a data set; rates takes several.
         scene: Without --data: a scene to render a small data set of (default: demo).
         methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
-            prb:bitmap prb:bitmap:split-halves.
+            prb:bitmap prb:bitmap:all-pairs.
         steps: Steps to take the median of, after warm-up (default: 100). For rates, the length of a
             fit (default: as in the settings). For ceiling, steps on the true maps (default: as
             many as they need).

@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 from rich.console import Console
 
-from ..config import FitConfig, to_toml
+from ..config import ChosenEstimator, FitConfig, to_toml
 from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults
 from ..dataset.lighting import ROWS, true_environment
@@ -36,7 +36,7 @@ from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
 from ..training.schedule import learning_rates
 from ..training.validation import Score
 from .method_variant import MethodVariant
-from .rate_search import LEAST, MARGIN, STEP, Estimator, Trial, beats, best_trial
+from .rate_search import LEAST, MARGIN, STEP, Trial, beats, best_trial
 from .tables import print_rates
 
 if sys.version_info >= (3, 11):
@@ -49,7 +49,7 @@ FORMAT = 1
 #: Camera samples a pixel of a score.
 SPP = 16
 #: The estimator of methods that follow paths where they were published, and in Mitsuba.
-PUBLISHED: Estimator = "two-pass"
+PUBLISHED: ChosenEstimator = "two-pass"
 #: Steps between looks at the clock, which wait for the machine.
 TIME_EVERY = 4
 
@@ -214,11 +214,13 @@ class _Search:
             variants = [replace(config, estimator=name) for name in _estimators(config)]
             compile_kernels(self._dataset.folder, variants)
         searched = [*reversed(materials), *lights, *self._schedule]
-        best = best_trial(searched, _estimators(config), self._score)
+        estimators = _estimators(config)
+        best = best_trial(searched, estimators, self._score)
         found = self._row(best)
         if "error" in found:
             raise UserError(found["error"], self._name)
-        taken = settled(record["trials"], found)
+        # A file of an earlier version may have trials with another estimator.
+        taken = settled([t for t in record["trials"] if t["estimator"] in estimators], found)
         record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
         self._write()
 
@@ -388,17 +390,18 @@ def _search(
 def _require_one_estimator(variants: Sequence[MethodVariant], shared: FitConfig) -> None:
     """Refuse to choose between estimators by fits of equal steps: two passes would trace more."""
     for variant in variants:
-        if len(_estimators(variant.settings(shared))) > 1:
+        config = variant.settings(shared)
+        if len(_estimators(config)) > 1:
             what = f"estimators of {variant.name} are compared at equal time"
-            other = f"{variant.method}:{shared.representation}:split-halves"
+            other = f"{variant.method}:{shared.representation}:{_estimators(config)[-1]}"
             raise UserError(what, "--steps", f"Give --seconds, or one estimator, such as {other}")
 
 
-def _estimators(config: FitConfig) -> list[Estimator]:
+def _estimators(config: FitConfig) -> list[ChosenEstimator]:
     """The estimators to choose from, the published one first."""
     if config.estimator != "auto":
-        return ["split-halves" if config.halves else "two-pass"]
-    return [PUBLISHED, "split-halves"] if config.follows_paths else ["split-halves"]
+        return [config.estimator]
+    return [PUBLISHED, config.one_pass] if config.follows_paths else [config.one_pass]
 
 
 def _learned(fit: FreshFit) -> Row:

@@ -9,9 +9,9 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, final
+from typing import final
 
-Estimator = Literal["split-halves", "two-pass"]
+from ..config import ChosenEstimator
 
 #: Ratio of neighbouring rates.
 STEP = 2.5
@@ -36,7 +36,7 @@ class Trial:
 
     unknowns: tuple[str, ...]
     powers: tuple[int, ...]
-    estimator: Estimator
+    estimator: ChosenEstimator
 
     @property
     def factors(self) -> dict[str, float]:
@@ -51,7 +51,7 @@ class Trial:
 
 
 def best_trial(
-    unknowns: Sequence[str], estimators: Sequence[Estimator], score: Callable[[Trial], float]
+    unknowns: Sequence[str], estimators: Sequence[ChosenEstimator], score: Callable[[Trial], float]
 ) -> Trial:
     """Search the rates of one unknown after the other, then the estimator, and once again.
 

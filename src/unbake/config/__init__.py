@@ -13,6 +13,7 @@ from .camera import CameraConfig
 from .fit import (
     MOST_BOUNCES,
     PAPER_DEPTH,
+    ChosenEstimator,
     Estimator,
     FitConfig,
     LightingConfig,
@@ -37,6 +38,7 @@ __all__ = [
     "QUALITIES",
     "BitmapConfig",
     "CameraConfig",
+    "ChosenEstimator",
     "DenseGridConfig",
     "Estimator",
     "FieldSettings",

@@ -14,13 +14,14 @@ from ..fields.grid_sizes import USUAL, sized
 from ..fields.registry import representation, representations
 from ..fields.settings import RATES, FieldSettings
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
-from ..transport.methods import METHODS, PATH_REPLAY, Method
+from ..transport.methods import KEPT_PATHS, METHODS, PATH_REPLAY, Method
 from .camera import CameraConfig
 from .flag import Flag
 from .objective import ObjectiveConfig
 from .tables import update
 
-Estimator = Literal["auto", "split-halves", "two-pass"]
+ChosenEstimator = Literal["all-pairs", "split-halves", "two-pass"]
+Estimator = Literal["auto", ChosenEstimator]
 Reference = Literal["smoothed", "photograph"]
 PixelSampling = Literal["all-views", "one-view-crop"]
 PriorName = Literal["one-bounce", "extra-bounce"]
@@ -260,7 +261,8 @@ class FitConfig:
             metavar="SHARE",
         ),
     ] = 0.02
-    #: Camera samples a pixel a step (Table 1); even, for the split halves.
+    #: Camera samples a pixel a step (Table 1); even: errors held aside, and some squared ones, come
+    #: from two halves.
     spp: Annotated[int, Flag("Samples per pixel in a step, an even number")] = 8
     radiance_spp: int = 2  #: how many of these L_θ learns of, too; even (ours; 0: all)
 
@@ -273,7 +275,8 @@ class FitConfig:
     #: Steps over which the unknowns' rates rise (ours). None: what was found best for the method,
     #: else `OWN_WARM_UP`, so that L_θ stays ahead, and none without L_θ.
     warm_up: int | None = None
-    #: Unbiased squared error (Sec. 5.2). auto: what was found best for the method; see `halves`.
+    #: Unbiased squared error (Sec. 5.2). auto: what was found best for the method; see
+    #: `chosen_estimator`.
     estimator: Estimator = "auto"
     loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)
     loss_epsilon: float = 0.001  #: added to the denominator of the relative L2 loss (release: 0.01)
@@ -327,6 +330,12 @@ class FitConfig:
             require(self.bounces == 1, "bounces", f"1 for the method {self.method}", self.bounces)
             only = f"extra-bounce for the method {self.method}"
             require(self.prior == "extra-bounce", "prior", only, self.prior)
+        if self.estimator == "all-pairs":
+            wanted = (
+                f"split-halves or two-pass for the method {self.method}, whose samples of a pixel "
+                "are independent in two halves only"
+            )
+            require(self.one_pass == "all-pairs", "estimator", wanted, self.estimator)
         if self.follows_paths:
             self._check_depth()
         self._complete_fields()
@@ -388,15 +397,30 @@ class FitConfig:
             object.__setattr__(self, key, value)
 
     @property
-    def halves(self) -> bool:
-        """Whether squared errors come from split halves of a pixel's samples.
+    def chosen_estimator(self) -> ChosenEstimator:
+        """The estimator of squared errors.
 
-        With `estimator = "auto"`, as runs of earlier versions may have it, they do but for methods
-        that follow paths. A fit that starts chooses the one that was found best.
+        With `estimator = "auto"`, as runs of earlier versions may have it, squared errors come from
+        split halves of a pixel's samples, but for methods that follow paths. A fit that starts
+        chooses the one that was found best.
         """
         if self.estimator == "auto":
-            return not self.follows_paths
-        return self.estimator == "split-halves"
+            return "two-pass" if self.follows_paths else "split-halves"
+        return self.estimator
+
+    @property
+    def one_pass(self) -> ChosenEstimator:
+        """The best estimator of the method that takes one pass.
+
+        That is all pairs, but for methods that keep paths: their wavefront narrows by systematic
+        sampling, so that samples of a pixel are independent in two halves only.
+        """
+        return "split-halves" if METHODS[self.method].sampler == KEPT_PATHS else "all-pairs"
+
+    @property
+    def two_passes(self) -> bool:
+        """Whether a step traces every pixel twice, for squared errors from two passes."""
+        return self.chosen_estimator == "two-pass"
 
     @property
     def half_precision(self) -> bool:
@@ -461,7 +485,7 @@ class FitConfig:
     @property
     def samples_per_step(self) -> int:
         """Camera samples that a training step traces, in all its passes."""
-        return self.samples_per_pass * (1 if self.halves else 2)
+        return self.samples_per_pass * (2 if self.two_passes else 1)
 
 
 def default_settings(name: str, form: str) -> FieldSettings:

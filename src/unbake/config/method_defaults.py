@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from ..dataset.scene_kind import SceneKind
+from .fit import ChosenEstimator
 
 
 @dataclass(frozen=True)
@@ -20,14 +21,15 @@ class MethodDefaults:
 
     Args:
         factors: by unknown, multiples of the learning rate of its field; 1 where absent.
-        estimator: of gradients; None: split halves, or two passes for methods that follow paths.
+        estimator: of gradients; None: all pairs, or two passes for methods that follow paths. Where
+            pairs are not independent, split halves take the place of all pairs.
         final_learning_rate: factor that all rates reach at the end; None: that of all methods.
         warm_up: steps over which the unknowns' rates rise; None: those of all methods with L_θ, and
             none without it.
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)
-    estimator: Literal["split-halves", "two-pass"] | None = None
+    estimator: ChosenEstimator | None = None
     final_learning_rate: float | None = None
     warm_up: int | None = None
 

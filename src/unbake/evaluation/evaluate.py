@@ -200,7 +200,7 @@ def description(config: FitConfig) -> dict:
         "prior": config.prior,
         "representation": config.representation if config.learns_materials else None,
         "radiance": config.radiance_representation if cached else None,
-        "estimator": "split-halves" if config.halves else "two-pass",
+        "estimator": config.chosen_estimator,
         "rate_factors": {name: config.rate_factors[name] for name in config.unknowns},
         "path_depth": config.path.chosen_depth if config.follows_paths else None,
     }

@@ -18,7 +18,7 @@ from .scenes import PaperScene, scenes_at
 from .tables import markdown
 
 #: By name. Methods that follow paths are measured with both estimators: two passes, as in Mitsuba,
-#: and split halves in one pass, as the others have.
+#: and split halves in one pass. The others have one pass, too.
 METHODS = {
     "ours": MethodVariant("ours"),
     "no prior": MethodVariant("no-prior"),
@@ -98,9 +98,9 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
         lines.append([scene.label, depth, "failed" if ours is None else f"{ours:.0f} ms", *cells])
     others = [f"{name} / ours" for name in METHODS if name != "ours"]
     caption = (
-        "PRB and AD-PT have two passes, as in Mitsuba, or split halves in one pass, as the others; "
-        "the faster one counts. In brackets: the bars of the paper, on its scenes and an RTX 3090, "
-        "with two passes and a depth of 15.\n\n"
+        "PRB and AD-PT have two passes, as in Mitsuba, or split halves in one pass; the others "
+        "have one pass. The faster one counts. In brackets: the bars of the paper, on its scenes "
+        "and an RTX 3090, with two passes and a depth of 15.\n\n"
     )
     table = markdown(["scene", "path depth", "ours", *others], lines)
     return ExperimentResult(rows, caption + table, lambda path: _draw(path, rows))

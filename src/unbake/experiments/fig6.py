@@ -28,7 +28,7 @@ METHODS = {
 AT_EQUAL_SAMPLES = {name: METHODS[name] for name in ("direct", "ours", "no prior")}
 SLOW = "PRB"
 #: Estimators of squared errors in words.
-ESTIMATORS = {"split-halves": "split halves", "two-pass": "two passes"}
+ESTIMATORS = {"all-pairs": "all pairs", "split-halves": "split halves", "two-pass": "two passes"}
 #: Methods that are shown with the better one.
 WITH_CHOICE = ("PRB", "AD-PT")
 #: Held-out views of each scene in the pictures.

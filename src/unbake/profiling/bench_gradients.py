@@ -157,7 +157,7 @@ def bench_gradients(
         "pixels": config.pixels,
         "spp": config.spp,
         "radiance_spp": config.radiance_samples,
-        "estimator": "split-halves" if config.halves else "two-pass",
+        "estimator": config.chosen_estimator,
         "representation": config.representation,
     }
     result["quantities"] = {name: _row(name, measured) for name in measured.slopes}

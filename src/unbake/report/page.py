@@ -398,7 +398,7 @@ def _described(run: Run) -> list[tuple[str, str, str]]:
         details.append((f"{metrics['bounces']} bounces", "", ""))
     if metrics.get("prior", "extra-bounce") != "extra-bounce":
         details.append((f"{metrics['prior']} prior".replace("-", " "), "", ""))
-    passes = {"split-halves": "split halves", "two-pass": "two passes"}
+    passes = {"all-pairs": "all pairs", "split-halves": "split halves", "two-pass": "two passes"}
     return [*details, (passes.get(estimator, estimator), "", "")]
 
 

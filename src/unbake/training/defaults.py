@@ -62,7 +62,8 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
     }
     estimator = config.estimator
     if estimator == "auto":
-        estimator = found.estimator or ("split-halves" if config.halves else "two-pass")
+        estimator = found.estimator or ("two-pass" if config.follows_paths else "all-pairs")
+        estimator = config.one_pass if estimator == "all-pairs" else estimator
     return replace(
         config,
         rate_factors=factors,

@@ -8,7 +8,7 @@ and what is taken away costs something, so that the objective has for each pixel
 (Black and Rangarajan 1996; with w at its optimum this is the estimator of Geman and McClure). μ is
 a multiple of the mean error of pixels that count. √w is learned with all other unknowns. A block is
 drawn many times in a fit where a pixel is drawn once or twice, and things that are in the way are
-larger than a pixel. Errors are those of the split halves, whose expectation has no noise of the
+larger than a pixel. Errors are those of independent samples, whose expectation has no noise of the
 rendering in it, and weights are not told from the samples that they multiply: gradients of all
 other unknowns stay unbiased.
 """

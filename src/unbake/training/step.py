@@ -438,7 +438,7 @@ class TrainingStep:
         batch = pixels.batch(rays, sampler, config.spp)
         with path_sampler.prepared():
             primal = None
-            if not config.halves:
+            if config.two_passes:
                 with dr.suspend_grad():
                     again = pixels.batch(rays, sampler, config.spp)
                     image = path_sampler.image(scene, again.ray, sampler)
@@ -455,7 +455,8 @@ class TrainingStep:
             if outliers is not None:
                 roots = outliers.roots(inputs.rays, pixels.numbers(), inputs.blocks)
                 trust = dr.square(roots)
-            loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain, trust)
+            pairs = config.chosen_estimator == "all-pairs"
+            loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain, trust, pairs)
             subset = _subset(config, inputs)
             terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
             terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))

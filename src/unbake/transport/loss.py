@@ -35,6 +35,7 @@ class RelativeL2:
             pixel; None: 1. ε is of radiance, so that it is multiplied by the squared gain: with the
             true gains errors are the same as if photographs had been divided by them.
         trust: by which errors are multiplied, one lane a pixel; it may pass gradients; None: 1.
+        pairs: see `squared_error`.
 
     Paper: Sec. 5.4.
     """
@@ -44,6 +45,7 @@ class RelativeL2:
     clipped: mi.Bool | None = None
     gain: mi.Color3f | None = None
     trust: mi.Float | None = None
+    pairs: bool = True
 
     def of_known_camera(self) -> RelativeL2:
         """The same loss without gradients to the gain and to what errors are multiplied by."""
@@ -63,7 +65,9 @@ class RelativeL2:
         weight = self.weight(target)
         if self.trust is not None:
             weight *= self.trust
-        return squared_error(samples, target, spp, weight, primal, self.clipped, self.gain)
+        return squared_error(
+            samples, target, spp, weight, primal, self.clipped, self.gain, pairs=self.pairs
+        )
 
     def weight(self, target: mi.Color3f) -> mi.Color3f:
         """1 / (reference² + ε) of each pixel, a constant."""
@@ -83,26 +87,34 @@ def squared_error(
     primal: mi.Color3f | None = None,
     clipped: mi.Bool | None = None,
     gain: mi.Color3f | None = None,
+    *,
+    pairs: bool = True,
 ) -> mi.Float:
     """Weighted squared error of pixels, w (I − G)², whose gradient is unbiased.
 
     The gradient 2 (I − G) ∂I of a squared error is biased if both factors come from the same noisy
-    samples. Without `primal` the samples of each pixel are split in halves A and B: the expectation
-    of (I_A − G)(I_B − G) is the squared error of the expected image, and so for its gradient. With
-    `primal`, an estimate from other random numbers, the factors are that one and ∂I.
+    samples. Without `primal` no sample of a pixel is multiplied by itself: the expectation of
+    (Iᵢ − G)(Iⱼ − G) for two independent samples is the squared error of the expected image, and so
+    for its gradient. With `primal`, an estimate from other random numbers, the factors are that one
+    and ∂I.
 
     Of a clipped channel only a shortfall counts: an estimate above G has no error and no gradient.
-    With halves the expectation is the square of the expected shortfall, E[min(I_A − G, 0)]², whose
-    gradient is unbiased in turn. Where noise is as large as the distance to G it is more than zero
-    although I is above G.
+    Single samples fall short of G too often, so that such channels always have halves, whose
+    expectation is the square of the expected shortfall, E[min(I_A − G, 0)]², and the gradient
+    unbiased in turn. Where noise is as large as the distance to G it is more than zero although I
+    is above G.
 
     Args:
-        samples: linear RGB, `spp` consecutive lanes a pixel.
+        samples: linear RGB, `spp` consecutive lanes a pixel, two or more. All of a pixel are
+            independent, or its two halves if not `pairs`.
         target: G, linear RGB, one lane a pixel.
         weight: of each pixel and channel, a constant.
         primal: I from an independent pass, one lane a pixel.
         clipped: channels of pixels for which G is the least that they can be; None: no channel.
         gain: takes the place of I by gain · I, one lane a pixel; it may pass gradients, as G may.
+        pairs: without `primal`, whether the mean product of all n (n - 1) pairs of different
+            samples is taken, or the product of their halves' means, which has n² / 2 of them and
+            more noise.
 
     Returns:
         Mean over pixels and channels.
@@ -116,14 +128,47 @@ def squared_error(
         error = one_sided(dr.detach(primal) - target, clipped)
         # The value is the squared error of the primal image, the gradient 2 (primal − G) ∂I.
         squared = dr.square(error) + 2 * error * (image - dr.detach(image))
+    elif not pairs:
+        squared = _of_halves(samples, target, spp, clipped, gain)
     else:
-        halves = pixel_means(samples, spp // 2)
-        even = 2 * dr.arange(mi.UInt32, dr.width(target))
-        a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
-        if gain is not None:
-            a, b = a * gain, b * gain
-        squared = one_sided(a - target, clipped) * one_sided(b - target, clipped)
+        squared = _of_pairs(samples, target, spp, gain)
+        if clipped is not None:
+            halves = _of_halves(samples, target, spp, clipped, gain)
+            squared = dr.select(clipped, halves, squared)
     return dr.mean(dr.mean(squared * weight))
+
+
+def _of_pairs(
+    samples: mi.Color3f, target: mi.Color3f, spp: int, gain: mi.Color3f | None
+) -> mi.Color3f:
+    """The mean product of the errors of two different samples, by pixel."""
+    pixel = dr.arange(mi.UInt32, dr.width(samples)) // spp
+    shown = samples if gain is None else samples * dr.gather(mi.Color3f, gain, pixel)
+    errors = shown - dr.gather(mi.Color3f, target, pixel)
+    # Samples as well: what follows, and the halves of clipped channels, shall not trace them anew.
+    dr.eval(samples, errors)
+
+    def products(c: mi.Float) -> mi.Float:
+        with_own = dr.square(dr.block_sum(c, spp))
+        return (with_own - dr.block_sum(dr.square(c), spp)) / (spp * (spp - 1))
+
+    return mi.Color3f([products(c) for c in errors])
+
+
+def _of_halves(
+    samples: mi.Color3f,
+    target: mi.Color3f,
+    spp: int,
+    clipped: mi.Bool | None,
+    gain: mi.Color3f | None,
+) -> mi.Color3f:
+    """The product of the errors of the two halves' means, by pixel."""
+    halves = pixel_means(samples, spp // 2)
+    even = 2 * dr.arange(mi.UInt32, dr.width(target))
+    a, b = dr.gather(mi.Color3f, halves, even), dr.gather(mi.Color3f, halves, even + 1)
+    if gain is not None:
+        a, b = a * gain, b * gain
+    return one_sided(a - target, clipped) * one_sided(b - target, clipped)
 
 
 def one_sided(error: mi.Color3f, clipped: mi.Bool | None) -> mi.Color3f:

@@ -72,7 +72,7 @@ def objective(
         target: pixels of the photographs, linear RGB, one lane a pixel.
         loss: the relative L2 loss.
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
-            None: the split-halves estimator.
+            None: one of a single pass.
         bounces: k, after which the image takes L_θ.
 
     Paper: Eq. 5, Eq. 11, Eq. 14, Sec. 4.1.

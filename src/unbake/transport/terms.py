@@ -38,7 +38,7 @@ class TermInputs:
         target: pixels of the photographs, linear RGB, one lane a pixel.
         loss: the relative L2 loss.
         primal: an independent, detached estimate of the same pixels for the two-pass estimator;
-            None: the split-halves estimator. For terms of the image alone.
+            None: one of a single pass. For terms of the image alone.
         bounces: k, after which the image takes L_θ.
         pair_rhs: as `rhs`, on `sample.pair`; empty where the method has no term that reads it.
     """
