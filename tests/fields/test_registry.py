@@ -98,7 +98,10 @@ def test_settings_may_be_choices_of_numbers_and_may_be_absent(monkeypatch):
     register_representation(Representation("choice", "choice", ChoiceConfig(), Strips))
     config = from_toml('representation = "choice"\n[materials.albedo.choice]\norder = 2\ncut = 3\n')
     assert config.material_settings["albedo"] == ChoiceConfig(order=2, cut=3.0)
-    assert "cells" not in to_toml(config) and from_toml(to_toml(config)) == config
+    written = to_toml(config)
+    table = written.partition("[materials.albedo.choice]")[2].partition("\n[")[0]
+    assert "order = 2" in table and "cells" not in table
+    assert from_toml(written) == config
     with pytest.raises(UserError, match=r"order: must be one of 1, 2, not 3"):
         from_toml("[materials.albedo.choice]\norder = 3")
     with pytest.raises(UserError, match=r"cells: must be int, not str"):

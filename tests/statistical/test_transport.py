@@ -16,6 +16,9 @@ from support import (
 )
 
 from unbake.dataset.camera import Camera
+from unbake.fields.domain import Domain
+from unbake.fields.guide import LightGuide
+from unbake.fields.settings import GuideConfig
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
@@ -36,7 +39,10 @@ def compare(
     hide_emitters: bool = False,
     spp: int = SPP,
 ) -> None:
-    """All three ways to an image: E + T(L) and E + L with an exact L, and the series."""
+    """All three ways to an image: E + T(L) and E + L with an exact L, and the series.
+
+    E + T(L) also with a guide that knows nothing, whose directions are as good as any.
+    """
     ray = pixel_rays(cameras, spp, seed=1)
     truth = stock_path(stock, ray, 3, max_depth=STOCK_DEPTH, hide_emitters=hide_emitters)
     # The series brings its own random numbers, from another seed.
@@ -47,8 +53,27 @@ def compare(
     )
     assert_same_expectation(rhs(sample, sample.radiance[1]), truth, spp)
     assert_same_expectation(lhs(sample, sample.radiance[0]), truth, spp)
+    guided = trace(
+        ours,
+        cache,
+        ray,
+        seeded(7, dr.width(ray)),
+        requirements,
+        hide_emitters=hide_emitters,
+        guide=random_guide(ours.scene),
+    )
+    assert_same_expectation(rhs(guided, guided.radiance[1]), truth, spp)
     series = path_traced(ours, ray, 6, max_depth=DEPTH, rr_depth=5, hide_emitters=hide_emitters)
     assert_same_expectation(series, truth, spp)
+
+
+def random_guide(scene: mi.Scene) -> LightGuide:
+    """A guide with a random distribution and share in each cell."""
+    guide = LightGuide(GuideConfig(cells=3, bands=4, sectors=4), Domain.of(scene.bbox()))
+    rng = np.random.default_rng(11)
+    values = guide.parameters().items()
+    guide.assign({key: mi.Float(rng.normal(0, 0.15, value.shape)) for key, value in values})
+    return guide
 
 
 def load(path) -> mi.Scene:

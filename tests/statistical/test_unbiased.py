@@ -244,7 +244,7 @@ def step_gradients(built_in, config, steps, first=0):
     photograph = np.array([[0.25, 0.2, 0.1]])
     pixels = PixelSource.of([camera], photograph, np.ones(1), foreground_only=False)
     φ = problem.materials.parameters()
-    state = State(mi.ad.SGD(1.0, φ), mi.ad.SGD(1.0, problem.radiance.parameters()))
+    state = State(mi.ad.SGD(1.0, φ), mi.ad.SGD(1.0, problem.learned_parameters()))
     step = TrainingStep(problem, pixels, config)
     start = {k: np.array(v) for k, v in φ.items()}
     rows = []

@@ -50,7 +50,8 @@ def numbers(state):
 def spoil(state, word="radiance", value=np.nan):
     """Make the last parameter of an unknown, or of L_θ, not finite: behind layers that hide it."""
     optimizer = state.theta if word == "radiance" else state.phi
-    key = [k for k in optimizer if word == "radiance" or k.startswith(word)][-1]
+    of_word = word != "radiance"
+    key = [k for k in optimizer if k.startswith(word) == of_word and not k.startswith("guide")][-1]
     optimizer[key] = type(optimizer[key])(np.full_like(np.array(optimizer[key]), value))
 
 

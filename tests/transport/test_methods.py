@@ -201,7 +201,7 @@ def test_a_method_of_ones_own_needs_no_photometric_term(built_in):
     regularization = config.RegularizationConfig(albedo_smoothness=1.0, roughness_smoothness=1.0)
     step, state = start(built_in, replace(TINY_FIT, method="blind", regularization=regularization))
     terms = step(state, 0, RATES)
-    assert set(terms) == {PRIOR, "roughness_smoothness", "skipped"}
+    assert set(terms) == {PRIOR, "guide", "roughness_smoothness", "skipped"}
     assert all(np.isfinite(value[0]) for value in terms.values()) and terms["skipped"][0] == 0
 
 

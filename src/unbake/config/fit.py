@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from ..errors import POSITIVE, UserError, require, require_name, require_ranges
 from ..fields.grid_sizes import USUAL, sized
 from ..fields.registry import representation, representations
-from ..fields.settings import RATES, FieldSettings
+from ..fields.settings import RATES, FieldSettings, GuideConfig
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
 from ..transport.methods import KEPT_PATHS, METHODS, PATH_REPLAY, Method
 from .camera import CameraConfig
@@ -285,6 +285,8 @@ class FitConfig:
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
     #: Of L_θ, by representation (Sec. 5.3).
     radiance: Mapping[str, FieldSettings] = field(default_factory=dict)
+    #: Where bounces of methods with L_θ look for light (ours).
+    guide: GuideConfig = field(default_factory=GuideConfig)
     precision: Precision = "single"  #: of the networks' products; all else is single (ours)
     lighting: LightingConfig = field(default_factory=LightingConfig)
     regularization: RegularizationConfig = field(default_factory=RegularizationConfig)

@@ -36,6 +36,7 @@ _GROUPS = ("grid", "bitmap")
 #: Settings that came later, at their value before: a run of an earlier version goes on as it began.
 _AS_BEFORE = {
     "held_aside": 0.0,
+    "guide.cells": 0,
     "materials.roughness.neural.pieces.most": 0,
     "materials.roughness.neural.pieces.colours": 0,
     "regularization.albedo_smoothness": 0.0,

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, get_args
 
 from ..errors import UserError, require_name
-from ..fields.settings import GridConfig, NetworkConfig
+from ..fields.settings import GridConfig, GuideConfig, NetworkConfig
 from ..quantities import QUANTITIES
 from ..transport.methods import method_named
 from .fit import FitConfig, LightingConfig, PresetName, RegularizationConfig
@@ -33,6 +33,7 @@ def _paper() -> FitConfig:
         final_learning_rate=1.0,
         warm_up=0,
         estimator="two-pass",
+        guide=GuideConfig(cells=0),
         loss_reference="photograph",
         loss_epsilon=0.01,
         lighting=LightingConfig(resolution=128, learning_rate=5e-4, initial_radiance=1.0),

@@ -124,6 +124,22 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True)
+class GuideConfig:
+    """Where bounces look for light, beside where the BSDF scatters (ours); see `guide.py`."""
+
+    cells: int = 8  #: along an edge of the scene's cube; 0: directions come from the BSDF alone
+    bands: int = 8  #: of a distribution of directions, from below to above
+    sectors: int = 16  #: of each band, around the z axis
+
+    def __post_init__(self) -> None:
+        require_ranges(self, {"cells": (0, 64), "bands": (1, 64), "sectors": (1, 128)})
+
+    def numbers(self) -> int:
+        """How many numbers are learned."""
+        return 6 * self.cells**3 * (self.bands * self.sectors + 1)
+
+
+@dataclass(frozen=True)
 class DenseGridConfig:
     """A dense 3D grid with trilinear interpolation over the scene's cube (Fig. 5)."""
 

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..dataset.pixels import PixelBatch
+from ..fields.guide import LightGuide
 from ..transport import operator, path_sample, samplers, wavefront
 
 #: Kernels outside of the calls below belong to this phase.
@@ -29,6 +30,8 @@ _CALLS = (
     (samplers, "path_light", "paths"),
     (samplers, "path_radiance", "paths"),
     (samplers, "objective", "losses"),
+    (LightGuide, "prepare", "BSDFs and lights"),
+    (LightGuide, "loss", "losses"),
     (dr, "backward", "gradients"),
 )
 

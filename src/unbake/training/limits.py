@@ -78,6 +78,8 @@ def require_room(config: FitConfig, materials: int) -> None:
         return
     worst = max(fields, key=lambda field: needs[field.key])
     others = total - needs[worst.key]
+    if has_radiance(config.chosen_method):
+        others, total = (x + BYTES_A_NUMBER * config.guide.numbers() for x in (others, total))
     factor, always = (_RESERVED, _RESERVED_ALWAYS) if reserved_counts() else (1.0, 0.0)
 
     def remedy(free: int) -> str:

@@ -20,6 +20,7 @@ from ..fields.domain import Domain
 from ..fields.emission import Emission, emission_textures
 from ..fields.envmap import EnvironmentMap, environment_emitter
 from ..fields.field import Field
+from ..fields.guide import LightGuide
 from ..fields.materials import Materials, make_materials
 from ..fields.pieces import Pieces
 from ..fields.radiance import RadianceField, make_radiance
@@ -55,6 +56,7 @@ class Problem:
     camera: CameraModel | None = None  #: of the training views; None: all is as the data set tells
     poses: PoseModel | None = None  #: corrections of the training views' cameras; None: as given
     outliers: OutlierModel | None = None  #: of the training views; None: all pixels count alike
+    guide: LightGuide | None = None  #: of bounces; None: BSDFs alone draw directions
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -76,6 +78,20 @@ class Problem:
         for model in self._of_photographs():
             named |= model.parameters()
         return named
+
+    def learned_parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
+        """The trainable arrays θ of L_θ by name, and those of the guide that learns beside it."""
+        if self.radiance is None:
+            return {}
+        guide = {} if self.guide is None else self.guide.parameters()
+        return {**self.radiance.parameters(), **guide}
+
+    def assign_learned(self, parameters: Parameters) -> None:
+        """Use these arrays of `learned_parameters`."""
+        if self.radiance is not None:
+            self.radiance.assign(dict(parameters))
+        if self.guide is not None:
+            self.guide.assign(parameters)
 
     def assign(self, parameters: Parameters) -> None:
         """Use these arrays, and update the tables that are derived from them."""
@@ -174,6 +190,9 @@ def make_problem(
             seed=int(seeds[1]),
             half=config.half_precision,
         )
+    guide = None
+    if radiance is not None and config.guide.cells:
+        guide = LightGuide(config.guide, domain)
     scene_view = SceneView.of(loaded, materials, config.transport.max_specular)
     return Problem(
         scene_view,
@@ -187,6 +206,7 @@ def make_problem(
         _unknown_camera(config.camera, len(views)),
         _unknown_poses(config.camera, unchanged, views),
         _unknown_outliers(config.objective, views),
+        guide,
     )
 
 

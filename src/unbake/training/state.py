@@ -47,7 +47,7 @@ class State:
         """Assign the present parameters to the problem's fields."""
         problem.assign(dict(self.phi.items()))
         if problem.radiance is not None and self.theta is not None:
-            problem.radiance.assign(dict(self.theta.items()))
+            problem.assign_learned(dict(self.theta.items()))
 
     def snapshot(self) -> Snapshot:
         """The present state. Nothing is copied: steps make new arrays, and do not change old ones.
@@ -102,7 +102,7 @@ def initial_state(problem: Problem) -> State:
     phi = mi.ad.Adam(1e-3, problem.parameters(), mask_updates=True)
     theta = None
     if problem.radiance is not None:
-        theta = mi.ad.Adam(1e-3, problem.radiance.parameters(), mask_updates=True)
+        theta = mi.ad.Adam(1e-3, problem.learned_parameters(), mask_updates=True)
     scale = first_scale() if problem.half_precision else None
     return State(phi, theta, scale)
 

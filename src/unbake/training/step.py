@@ -539,6 +539,7 @@ def _context(problem: Problem, config: FitConfig) -> SamplerContext:
         max_depth=config.path.chosen_depth,
         rr_depth=config.path.rr_depth,
         read_by_scene=problem.read_by_scene,
+        guide=problem.guide,
     )
 
 

@@ -1,4 +1,4 @@
-"""The transport operator T: one bounce by emitter and BSDF sampling with MIS (Eq. 1, 8)."""
+"""The transport operator T: one bounce by emitter and direction sampling with MIS (Eq. 1, 8)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..fields.guide import Choice, LightGuide
 from ..fields.materials import carry, with_joint_gradients
 from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
 
@@ -21,6 +22,7 @@ class Bounce:
     direct: mi.Color3f  # light of emitters, by emitter sampling, MIS weighted
     weight: mi.Color3f  # BSDF · cosine / density of the sampled direction
     next: Vertex
+    choice: Choice | None = None  # how the direction was drawn, where there is a guide
 
 
 def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
@@ -49,10 +51,19 @@ def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
     return replace(vertex, albedo=dr.detach(albedo))
 
 
-def bounce(scene_view: SceneView, vertex: Vertex, sampler: mi.Sampler) -> Bounce:
-    """Sample T at a vertex: one emitter sample and one BSDF sample, combined by MIS.
+def bounce(
+    scene_view: SceneView,
+    vertex: Vertex,
+    sampler: mi.Sampler,
+    guide: LightGuide | None = None,
+) -> Bounce:
+    """Sample T at a vertex: one emitter sample and one of direction, combined by MIS.
 
-    Sampling is detached; the BSDF is evaluated with gradients (value / detached density).
+    The direction is drawn by the BSDF, or with a guide by one of the two, with the density of both
+    together. Sampling is detached; the BSDF is evaluated with gradients (value / detached density).
+
+    Args:
+        guide: prepared; None: the BSDF alone draws directions.
 
     Paper: Eq. 1, Eq. 8, Sec. 4.2, 5.2.
     """
@@ -64,33 +75,70 @@ def bounce(scene_view: SceneView, vertex: Vertex, sampler: mi.Sampler) -> Bounce
     # opposite of what it should: it lets every ray pass.)
     opacity = vertex.opacity if scene_view.has_chains else mi.Float(1)
     solid = dr.rcp(opacity)
+    choice = None if guide is None else _choice(guide, vertex)
 
     # -------------------------------- Emitter sampling --------------------------------
 
     ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
     active_em = active & (ds.pdf != 0)
     bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
-    mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf_em * solid))
+    pdf_em = bsdf_pdf_em * solid
+    if guide is not None and choice is not None:
+        pdf_em = choice.mixed(guide, pdf_em, ds.d)
+    mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_em))
     direct = dr.select(active_em, bsdf_em * em_weight * mis_em * solid, 0)
 
-    # ----------------------------- Detached BSDF sampling -----------------------------
+    # -------------------------- Detached sampling of directions -----------------------
 
     with dr.suspend_grad():
-        lobe = sampler.next_1d() * opacity
-        bs, bs_weight = bsdf.sample(ctx, si, lobe, sampler.next_2d(), active)
+        number = sampler.next_1d()
+        guided = mi.Bool(False)
+        if choice is not None:
+            # One number decides who draws, and then the lobe.
+            guided, rest = number < choice.share, number - choice.share
+            last = dr.one_minus_epsilon(mi.Float)
+            number = dr.select(guided, 0, dr.minimum(rest / (1 - choice.share), last))
+        square = sampler.next_2d()
+        bs, bs_weight = bsdf.sample(ctx, si, number * opacity, square, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        ray = si.spawn_ray(si.to_world(bs.wo))
         goes_on = active & (bs.pdf > 0) & (dr.max(bs_weight) > 0)
         goes_on &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        wo, pdf = bs.wo, bs.pdf
+        if guide is not None and choice is not None:
+            wo = dr.select(guided, si.to_local(guide.sample(choice.cell, square)), wo)
+            delta, goes_on = delta & ~guided, active & (guided | goes_on)
+        direction = si.to_world(wo)
 
-    value = bsdf.eval(ctx, si, bs.wo, goes_on & ~delta)
-    smooth = value * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
+    if guide is None or choice is None:
+        value = bsdf.eval(ctx, si, wo, goes_on & ~delta)
+    else:
+        value, own = bsdf.eval_pdf(ctx, si, wo, goes_on & ~delta)
+        with dr.suspend_grad():
+            goes_on &= delta | (dr.max(dr.detach(value)) > 0)
+            choice.direction, choice.pdf = direction, dr.detach(own) * solid
+            mixed = choice.mixed(guide, choice.pdf, direction) * opacity
+            pdf = dr.select(delta, pdf, mixed)
+    smooth = value * dr.select(pdf > 0, dr.rcp(pdf), 0)
     weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
+    ray = si.spawn_ray(direction)
 
     # Evaluated together here: each reduction further on would compute them again.
-    evaluate(sampler, direct, weight, ray, goes_on, bs.pdf, delta)
-    origin = Scattering(dr.detach(si), bs.pdf * solid, delta)
-    return Bounce(direct, weight, find_vertex(scene_view, ray, goes_on, sampler, origin=origin))
+    evaluate(sampler, direct, weight, ray, goes_on, pdf, delta, choice)
+    origin = Scattering(dr.detach(si), pdf * solid, delta)
+    following = find_vertex(scene_view, ray, goes_on, sampler, origin=origin)
+    return Bounce(direct, weight, following, choice)
+
+
+def _choice(guide: LightGuide, vertex: Vertex) -> Choice:
+    """What is known before a direction is drawn: cell, and the probability of the guide.
+
+    It never draws where the BSDF has directions without a density, such as those of a coating.
+    """
+    with dr.suspend_grad():
+        cell = guide.cell(vertex.si.p, vertex.n, vertex.valid)
+        dense = ~mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Delta)
+        share = dr.select(dense & vertex.valid, dr.detach(guide.share(cell)), 0)
+        return Choice(cell, share, mi.Vector3f(0), mi.Float(0))
 
 
 def transported(step: Bounce, radiance: mi.Color3f) -> mi.Color3f:

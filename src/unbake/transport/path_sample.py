@@ -17,6 +17,7 @@ from typing import Any, TypeVar, cast
 import drjit as dr
 import mitsuba as mi
 
+from ..fields.guide import LightGuide
 from ..fields.radiance import RadianceField
 from .operator import Bounce, attach_albedo, attach_material, bounce, transported
 from .vertex import SceneView, Vertex, find_vertex
@@ -96,6 +97,7 @@ def trace(
     *,
     hide_emitters: bool = False,
     subset: SampleSubset | None = None,
+    guide: LightGuide | None = None,
 ) -> PathSample:
     """Trace one path sample for each camera ray.
 
@@ -109,28 +111,32 @@ def trace(
         requirements: what to compute.
         hide_emitters: whether cameras see neither environment nor area emitters.
         subset: the samples that L_θ learns from; None: all.
+        guide: where bounces look for light beside where BSDFs scatter, as it was assigned.
 
     Raises:
         ValueError: a radiance field is needed and there is none.
 
     Paper: Sec. 4.2, 6.3, Fig. 2.
     """
+    if guide is not None:
+        guide.prepare()
     x1 = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
     sample = learned = PathSample(x1, [], [])
-    _prolong(scene_view, sample, requirements.bounces, sampler, requirements)
+    _prolong(scene_view, sample, requirements.bounces, sampler, requirements, guide)
     if subset is not None and requirements.radiance:
         _end(scene_view, sample)
         x1, bounces = _gather(sample.x1, subset), [_gather(b, subset) for b in sample.bounces]
         sample.learned = learned = PathSample(x1, bounces, [])
         sampler = subset.sampler
-    _prolong(scene_view, learned, requirements.residuals, sampler, requirements)
+    _prolong(scene_view, learned, requirements.residuals, sampler, requirements, guide)
     if requirements.radiance and (
         learned is sample or requirements.residuals > requirements.bounces
     ):
         _end(scene_view, learned)
     if requirements.pair:
         # The material at x₁ is attached already, by the first bounce.
-        learned.pair = PathSample(learned.x1, [bounce(scene_view, learned.x1, sampler)], [])
+        again = bounce(scene_view, learned.x1, sampler, guide)
+        learned.pair = PathSample(learned.x1, [again], [])
         _end(scene_view, learned.pair)
     for paths in filter(None, (sample, learned, learned.pair)):
         paths.radiance = [mi.Color3f(0)] * (len(paths.bounces) + 1)
@@ -160,6 +166,7 @@ def _prolong(
     bounces: int,
     sampler: mi.Sampler,
     requirements: Requirements,
+    guide: LightGuide | None,
 ) -> None:
     """Extend a path to this number of bounces."""
     for number in range(len(sample.bounces) + 1, bounces + 1):
@@ -167,7 +174,7 @@ def _prolong(
         with dr.suspend_grad(when=not passes):
             x = attach_material(scene_view, sample.vertex(number))
             sample.place(number, x)
-            sample.bounces.append(bounce(scene_view, x, sampler))
+            sample.bounces.append(bounce(scene_view, x, sampler, guide))
 
 
 def _end(scene_view: SceneView, sample: PathSample) -> None:
@@ -178,7 +185,9 @@ def _end(scene_view: SceneView, sample: PathSample) -> None:
 
 
 def _gather(piece: Piece, subset: SampleSubset) -> Piece:
-    """The lanes of a subset, of an array or of all arrays of a dataclass."""
+    """The lanes of a subset, of an array or of all arrays of a dataclass; None stays None."""
+    if piece is None:
+        return piece
     if isinstance(piece, type) or not dataclasses.is_dataclass(piece):
         return dr.gather(type(piece), piece, subset.lanes)
     parts = {f.name: _gather(getattr(piece, f.name), subset) for f in dataclasses.fields(piece)}

@@ -12,18 +12,23 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
 
+import drjit as dr
 import mitsuba as mi
 
 from ..errors import UserError, require_name
+from ..fields.guide import LightGuide
 from ..fields.radiance import RadianceField
 from .loss import RelativeL2
 from .methods import BOUNCES, KEPT_PATHS, PATH_REPLAY, PHOTOMETRIC, Method
 from .objective import objective, requirements
+from .operator import transported
 from .path_sample import PathSample, SampleSubset, rhs, trace
 from .prb import materials_along_paths, path_radiance, path_replay
 from .vertex import SceneView
 from .wavefront import PathLimits, Plan, path_light, plan_widths
 
+#: Name of the guide's loss among the terms.
+GUIDE = "guide"
 #: The arrays that the scene's textures and emitters read, by name.
 Arrays = dict[str, mi.Float | mi.TensorXf]
 
@@ -42,6 +47,7 @@ class SamplerContext:
         max_depth: longest path in bounces, plus one, of methods that follow paths to their end.
         rr_depth: bounces of these before Russian roulette.
         read_by_scene: gives the present arrays that the scene's textures and emitters read.
+        guide: where bounces look for light beside where BSDFs scatter; None: nowhere else.
     """
 
     method: Method
@@ -53,6 +59,7 @@ class SamplerContext:
     max_depth: int
     rr_depth: int
     read_by_scene: Callable[[], Arrays]
+    guide: LightGuide | None = None
 
 
 class PathSampler(Protocol):
@@ -140,8 +147,12 @@ class BounceSampler:
         primal: mi.Color3f | None,
     ) -> dict[str, mi.Float]:
         """The terms of the objective."""
+        guide, terms = self._context.guide, self._context.method.terms
         sample = self._trace(scene, ray, sampler, subset)
-        return objective(self._context.method.terms, sample, target, loss, primal, self._bounces)
+        values = objective(terms, sample, target, loss, primal, self._bounces)
+        if guide is not None:
+            values[GUIDE] = _guide_loss(guide, sample, self._bounces, target, loss)
+        return values
 
     def _trace(
         self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler, subset: SampleSubset | None
@@ -155,7 +166,27 @@ class BounceSampler:
             self._requirements,
             hide_emitters=c.hide_emitters,
             subset=subset,
+            guide=c.guide,
         )
+
+
+def _guide_loss(
+    guide: LightGuide, sample: PathSample, bounces: int, target: mi.Color3f, loss: RelativeL2
+) -> mi.Float:
+    """The loss of the guide, by what the first bounces of camera samples found."""
+    first = sample.bounces[0]
+    assert first.choice is not None
+    spp = dr.width(sample.x1.valid) // dr.width(target)
+    with dr.suspend_grad():
+        radiance = sample.radiance[bounces]
+        for further in reversed(sample.bounces[1:bounces]):
+            radiance = transported(further, radiance)
+        # Of emission that emitter sampling finds as well, the part that MIS leaves to bounces.
+        light = first.next.emitted + first.next.throughput * radiance
+        relative = dr.repeat(dr.sqrt(loss.weight(target)), spp)
+        found = dr.mean(first.weight * light * relative)
+        dr.eval(found)
+    return guide.loss(first.choice, found)
 
 
 class _WholePathSampler(ABC):

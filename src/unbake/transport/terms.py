@@ -22,7 +22,7 @@ from .prior import residual, residual_norm
 LOGGED = frozenset(
     [
         *("step", "seconds", "samples", "samples_per_second", "memory_mb", "learning_rate"),
-        *("skipped", "held_aside"),
+        *("skipped", "held_aside", "guide"),
     ]
 )
 

@@ -1,0 +1,152 @@
+"""Where light comes from: directions at places of the scene, learned together with L_θ (ours)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .arrays import sigmoid
+from .domain import Domain
+from .settings import GuideConfig
+
+#: Share of each distribution that is uniform over the sphere: no direction is left out.
+_UNIFORM = 0.1
+#: The largest share of bounces whose direction is drawn by the guide.
+_MOST = 0.9
+#: Logarithms of densities, and of the odds of a guided bounce, are these multiples of what Adam
+#: moves, so that they learn at the rate of L_θ.
+_GAIN, _GAIN_OF_SHARES = 10.0, 4.0
+#: The most that a sample counts, in multiples of a pixel's radiance: fireflies are no light.
+_MOST_WEIGHT = 20.0
+
+
+@dataclass
+class Choice:
+    """Between BSDF and guide, by which the direction of a bounce was drawn; a PyTree."""
+
+    cell: mi.UInt32
+    share: mi.Float  # probability that the guide draws
+    direction: mi.Vector3f  # that was drawn, world space
+    pdf: mi.Float  # of the BSDF in that direction, solid angle
+
+    def mixed(self, guide: LightGuide, pdf: mi.Float, direction: mi.Vector3f) -> mi.Float:
+        """The density of a direction, drawn by either, where the BSDF's is `pdf`."""
+        return dr.fma(self.share, guide.pdf(self.cell, direction) - pdf, pdf)
+
+
+class LightGuide:
+    """Distributions of directions, by which bounces find the light that surfaces reflect.
+
+    Directions drawn by the BSDF alone seldom meet small bright places, and nearly all noise of one
+    bounce is that of the radiance that it meets. Here the cells of a grid over the scene's cube,
+    each divided by the six directions that normals are nearest to, have a distribution over world
+    space directions, constant in bins of equal solid angle: bands of height z times sectors around
+    the z axis. It is learned by the cross-entropy with what samples contribute, and so is the share
+    of bounces that are drawn by it. It changes the noise of estimates, and not what they expect.
+
+    Args:
+        settings: sizes.
+        domain: the scene's cube.
+
+    See Müller et al. 2017, Practical Path Guiding, and Müller 2019, whose shares are learned alike.
+    """
+
+    def __init__(self, settings: GuideConfig, domain: Domain) -> None:
+        self._settings = settings
+        self._domain = domain
+        cells = 6 * settings.cells**3
+        self._bins = settings.bands * settings.sectors
+        self._logits = dr.opaque(mi.Float, 0, cells * self._bins)
+        self._odds = dr.opaque(mi.Float, 0, cells)
+        self.prepare()
+
+    def parameters(self) -> dict[str, mi.Float]:
+        """`guide.directions` and `guide.shares`, which are learned beside θ."""
+        return {"guide.directions": self._logits, "guide.shares": self._odds}
+
+    def assign(self, parameters: Mapping[str, Any]) -> None:
+        """Use these arrays from now on; `prepare` makes the tables of them."""
+        self._logits, self._odds = parameters["guide.directions"], parameters["guide.shares"]
+
+    def prepare(self) -> None:
+        """Make the tables that directions are drawn from."""
+        n = self._bins
+        with dr.suspend_grad():
+            weight = dr.exp(self._centred())
+            share = weight / dr.repeat(dr.block_sum(weight, n), n)
+            self._table = dr.fma(1 - _UNIFORM, share, _UNIFORM / n)
+            self._sums = dr.block_prefix_sum(self._table, n, exclusive=False)
+            dr.eval(self._table, self._sums)
+
+    def cell(self, p: mi.Point3f, n: mi.Normal3f, valid: mi.Bool) -> mi.UInt32:
+        """The cell of points in world space with their unit normals."""
+        count = self._settings.cells
+        at = [dr.minimum(mi.UInt32(x * count), count - 1) for x in self._domain.to_unit(p, valid)]
+        size = dr.abs(n)
+        first, second = (size.x >= size.y) & (size.x >= size.z), size.y >= size.z
+        axis = dr.select(first, mi.UInt32(0), dr.select(second, mi.UInt32(1), mi.UInt32(2)))
+        along = dr.select(first, n.x, dr.select(second, n.y, n.z))
+        side = 2 * axis + dr.select(along > 0, mi.UInt32(1), mi.UInt32(0))
+        return dr.select(valid, ((at[0] * count + at[1]) * count + at[2]) * 6 + side, 0)
+
+    def share(self, cell: mi.UInt32) -> mi.Float:
+        """The probability that the guide draws a bounce from a cell; it passes gradients."""
+        return _MOST * sigmoid(_GAIN_OF_SHARES * dr.gather(mi.Float, self._odds, cell))
+
+    def pdf(self, cell: mi.UInt32, direction: mi.Vector3f) -> mi.Float:
+        """The density of unit directions in world space, solid angle; as was prepared."""
+        inside = dr.gather(mi.Float, self._table, cell * self._bins + self._bin(direction))
+        return inside * (self._bins / (4 * math.pi))
+
+    def sample(self, cell: mi.UInt32, number: mi.Point2f) -> mi.Vector3f:
+        """Unit directions in world space from uniform random numbers, [0,1)²; as was prepared."""
+        s, first = self._settings, cell * self._bins
+        chosen = dr.binary_search(
+            0, self._bins - 1, lambda i: dr.gather(mi.Float, self._sums, first + i) < number.x
+        )
+        inside = dr.gather(mi.Float, self._table, first + chosen)
+        below = dr.gather(mi.Float, self._sums, first + chosen) - inside
+        rest = dr.clip((number.x - below) / inside, 0, 1)
+        band, sector = chosen // s.sectors, chosen % s.sectors
+        z = 2 * (mi.Float(band) + rest) / s.bands - 1
+        sine, cosine = dr.sincos(2 * dr.pi * (mi.Float(sector) + number.y) / s.sectors)
+        radius = dr.safe_sqrt(1 - dr.square(z))
+        return mi.Vector3f(radius * cosine, radius * sine, z)
+
+    def loss(self, choice: Choice, weight: mi.Float) -> mi.Float:
+        """The cross-entropy of the distributions with what samples contribute; smaller is better.
+
+        That of the guide alone trains directions, so that a direction in which nothing was found so
+        far comes back when there is light; that of guide and BSDF together trains the shares.
+
+        Args:
+            choice: of each sample.
+            weight: its contribution to its pixel, over the pixel's radiance.
+        """
+        n, cell = self._bins, choice.cell
+        weight = dr.detach(dr.minimum(weight, _MOST_WEIGHT))
+        logits = self._centred()
+        total = dr.log(dr.block_sum(dr.exp(logits), n))
+        inside = dr.gather(mi.Float, logits, cell * n + self._bin(choice.direction))
+        guided = self.pdf(cell, choice.direction)
+        mixed = dr.fma(self.share(cell), guided - choice.pdf, choice.pdf)
+        told = inside - dr.gather(mi.Float, total, cell) + dr.log(mixed)
+        return -dr.mean(dr.select(weight > 0, weight * told, 0))
+
+    def _centred(self) -> mi.Float:
+        """Logarithms of densities up to a factor a cell, 0 at most."""
+        logits = _GAIN * self._logits
+        most = dr.block_reduce(dr.ReduceOp.Max, dr.detach(logits), self._bins)
+        return logits - dr.repeat(most, self._bins)
+
+    def _bin(self, direction: mi.Vector3f) -> mi.UInt32:
+        s, d = self._settings, dr.detach(direction)
+        band = dr.clip(mi.Int32(0.5 * (d.z + 1) * s.bands), 0, s.bands - 1)
+        turn = dr.atan2(d.y, d.x) / (2 * dr.pi)
+        sector = dr.clip(mi.Int32((turn - dr.floor(turn)) * s.sectors), 0, s.sectors - 1)
+        return mi.UInt32(band * s.sectors + sector)

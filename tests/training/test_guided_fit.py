@@ -1,0 +1,71 @@
+"""Bounces of a fit look for light: what the guide has learned takes noise out of its steps."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import tiny_fields
+
+from unbake.config import read_toml, to_toml
+from unbake.dataset.views import Dataset
+from unbake.fields.settings import GuideConfig
+from unbake.training.problem import pixels_of, problem_of
+from unbake.training.schedule import learning_rates
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
+
+STEPS, GUIDE = 150, "guide.directions"
+
+
+@pytest.fixture(scope="module")
+def fitted(cornell):
+    """A step with its state after a short fit, and its pixels."""
+    config = replace(tiny_fields(), pixels=256, guide=GuideConfig(cells=4, bands=4, sectors=8))
+    dataset = Dataset.load(cornell)
+    pixels = pixels_of(dataset, config, clip_negative=False)
+    problem = problem_of(dataset, config, pixels.photographs.mean)
+    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    terms = [step(state, i, learning_rates(config, i, i / STEPS)) for i in range(STEPS)]
+    return step, state, pixels, [float(term["guide"][0]) for term in terms]
+
+
+def noise(step, state, pixels):
+    """Mean variance of a pixel's estimate from half of its samples."""
+    halves = step.probe(state, pixels.rays, pixels.draw(3, 256), seed=5)
+    return float(np.square(halves[:, 0] - halves[:, 1]).mean() / 2)
+
+
+def test_what_the_guide_has_learned_takes_noise_out_of_steps(fitted):
+    step, state, pixels, losses = fitted
+    assert np.mean(losses[-30:]) < np.mean(losses[:30])
+    learned = noise(step, state, pixels)
+    before = state.snapshot()
+    state.theta[GUIDE] = dr.zeros(mi.Float, dr.width(state.theta[GUIDE]))
+    uniform = noise(step, state, pixels)
+    state.restore(before)
+    print(f"variance {learned:.4g} with the guide, {uniform:.4g} with even directions")
+    assert learned < 0.9 * uniform
+    assert noise(step, state, pixels) == learned
+
+
+def test_methods_without_a_radiance_field_and_settings_without_cells_have_no_guide(cornell):
+    dataset, config = Dataset.load(cornell), tiny_fields()
+    guided = [
+        problem_of(dataset, changed, 1.0).guide is not None
+        for changed in (config, replace(config, guide=GuideConfig(cells=0)))
+    ]
+    assert guided == [True, False]
+    assert problem_of(dataset, replace(config, method="direct"), 1.0).guide is None
+
+
+def test_runs_of_before_go_on_without_a_guide(tmp_path):
+    text = to_toml(tiny_fields())
+    start = text.index("[guide]")
+    table = text[start : text.index("\n[", start)]
+    file = tmp_path / "config.toml"
+    file.write_text(text)
+    assert read_toml(file).guide.cells == GuideConfig().cells
+    file.write_text(text.replace(table, ""))
+    assert read_toml(file).guide.cells == 0
