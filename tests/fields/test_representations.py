@@ -170,6 +170,32 @@ def test_near_points_are_near_in_the_tangent_plane(representation, monkeypatch):
     assert 0.095 < length.max() <= 0.1 + 1e-6
 
 
+@pytest.mark.parametrize("name", ["albedo", "roughness"])
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_points_and_those_near_them_are_asked_together(representation, name):
+    """Values and gradients are those of two questions."""
+    fields, si = made(representation), interactions()
+    parameters, numbers = randomised(fields), mi.Point2f(*uniform(2))
+    valid, found = dr.arange(mi.UInt32, LANES) % 4 != 1, []
+    for together in (False, True):
+        if together:
+            pair = fields.evaluate_one_and_near(name, si, valid, numbers, 0.1)
+        else:
+            near = fields.evaluate_near(si, valid, numbers, 0.1)
+            pair = fields.evaluate(si, valid)[name], near[name]
+        difference = dr.square(mi.Color3f(pair[0]) - 2 * mi.Color3f(pair[1]))
+        dr.backward(dr.sum(dr.select(valid, dr.mean(difference), 0)))
+        found.append(
+            (list(map(np.array, pair)), [np.array(dr.grad(v)) for v in parameters.values()])
+        )
+        dr.clear_grad(list(parameters.values()))
+    (values, gradients), (values_together, gradients_together) = found
+    np.testing.assert_allclose(values_together, values, atol=1e-5)
+    assert any(gradient.any() for gradient in gradients)
+    for one, other in zip(gradients_together, gradients, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+
+
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
 def test_near_points_show_a_slope(representation):
     """Differences at near points are small with the radius, and not zero."""

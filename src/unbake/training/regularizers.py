@@ -63,23 +63,28 @@ def regularization_terms(
     scene_view, everywhere = problem.scene_view.with_scene(scene), mi.Bool(True)
     vertex = find_vertex(scene_view, ray, everywhere, sampler, hide_emitters=problem.hide_emitters)
     valid = vertex.valid & scene_view.is_optimized(vertex.si.shape)
+    terms: dict[str, mi.Float] = {}
+    if photometric is not None and smooths_albedo(problem, config):
+        radius = r.albedo_radius or USUAL.footprint
+        here, near = materials.evaluate_one_and_near(
+            "albedo", vertex.si, valid, sampler.next_2d(), radius
+        )
+        unexplained = as_weight(photometric, 0, _LARGEST_LOSS)
+        value = albedo_smoothness(here, near, valid)
+        terms["albedo_smoothness"] = r.albedo_smoothness * unexplained * value
+    anchored = is_anchored(problem, config)
+    if not (r.roughness_smoothness or r.albedo_ties_roughness or anchored):
+        return terms
     here = materials.evaluate(vertex.si, valid)
     dr.eval(here)
-    terms: dict[str, mi.Float] = {}
     if r.roughness_smoothness:
         near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), r.radius)
         value = roughness_smoothness(here, near, valid)
         terms["roughness_smoothness"] = r.roughness_smoothness * value
-    if photometric is not None and smooths_albedo(problem, config):
-        radius = r.albedo_radius or USUAL.footprint
-        near = materials.evaluate_near(vertex.si, valid, sampler.next_2d(), radius)
-        unexplained = as_weight(photometric, 0, _LARGEST_LOSS)
-        value = albedo_smoothness(here, near, valid)
-        terms["albedo_smoothness"] = r.albedo_smoothness * unexplained * value
     if r.albedo_ties_roughness:
         value = albedo_ties_roughness(here, valid, r.similarity, shift=1)
         terms["albedo_ties_roughness"] = r.albedo_ties_roughness * value
-    if is_anchored(problem, config):
+    if anchored:
         value = mean_albedo_deviation(here, valid, config.lighting.mean_albedo)
         terms["mean_albedo"] = config.lighting.anchor * value
     return terms

@@ -17,9 +17,9 @@ def roughness_smoothness(here: Material, near: Material, valid: mi.Bool) -> mi.F
     return _mean(dr.select(valid, difference, 0), valid)
 
 
-def albedo_smoothness(here: Material, near: Material, valid: mi.Bool) -> mi.Float:
+def albedo_smoothness(here: mi.Color3f, near: mi.Color3f, valid: mi.Bool) -> mi.Float:
     """Mean absolute difference of the albedo of points and of others near them, over channels."""
-    difference = dr.mean(dr.abs(here["albedo"] - near["albedo"]))
+    difference = dr.mean(dr.abs(here - near))
     return _mean(dr.select(valid, difference, 0), valid)
 
 
