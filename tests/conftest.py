@@ -151,4 +151,5 @@ def one_thread():
     threads = dr.thread_count()
     dr.set_thread_count(1)
     yield
+    dr.sync_thread()
     dr.set_thread_count(threads)

@@ -69,7 +69,7 @@ def learn(guide: LightGuide, bright: float, steps: int, pdf: float = 0.08) -> No
         cell = mi.UInt32(7) + dr.zeros(mi.UInt32, n)
         d = mi.warp.square_to_uniform_sphere(sampler.next_2d())
         # Of a BSDF that scatters everywhere alike
-        choice = Choice(cell, dr.detach(guide.share(cell)), d, mi.Float(pdf))
+        choice = Choice(cell, d, mi.Float(pdf))
         dr.backward(guide.loss(choice, dr.select(bright * d.z > 0, mi.Float(2), 0)))
         optimizer.step()
     guide.assign(dict(optimizer.items()))
@@ -103,7 +103,7 @@ def test_samples_without_light_teach_nothing():
     values = guide.parameters()
     dr.enable_grad(*values.values())
     cell = dr.arange(mi.UInt32, 48)
-    choice = Choice(cell, mi.Float(0), mi.Vector3f(0, 0, 1), dr.opaque(mi.Float, 0, 48))
+    choice = Choice(cell, mi.Vector3f(0, 0, 1), dr.opaque(mi.Float, 0, 48))
     loss = guide.loss(choice, dr.opaque(mi.Float, 0, 48))
     dr.backward(loss)
     assert loss[0] == 0

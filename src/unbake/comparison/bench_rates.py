@@ -390,10 +390,10 @@ def _search(
 def _require_one_estimator(variants: Sequence[MethodVariant], shared: FitConfig) -> None:
     """Refuse to choose between estimators by fits of equal steps: two passes would trace more."""
     for variant in variants:
-        config = variant.settings(shared)
-        if len(_estimators(config)) > 1:
+        estimators = _estimators(variant.settings(shared))
+        if len(estimators) > 1:
             what = f"estimators of {variant.name} are compared at equal time"
-            other = f"{variant.method}:{shared.representation}:{_estimators(config)[-1]}"
+            other = f"{variant.method}:{shared.representation}:{estimators[-1]}"
             raise UserError(what, "--steps", f"Give --seconds, or one estimator, such as {other}")
 
 

@@ -21,22 +21,38 @@ _MOST = 0.9
 #: Logarithms of densities, and of the odds of a guided bounce, are these multiples of what Adam
 #: moves, so that they learn at the rate of L_θ.
 _GAIN, _GAIN_OF_SHARES = 10.0, 4.0
+#: The largest size of a logarithm of a density, whose exponential is a number yet.
+_FURTHEST = 40.0
 #: The most that a sample counts, in multiples of a pixel's radiance: fireflies are no light.
 _MOST_WEIGHT = 20.0
 
 
 @dataclass
 class Choice:
-    """Between BSDF and guide, by which the direction of a bounce was drawn; a PyTree."""
+    """What a guide learns from the direction of a bounce; a PyTree."""
 
     cell: mi.UInt32
-    share: mi.Float  # probability that the guide draws
     direction: mi.Vector3f  # that was drawn, world space
     pdf: mi.Float  # of the BSDF in that direction, solid angle
 
-    def mixed(self, guide: LightGuide, pdf: mi.Float, direction: mi.Vector3f) -> mi.Float:
+
+@dataclass(frozen=True)
+class Mixture:
+    """A guide and a BSDF, by one of which each direction is drawn."""
+
+    guide: LightGuide
+    cell: mi.UInt32
+    share: mi.Float  # probability that the guide draws
+
+    def decide(self, number: mi.Float) -> tuple[mi.Bool, mi.Float]:
+        """Whether the guide draws, by a uniform random number, and one for the BSDF to draw by."""
+        guided, rest = number < self.share, number - self.share
+        last = dr.one_minus_epsilon(mi.Float)
+        return guided, dr.select(guided, 0, dr.minimum(rest / (1 - self.share), last))
+
+    def pdf(self, pdf: mi.Float, direction: mi.Vector3f) -> mi.Float:
         """The density of a direction, drawn by either, where the BSDF's is `pdf`."""
-        return dr.fma(self.share, guide.pdf(self.cell, direction) - pdf, pdf)
+        return dr.fma(self.share, self.guide.pdf(self.cell, direction) - pdf, pdf)
 
 
 class LightGuide:
@@ -63,25 +79,21 @@ class LightGuide:
         self._bins = settings.bands * settings.sectors
         self._logits = dr.opaque(mi.Float, 0, cells * self._bins)
         self._odds = dr.opaque(mi.Float, 0, cells)
-        self.prepare()
 
     def parameters(self) -> dict[str, mi.Float]:
         """`guide.directions` and `guide.shares`, which are learned beside θ."""
         return {"guide.directions": self._logits, "guide.shares": self._odds}
 
     def assign(self, parameters: Mapping[str, Any]) -> None:
-        """Use these arrays from now on; `prepare` makes the tables of them."""
+        """Use these arrays from now on; densities and samples need `prepare` first."""
         self._logits, self._odds = parameters["guide.directions"], parameters["guide.shares"]
 
     def prepare(self) -> None:
         """Make the tables that directions are drawn from."""
-        n = self._bins
         with dr.suspend_grad():
-            weight = dr.exp(self._centred())
-            share = weight / dr.repeat(dr.block_sum(weight, n), n)
-            self._table = dr.fma(1 - _UNIFORM, share, _UNIFORM / n)
-            self._sums = dr.block_prefix_sum(self._table, n, exclusive=False)
-            dr.eval(self._table, self._sums)
+            self._weights = dr.exp(dr.clip(_GAIN * self._logits, -_FURTHEST, _FURTHEST))
+            self._sums = dr.block_prefix_sum(self._weights, self._bins, exclusive=False)
+            dr.eval(self._weights, self._sums)
 
     def cell(self, p: mi.Point3f, n: mi.Normal3f, valid: mi.Bool) -> mi.UInt32:
         """The cell of points in world space with their unit normals."""
@@ -94,24 +106,42 @@ class LightGuide:
         side = 2 * axis + dr.select(along > 0, mi.UInt32(1), mi.UInt32(0))
         return dr.select(valid, ((at[0] * count + at[1]) * count + at[2]) * 6 + side, 0)
 
+    def mixture(self, cell: mi.UInt32, dense: mi.Bool) -> Mixture:
+        """The guide and a BSDF at vertices; detached.
+
+        Args:
+            cell: of the vertices.
+            dense: whether all directions of the BSDF have a density; elsewhere it alone draws.
+        """
+        with dr.suspend_grad():
+            return Mixture(self, cell, dr.select(dense, self.share(cell), 0))
+
     def share(self, cell: mi.UInt32) -> mi.Float:
-        """The probability that the guide draws a bounce from a cell; it passes gradients."""
+        """The probability that the guide draws a bounce from a cell."""
         return _MOST * sigmoid(_GAIN_OF_SHARES * dr.gather(mi.Float, self._odds, cell))
 
     def pdf(self, cell: mi.UInt32, direction: mi.Vector3f) -> mi.Float:
         """The density of unit directions in world space, solid angle; as was prepared."""
-        inside = dr.gather(mi.Float, self._table, cell * self._bins + self._bin(direction))
-        return inside * (self._bins / (4 * math.pi))
+        weight = dr.gather(mi.Float, self._weights, cell * self._bins + self._bin(direction))
+        part = dr.fma(1 - _UNIFORM, weight / self._total(cell), _UNIFORM / self._bins)
+        return part * (self._bins / (4 * math.pi))
 
     def sample(self, cell: mi.UInt32, number: mi.Point2f) -> mi.Vector3f:
         """Unit directions in world space from uniform random numbers, [0,1)²; as was prepared."""
-        s, first = self._settings, cell * self._bins
+        s, first, scale = self._settings, cell * self._bins, (1 - _UNIFORM) / self._total(cell)
+
+        def below(bins: mi.UInt32, weights: mi.Float) -> mi.Float:
+            """The probability of the first bins, whose weights sum to this."""
+            return dr.fma(scale, weights, mi.Float(bins) * (_UNIFORM / self._bins))
+
         chosen = dr.binary_search(
-            0, self._bins - 1, lambda i: dr.gather(mi.Float, self._sums, first + i) < number.x
+            0,
+            self._bins - 1,
+            lambda i: below(i + 1, dr.gather(mi.Float, self._sums, first + i)) < number.x,
         )
-        inside = dr.gather(mi.Float, self._table, first + chosen)
-        below = dr.gather(mi.Float, self._sums, first + chosen) - inside
-        rest = dr.clip((number.x - below) / inside, 0, 1)
+        weight = dr.gather(mi.Float, self._weights, first + chosen)
+        start = below(chosen, dr.gather(mi.Float, self._sums, first + chosen) - weight)
+        rest = dr.clip((number.x - start) / below(mi.UInt32(1), weight), 0, 1)
         band, sector = chosen // s.sectors, chosen % s.sectors
         z = 2 * (mi.Float(band) + rest) / s.bands - 1
         sine, cosine = dr.sincos(2 * dr.pi * (mi.Float(sector) + number.y) / s.sectors)
@@ -129,20 +159,24 @@ class LightGuide:
             weight: its contribution to its pixel, over the pixel's radiance.
         """
         n, cell = self._bins, choice.cell
-        weight = dr.detach(dr.minimum(weight, _MOST_WEIGHT))
-        logits = self._centred()
-        total = dr.log(dr.block_sum(dr.exp(logits), n))
-        inside = dr.gather(mi.Float, logits, cell * n + self._bin(choice.direction))
-        guided = self.pdf(cell, choice.direction)
-        mixed = dr.fma(self.share(cell), guided - choice.pdf, choice.pdf)
-        told = inside - dr.gather(mi.Float, total, cell) + dr.log(mixed)
-        return -dr.mean(dr.select(weight > 0, weight * told, 0))
-
-    def _centred(self) -> mi.Float:
-        """Logarithms of densities up to a factor a cell, 0 at most."""
+        weight = dr.select(weight > 0, dr.detach(dr.minimum(weight, _MOST_WEIGHT)), 0)
+        mixed = Mixture(self, cell, self.share(cell)).pdf(choice.pdf, choice.direction)
+        index, count = cell * n + self._bin(choice.direction), dr.width(weight)
+        own = dr.log(dr.gather(mi.Float, self._weights, index) / self._total(cell))
+        told = -dr.mean(weight * (own + dr.log(mixed)))
+        # The logarithm of a density passes gradients to all bins of its cell, which are the same
+        # for all samples there: they are summed by cell first.
         logits = _GAIN * self._logits
-        most = dr.block_reduce(dr.ReduceOp.Max, dr.detach(logits), self._bins)
-        return logits - dr.repeat(most, self._bins)
+        here = dr.gather(mi.Float, logits, index, mode=dr.ReduceMode.Direct)
+        found = dr.zeros(mi.Float, dr.width(self._odds))
+        dr.scatter_add(found, weight, cell)
+        every = self._weights * dr.repeat(found / self._total(dr.arange(mi.UInt32, len(found))), n)
+        slope = dr.sum(every * logits) / count - dr.mean(weight * here)
+        return told + dr.replace_grad(mi.Float(0), slope)
+
+    def _total(self, cell: mi.UInt32) -> mi.Float:
+        """The sum of a cell's weights."""
+        return dr.gather(mi.Float, self._sums, cell * self._bins + (self._bins - 1))
 
     def _bin(self, direction: mi.Vector3f) -> mi.UInt32:
         s, d = self._settings, dr.detach(direction)

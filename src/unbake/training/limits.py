@@ -77,9 +77,9 @@ def require_room(config: FitConfig, materials: int) -> None:
     if not total:
         return
     worst = max(fields, key=lambda field: needs[field.key])
-    others = total - needs[worst.key]
     if has_radiance(config.chosen_method):
-        others, total = (x + BYTES_A_NUMBER * config.guide.numbers() for x in (others, total))
+        total += BYTES_A_NUMBER * config.guide.numbers()
+    others = total - needs[worst.key]
     factor, always = (_RESERVED, _RESERVED_ALWAYS) if reserved_counts() else (1.0, 0.0)
 
     def remedy(free: int) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..fields.guide import Choice, LightGuide
+from ..fields.guide import Choice, LightGuide, Mixture
 from ..fields.materials import carry, with_joint_gradients
 from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
 
@@ -75,7 +75,7 @@ def bounce(
     # opposite of what it should: it lets every ray pass.)
     opacity = vertex.opacity if scene_view.has_chains else mi.Float(1)
     solid = dr.rcp(opacity)
-    choice = None if guide is None else _choice(guide, vertex)
+    mixture = None if guide is None else _mixture(guide, vertex)
 
     # -------------------------------- Emitter sampling --------------------------------
 
@@ -83,8 +83,8 @@ def bounce(
     active_em = active & (ds.pdf != 0)
     bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
     pdf_em = bsdf_pdf_em * solid
-    if guide is not None and choice is not None:
-        pdf_em = choice.mixed(guide, pdf_em, ds.d)
+    if mixture is not None:
+        pdf_em = mixture.pdf(pdf_em, ds.d)
     mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_em))
     direct = dr.select(active_em, bsdf_em * em_weight * mis_em * solid, 0)
 
@@ -93,34 +93,31 @@ def bounce(
     with dr.suspend_grad():
         number = sampler.next_1d()
         guided = mi.Bool(False)
-        if choice is not None:
+        if mixture is not None:
             # One number decides who draws, and then the lobe.
-            guided, rest = number < choice.share, number - choice.share
-            last = dr.one_minus_epsilon(mi.Float)
-            number = dr.select(guided, 0, dr.minimum(rest / (1 - choice.share), last))
+            guided, number = mixture.decide(number)
         square = sampler.next_2d()
         bs, bs_weight = bsdf.sample(ctx, si, number * opacity, square, active)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        wo, pdf, delta = bs.wo, bs.pdf, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         goes_on = active & (bs.pdf > 0) & (dr.max(bs_weight) > 0)
         goes_on &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        wo, pdf = bs.wo, bs.pdf
-        if guide is not None and choice is not None:
-            wo = dr.select(guided, si.to_local(guide.sample(choice.cell, square)), wo)
+        if mixture is not None:
+            found = mixture.guide.sample(mixture.cell, square)
+            wo = dr.select(guided, si.to_local(found), wo)
             delta, goes_on = delta & ~guided, active & (guided | goes_on)
-        direction = si.to_world(wo)
+        ray = si.spawn_ray(si.to_world(wo))
 
-    if guide is None or choice is None:
+    choice = None
+    if mixture is None:
         value = bsdf.eval(ctx, si, wo, goes_on & ~delta)
     else:
         value, own = bsdf.eval_pdf(ctx, si, wo, goes_on & ~delta)
         with dr.suspend_grad():
             goes_on &= delta | (dr.max(dr.detach(value)) > 0)
-            choice.direction, choice.pdf = direction, dr.detach(own) * solid
-            mixed = choice.mixed(guide, choice.pdf, direction) * opacity
-            pdf = dr.select(delta, pdf, mixed)
+            choice = Choice(mixture.cell, ray.d, dr.detach(own) * solid)
+            pdf = dr.select(delta, pdf, mixture.pdf(choice.pdf, ray.d) * opacity)
     smooth = value * dr.select(pdf > 0, dr.rcp(pdf), 0)
     weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
-    ray = si.spawn_ray(direction)
 
     # Evaluated together here: each reduction further on would compute them again.
     evaluate(sampler, direct, weight, ray, goes_on, pdf, delta, choice)
@@ -129,16 +126,10 @@ def bounce(
     return Bounce(direct, weight, following, choice)
 
 
-def _choice(guide: LightGuide, vertex: Vertex) -> Choice:
-    """What is known before a direction is drawn: cell, and the probability of the guide.
-
-    It never draws where the BSDF has directions without a density, such as those of a coating.
-    """
-    with dr.suspend_grad():
-        cell = guide.cell(vertex.si.p, vertex.n, vertex.valid)
-        dense = ~mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Delta)
-        share = dr.select(dense & vertex.valid, dr.detach(guide.share(cell)), 0)
-        return Choice(cell, share, mi.Vector3f(0), mi.Float(0))
+def _mixture(guide: LightGuide, vertex: Vertex) -> Mixture:
+    """The guide and the BSDF; it alone where it has directions without a density (a coating)."""
+    dense = vertex.valid & ~mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Delta)
+    return guide.mixture(guide.cell(vertex.si.p, vertex.n, vertex.valid), dense)
 
 
 def transported(step: Bounce, radiance: mi.Color3f) -> mi.Color3f:

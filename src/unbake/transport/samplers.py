@@ -151,8 +151,27 @@ class BounceSampler:
         sample = self._trace(scene, ray, sampler, subset)
         values = objective(terms, sample, target, loss, primal, self._bounces)
         if guide is not None:
-            values[GUIDE] = _guide_loss(guide, sample, self._bounces, target, loss)
+            values[GUIDE] = self._guide_loss(guide, sample, loss.weight(target))
         return values
+
+    def _guide_loss(self, guide: LightGuide, sample: PathSample, weight: mi.Color3f) -> mi.Float:
+        """The loss of the guide, by what the first bounces of camera samples found.
+
+        Args:
+            weight: of the pixels' squared errors.
+        """
+        first = sample.bounces[0]
+        assert first.choice is not None
+        with dr.suspend_grad():
+            radiance = sample.radiance[self._bounces]
+            for further in reversed(sample.bounces[1 : self._bounces]):
+                radiance = transported(further, radiance)
+            # Of emission that emitter sampling finds as well, the part that MIS leaves to bounces.
+            light = first.next.emitted + first.next.throughput * radiance
+            relative = dr.repeat(dr.sqrt(weight), self._context.spp)
+            found = dr.mean(first.weight * light * relative)
+            dr.eval(found)
+        return guide.loss(first.choice, found)
 
     def _trace(
         self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler, subset: SampleSubset | None
@@ -168,25 +187,6 @@ class BounceSampler:
             subset=subset,
             guide=c.guide,
         )
-
-
-def _guide_loss(
-    guide: LightGuide, sample: PathSample, bounces: int, target: mi.Color3f, loss: RelativeL2
-) -> mi.Float:
-    """The loss of the guide, by what the first bounces of camera samples found."""
-    first = sample.bounces[0]
-    assert first.choice is not None
-    spp = dr.width(sample.x1.valid) // dr.width(target)
-    with dr.suspend_grad():
-        radiance = sample.radiance[bounces]
-        for further in reversed(sample.bounces[1:bounces]):
-            radiance = transported(further, radiance)
-        # Of emission that emitter sampling finds as well, the part that MIS leaves to bounces.
-        light = first.next.emitted + first.next.throughput * radiance
-        relative = dr.repeat(dr.sqrt(loss.weight(target)), spp)
-        found = dr.mean(first.weight * light * relative)
-        dr.eval(found)
-    return guide.loss(first.choice, found)
 
 
 class _WholePathSampler(ABC):
