@@ -189,16 +189,21 @@ ABLATION = (
 )  # fmt: skip
 STEP_METHODS = (
     "ours", "direct", "no-prior", "ad-pt:neural:two-pass", "ad-pt:neural:split-halves",
-    "prb:neural:two-pass", "prb:neural:split-halves", "ours:bitmap", "prb:bitmap:two-pass",
-    "prb:bitmap:split-halves", "ours:grid", "prb:grid:two-pass", "prb:grid:split-halves",
+    "prb:neural:two-pass", "prb:neural:all-pairs", "ours:bitmap", "prb:bitmap:two-pass",
+    "prb:bitmap:all-pairs", "ours:grid", "prb:grid:two-pass", "prb:grid:all-pairs",
 )  # fmt: skip
-#: The estimator of PRB and AD-PT that is not their default in rooms.
-_OF_PRB = method_defaults.method_defaults("prb", "room").estimator
-OTHER_ESTIMATOR = "split-halves" if _OF_PRB == "two-pass" else "two-pass"
+#: Whether PRB and AD-PT take two passes by default in rooms. The other estimator, the best one of
+#: one pass otherwise, has rows of its own.
+_TWO_PASSES = method_defaults.method_defaults("prb", "room").estimator == "two-pass"
 ROOM_RIVALS = (
-    "ours", "prb", f"prb:neural:{OTHER_ESTIMATOR}", "ad-pt", f"ad-pt:neural:{OTHER_ESTIMATOR}",
-    "direct", "no-prior",
-)  # fmt: skip
+    "ours",
+    "prb",
+    f"prb:neural:{'all-pairs' if _TWO_PASSES else 'two-pass'}",
+    "ad-pt",
+    f"ad-pt:neural:{'split-halves' if _TWO_PASSES else 'two-pass'}",
+    "direct",
+    "no-prior",
+)
 RIVALS = (*ROOM_RIVALS, "prb:bitmap")
 
 #: By the name of the file of results; that of `machine` is named after the machine.
