@@ -15,7 +15,6 @@ import argparse
 import itertools
 import json
 import os
-import shutil
 import sys
 from pathlib import Path
 from statistics import median
@@ -25,6 +24,7 @@ SRC = str(ROOT / "src")
 sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
+from small_run import mpiexec  # noqa: E402
 from variants import SCORES  # noqa: E402
 
 from unbake import backend  # noqa: E402
@@ -61,12 +61,8 @@ def main() -> None:
 def fit(data: Path, run: Path, ranks: int, seed: int, steps: int) -> dict[str, float]:
     """Scores, and milliseconds a step after the first ones, of a fit with one core a rank."""
     words = (sys.executable, "-m", "unbake", "fit", data, "--out", run)
-    folder = Path(sys.executable).parent
-    mpiexec = shutil.which("mpiexec", path=os.pathsep.join((str(folder), os.environ["PATH"])))
-    if mpiexec is None:
-        sys.exit("mpiexec is missing: pip install unbake[mpi]")
     cores = ",".join(map(str, range(ranks)))
-    start = ["taskset", "-c", cores] + ([mpiexec, "-n", ranks] if ranks > 1 else [])
+    start = ["taskset", "-c", cores] + ([mpiexec(), "-n", ranks] if ranks > 1 else [])
     run.parent.mkdir(parents=True, exist_ok=True)
     log = run.parent / "log.txt"
     command([*start, *words, "--seed", seed, "--steps", steps], log=log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -35,10 +36,20 @@ def prepare(folder: Path) -> tuple[Path, list[str]]:
     return data, ["fit", str(data), "--settings", str(settings), "--method", "direct"]
 
 
-def start(words: list[str]) -> subprocess.Popen[str]:
-    """A command of `unbake`, in a process group of its own."""
+def mpiexec() -> str:
+    """The program that starts several processes, beside this interpreter or in the path."""
+    folder = str(Path(sys.executable).parent)
+    found = shutil.which("mpiexec", path=os.pathsep.join((folder, os.environ["PATH"])))
+    if found is None:
+        sys.exit("mpiexec is missing: pip install unbake[mpi]")
+    return found
+
+
+def start(words: list[str], ranks: int = 1) -> subprocess.Popen[str]:
+    """A command of `unbake`, in a process group of its own; of several ranks that of `mpiexec`."""
+    several = [mpiexec(), "-n", str(ranks)] if ranks > 1 else []
     return subprocess.Popen(
-        [sys.executable, "-m", "unbake", *words],
+        [*several, sys.executable, "-m", "unbake", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

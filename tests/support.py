@@ -5,9 +5,13 @@ Import it from test modules alone, which are read once the Mitsuba variant is se
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import NormalDist
 
@@ -31,6 +35,12 @@ from unbake.transport.path_sample import Requirements
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.samplers import PathSampler, SamplerContext, make_sampler
 from unbake.transport.vertex import SceneView, find_vertex
+
+#: Starts several processes of one command, where MPI is installed.
+MPIEXEC = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+needs_mpi = pytest.mark.skipif(
+    MPIEXEC is None or find_spec("mpi4py") is None, reason="mpiexec and mpi4py are not installed"
+)
 
 #: The smallest network that still has a hash table and a hidden layer.
 TINY = NetworkConfig(

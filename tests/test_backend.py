@@ -201,3 +201,32 @@ def test_doctor_survives_a_probe_that_aborts(monkeypatch):
 def test_cuda_is_chosen_where_it_runs():
     run = run_python(ACTIVATE, UNBAKE_VARIANT=None)
     assert "active: cuda_ad_rgb" in run.stdout, run.stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "visible", "seen"),
+    [
+        ("0", None, "0"),
+        ("3", None, "1"),
+        (None, None, None),
+        ("1", "4,6,7", "6"),
+        ("1", "GPU-a,GPU-b", "GPU-b"),
+        ("1", "5", "5"),
+        ("1", "", ""),
+        ("many", None, None),
+    ],
+)
+def test_processes_of_a_machine_take_its_gpus_in_turn(number, visible, seen, monkeypatch, tmp_path):
+    for name in backend.LOCAL_RANKS:
+        monkeypatch.delenv(name, raising=False)
+    for gpu in ("0000:01:00.0", "0000:02:00.0"):
+        (tmp_path / gpu).mkdir()
+    monkeypatch.setattr(backend, "GPUS", tmp_path)
+    # Set first, so that what the test changes is taken back.
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible or "")
+    if visible is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    if number is not None:
+        monkeypatch.setenv("MPI_LOCALRANKID", number)
+    backend._take_a_gpu()
+    assert os.environ.get("CUDA_VISIBLE_DEVICES") == seen

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from unbake.errors import UserError
-from unbake.ranks import SIZES, Agreed, Ranks
+from unbake.ranks import SIZES, Agreed, Ranks, alone
 
 
 class Request:
@@ -124,3 +124,29 @@ def test_what_all_know_of_is_told_by_the_first_and_ends_the_others():
         with pytest.raises(kind), Ranks(world).guarded(told.append):
             raise Agreed("bad")
         assert not told and world.status is None
+
+
+def test_jobs_are_dealt_like_cards_and_each_is_of_one_rank():
+    jobs = ["a", "b", "c", "d", "e"]
+    dealt = [list(Ranks(Two(rank)).mine(jobs)) for rank in (0, 1)]
+    assert dealt == [["a", "c", "e"], ["b", "d"]]
+    assert list(Ranks().mine(jobs)) == jobs
+
+
+def test_what_each_rank_tells_is_known_to_all_and_may_take_its_time():
+    own, other = {"a": [1, None, "ü"]}, {"other": 2.5}
+    text = b'{"other": 2.5}'
+    longest = len('{"a": [1, null, "\\u00fc"]}')
+    lengths, padded = np.int64([len(text)]), np.frombuffer(text.ljust(longest, b"\0"), np.uint8)
+    ranks = Ranks(Two(others=[lengths, padded], looks=200), patience=1e-9)
+    assert ranks.told(own) == [own, other]
+    assert Ranks().told(own) == [own]
+
+
+def test_a_process_that_ranks_start_is_none_of_them(monkeypatch):
+    for name in ("PMI_SIZE", "PMI_FD", "OMPI_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS"):
+        monkeypatch.setenv(name, "2")
+    monkeypatch.setenv("PATH_OF_MINE", "here")
+    found = alone()
+    assert found["PATH_OF_MINE"] == "here" and not set(SIZES) & set(found)
+    assert not any(name.startswith("PMI") for name in found)

@@ -26,6 +26,16 @@ CUDA_VARIANT = "cuda_ad_rgb"
 LLVM_VARIANT = "llvm_ad_rgb"
 VARIANTS = (CUDA_VARIANT, LLVM_VARIANT)
 
+#: What `mpiexec` and Slurm tell a process: which one of its machine it is, from 0.
+LOCAL_RANKS = (
+    "MPI_LOCALRANKID",
+    "OMPI_COMM_WORLD_LOCAL_RANK",
+    "MV2_COMM_WORLD_LOCAL_RANK",
+    "SLURM_LOCALID",
+)
+#: Where NVIDIA's driver lists the GPUs of a machine, on Linux.
+GPUS = Path("/proc/driver/nvidia/gpus")
+_VISIBLE = "CUDA_VISIBLE_DEVICES"
 _LLVM_PATH = "DRJIT_LIBLLVM_PATH"
 _LLVM_REMEDY = (
     f"Install LLVM {LLVM_MINIMUM} or newer (Debian, Ubuntu: apt-get install libllvm19; "
@@ -137,6 +147,8 @@ def activate(variant: str | None = None) -> str:
     Raises UserError where the variant is unknown or cannot run on this machine, with the remedy.
     """
     wanted = _wanted(variant)
+    if wanted != LLVM_VARIANT and "drjit" not in sys.modules:
+        _take_a_gpu()
     gpu_possible = wanted != LLVM_VARIANT and cuda_driver() and optix()
     if wanted == CUDA_VARIANT and not gpu_possible:
         raise _no_cuda()
@@ -159,6 +171,22 @@ def activate(variant: str | None = None) -> str:
         mi.set_variant(wanted)
     _keep_two_threads()
     return wanted
+
+
+def _take_a_gpu() -> None:
+    """Let one of several processes of this machine see one of its GPUs, in turn.
+
+    Where Slurm or the user left each process one, as `CUDA_VISIBLE_DEVICES` tells, that is it.
+    """
+    number = next((os.environ[name] for name in LOCAL_RANKS if name in os.environ), "")
+    chosen = os.environ.get(_VISIBLE)
+    if not number.isdecimal():
+        return
+    gpus = (
+        [str(i) for i in range(len(list(GPUS.glob("*"))))] if chosen is None else chosen.split(",")
+    )
+    if len(gpus) > 1:
+        os.environ[_VISIBLE] = gpus[int(number) % len(gpus)]
 
 
 def _require_working_folder() -> None:
@@ -324,3 +352,16 @@ def _major_in_name(path: str) -> int:
     folder = re.search(r"llvm[-@/]?(\d+)", str(Path(path).parent))
     match = name or folder
     return int(match[1]) if match else 0
+
+
+def share_cores(processes: int, least: int = 2) -> None:
+    """Compute with an equal share of this machine's cores from now on.
+
+    Args:
+        processes: of this machine that share them.
+        least: number of threads; images are read with two or more (`_keep_two_threads`).
+    """
+    import drjit as dr
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    dr.set_thread_count(max(least, (cores or 1) // processes))

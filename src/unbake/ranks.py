@@ -11,10 +11,12 @@ waiting is done here, with a limit, and leaves the processor to others.
 from __future__ import annotations
 
 import hashlib
+import json
+import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
@@ -23,8 +25,11 @@ import numpy as np
 from .errors import UserError
 
 Result = TypeVar("Result")
+Job = TypeVar("Job")
 
-#: What `mpiexec` and Slurm tell a process: how many there are.
+#: How names of what `mpiexec` and Slurm tell a process begin.
+_TOLD = ("PMI", "MPI_LOCAL", "MPIEXEC", "HYDRA", "OMPI_", "MV2_COMM", "SLURM_STEP", "SLURM_PROCID")
+#: What they tell a process: how many there are.
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
 #: Seconds that a rank waits for the others. Kernels are compiled in the first steps, and rank 0
 #: writes checkpoints and previews while the others wait.
@@ -36,6 +41,13 @@ _AFTER_YOU = 0.5
 _LONGEST = 4096
 #: Waiting: this long without sleep, then with naps.
 _AWAKE, _NAP = 2e-4, 5e-5
+#: After so many seconds others are at work of their own: naps become longer.
+_LONG, _LONG_NAP = 5.0, 0.05
+
+
+def alone() -> dict[str, str]:
+    """The environment, for a process that is not to take itself for one of several."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(_TOLD)}
 
 
 class Communicator(Protocol):
@@ -143,6 +155,24 @@ class Ranks:
         self._wait(self._communicator.Ibcast(array, root=0))
         return float(array[0])
 
+    def mine(self, jobs: Sequence[Job]) -> Sequence[Job]:
+        """The jobs of this rank, of a list that all have: every so many, dealt like cards."""
+        return jobs[self.rank :: self.size]
+
+    def told(self, own: object) -> list[Any]:
+        """What each rank tells, in their order, on all; it waits for as long as that takes.
+
+        Args:
+            own: serializable as JSON.
+        """
+        if self._communicator is None:
+            return [own]
+        text = json.dumps(own).encode()
+        length = np.array([len(text)], np.int64)
+        lengths = self._gathered(length, math.inf)[:, 0]
+        padded = np.frombuffer(text.ljust(int(lengths.max()), b"\0"), np.uint8)
+        return [json.loads(_text(row)) for row in self._gathered(padded, math.inf)]
+
     def require_same(self, told: Mapping[str, str]) -> None:
         """Check that all ranks have the same.
 
@@ -189,28 +219,31 @@ class Ranks:
         alone = None if len(failures) == self.size else int(failures[0])
         raise Agreed.of(UserError(what, where or None, remedy or None), alone)
 
-    def _gathered(self, array: np.ndarray) -> np.ndarray:
+    def _gathered(self, array: np.ndarray, patience: float | None = None) -> np.ndarray:
         """The arrays of all ranks, one a row."""
         assert self._communicator is not None
         rows = np.empty((self.size, *array.shape), array.dtype)
-        self._wait(self._communicator.Iallgather(np.ascontiguousarray(array), rows))
+        self._wait(self._communicator.Iallgather(np.ascontiguousarray(array), rows), patience)
         return rows
 
-    def _wait(self, request: Any) -> None:
+    def _wait(self, request: Any, patience: float | None = None) -> None:
         """Wait for the others.
+
+        Args:
+            patience: for how many seconds; None: as long as this object always waits.
 
         Raises:
             UserError: they do not answer.
         """
-        start = time.monotonic()
+        start, patience = time.monotonic(), self._patience if patience is None else patience
         while not request.Test():
             waited = time.monotonic() - start
-            if waited > self._patience:
-                what = f"the other ranks have not answered for {self._patience:.0f} s"
+            if waited > patience:
+                what = f"the other ranks have not answered for {patience:.0f} s"
                 remedy = "See whether one of them hangs or its network is cut; go on with --resume"
                 raise UserError(what, remedy=remedy)
             if waited > _AWAKE:
-                time.sleep(_NAP)
+                time.sleep(_NAP if waited < _LONG else _LONG_NAP)
 
     # --------------------------------------------------------------------------- how all are ended
 
@@ -238,7 +271,9 @@ class Ranks:
             if not self.leads:
                 time.sleep(_AFTER_YOU)
             told = str(error) or type(error).__name__
-            if not isinstance(error, UserError):
+            if isinstance(error, KeyboardInterrupt):
+                told = "stopped"
+            elif not isinstance(error, UserError):
                 told = f"{type(error).__name__}: {told}"
             say(f"rank {self.rank}: {told}")
             sys.stderr.flush()

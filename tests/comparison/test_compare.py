@@ -6,9 +6,12 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 
 import pytest
 from rich.console import Console
+from support import MPIEXEC, needs_mpi
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
@@ -20,6 +23,7 @@ from unbake.evaluation import yardsticks
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.ranks import Ranks
 from unbake.training import loop
 
 
@@ -278,6 +282,42 @@ def test_a_method_that_fails_is_recorded_and_the_others_go_on(compare, tmp_path,
     monkeypatch.setattr(module, "fit", real)
     assert compare("ours", "direct", steps=3).status == 0
     assert "error" not in result(tmp_path)["methods"]["ours"]
+
+
+def test_rows_and_errors_of_all_ranks_come_together():
+    told = [
+        {"rows": {"a": {"steps": 3}}, "errors": {}},
+        {"rows": {"b": {"error": "bad"}}, "errors": {"b": ["bad", "a file", None]}},
+    ]
+
+    class Two(Ranks):
+        def told(self, own):
+            assert json.loads(json.dumps(own)) == told[1]
+            return told
+
+    error = UserError("bad", "a file")
+    rows, errors = module._of_all(Two(), told[1]["rows"], {"b": error})
+    assert rows == {"a": {"steps": 3}, "b": {"error": "bad"}}
+    assert list(errors) == ["b"] and str(errors["b"]) == str(error)
+
+
+@needs_mpi
+def test_processes_share_the_methods(compare, cornell, tiny, tmp_path):
+    out, data = tmp_path / "out", shutil.copytree(cornell, tmp_path / "data")
+    shutil.rmtree(data / "truth")  # ceilings take as long as they need
+    words = ("compare", data, "--methods", "direct", "no-prior", "--out", out)
+    words += ("--settings", tiny, "--steps", 8, "--score-seconds", 0.000001, "--evaluate-spp", 2)
+    start = [MPIEXEC, "-n", "2", sys.executable, "-m", "unbake"]
+    done = subprocess.run([*start, *map(str, words)], capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("compare.json") == 1 and not done.stderr
+    found = result(tmp_path)
+    assert list(found["methods"]) == ["direct", "no-prior"] and found["untrained"]["heldout"]
+    assert [row["steps"] for row in found["methods"].values()] == [8, 8]
+    kept = [out / name / "evaluation" for name in ("untrained", "direct", "no-prior")]
+    before = [contents(folder) for folder in kept]
+    assert compare("direct", "no-prior", data=data).status == 0  # one process finds all done
+    assert all(before) and [contents(folder) for folder in kept] == before
 
 
 def test_where_every_method_fails_the_first_error_is_told(compare, cornell, tmp_path):

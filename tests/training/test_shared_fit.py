@@ -1,21 +1,18 @@
 """Fits of several ranks: the same step on all, and runs that do not tell how many there were."""
 
 import json
-import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from importlib.util import find_spec
-from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import psutil
 import pytest
-from support import tiny_fields
+from support import MPIEXEC, needs_mpi, tiny_fields
 
 from unbake.config import to_toml
 from unbake.dataset.views import Dataset
@@ -27,11 +24,6 @@ from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep, with_share
-
-MPIEXEC = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-needs_mpi = pytest.mark.skipif(
-    MPIEXEC is None or find_spec("mpi4py") is None, reason="mpiexec and mpi4py are not installed"
-)
 
 
 class Fake(Ranks):
@@ -82,6 +74,56 @@ def test_ranks_draw_different_pixels_and_take_the_same_step(cornell):
     assert len(digests) == 1
 
 
+def test_ranks_may_take_some_steps_by_themselves_before_they_share_what_they_learned(cornell):
+    config = replace(tiny_fields(), pixels=64, sync_every=4)
+    half, shared = replace(config, pixels=32), []
+
+    def noted(own):
+        shared.append(own.copy())
+        return own
+
+    for steps, times in ((3, 0), (4, 1), (7, 1), (8, 2)):
+        shared.clear()
+        digest, terms, _ = steps_of(cornell, config, Fake(0, noted), steps)
+        alone, expected, _ = steps_of(cornell, half, None, steps)
+        assert digest == alone and terms == expected and len(shared) == times
+
+
+def test_shared_states_are_the_mean_of_all_numbers(cornell):
+    config = replace(tiny_fields(), pixels=64, sync_every=4)
+    others = {}
+
+    def noted(rank):
+        return lambda own: others.setdefault(rank, own.copy())
+
+    for rank in (0, 1):
+        steps_of(cornell, config, Fake(rank, noted(rank)), 4)
+    assert (others[0] != others[1]).any() and np.isfinite(others[0]).all()
+    mean = (others[0] + others[1]) / np.float32(2)
+    found = []
+    for rank in (0, 1):
+        digest, _, step = steps_of(cornell, config, Fake(rank, lambda own: mean), 4)
+        assert 1 <= step.recordings() <= 3
+        found.append(digest)
+    assert found[0] == found[1]
+
+
+def test_losses_are_told_as_the_mean_of_all_ranks(cornell):
+    config = replace(tiny_fields(), pixels=64, sync_every=4, method="direct")
+    _, terms, step = steps_of(cornell, config, Fake(0, lambda own: 3 * own), 1)
+    read = step.read([{name: mi.Float(value) for name, value in terms.items()}] * 2)
+    assert len(read) == 2 and set(read[0]) == set(terms)
+    assert all(read[1][name] == pytest.approx(3 * value) for name, value in terms.items())
+
+
+def test_a_fit_of_one_process_does_not_ask_how_often_others_share(cornell):
+    config = replace(tiny_fields(), pixels=64)
+    often, seldom = (
+        steps_of(cornell, replace(config, sync_every=every), None, 5)[:2] for every in (1, 3)
+    )
+    assert often == seldom
+
+
 def test_batches_that_cannot_be_shared_equally_are_refused():
     config = tiny_fields()
     assert with_share(replace(config, pixels=96), 3).pixels == 32
@@ -105,9 +147,11 @@ def settings(tmp_path):
 
 
 @needs_mpi
-def test_a_run_of_two_ranks_goes_on_with_one(cornell, settings, tmp_path, unbake):
+@pytest.mark.parametrize("every", [1, 8])
+def test_a_run_of_two_ranks_goes_on_with_one(cornell, settings, tmp_path, unbake, every):
     out = tmp_path / "run"
-    done = run(command(cornell, "--out", out, "--settings", settings, "--steps", 24))
+    options = ["--settings", settings, "--sync-every", every]
+    done = run(command(cornell, "--out", out, *options, "--steps", 24))
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("24 steps, 0.0 M samples") == 1
     assert [line["step"] for line in RunFolder(out).log() if "photometric" in line] == [20, 24]
@@ -117,6 +161,8 @@ def test_a_run_of_two_ranks_goes_on_with_one(cornell, settings, tmp_path, unbake
     assert more.status == 0, more.err
     log = [line["step"] for line in RunFolder(out).log() if "photometric" in line]
     assert log == [20, 24, 30]
+    if every > 1:
+        return
     wrong = [*command(cornell, "--out", tmp_path / "other", "--settings", settings, ranks=1)]
     wrong += ["--seed", "1", ":", *wrong[1:]]
     refused = run(wrong)

@@ -369,7 +369,7 @@ def fit(
 
     console = Console(highlight=False)
     ranks = Ranks.of_environment()
-    with ranks.guarded(lambda line: print(printable(line, _LONGEST), file=sys.stderr)):
+    with ranks.guarded(_say_error):
         progress = run(
             data,
             out,
@@ -721,7 +721,7 @@ def compare(
     the fields before the first step: a method is worth what it adds to these. Where the data set
     has true maps, the same fields are first trained on these: the ceiling of every method. The same
     command again keeps finished runs and goes on with interrupted ones. A method that fails is
-    recorded with its error; the exit status is then 1.
+    recorded with its error; the exit status is then 1. With mpiexec, processes share the methods.
 
     Args:
         data: Folder of the data set, with its transforms.json.
@@ -752,15 +752,20 @@ def compare(
     evaluation = EvaluationSettings(
         spp=evaluate_spp, clip_negative=clip_negative, truth=evaluate_truth
     )
-    result = run(
-        data,
-        variants,
-        out,
-        chosen,
-        evaluation=evaluation,
-        clip_negative=clip_negative,
-        allow_outside=allow_outside,
-    )
+    ranks = Ranks.of_environment()
+    with ranks.guarded(_say_error):
+        result = run(
+            data,
+            variants,
+            out,
+            chosen,
+            evaluation=evaluation,
+            clip_negative=clip_negative,
+            allow_outside=allow_outside,
+            ranks=ranks,
+        )
+    if not ranks.leads:
+        return 0
     _say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
     return 1 if any("error" in row for row in result["methods"].values()) else 0
 
@@ -1038,6 +1043,11 @@ def _word(path: Path) -> str:
 def _say(line: str) -> None:
     """Print a line; names in it may have control characters, which a terminal would obey."""
     print(printable(line, _LONGEST), flush=True)
+
+
+def _say_error(line: str) -> None:
+    """Print the error of one of several processes."""
+    print(printable(line, _LONGEST), file=sys.stderr)
 
 
 def _fail(message: str) -> NoReturn:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ from typing import Any
 import drjit as dr
 from rich.console import Console
 
-from .. import signals
-from ..config import FitConfig
+from .. import backend, signals
+from ..config import FitConfig, to_toml
+from ..dataset.fingerprint import fingerprint
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..evaluation.convergence import (
@@ -26,11 +28,13 @@ from ..evaluation.settings import EvaluationSettings
 from ..evaluation.yardsticks import can_have_ceiling, find_ceiling, measure_ceiling
 from ..io import write_json
 from ..machine import machine
+from ..ranks import Agreed, Ranks
 from ..report.page import write_report
 from ..training.checkpoint import Progress
 from ..training.defaults import with_data_defaults, with_defaults
 from ..training.loop import fit
 from ..training.run_folder import RunFolder, require_no_link
+from ..version import VERSION
 from .method_variant import MethodVariant
 from .tables import print_comparison
 
@@ -83,6 +87,7 @@ def compare(
     allow_outside: bool = False,
     ceiling: bool = True,
     console: Console | None = None,
+    ranks: Ranks | None = None,
 ) -> dict[str, Any]:
     """Fit, evaluate and report several methods, one after the other.
 
@@ -101,10 +106,12 @@ def compare(
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         ceiling: measure ceilings that the data set does not have yet.
         console: shows progress and tables.
+        ranks: of MPI, which share the methods among them and all call this; None: this process is
+            alone. What rank 0 writes is the same, but for times: fits run side by side.
 
     Returns:
         The content of `compare.json`: the methods' rows by name in `methods`, and that of the
-        untrained fields in `untrained`.
+        untrained fields in `untrained`. Other ranks than the first return nothing.
 
     Raises:
         UserError: the data set cannot be used, a run in `out` has other settings or data, or every
@@ -113,45 +120,46 @@ def compare(
 
     Paper: Sec. 6.1, Fig. 3.
     """
-    console = console or Console(highlight=False)
+    console, ranks = console or Console(highlight=False), ranks or Ranks()
+    if not ranks.leads:
+        console = Console(quiet=True)
     data, out = Path(data), Path(out)
-    names = [variant.name for variant in variants]
-    if len(set(names)) < len(names) or not names:
-        what = "a method is given twice" if names else "no method given"
-        raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
-    if UNTRAINED in names:
-        raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
-    dataset = Dataset.load(data, allow_outside=allow_outside)
-    if evaluation.truth:
-        require_true_materials(dataset)
-    config = with_data_defaults(config, dataset)
-    chosen = {v.name: with_defaults(v.settings(config), dataset) for v in variants}
-    untrained = with_defaults(_CHEAPEST.settings(config), dataset)
-    untrained = replace(untrained, steps=0, seconds=0.0, score_seconds=0.0)
-    fits = {UNTRAINED: untrained, **chosen}
-    for name, settings in {**chosen, **fits}.items():
-        _check_kept(RunFolder(out / name), settings, data)
 
-    if ceiling:
+    dataset, config, fits = ranks.together(
+        lambda: _checked(data, variants, out, config, evaluation, allow_outside)
+    )
+    chosen = {name: settings for name, settings in fits.items() if name != UNTRAINED}
+    if ranks.size > 1:
+        told = json.dumps({name: to_toml(settings) for name, settings in fits.items()})
+        files = json.dumps(fingerprint(dataset), sort_keys=True)
+        ranks.require_same({"version": VERSION, "settings": told, "data set": files})
+        backend.share_cores(ranks.here)
+
+    if ceiling and ranks.leads:
         _measure_ceilings(dataset, list(chosen.values()), console)
+    ranks.told(None)  # the others find it in the data set
     rows: dict[str, dict[str, Any]] = {}
     errors: dict[str, UserError] = {}
-    for name, settings in fits.items():
+    for name in ranks.mine(list(fits)):
         console.rule(name, align="left")
         try:
             run = RunFolder(out / name)
-            progress = _fitted(data, run, settings, clip_negative, allow_outside, console)
+            progress = _fitted(data, run, fits[name], clip_negative, allow_outside, console)
             metrics = _evaluated(run, progress, evaluation, allow_outside, console)
-            rows[name] = description(settings) | _numbers(run, metrics)
+            rows[name] = description(fits[name]) | _numbers(run, metrics)
         except UserError as error:
             errors[name] = error
-            rows[name] = description(settings) | {"error": str(error)}
+            rows[name] = description(fits[name]) | {"error": str(error)}
             console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
         # Free the memory of this method for the next one.
         gc.collect()
         dr.flush_malloc_cache()
+    found, errors = _of_all(ranks, rows, errors)
+    rows = {name: found[name] for name in fits}
     if errors.keys() >= chosen.keys():
-        raise next(iter(errors.values()))
+        raise Agreed.of(errors[next(iter(chosen))])
+    if not ranks.leads:
+        return {}
 
     start = {key: value for key, value in rows.pop(UNTRAINED).items() if key in OF_UNTRAINED}
     targets = time_to_quality({name: row.get("score", []) for name, row in rows.items()})
@@ -172,6 +180,52 @@ def compare(
     write_report(good, out / "report.html", failed, allow_outside=allow_outside)
     print_comparison(result, console)
     return result
+
+
+def _checked(
+    data: Path,
+    variants: Sequence[MethodVariant],
+    out: Path,
+    config: FitConfig,
+    evaluation: EvaluationSettings,
+    allow_outside: bool,
+) -> tuple[Dataset, FitConfig, dict[str, FitConfig]]:
+    """The data set, settings of all runs, and those of each by its name, the untrained one first.
+
+    Raises:
+        UserError: see `compare`.
+    """
+    names = [variant.name for variant in variants]
+    if len(set(names)) < len(names) or not names:
+        what = "a method is given twice" if names else "no method given"
+        raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
+    if UNTRAINED in names:
+        raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
+    dataset = Dataset.load(data, allow_outside=allow_outside)
+    if evaluation.truth:
+        require_true_materials(dataset)
+    config = with_data_defaults(config, dataset)
+    chosen = {v.name: with_defaults(v.settings(config), dataset) for v in variants}
+    untrained = with_defaults(_CHEAPEST.settings(config), dataset)
+    untrained = replace(untrained, steps=0, seconds=0.0, score_seconds=0.0)
+    fits = {UNTRAINED: untrained, **chosen}
+    for name, settings in {**chosen, **fits}.items():
+        _check_kept(RunFolder(out / name), settings, data)
+    return dataset, config, fits
+
+
+def _of_all(
+    ranks: Ranks, rows: Mapping[str, Any], errors: Mapping[str, UserError]
+) -> tuple[dict[str, Any], dict[str, UserError]]:
+    """The rows and the errors of all ranks."""
+    parts = {
+        name: [e.what, None if e.where is None else str(e.where), e.remedy]
+        for name, e in errors.items()
+    }
+    every = ranks.told({"rows": dict(rows), "errors": parts})
+    failed = {name: error for one in every for name, error in one["errors"].items()}
+    found = {name: row for one in every for name, row in one["rows"].items()}
+    return found, {name: UserError(*error) for name, error in failed.items()}
 
 
 def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:

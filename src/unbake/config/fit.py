@@ -52,6 +52,8 @@ class TransportConfig:
         require_ranges(self, {"max_specular": (0, DEEPEST)})
 
 
+#: Steps between readings of the loss; reading waits for the machine.
+READ_EVERY = 20
 #: The depth of paths in the paper (Sec. 6).
 PAPER_DEPTH = 15
 
@@ -247,6 +249,16 @@ class FitConfig:
     ] = 0.0
     #: Batch size in pixels (Table 1).
     pixels: Annotated[int, Flag("Pixels in a step", name="batch")] = 1024
+    #: Steps that each of several ranks takes by itself before their states are averaged (local SGD;
+    #: ours). 1: gradients are averaged in each step.
+    sync_every: Annotated[
+        int,
+        Flag(
+            "With mpiexec: steps that each process takes by itself, until all average what they "
+            "learned; for slow networks. 1: they take every step together",
+            metavar="STEPS",
+        ),
+    ] = 1
     #: Which pixels: random ones of all views (ours), or a random square crop of a random view, half
     #: of it foreground at least (Sec. 5.4).
     pixel_sampling: Annotated[
@@ -307,6 +319,7 @@ class FitConfig:
             | {
                 "seed": (0, (1 << 63) - 1),  # as TOML has them
                 "pixels": (1, MOST_SAMPLES),
+                "sync_every": (1, READ_EVERY),  # what is told is of one state
                 "held_aside": (0, 0.5),
                 "final_learning_rate": (POSITIVE, 1e3),
                 "loss_epsilon": (1e-12, 1e20),  # its inverse is a weight, in single precision

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..errors import UserError
+from ..ranks import alone
 from ..signals import STOPPING
 from .jobs import Job, JobRunner, Outcome, Unfinished
 
@@ -59,6 +60,7 @@ def command(
             stdout=None if log is None else subprocess.PIPE,
             stderr=None if log is None else subprocess.STDOUT,
             start_new_session=True,
+            env=alone(),
         )
     except OSError as error:
         raise UserError(f"the program cannot be started ({error.strerror})", words[0]) from error

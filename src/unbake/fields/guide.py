@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .arrays import sigmoid
+from .arrays import read_small, sigmoid
 from .domain import Domain
 from .settings import GuideConfig
 
@@ -118,7 +118,7 @@ class LightGuide:
 
     def share(self, cell: mi.UInt32) -> mi.Float:
         """The probability that the guide draws a bounce from a cell."""
-        return _MOST * sigmoid(_GAIN_OF_SHARES * dr.gather(mi.Float, self._odds, cell))
+        return _MOST * sigmoid(_GAIN_OF_SHARES * read_small(self._odds, cell))
 
     def pdf(self, cell: mi.UInt32, direction: mi.Vector3f) -> mi.Float:
         """The density of unit directions in world space, solid angle; as was prepared."""
@@ -169,7 +169,7 @@ class LightGuide:
         logits = _GAIN * self._logits
         here = dr.gather(mi.Float, logits, index, mode=dr.ReduceMode.Direct)
         found = dr.zeros(mi.Float, dr.width(self._odds))
-        dr.scatter_add(found, weight, cell)
+        dr.scatter_add(found, weight, cell, mode=dr.ReduceMode.Local)  # as in `read_small`
         every = self._weights * dr.repeat(found / self._total(dr.arange(mi.UInt32, len(found))), n)
         slope = dr.sum(every * logits) / count - dr.mean(weight * here)
         return told + dr.replace_grad(mi.Float(0), slope)

@@ -16,7 +16,9 @@ import drjit as dr
 import mitsuba as mi
 from rich.console import Console
 
+from .. import backend
 from ..config import FitConfig, to_toml
+from ..config.fit import READ_EVERY
 from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.photographs import MOST_PIXELS
 from ..dataset.pixels import CameraRays, PixelSource
@@ -48,8 +50,6 @@ from .validation import Score
 from .warm_start import OPTION, start_radiance, told_start, warm_start, with_solved_field
 from .watchdog import Watchdog
 
-#: Steps between readings of the loss; reading waits for the machine.
-READ_EVERY = 20
 #: Steps between looks at the clock, where time is the limit or decides when to score. Looking waits
 #: for the machine, too.
 TIME_EVERY = 4
@@ -245,8 +245,7 @@ def _agree(begun: _Begun, ranks: Ranks) -> None:
         }
     )
     _require_same_state(begun.state, ranks)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    dr.set_thread_count(max(1, (cores or 1) // ranks.here))
+    backend.share_cores(ranks.here, least=1)  # all is read
 
 
 def _require_same_state(state: State, ranks: Ranks) -> None:
@@ -350,7 +349,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             if not (full or last or due or save or tell):
                 continue
 
-            readings = [{term: float(x[0]) for term, x in losses.items()} for losses in recent]
+            begun.step.unite(state)
+            readings = begun.step.read(recent)
             recent.clear()
             entry = _log_entry(readings, progress, rates[unknown])
             # Scores, checkpoints and previews are not training: the clock stands still.

@@ -8,7 +8,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..fields.arrays import from_numpy
 from .loss_scaling import first_scale
 from .problem import Problem
 
@@ -73,6 +75,40 @@ class State:
                 value = _same(value)
                 dr.enable_grad(value)
                 optimizer.state[key] = (value, promoted, rate, (*map(_same, extra), None))
+
+    def numbers(self) -> np.ndarray:
+        """All parameters, the optimisers' moments and counts of steps, and the scale of the loss.
+
+        Returns:
+            float32, one after the other; counts are exact up to 2^24 steps.
+        """
+        parts = [] if self.scale is None else [self.scale.numpy()]
+        for _, optimizer in self.optimizers():
+            for value, _, _, (count, first, second, _) in optimizer.state.values():
+                parts += [x.numpy().ravel() for x in (dr.detach(value), first, second)]
+                parts.append(np.asarray(count).ravel()[:1])
+        return np.concatenate(parts, dtype=np.float32)
+
+    def assign_numbers(self, numbers: np.ndarray) -> None:
+        """Use these numbers from now on, in the order of `numbers`."""
+        taken = 0
+
+        def take(like: Any) -> Any:
+            nonlocal taken
+            part = numbers[taken : taken + dr.width(like.array)]
+            taken += len(part)
+            array = from_numpy(mi.Float, part)
+            return mi.TensorXf(array, like.shape) if dr.is_tensor_v(like) else array
+
+        if self.scale is not None:
+            self.scale = take(self.scale)
+        for _, optimizer in self.optimizers():
+            for key, (value, promoted, rate, extra) in list(optimizer.state.items()):
+                value, first, second = (take(x) for x in (value, *extra[1:3]))
+                dr.enable_grad(value)
+                count = dr.opaque(mi.UInt32, round(float(numbers[taken])))
+                taken += 1
+                optimizer.state[key] = (value, promoted, rate, (count, first, second, None))
 
     def moved(self) -> bool:
         """Whether any gradient has reached the unknowns, as Adam's moments tell."""

@@ -8,7 +8,7 @@ argument, and after the first steps nothing is traced or compiled again.
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -75,7 +75,8 @@ class TrainingStep:
     """The training step of a method on a problem.
 
     With several ranks each takes an equal share of the batch, with random numbers of its own.
-    Gradients and loss terms are averaged, so that all take the same step.
+    Gradients and loss terms are averaged, so that all take the same step. With `sync_every` > 1
+    each takes so many steps by itself, and then their states are averaged (local SGD, Stich 2019).
 
     Args:
         problem: what is learned; the same on all ranks.
@@ -128,6 +129,7 @@ class TrainingStep:
         self._own = dr.freeze(self._own_gradients) if recordable else self._own_gradients
         self._common = dr.freeze(self._step_by) if recordable else self._step_by
         self._terms: list[str] = []  # names of the loss terms, once a step was traced
+        self._apart = False  # whether ranks have taken steps by themselves since they were united
         self._probed = mi.load_dict({"type": "independent"})
         self._frozen_probe = dr.freeze(self._probe) if recordable else None
         self._fits_memory = False  # as far as is known
@@ -148,11 +150,11 @@ class TrainingStep:
         self.plan(state)
         self.require_memory(state)
         step = self._step if self._frozen is None else self._frozen
-        if self._ranks.size > 1:
-            step = self._shared_step
+        alone = self._ranks.size == 1 or self._config.sync_every > 1
         try:
             with without_garbage_collection():
-                return step(self.prepare(state, number, rates), state)
+                inputs = self.prepare(state, number, rates)
+                terms = (step if alone else self._shared_step)(inputs, state)
         except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
                 raise
@@ -160,6 +162,25 @@ class TrainingStep:
             raise UserError(
                 f"no memory for a step of {paths} paths", None, self._smaller()
             ) from None
+        self._apart = alone and self._ranks.size > 1
+        if (number + 1) % self._config.sync_every == 0:
+            self.unite(state)
+        return terms
+
+    def unite(self, state: State) -> None:
+        """Give all ranks the mean of their states, if they have taken steps by themselves."""
+        if self._apart:
+            state.assign_numbers(self._ranks.mean(state.numbers()))
+            self._apart = False
+
+    def read(self, losses: Sequence[Mapping[str, mi.Float]]) -> list[dict[str, float]]:
+        """The numbers of loss terms that steps returned, the same on all ranks."""
+        read = [{term: float(x[0]) for term, x in terms.items()} for terms in losses]
+        if self._ranks.size == 1 or self._config.sync_every == 1 or not read:
+            return read
+        own = np.array([list(row.values()) for row in read], np.float32)
+        names, rows = read[0], self._ranks.mean(own)
+        return [dict(zip(names, map(float, row), strict=True)) for row in rows]
 
     @carrying()
     def plan(self, state: State) -> None:
