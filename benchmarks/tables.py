@@ -32,17 +32,23 @@ def main(folder: Path = RESULTS) -> None:
 
 def steps(demo: dict, staircase: dict) -> str:
     """Milliseconds of a step, and as multiples of the step of ours."""
+    keys = dict.fromkeys(_case(row) for row in (*demo["rows"], *staircase["rows"]))
     rows = []
-    for a, b in zip(demo["rows"], staircase["rows"], strict=True):
-        name = (f"`{a['method']}`", a["representation"], a["estimator"].replace("-", " "))
-        cells = [
-            cell
-            for row, table in ((a, demo), (b, staircase))
-            for cell in (f"{row['milliseconds_per_step']:.0f} ms", f"{ratio(row, table):.2f}")
-        ]
-        rows.append([*name, *cells])
+    for key in keys:
+        cells = []
+        for table in (demo, staircase):
+            found = [row for row in table["rows"] if _case(row) == key]
+            ms = [f"{row['milliseconds_per_step']:.0f} ms" for row in found]
+            cells += [*ms, *(f"{ratio(row, table):.2f}" for row in found)] or ["", ""]
+        method, materials, estimator = key
+        rows.append([f"`{method}`", materials, estimator.replace("-", " "), *cells])
     titles = ["method", "materials", "estimator", "demo", "/ ours", "STAIRCASE", "/ ours"]
     return markdown(titles, rows)
+
+
+def _case(row: dict) -> tuple[str, str, str]:
+    """What tells a step from others of its table."""
+    return row["method"], row["representation"], row["estimator"]
 
 
 def ratio(row: dict, table: dict) -> float:

@@ -118,6 +118,24 @@ def test_what_fails_on_one_rank_alone_ends_all(rank):
     assert told == [f"rank {rank}: a file: disk full. Mend it"] and world.status == 2
 
 
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError(), "out of memory. Lower the resolution, --batch"),
+        (RuntimeError("jit_malloc(): out of memory! Could not"), "out of memory. Lower the res"),
+        (OSError(28, "No space left on device", "run/log.jsonl"), "run/log.jsonl: No space left"),
+        (KeyboardInterrupt(), "stopped"),
+        (ValueError("odd"), "ValueError: odd"),
+        (AssertionError(), "AssertionError"),
+    ],
+)
+def test_an_error_of_one_rank_is_one_line_with_the_remedy(error, told):
+    world, said = Two(1), []
+    with pytest.raises(SystemExit, match="2"), Ranks(world).guarded(said.append):
+        raise error
+    assert len(said) == 1 and said[0].startswith(f"rank 1: {told}") and "\n" not in said[0]
+
+
 def test_what_all_know_of_is_told_by_the_first_and_ends_the_others():
     for rank, kind in ((0, Agreed), (1, SystemExit)):
         world, told = Two(rank), []

@@ -93,6 +93,10 @@ def require_memory(
     raise UserError(told, where, remedy if isinstance(remedy, str) else remedy(free))
 
 
+#: What is told of such an error.
+NO_MEMORY = "out of memory. Lower the resolution, --batch or --spp, or the size of the fields"
+
+
 def lacks_memory(error: BaseException | None) -> bool:
     """Whether an error comes from running out of memory, also in native code."""
     while error is not None:

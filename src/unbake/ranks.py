@@ -23,6 +23,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from .errors import UserError
+from .memory import NO_MEMORY, lacks_memory
 
 Result = TypeVar("Result")
 Job = TypeVar("Job")
@@ -270,15 +271,23 @@ class Ranks:
                 raise
             if not self.leads:
                 time.sleep(_AFTER_YOU)
-            told = str(error) or type(error).__name__
-            if isinstance(error, KeyboardInterrupt):
-                told = "stopped"
-            elif not isinstance(error, UserError):
-                told = f"{type(error).__name__}: {told}"
-            say(f"rank {self.rank}: {told}")
+            say(f"rank {self.rank}: {_told(error)}")
             sys.stderr.flush()
             self._communicator.Abort(2)
             sys.exit(2)  # where MPI returns, because another rank does not end
+
+
+def _told(error: BaseException) -> str:
+    """What ends a rank, on one line, as the command line of one process tells it."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, KeyboardInterrupt):
+        return "stopped"
+    if lacks_memory(error):
+        return NO_MEMORY
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror or error}"
+    return f"{type(error).__name__}: {error}".rstrip(": ")
 
 
 def _text(row: np.ndarray) -> str:

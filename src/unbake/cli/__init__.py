@@ -28,7 +28,7 @@ from ..errors import UserError, printable
 from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
-from ..memory import lacks_memory
+from ..memory import NO_MEMORY, lacks_memory
 from ..ranks import Ranks
 from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
@@ -128,7 +128,7 @@ def main() -> None:
     except (MemoryError, RuntimeError, ImportError) as error:  # Dr.Jit raises the second
         if not lacks_memory(error):
             raise
-        _fail("out of memory. Lower the resolution, --batch or --spp, or the size of the fields")
+        _fail(NO_MEMORY)
     except OSError as error:
         # A full disk, a file taken away: nothing that a traceback would explain.
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}")
