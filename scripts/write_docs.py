@@ -114,6 +114,12 @@ def pages(results: Path = RESULTS, kept: Path = KEPT) -> dict[Path, str]:
     return {template.with_suffix(""): render(template, facts) for template in templates()}
 
 
+def page(name: str, results: Path = RESULTS, kept: Path = KEPT) -> str:
+    """The text of one page, by its name from the repository's folder."""
+    activate()
+    return render(ROOT / f"{name}.jinja", Facts(results, kept))
+
+
 def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
     """Copy tables and data, pictures as JPEG, and licences, a folder an experiment."""
     import mitsuba as mi

@@ -56,7 +56,7 @@ def test_another_result_makes_another_page(writer, tmp_path):
     content = json.loads(file.read_text())
     content["methods"]["ours"]["albedo_psnr"] = 77.7
     file.write_text(json.dumps(content))
-    text = writer["pages"](results=results)[ROOT / "docs" / "comparison.md"]
+    text = writer["page"]("docs/comparison.md", results=results)
     assert "77.7" in text
 
 
@@ -124,7 +124,7 @@ def test_a_search_that_finds_split_halves_better_is_told(writer, tmp_path):
     content = json.loads((results / "rates.json").read_text())
     content["searches"][0]["best"]["estimator"] = "split-halves"
     (results / "rates.json").write_text(json.dumps(content))
-    page = writer["pages"](results=results)[ROOT / "docs" / "comparison.md"]
+    page = writer["page"]("docs/comparison.md", results=results)
     assert "| two passes, as in Mitsuba; split halves for rooms | no |" in page
 
 
@@ -142,7 +142,7 @@ def test_the_headline_is_of_the_better_estimator_and_of_equal_schedules(writer, 
         score = [*curve, end | {"albedo_psnr": psnr}]
         rows[name]["per_seed"] = [{"seed": seed, "score": score} for seed in (0, 1)]
     (results / "rivals-demo.json").write_text(json.dumps(content))
-    readme = " ".join(writer["pages"](results=results)[ROOT / "README.md"].split())
+    readme = " ".join(writer["page"]("README.md", results=results).split())
     assert "ahead by +20.0 dB in albedo" in readme
     assert "ours has after 25.0 ± 0.0 s, 2 times sooner" in readme
 
@@ -157,7 +157,7 @@ def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, t
     about.pop("made_with", None)
     for older in ({}, {"made_with": "Made with the exact light."}):
         file.write_text(json.dumps(about | older))
-        page = writer["pages"](kept=kept)[ROOT / "docs" / "reproduction.md"]
+        page = writer["page"]("docs/reproduction.md", kept=kept)
         assert (sentence in page) != bool(older)
 
 
@@ -167,7 +167,7 @@ def test_estimators_are_told_as_the_data_have_them(writer, tmp_path):
     shutil.copytree(ROOT / "docs" / "reproduction", kept)
 
     def page():
-        return " ".join(writer["pages"](kept=kept)[ROOT / "docs" / "reproduction.md"].split())
+        return " ".join(writer["page"]("docs/reproduction.md", kept=kept).split())
 
     for figure, title, both in (
         ("fig3", "PRB", "shown with both estimators"),

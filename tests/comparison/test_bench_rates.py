@@ -81,6 +81,7 @@ def test_a_search_goes_on_with_the_trials_that_it_has(rates, tmp_path, monkeypat
     assert searches(tmp_path) == [ended]
 
 
+@pytest.mark.slow
 def test_scores_are_means_over_seeds_which_may_become_more(rates, tmp_path, monkeypatch):
     made = []
 

@@ -199,12 +199,12 @@ def test_another_quality_of_evaluation_is_evaluated_anew(compare, tmp_path):
     "changes",
     [
         {"train_views": 1},
-        *(
-            pytest.param(changes, marks=pytest.mark.slow)
-            for changes in ({"clip_negative": True}, {"material_spp": 3}, {"rr_depth": 2})
-        ),
+        {"clip_negative": True},
+        {"material_spp": 3},
+        {"rr_depth": 2},
     ],
 )
+@pytest.mark.slow
 def test_an_evaluation_with_other_settings_is_repeated(changes, cornell, tiny, tmp_path):
     config = dataclasses.replace(read_toml(tiny), steps=1)
     console = Console(file=io.StringIO())
@@ -404,6 +404,7 @@ def test_a_contender_is_a_method_and_maybe_a_representation():
     assert (chosen.bounces, chosen.prior) == (1, "extra-bounce")
 
 
+@pytest.mark.slow
 def test_samples_of_both_passes_count(compare, tmp_path):
     assert compare("direct", "prb:neural:two-pass", "prb:neural:all-pairs").status == 0
     rows = result(tmp_path)["methods"]

@@ -81,6 +81,7 @@ def test_fig5_ours_does_not_grow_and_differentiated_paths_do(rows, out):
     assert path[1] > 1.5 * path[0] and ours[1] - ours[0] < path[1] - path[0]
 
 
+@pytest.mark.slow
 def test_what_was_done_is_not_done_again(rows, unbake, out):
     rows("table2", figure=False)
     again = unbake("reproduce", "table2", "--scale", "smoke", "--out", out)

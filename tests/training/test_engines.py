@@ -60,6 +60,7 @@ def test_one_step_is_the_same_on_every_engine(built_in, monkeypatch, engine):
     assert np.linalg.norm(other - row) < 1e-4 * np.linalg.norm(row)
 
 
+@pytest.mark.slow
 def test_losses_and_gradients_are_those_of_single_precision(built_in):
     single, half = trained(built_in, 60)
     differences, exact = [], []

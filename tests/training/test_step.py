@@ -190,6 +190,7 @@ def test_the_estimate_of_memory_is_what_a_step_then_takes(built_in):
     assert 0.5 * taken < estimate < 2 * taken
 
 
+@pytest.mark.slow
 def test_russian_roulette_saves_memory(built_in):
     """In a closed room, where all other paths go on to the longest."""
     needed = {}
