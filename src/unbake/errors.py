@@ -37,6 +37,11 @@ class UserError(Exception):
         return text if self.remedy is None else f"{text}. {_one_line(self.remedy)}"
 
 
+def of_system(error: OSError) -> str:
+    """A full disk, a file taken away: which file, and what the system says."""
+    return f"{error.filename or 'a file'}: {error.strerror or error}"
+
+
 def printable(name: object, longest: int = _LONGEST_NAME) -> str:
     """A name on one line of a terminal, whatever it is.
 

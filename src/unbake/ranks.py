@@ -22,14 +22,23 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from .errors import UserError
+from .errors import UserError, of_system
 from .memory import NO_MEMORY, lacks_memory
 
 Result = TypeVar("Result")
 Job = TypeVar("Job")
 
 #: How names of what `mpiexec` and Slurm tell a process begin.
-_TOLD = ("PMI", "MPI_LOCAL", "MPIEXEC", "HYDRA", "OMPI_", "MV2_COMM", "SLURM_STEP", "SLURM_PROCID")
+_OF_LAUNCHERS = (
+    "PMI",
+    "MPI_LOCAL",
+    "MPIEXEC",
+    "HYDRA",
+    "OMPI_",
+    "MV2_COMM",
+    "SLURM_STEP",
+    "SLURM_PROCID",
+)
 #: What they tell a process: how many there are.
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
 #: Seconds that a rank waits for the others. Kernels are compiled in the first steps, and rank 0
@@ -48,7 +57,7 @@ _LONG, _LONG_NAP = 5.0, 0.05
 
 def alone() -> dict[str, str]:
     """The environment, for a process that is not to take itself for one of several."""
-    return {name: value for name, value in os.environ.items() if not name.startswith(_TOLD)}
+    return {name: value for name, value in os.environ.items() if not name.startswith(_OF_LAUNCHERS)}
 
 
 class Communicator(Protocol):
@@ -286,7 +295,7 @@ def _told(error: BaseException) -> str:
     if lacks_memory(error):
         return NO_MEMORY
     if isinstance(error, OSError):
-        return f"{error.filename or 'a file'}: {error.strerror or error}"
+        return of_system(error)
     return f"{type(error).__name__}: {error}".rstrip(": ")
 
 

@@ -161,8 +161,10 @@ def test_a_run_of_two_ranks_goes_on_with_one(cornell, settings, tmp_path, unbake
     assert more.status == 0, more.err
     log = [line["step"] for line in RunFolder(out).log() if "photometric" in line]
     assert log == [20, 24, 30]
-    if every > 1:
-        return
+
+
+@needs_mpi
+def test_ranks_with_other_settings_are_refused(cornell, settings, tmp_path):
     wrong = [*command(cornell, "--out", tmp_path / "other", "--settings", settings, ranks=1)]
     wrong += ["--seed", "1", ":", *wrong[1:]]
     refused = run(wrong)

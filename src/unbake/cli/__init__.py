@@ -11,7 +11,8 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -24,7 +25,7 @@ from .. import backend, experiments, exports, signals
 from ..acquisition.settings import CaptureSettings, DegradeSettings
 from ..config import FitConfig, with_quality
 from ..config.light import LightConfig
-from ..errors import UserError, printable
+from ..errors import UserError, of_system, printable
 from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
@@ -131,7 +132,7 @@ def main() -> None:
         _fail(NO_MEMORY)
     except OSError as error:
         # A full disk, a file taken away: nothing that a traceback would explain.
-        _fail(f"{error.filename or 'a file'}: {error.strerror or error}")
+        _fail(of_system(error))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(signals.status())
@@ -368,8 +369,7 @@ def fit(
     from ..training.loop import fit as run
 
     console = Console(highlight=False)
-    ranks = Ranks.of_environment()
-    with ranks.guarded(_say_error):
+    with _ranks() as ranks:
         progress = run(
             data,
             out,
@@ -752,8 +752,7 @@ def compare(
     evaluation = EvaluationSettings(
         spp=evaluate_spp, clip_negative=clip_negative, truth=evaluate_truth
     )
-    ranks = Ranks.of_environment()
-    with ranks.guarded(_say_error):
+    with _ranks() as ranks:
         result = run(
             data,
             variants,
@@ -1045,9 +1044,12 @@ def _say(line: str) -> None:
     print(printable(line, _LONGEST), flush=True)
 
 
-def _say_error(line: str) -> None:
-    """Print the error of one of several processes."""
-    print(printable(line, _LONGEST), file=sys.stderr)
+@contextmanager
+def _ranks() -> Iterator[Ranks]:
+    """The ranks that this process is one of; what fails on one of them ends all, in one line."""
+    ranks = Ranks.of_environment()
+    with ranks.guarded(lambda line: print(printable(line, _LONGEST), file=sys.stderr)):
+        yield ranks
 
 
 def _fail(message: str) -> NoReturn:

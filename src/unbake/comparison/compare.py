@@ -32,9 +32,8 @@ from ..ranks import Agreed, Ranks
 from ..report.page import write_report
 from ..training.checkpoint import Progress
 from ..training.defaults import with_data_defaults, with_defaults
-from ..training.loop import fit
+from ..training.loop import fit, what_ranks_share
 from ..training.run_folder import RunFolder, require_no_link
-from ..version import VERSION
 from .method_variant import MethodVariant
 from .tables import print_comparison
 
@@ -131,8 +130,7 @@ def compare(
     chosen = {name: settings for name, settings in fits.items() if name != UNTRAINED}
     if ranks.size > 1:
         told = json.dumps({name: to_toml(settings) for name, settings in fits.items()})
-        files = json.dumps(fingerprint(dataset), sort_keys=True)
-        ranks.require_same({"version": VERSION, "settings": told, "data set": files})
+        ranks.require_same(what_ranks_share(told, fingerprint(dataset)))
         backend.share_cores(ranks.here)
 
     if ceiling and ranks.leads:

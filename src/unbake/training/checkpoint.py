@@ -22,14 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
 from ..errors import UserError
-from ..fields.arrays import from_numpy
 from ..formats import check_format
 from .run_folder import MANIFEST, STATE, SUFFIX_OF_VERSION_0_1, RunFolder, require_no_link
 from .state import State
@@ -78,7 +75,7 @@ def save_checkpoint(
     Raises:
         UserError: it cannot be written; older checkpoints are untouched.
     """
-    content = save(_arrays(state))
+    content = save(state.arrays())
     manifest = {
         "format": FORMAT,
         **progress.counted(),
@@ -108,10 +105,10 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
         UserError: the checkpoint belongs to other settings or was written by a newer version, or
             none can be used.
     """
-    expected = _arrays(state)
+    expected = state.arrays()
     for path, arrays, progress in _whole(run, _most(expected)):
         _require_fit(arrays, expected, path)
-        _restore(state, arrays)
+        state.assign(arrays)
         return progress
     return None
 
@@ -128,13 +125,13 @@ def load_written(run: RunFolder, state: State, path: Path) -> Progress | None:
     Raises:
         UserError: it belongs to other settings or was written by a newer version.
     """
-    expected = _arrays(state)
+    expected = state.arrays()
     found = _good(path, _most(expected))
     if found is None or found[2].get("run") != _identity(run):
         return None
     arrays, progress, _ = found
     _require_fit(arrays, expected, path)
-    _restore(state, arrays)
+    state.assign(arrays)
     return progress
 
 
@@ -207,28 +204,13 @@ def _most(expected: Mapping[str, np.ndarray]) -> int:
 def state_digest(state: State) -> str:
     """SHA-256 of all numbers of a state, the moments among them: equal for the same bits."""
     digest = hashlib.sha256()
-    for name, array in _arrays(state).items():
+    for name, array in state.arrays().items():
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
 # ------------------------------------------------------------------------------------------ writing
-
-
-def _arrays(state: State) -> dict[str, np.ndarray]:
-    """All numbers of a state by name."""
-    arrays = {}
-    for name, optimizer in state.optimizers():
-        for key, (value, _, _, extra) in optimizer.state.items():
-            count, first, second, _ = extra
-            arrays[f"{name}.{key}"] = value.numpy()
-            arrays[f"{name}.{key}:m"] = first.numpy()
-            arrays[f"{name}.{key}:v"] = second.numpy()
-            arrays[f"{name}.{key}:t"] = np.asarray(count).astype(np.uint32).ravel()[:1]
-    if state.scale is not None:
-        arrays["scale"] = np.array(state.scale)
-    return arrays
 
 
 def _write_folder(path: Path, files: Mapping[str, bytes]) -> None:
@@ -357,18 +339,3 @@ def _require_fit(
                 where=path,
                 remedy="Resume with the settings that the run was started with",
             )
-
-
-def _restore(state: State, arrays: Mapping[str, np.ndarray]) -> None:
-    if state.scale is not None and "scale" in arrays:
-        state.scale = dr.opaque(mi.Float, float(arrays["scale"][0]))
-    for name, optimizer in state.optimizers():
-        for key, (value, promoted, rate, _) in list(optimizer.state.items()):
-            full = f"{name}.{key}"
-            first, second = (from_numpy(mi.Float, arrays[f"{full}:{x}"]) for x in "mv")
-            count = dr.opaque(mi.UInt32, int(arrays[f"{full}:t"][0]))
-            new = from_numpy(mi.Float, arrays[full])
-            if dr.is_tensor_v(value):
-                new = mi.TensorXf(new, value.shape)
-            dr.enable_grad(new)
-            optimizer.state[key] = (new, promoted, rate, (count, first, second, None))

@@ -8,9 +8,11 @@ import math
 import os
 import time
 import uuid
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -227,6 +229,20 @@ def _begin(
     )
 
 
+def what_ranks_share(settings: str, files: Mapping[str, Any]) -> dict[str, str]:
+    """Version, settings and data set, for `Ranks.require_same`.
+
+    Args:
+        settings: as text.
+        files: the data set's fingerprint.
+    """
+    return {
+        "version": f"{VERSION}, Mitsuba {mi.__version__}, {mi.variant()}",
+        "settings": settings,
+        "data set": json.dumps(files, sort_keys=True),
+    }
+
+
 def _agree(begun: _Begun, ranks: Ranks) -> None:
     """Check that all ranks work on the same, from the same state.
 
@@ -236,14 +252,8 @@ def _agree(begun: _Begun, ranks: Ranks) -> None:
     if ranks.size == 1:
         return
     origin, progress = begun.origin, begun.restored or Progress()
-    ranks.require_same(
-        {
-            "version": f"{VERSION}, Mitsuba {mi.__version__}, {mi.variant()}",
-            "settings": to_toml(begun.config),
-            "data set": json.dumps(origin.fingerprint, sort_keys=True),
-            "length so far": json.dumps(progress.counted()),
-        }
-    )
+    alike = what_ranks_share(to_toml(begun.config), origin.fingerprint)
+    ranks.require_same(alike | {"length so far": json.dumps(progress.counted())})
     _require_same_state(begun.state, ranks)
     backend.share_cores(ranks.here, least=1)  # all is read
 

@@ -76,39 +76,53 @@ class State:
                 dr.enable_grad(value)
                 optimizer.state[key] = (value, promoted, rate, (*map(_same, extra), None))
 
-    def numbers(self) -> np.ndarray:
-        """All parameters, the optimisers' moments and counts of steps, and the scale of the loss.
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All numbers by name: parameters, the optimisers' moments and counts, and the scale."""
+        arrays = {}
+        for name, optimizer in self.optimizers():
+            for key, (value, _, _, extra) in optimizer.state.items():
+                count, first, second, _ = extra
+                arrays[f"{name}.{key}"] = value.numpy()
+                arrays[f"{name}.{key}:m"] = first.numpy()
+                arrays[f"{name}.{key}:v"] = second.numpy()
+                arrays[f"{name}.{key}:t"] = np.asarray(count).astype(np.uint32).ravel()[:1]
+        if self.scale is not None:
+            arrays["scale"] = np.array(self.scale)
+        return arrays
 
-        Returns:
-            float32, one after the other; counts are exact up to 2^24 steps.
+    def assign(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Use these numbers from now on, by the names and in the shapes of `arrays`.
+
+        The scale may be missing, as of a fit in single precision.
         """
-        parts = [] if self.scale is None else [self.scale.numpy()]
-        for _, optimizer in self.optimizers():
-            for value, _, _, (count, first, second, _) in optimizer.state.values():
-                parts += [x.numpy().ravel() for x in (dr.detach(value), first, second)]
-                parts.append(np.asarray(count).ravel()[:1])
-        return np.concatenate(parts, dtype=np.float32)
+        if self.scale is not None and "scale" in arrays:
+            self.scale = dr.opaque(mi.Float, float(arrays["scale"][0]))
+        for name, optimizer in self.optimizers():
+            for key, (value, promoted, rate, _) in list(optimizer.state.items()):
+                full = f"{name}.{key}"
+                first, second = (from_numpy(mi.Float, arrays[f"{full}:{x}"]) for x in "mv")
+                count = dr.opaque(mi.UInt32, int(arrays[f"{full}:t"][0]))
+                new = from_numpy(mi.Float, arrays[full])
+                if dr.is_tensor_v(value):
+                    new = mi.TensorXf(new, value.shape)
+                dr.enable_grad(new)
+                optimizer.state[key] = (new, promoted, rate, (count, first, second, None))
+
+    def numbers(self) -> np.ndarray:
+        """All numbers one after the other, float32; counts are exact up to 2^24 steps."""
+        return np.concatenate([a.ravel() for a in self.arrays().values()], dtype=np.float32)
 
     def assign_numbers(self, numbers: np.ndarray) -> None:
-        """Use these numbers from now on, in the order of `numbers`."""
-        taken = 0
-
-        def take(like: Any) -> Any:
-            nonlocal taken
-            part = numbers[taken : taken + dr.width(like.array)]
-            taken += len(part)
-            array = from_numpy(mi.Float, part)
-            return mi.TensorXf(array, like.shape) if dr.is_tensor_v(like) else array
-
-        if self.scale is not None:
-            self.scale = take(self.scale)
-        for _, optimizer in self.optimizers():
-            for key, (value, promoted, rate, extra) in list(optimizer.state.items()):
-                value, first, second = (take(x) for x in (value, *extra[1:3]))
-                dr.enable_grad(value)
-                count = dr.opaque(mi.UInt32, round(float(numbers[taken])))
-                taken += 1
-                optimizer.state[key] = (value, promoted, rate, (count, first, second, None))
+        """Use these numbers from now on, in the order of `numbers`; counts are rounded."""
+        now = self.arrays()
+        ends = np.cumsum([array.size for array in now.values()])
+        parts = np.split(numbers, ends[:-1])
+        self.assign(
+            {
+                name: np.rint(part) if array.dtype == np.uint32 else part
+                for (name, array), part in zip(now.items(), parts, strict=True)
+            }
+        )
 
     def moved(self) -> bool:
         """Whether any gradient has reached the unknowns, as Adam's moments tell."""
