@@ -54,12 +54,12 @@ def start(words: list[str], ranks: int = 1) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        preexec_fn=_default_signals,
+        preexec_fn=default_signals,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
 
 
-def _default_signals() -> None:
+def default_signals() -> None:
     """What a shell starts in the background ignores SIGINT, and unbake then does, too."""
     for number in STOPPING:
         signal.signal(number, signal.SIG_DFL)

@@ -1,10 +1,14 @@
 """What the ranks of a fit tell each other, and how they end together."""
 
+import os
+import signal
+import threading
 import time
 
 import numpy as np
 import pytest
 
+from unbake import ranks as module
 from unbake.errors import UserError
 from unbake.ranks import SIZES, Agreed, Ranks, alone
 
@@ -29,6 +33,7 @@ class Two:
 
     def __init__(self, rank=0, others=(), looks=3):
         self.rank, self.others, self.looks, self.status = rank, list(others), looks, None
+        self.signs = []  # of life that were sent
 
     def Iallreduce(self, send, total):
         total[:] = send + self.others.pop(0)
@@ -45,8 +50,26 @@ class Two:
             array[:] = self.others.pop(0)
         return Request(self.looks)
 
+    def Isend(self, sign, dest, tag):
+        self.signs.append(dest)
+        return Request()
+
+    def Irecv(self, sign, source, tag):
+        assert source == 0
+        return Request()
+
     def Abort(self, status):
         self.status = status
+
+
+@pytest.fixture
+def alarms(monkeypatch):
+    """Ends of the process are exits of the test, and what would end it later is noted."""
+    noted = []
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(signal, "alarm", noted.append)
+    monkeypatch.setattr(os, "_exit", lambda status: (_ for _ in ()).throw(SystemExit(status)))
+    return noted
 
 
 def error_of(what, where="", remedy=""):
@@ -110,12 +133,112 @@ def test_waiting_has_a_limit():
     assert 0.05 <= time.monotonic() - start < 1
 
 
+def after_steps(rank, seconds, clock, **options):
+    """A rank of two that has taken some steps of so many seconds."""
+    ranks = Ranks(Two(rank, others=[1] * 200), **options)
+    for _ in range(20):
+        clock.now += seconds
+        ranks.any(True)
+    return ranks
+
+
+class Clock:
+    """The seconds that the test says; each look takes one of the given lengths."""
+
+    def __init__(self, look=0.0):
+        self.now, self.look = 0.0, look
+
+    def __call__(self):
+        self.now += self.look
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    return clock
+
+
+def waits(ranks, clock, look=0.5):
+    """The seconds after which a rank gives up."""
+    ranks._communicator.looks, clock.look = None, look
+    began = clock.now
+    with pytest.raises(UserError, match="have not answered for"):
+        ranks.any(True)
+    clock.look = 0.0
+    return clock.now - began
+
+
+def test_the_limit_is_short_in_steps_and_long_where_one_may_have_something_else_to_do(clock):
+    assert waits(after_steps(0, 0.1, clock), clock) == pytest.approx(20, abs=2)
+    assert waits(after_steps(1, 5.0, clock), clock) == pytest.approx(50, abs=2)
+    first = Ranks(Two(others=[1] * 9))
+    assert first.any(True) and waits(first, clock) == pytest.approx(120, abs=2)
+    follower, leader = after_steps(1, 0.1, clock), after_steps(0, 0.1, clock)
+    for ranks, limit in ((follower, 120), (leader, 50)):
+        ranks.announce()
+        clock.now += 5  # rank 0 needs so long itself
+        assert waits(ranks, clock) == pytest.approx(limit, rel=0.15)
+
+
+def test_after_a_long_phase_the_limit_is_short_again(clock):
+    ranks = after_steps(1, 0.1, clock)
+    ranks.announce()
+    clock.now += 100
+    assert ranks.any(True) and ranks.any(True)
+    assert waits(ranks, clock) == pytest.approx(20, abs=2)
+
+
+def test_time_in_which_a_process_was_stopped_is_no_waiting(clock):
+    ranks = after_steps(0, 0.1, clock)
+    assert waits(ranks, clock, look=100.0) > 10 * 100
+
+
+def test_rank_0_may_take_as_long_as_it_likes_while_it_gives_signs_of_life(clock):
+    ranks = after_steps(1, 0.1, clock, beats=True)
+    ranks.announce()
+    ranks._communicator.looks, clock.look = 2000, 0.5
+    assert ranks.any(True) == (True,) and clock.now > 900
+
+
+def test_signs_of_life_end_when_all_meet_again(monkeypatch):
+    monkeypatch.setattr(module, "_BEAT", 0.005)
+    world = Two(others=[1, 1])
+    ranks, before = Ranks(world, beats=True), threading.active_count()
+    ranks.announce()
+    ranks.announce()
+    assert threading.active_count() == before + 1
+    deadline = time.monotonic() + 5
+    while len(world.signs) < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert ranks.any(True) and threading.active_count() == before
+    sent = len(world.signs)
+    assert sent >= 3 and set(world.signs) == {1}
+    time.sleep(0.05)
+    assert len(world.signs) == sent
+    for quiet in (Ranks(Two(1), beats=True), Ranks(Two(0)), Ranks()):
+        quiet.announce()
+    assert threading.active_count() == before
+
+
+def test_a_connection_that_the_library_knows_is_lost_is_told(monkeypatch):
+    def lost(self):
+        raise RuntimeError("MPI_ERR_OTHER:\n known error not in list")
+
+    monkeypatch.setattr(Request, "Test", lost)
+    with pytest.raises(UserError, match=r"is lost \(MPI_ERR_OTHER: known .*go on with --resume"):
+        Ranks(Two(others=[1])).any(True)
+
+
 @pytest.mark.parametrize("rank", [0, 1])
-def test_what_fails_on_one_rank_alone_ends_all(rank):
+def test_what_fails_on_one_rank_alone_ends_all(rank, alarms):
     world, told = Two(rank), []
     with pytest.raises(SystemExit, match="2"), Ranks(world).guarded(told.append):
         fail("disk full")
     assert told == [f"rank {rank}: a file: disk full. Mend it"] and world.status == 2
+    assert len(alarms) == 1 and 1 < alarms[0] < 60
 
 
 @pytest.mark.parametrize(
@@ -129,6 +252,7 @@ def test_what_fails_on_one_rank_alone_ends_all(rank):
         (AssertionError(), "AssertionError"),
     ],
 )
+@pytest.mark.usefixtures("alarms")
 def test_an_error_of_one_rank_is_one_line_with_the_remedy(error, told):
     world, said = Two(1), []
     with pytest.raises(SystemExit, match="2"), Ranks(world).guarded(said.append):

@@ -5,20 +5,26 @@ every batch. Rank 0 leads: it alone writes, prints and decides what depends on a
 `mpiexec` there is one rank, MPI is not loaded, and nothing here does anything.
 
 The library waits for ever, and at full load, where another rank hangs or a network is cut. So all
-waiting is done here, with a limit, and leaves the processor to others.
+waiting is done here, with a limit, and leaves the processor to others. The limit is short within a
+step, and long where a rank may have something else to do. Rank 0 tells the others that it lives
+while they wait for what it does by itself, however long that takes.
 """
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import json
 import math
 import os
+import signal
 import sys
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn, Protocol, TypeVar
 
 import numpy as np
 
@@ -28,6 +34,7 @@ from .memory import NO_MEMORY, lacks_memory
 Result = TypeVar("Result")
 Job = TypeVar("Job")
 
+_GO_ON = "See whether one of them hangs or its network is cut; go on with --resume"
 #: How names of what `mpiexec` and Slurm tell a process begin.
 _OF_LAUNCHERS = (
     "PMI",
@@ -41,9 +48,20 @@ _OF_LAUNCHERS = (
 )
 #: What they tell a process: how many there are.
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
-#: Seconds that a rank waits for the others. Kernels are compiled in the first steps, and rank 0
-#: writes checkpoints and previews while the others wait.
+#: Seconds that a rank waits for the others while they read input, in the first steps, which compile
+#: kernels, and where rank 0 writes and measures.
 PATIENCE = 120.0
+#: Within later steps: so many times the longest of the last ones, and no less than so many seconds,
+#: which a network that fails for some seconds and a machine at its limits may need.
+_TIMES, LEAST = 10.0, 20.0
+#: Steps that count as the first ones, and as the last ones.
+_FIRST, _LAST = 10, 100
+#: Seconds between signs of life of a rank that does something by itself, and their tag.
+_BEAT, _ALIVE = 1.0, 77
+#: Longer between two looks, in seconds, this process itself was stopped, which is no waiting.
+_PAUSE = 1.0
+#: Seconds in which MPI must end a process; after that the system does.
+_LAST_RESORT = 10
 #: Seconds that a rank other than the first waits before it ends all for what happened to it, so
 #: that what happened to all is told once, by rank 0.
 _AFTER_YOU = 0.5
@@ -78,6 +96,14 @@ class Communicator(Protocol):
         """Copy an array of one rank to all."""
         ...
 
+    def Isend(self, buf: Any, dest: int, tag: int = ...) -> Any:
+        """Send an array to one rank."""
+        ...
+
+    def Irecv(self, buf: Any, source: int = ..., tag: int = ...) -> Any:
+        """Receive an array of one rank."""
+        ...
+
     def Abort(self, status: int, /) -> Any:
         """End all processes."""
         ...
@@ -99,7 +125,8 @@ class Ranks:
     Args:
         communicator: of mpi4py; None: this process is alone.
         here: how many of them are on this machine.
-        patience: seconds to wait for the others.
+        patience: seconds to wait for the others where some may take long.
+        beats: whether a thread may tell others that this rank lives.
     """
 
     def __init__(
@@ -107,8 +134,15 @@ class Ranks:
         communicator: Communicator | None = None,
         here: int = 1,
         patience: float = PATIENCE,
+        beats: bool = False,
     ) -> None:
         self._communicator, self.here, self._patience = communicator, here, patience
+        self._beats = beats
+        self._beating: tuple[threading.Thread, threading.Event] | None = None
+        self._life: Any = None  # the request for the next sign of life of rank 0
+        self._steps: deque[float] = deque(maxlen=_LAST)  # seconds of the last steps
+        self._first_steps, self._step_began = _FIRST, math.nan
+        self._announced: float | None = None  # when it was told that some rank may take long
         self.rank = 0 if communicator is None else communicator.rank
         self.size = 1 if communicator is None else communicator.size
 
@@ -127,8 +161,10 @@ class Ranks:
         except (ImportError, RuntimeError) as error:
             what = f"several processes were started, and mpi4py cannot be loaded ({error})"
             raise UserError(what, remedy="Install it: pip install unbake[mpi]") from None
+        atexit.register(_end_soon)  # all work is done, and MPI may wait for ranks that are gone
         here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size
-        return Ranks(MPI.COMM_WORLD, here)
+        beats = MPI.Query_thread() >= MPI.THREAD_SERIALIZED
+        return Ranks(MPI.COMM_WORLD, here, beats=beats)
 
     @property
     def leads(self) -> bool:
@@ -146,15 +182,18 @@ class Ranks:
         if self._communicator is None:
             return numbers
         total = np.empty_like(numbers)
-        self._wait(self._communicator.Iallreduce(np.ascontiguousarray(numbers), total))
+        own = np.ascontiguousarray(numbers)
+        self._exchange(lambda all_: all_.Iallreduce(own, total))
         return total / np.float32(self.size)
 
     def any(self, *told: bool) -> tuple[bool, ...]:
-        """For each answer, whether any rank says so."""
+        """For each answer, whether any rank says so; asked once a step."""
         if self._communicator is None:
             return told
         total = np.empty(len(told), np.int32)
-        self._wait(self._communicator.Iallreduce(np.array(told, np.int32), total))
+        own = np.array(told, np.int32)
+        self._exchange(lambda all_: all_.Iallreduce(own, total))
+        self._note_step()
         return tuple(bool(count) for count in total)
 
     def of_first(self, number: float) -> float:
@@ -162,7 +201,7 @@ class Ranks:
         if self._communicator is None:
             return number
         array = np.array([number], np.float64)
-        self._wait(self._communicator.Ibcast(array, root=0))
+        self._exchange(lambda all_: all_.Ibcast(array, root=0))
         return float(array[0])
 
     def mine(self, jobs: Sequence[Job]) -> Sequence[Job]:
@@ -231,27 +270,113 @@ class Ranks:
 
     def _gathered(self, array: np.ndarray, patience: float | None = None) -> np.ndarray:
         """The arrays of all ranks, one a row."""
-        assert self._communicator is not None
         rows = np.empty((self.size, *array.shape), array.dtype)
-        self._wait(self._communicator.Iallgather(np.ascontiguousarray(array), rows), patience)
+        own = np.ascontiguousarray(array)
+        self._exchange(lambda all_: all_.Iallgather(own, rows), patience)
         return rows
 
-    def _wait(self, request: Any, patience: float | None = None) -> None:
-        """Wait for the others.
+    # --------------------------------------------------------------------- how long a rank waits
+
+    def announce(self, long: bool = True) -> None:
+        """Tell that some rank may take long until all meet again; all ranks call this.
+
+        They are patient then, and more so with rank 0: a thread sends its signs of life.
 
         Args:
-            patience: for how many seconds; None: as long as this object always waits.
+            long: False: nothing is told.
+        """
+        if not long or self.size == 1 or self._announced is not None:
+            return
+        self._announced, self._step_began = time.monotonic(), math.nan  # this is no step
+        if self.leads and self._beats:
+            stop = threading.Event()
+            thread = threading.Thread(target=self._beat, args=(stop,), daemon=True)
+            self._beating = thread, stop
+            thread.start()
+
+    def _beat(self, stop: threading.Event) -> None:
+        """Send signs of life. The main thread leaves the library alone meanwhile."""
+        assert self._communicator is not None
+        sign, sent = np.zeros(1, np.uint8), []
+        with suppress(RuntimeError):  # where the library fails, the main thread finds out, too
+            while not stop.wait(_BEAT):
+                sent = [request for request in sent if not request.Test()]
+                for rank in () if sent else range(1, self.size):
+                    sent.append(self._communicator.Isend(sign, dest=rank, tag=_ALIVE))
+
+    def _alone_with(self) -> Communicator:
+        """The communicator, which no thread uses any more."""
+        assert self._communicator is not None
+        if self._beating is not None:
+            thread, stop = self._beating
+            stop.set()
+            thread.join(_LAST_RESORT)
+            self._beating = None
+        return self._communicator
+
+    def _exchange(
+        self, begin: Callable[[Communicator], Any], patience: float | None = None
+    ) -> None:
+        """Begin to exchange something, and wait until that is done.
+
+        Args:
+            patience: seconds to wait for the others; None: as this moment needs.
+        """
+        try:
+            request = begin(self._alone_with())
+            self._wait(request, self._limit() if patience is None else patience)
+        except RuntimeError as error:  # the library knows that a rank is gone
+            what = f"the connection to the other ranks is lost ({error})"
+            raise UserError(" ".join(what.split()), remedy=_GO_ON) from None
+        self._announced = None
+
+    def _limit(self) -> float:
+        """Seconds to wait for the others at this moment."""
+        if not self._steps:
+            return self._patience
+        step = max(min(LEAST, self._patience), _TIMES * max(self._steps))
+        if self._announced is None:
+            return step
+        if self.leads:  # it is done itself, and the others had less to do
+            own = _TIMES * (time.monotonic() - self._announced)
+            return max(step, min(own, self._patience))
+        return max(step, self._patience)
+
+    def _is_alive(self) -> bool:
+        """Whether rank 0 has told so since this was asked."""
+        if self._communicator is None or self.leads or not self._beats:
+            return False
+        if self._life is not None and not self._life.Test():
+            return False
+        told, sign = self._life is not None, np.empty(1, np.uint8)
+        self._life = self._communicator.Irecv(sign, source=0, tag=_ALIVE)
+        return told
+
+    def _note_step(self) -> None:
+        """A step has ended on all ranks."""
+        began, self._step_began = self._step_began, time.monotonic()
+        if math.isnan(began):
+            return
+        if self._first_steps:
+            self._first_steps -= 1
+        else:
+            self._steps.append(self._step_began - began)
+
+    def _wait(self, request: Any, patience: float) -> None:
+        """Wait for the others, for so many seconds.
 
         Raises:
             UserError: they do not answer.
         """
-        start, patience = time.monotonic(), self._patience if patience is None else patience
+        before, waited = time.monotonic(), 0.0
         while not request.Test():
-            waited = time.monotonic() - start
+            now = time.monotonic()
+            waited, before = waited + min(now - before, _PAUSE), now
+            if waited > _LONG and self._is_alive():
+                waited = _LONG
             if waited > patience:
                 what = f"the other ranks have not answered for {patience:.0f} s"
-                remedy = "See whether one of them hangs or its network is cut; go on with --resume"
-                raise UserError(what, remedy=remedy)
+                raise UserError(what, remedy=_GO_ON)
             if waited > _AWAKE:
                 time.sleep(_NAP if waited < _LONG else _LONG_NAP)
 
@@ -281,9 +406,26 @@ class Ranks:
             if not self.leads:
                 time.sleep(_AFTER_YOU)
             say(f"rank {self.rank}: {_told(error)}")
-            sys.stderr.flush()
-            self._communicator.Abort(2)
-            sys.exit(2)  # where MPI returns, because another rank does not end
+            _end_by(self._alone_with())
+
+
+def _end_by(communicator: Communicator) -> NoReturn:
+    """End all ranks, and in any case this one.
+
+    MPI may return, and then waits for ever for ranks that do not end, or that a cut network hides.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    _end_soon()
+    communicator.Abort(2)
+    os._exit(2)
+
+
+def _end_soon() -> None:
+    """End this process before long, whatever MPI waits for."""
+    if hasattr(signal, "SIGALRM"):
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(_LAST_RESORT)
 
 
 def _told(error: BaseException) -> str:
