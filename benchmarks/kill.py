@@ -41,7 +41,7 @@ from unbake.training.run_folder import RunFolder  # noqa: E402
 _TRAINING = 1.5
 #: Share of the kills that come before the first step.
 _EARLY = 0.25
-_GOES_ON = re.compile(r"going on after step (\d+)")
+GOES_ON = re.compile(r"going on after step (\d+)")
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def kill(folder: Path, kills: int, seed: int, ranks: int = 1) -> dict[str, Any]:
     resume = ["fit", str(data), "--resume"]
     pending = 1  # kills that no start has gone on after, yet
     while tally.kills < kills:
-        logged, expected = _last_logged(run), before
+        logged, expected = last_logged(run), before
         late = chance.random() > _EARLY or tally.kills + pending >= kills
         told, start_up, lived = _one(resume, run, chance, start_up, late, ranks)
         tally.seconds_to_end = max(tally.seconds_to_end, lived)
@@ -130,7 +130,7 @@ def _one(
     begun, told, lived = time.monotonic(), None, 0.0
     try:
         if late:
-            text = _until(process, "step ")
+            text = until(process, "step ")
             start_up = time.monotonic() - begun
             time.sleep(chance.uniform(0, _TRAINING))
         else:
@@ -141,7 +141,7 @@ def _one(
     finally:
         process.kill()
         text += process.communicate()[0]
-    if found := _GOES_ON.search(text):
+    if found := GOES_ON.search(text):
         told = int(found[1])
     return told, start_up, lived
 
@@ -162,7 +162,7 @@ def _kill_one_of(process: subprocess.Popen[str], chance: random.Random) -> float
     return time.monotonic() - killed
 
 
-def _until(process: subprocess.Popen[str], word: str) -> str:
+def until(process: subprocess.Popen[str], word: str) -> str:
     """What a process prints up to a line with a word in it."""
     assert process.stdout is not None and process.stderr is not None
     text = ""
@@ -178,7 +178,8 @@ def _until(process: subprocess.Popen[str], word: str) -> str:
     raise RuntimeError(f"the fit does not train: {text}")
 
 
-def _last_logged(run: RunFolder) -> int:
+def last_logged(run: RunFolder) -> int:
+    """The last step in the log of a run; 0 without one."""
     return max((line["step"] for line in run.log()), default=0)
 
 

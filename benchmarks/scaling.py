@@ -144,12 +144,21 @@ def modelled(found: dict[str, Any], exchanged: float) -> list[dict[str, Any]]:
                 seconds = found["fixed_seconds"]
                 seconds += found["seconds_a_pixel"] * found["batch"] / ranks
                 if ranks > 1:
-                    ring = 2 * (ranks - 1) / ranks * (exchanged + 1 / bandwidth)
-                    seconds += size * (found["seconds_a_byte_copied"] + ring)
-                    seconds += 2 * math.log2(ranks) * latency / every
+                    seconds += size * found["seconds_a_byte_copied"]
+                    seconds += seconds_to_exchange(
+                        size, ranks, exchanged, bandwidth, latency / every
+                    )
                 row = {"network": network, "sync_every": every, "ranks": ranks}
                 rows.append(row | {"seconds": seconds})
     return rows
+
+
+def seconds_to_exchange(
+    size: float, ranks: int, exchanged: float, bandwidth: float, latency: float
+) -> float:
+    """Of an Allreduce as a ring; with the time that a byte takes in memory."""
+    ring = 2 * (ranks - 1) / ranks * (exchanged + 1 / bandwidth)
+    return size * ring + 2 * math.log2(ranks) * latency
 
 
 def seconds_a_byte_exchanged() -> float:

@@ -12,23 +12,29 @@ from pathlib import Path
 from unbake.quantities import QUANTITIES
 from unbake.signals import STOPPING
 
-#: A checkpoint after every step, so that ends at random instants meet many that are being written.
-_SETTINGS = "steps = 100000000\npixels = 64\nspp = 4\nwarm_up = 0\ncheckpoint_seconds = 0\n"
+_SETTINGS = "steps = 100000000\npixels = 64\nspp = 4\nwarm_up = 0\ncheckpoint_seconds = {}\n"
 _FIELD = (
     "[{}.neural]\nwidth = 8\nhidden = 1\n"
     "[{}.neural.grid]\nlevels = 2\ntable_log2 = 8\nbase_resolution = 2\n"
 )
 
 
-def prepare(folder: Path) -> tuple[Path, list[str]]:
+def prepare(folder: Path, checkpoint_seconds: float = 0) -> tuple[Path, list[str]]:
     """Make a data set of two views, and a fit of it that never comes to its end.
+
+    Args:
+        folder: for both.
+        checkpoint_seconds: between checkpoints; 0: one after every step, so that ends at random
+            instants meet many that are being written.
 
     Returns:
         The data set, and the words after `unbake` that begin the fit, but for `--out`.
     """
     data, settings = folder / "data", folder / "settings.toml"
     names = [*(f"materials.{name}" for name in QUANTITIES), "radiance"]
-    settings.write_text(_SETTINGS + "".join(_FIELD.format(name, name) for name in names))
+    settings.write_text(
+        _SETTINGS.format(checkpoint_seconds) + "".join(_FIELD.format(name, name) for name in names)
+    )
     if not data.is_dir():
         size = {"views": 2, "held-out": 1, "resolution": 16, "spp": 8, "max-depth": 6}
         words = [word for name, value in size.items() for word in (f"--{name}", str(value))]

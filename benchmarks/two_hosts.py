@@ -81,12 +81,19 @@ class TwoHosts:
     def __exit__(self, *error: object) -> None:
         self._held.close()
 
-    def start(self, *words: str, **options: object) -> subprocess.Popen[str]:
-        """Start a command by `mpiexec` on the first host: two processes, one on each host."""
+    def start(self, *words: str, core_each: bool = False) -> subprocess.Popen[str]:
+        """Start a command by `mpiexec` on the first host: two processes, one on each host.
+
+        Args:
+            words: of the command.
+            core_each: give each process one core of its own, instead of all.
+        """
         launcher = ("-launcher", "ssh", "-launcher-exec", str(self._launcher))
-        hosts = ("-hosts", ",".join(ADDRESSES), "-n", "2", "-ppn", "1")
+        hosts = ("-hosts", ",".join(ADDRESSES), "-ppn", "1")
+        cores = (("taskset", "-c", str(core)) if core_each else () for core in (0, 1))
+        first, second = (("-n", "1", *core, *words) for core in cores)
         return subprocess.Popen(
-            self._words(0, mpiexec(), *launcher, *hosts, *words),
+            self._words(0, mpiexec(), *launcher, *hosts, *first, ":", *second),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
