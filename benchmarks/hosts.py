@@ -23,6 +23,7 @@ import json
 import os
 import random
 import re
+import signal
 import statistics
 import subprocess
 import sys
@@ -81,6 +82,7 @@ def main() -> None:
         return allreduce(args.sizes)
     if reason := why_not():
         sys.exit(reason)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the hosts end with this process
     with TwoHosts() as hosts:
         if args.what == "exchange":
             found = exchange(hosts)
@@ -203,7 +205,8 @@ def cuts(hosts: TwoHosts, folder: Path, times: int) -> dict[str, Any]:
     run, chance, rows = RunFolder(folder / "run"), random.Random(0), []
     resume, pending = ["fit", str(data), "--resume"], None
     for number in range(2 * times + 1):  # the last one shows that the one before went well
-        expected, logged = newest_progress(run), last_logged(run)
+        expected = newest_progress(run)
+        logged = last_logged(run) if expected else 0
         command = (sys.executable, "-m", "unbake", *words, "--out", str(run.path))
         words, process = resume, hosts.start(*command)
         text = until(process, "step ")

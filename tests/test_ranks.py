@@ -2,11 +2,15 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
 import numpy as np
 import pytest
+
+from support import MPIEXEC, needs_mpi
 
 from unbake import ranks as module
 from unbake.errors import UserError
@@ -24,6 +28,12 @@ class Request:
             return False
         self.looks -= 1
         return self.looks < 0
+
+    def Cancel(self):
+        self.looks = 0
+
+    def Wait(self):
+        assert self.looks == 0, "nobody cancelled it, and nothing will come"
 
 
 class Two:
@@ -221,6 +231,38 @@ def test_signs_of_life_end_when_all_meet_again(monkeypatch):
     for quiet in (Ranks(Two(1), beats=True), Ranks(Two(0)), Ranks()):
         quiet.announce()
     assert threading.active_count() == before
+
+
+#: Rank 0 does something for longer than the other one would wait without signs of life.
+_LONG = """
+import sys, time
+from unbake import ranks as module
+module._BEAT, module._LONG = 0.1, 0.2
+ranks = module.Ranks.of_environment()
+ranks._patience, ranks._beats = 1.0, sys.argv[1] == "True"
+for _ in range(20):
+    ranks.any(True)
+ranks.announce()
+start = time.monotonic()
+if ranks.leads:
+    time.sleep(2)
+with ranks.guarded(print):
+    ranks.any(True)
+    ranks.any(True)
+    print(ranks.rank, time.monotonic() - start > 1.9)
+"""
+
+
+@needs_mpi
+@pytest.mark.parametrize("beats", [True, False])
+def test_signs_of_life_arrive(beats, repository, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(repository / "src"))
+    words = [MPIEXEC, "-n", "2", sys.executable, "-c", _LONG, str(beats)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    if beats:
+        assert sorted(done.stdout.splitlines()) == ["0 True", "1 True"] and not done.stderr
+    else:
+        assert done.returncode == 2 and "rank 1: the other ranks have not answered" in done.stdout
 
 
 def test_a_connection_that_the_library_knows_is_lost_is_told(monkeypatch):

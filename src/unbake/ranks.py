@@ -303,6 +303,8 @@ class Ranks:
                 sent = [request for request in sent if not request.Test()]
                 for rank in () if sent else range(1, self.size):
                     sent.append(self._communicator.Isend(sign, dest=rank, tag=_ALIVE))
+            for request in sent:
+                request.Test()
 
     def _alone_with(self) -> Communicator:
         """The communicator, which no thread uses any more."""
@@ -379,6 +381,10 @@ class Ranks:
                 raise UserError(what, remedy=_GO_ON)
             if waited > _AWAKE:
                 time.sleep(_NAP if waited < _LONG else _LONG_NAP)
+        if self._life is not None:  # what comes late counts for the next wait
+            self._life.Cancel()
+            self._life.Wait()
+            self._life = None
 
     # --------------------------------------------------------------------------- how all are ended
 
