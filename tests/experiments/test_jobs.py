@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 import time
 
 import pytest
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from unbake.errors import UserError
 from unbake.experiments.jobs import Job, JobRunner, Unfinished, duration
+from unbake.ranks import Ranks
 
 
 @pytest.fixture
@@ -127,3 +129,76 @@ def test_time_is_told_first(runner, seconds, words):
 )
 def test_lengths_of_time_are_told_in_words(seconds, told):
     assert duration(seconds) == told
+
+
+# ------------------------------------------------------------------------------------------ ranks
+
+
+class Half(Ranks):
+    """A rank of two that are threads of this process."""
+
+    def __init__(self, rank, shared, barrier):
+        super().__init__()
+        self.rank, self.size, self._shared, self._barrier = rank, 2, shared, barrier
+
+    def told(self, own):
+        self._shared[self.rank] = json.loads(json.dumps(own))
+        self._barrier.wait(10)
+        every = list(self._shared)
+        self._barrier.wait(10)
+        return every
+
+
+def run_by_two(folder, jobs_of):
+    """What two ranks return that run the jobs which a function makes for each."""
+    shared, barrier, outcomes = [None, None], threading.Barrier(2), [None, None]
+
+    def run(rank):
+        ranks = Half(rank, shared, barrier)
+        runner = JobRunner(folder, Console(quiet=True), ranks=ranks)
+        outcomes[rank] = runner.run(jobs_of(rank))
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    return outcomes
+
+
+def test_ranks_share_jobs_by_group_and_keep_the_order_of_each(tmp_path):
+    done = ([], [])
+    names = {"a": ("a1", "a2"), "b": ("b1", "b2"), "c": ("c1",)}
+
+    def jobs_of(rank):
+        return [
+            noted(done[rank], name, group=group) for group, jobs in names.items() for name in jobs
+        ]
+
+    first, second = run_by_two(tmp_path, jobs_of)
+    assert done == (["a1", "a2", "c1"], ["b1", "b2"]) and not first.left
+    assert list(first.findings) == ["a1", "a2", "b1", "b2", "c1"]
+    assert first.findings == second.findings
+    (tmp_path / "b2.json").unlink()
+    again, _ = run_by_two(tmp_path, jobs_of)
+    assert done[0][3:] == ["b2"] and not again.left, "what is left is dealt anew"
+
+
+def test_jobs_without_a_group_are_of_the_first_rank(tmp_path):
+    done = ([], [])
+    run_by_two(tmp_path, lambda rank: [noted(done[rank], "a"), noted(done[rank], "b")])
+    assert done == (["a", "b"], [])
+
+
+def test_a_job_that_fails_on_one_rank_is_known_to_all_and_ends_no_other(tmp_path):
+    done = ([], [])
+
+    def jobs_of(rank):
+        bad = failing("b1", UserError("no luck", "here", "Try again"))
+        bad = Job(bad.name, bad.settings, bad.work, group="b")
+        return [noted(done[rank], "a", group="a"), bad, noted(done[rank], "b2", group="b")]
+
+    for outcome in run_by_two(tmp_path, jobs_of):
+        assert str(outcome.failed["b1"]) == "here: no luck. Try again"
+        assert list(outcome.findings) == ["a", "b2"] and not outcome.left
+    assert done == (["a"], ["b2"])

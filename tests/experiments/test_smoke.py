@@ -3,10 +3,13 @@
 import csv
 import json
 import math
+import subprocess
+import sys
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from support import MPIEXEC, needs_mpi
 
 import unbake.experiments.fig6 as fig6
 import unbake.experiments.fig7 as fig7
@@ -49,6 +52,18 @@ def picture(path) -> np.ndarray:
 
 def column(rows, key):
     return [row[key] for row in rows]
+
+
+@needs_mpi
+@pytest.mark.slow
+def test_processes_share_the_jobs_of_an_experiment(rows, tmp_path):
+    alone = rows("table2", figure=False)
+    words = ["unbake", "reproduce", "table2", "--scale", "smoke", "--out", str(tmp_path)]
+    start = [MPIEXEC, "-n", "2", sys.executable, "-m"]
+    done = subprocess.run([*start, *words], capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    assert json.loads((tmp_path / "table2" / "data.json").read_text())["rows"] == alone
+    assert done.stdout.count("wrote") == 1 and done.stdout.count("0 of 6 jobs are done") == 1
 
 
 @pytest.mark.slow

@@ -970,7 +970,8 @@ def reproduce(
     from ..experiments.experiment import ExperimentContext
     from ..experiments.experiment import reproduce as run
 
-    run(experiments.load(what), ExperimentContext(scale, out, scenes), plan=plan)
+    with _ranks() as ranks:
+        run(experiments.load(what), ExperimentContext(scale, out, scenes), plan=plan, ranks=ranks)
 
 
 def doctor() -> int:

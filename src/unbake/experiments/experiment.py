@@ -7,16 +7,18 @@ import json
 import shutil
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
 import drjit as dr
 from rich.console import Console
 
-from ..errors import UserError
+from .. import backend
 from ..io import write_atomically, write_json, write_text
 from ..machine import machine
+from ..ranks import Agreed, Ranks
+from ..version import VERSION
 from . import Scale
 from .jobs import Findings, Job, JobRunner, Record
 from .speed import slowness
@@ -95,13 +97,21 @@ class Experiment:
     result: Callable[[ExperimentContext, Mapping[str, Findings]], ExperimentResult]
 
 
-def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool = False) -> None:
+def reproduce(
+    experiment: Experiment,
+    context: ExperimentContext,
+    *,
+    plan: bool = False,
+    ranks: Ranks | None = None,
+) -> None:
     """Run what is left of an experiment, and write its data, table and figure to OUT/NAME.
 
     A job that fails does not keep the others from running.
 
     Args:
         plan: only show what is left and how long it takes.
+        ranks: of MPI, which share the jobs and all call this; None: this process is alone. Rank 0
+            writes the results.
 
     Raises:
         UserError: a scene is missing, a job failed, or a file cannot be written.
@@ -110,20 +120,30 @@ def reproduce(experiment: Experiment, context: ExperimentContext, *, plan: bool 
 
     Paper: Table 1, 2, Fig. 3–8.
     """
-    jobs = experiment.jobs(context)
+    ranks = ranks or Ranks()
+    if not ranks.leads:
+        context = replace(context, console=Console(quiet=True))
+    jobs = ranks.together(lambda: experiment.jobs(context))
     runner = JobRunner(
-        context.work / experiment.name, context.console, machine, slowness, _release_memory
+        context.work / experiment.name, context.console, machine, slowness, _release_memory, ranks
     )
     context.tell(f"{experiment.name}: {experiment.title} ({context.scale} scale)")
-    context.tell(runner.plan(jobs))
+    if ranks.leads:
+        context.tell(runner.plan(jobs))
     if plan:
         return
     context.work.mkdir(parents=True, exist_ok=True)
+    if ranks.size > 1:
+        told = json.dumps([[job.name, dict(job.settings)] for job in jobs])
+        ranks.require_same({"version": VERSION, "jobs": told})
+        backend.share_cores(ranks.here)
     outcome = runner.run(jobs)
     for name, error in outcome.failed.items():
-        raise UserError(f"{experiment.name}, {name}: {error.what}", error.where, error.remedy)
+        raise Agreed(f"{experiment.name}, {name}: {error.what}", error.where, error.remedy)
     if outcome.left:
         raise KeyboardInterrupt  # a job was stopped
+    if not ranks.leads:
+        return
     result = experiment.result(context, outcome.findings)
     _write(experiment, context, result, outcome.records)
     context.tell(result.tables)

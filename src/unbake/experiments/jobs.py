@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
@@ -21,6 +21,7 @@ from rich.console import Console
 
 from ..errors import UserError
 from ..io import write_json
+from ..ranks import Ranks
 from ..signals import cleaned_up, interrupt
 
 #: What a job finds. It must be serializable as JSON.
@@ -46,6 +47,8 @@ class Job:
         seconds: computing time on the machine of `speed.REFERENCE`; None if it was not measured.
         waits: seconds that do not depend on the machine, such as a fit of a given duration.
         files: files that it writes. Without them the job is repeated.
+        group: jobs of one group need each other's files, or the whole machine: one process does
+            them, in order. Several processes may do those of several groups at the same time.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Job:
     seconds: float | None = None
     waits: float = 0.0
     files: Sequence[Path] = ()
+    group: str = ""
 
 
 @final
@@ -82,12 +86,15 @@ class Outcome:
 class JobRunner:
     """Runs jobs one after the other and keeps a record of each.
 
+    Several ranks share them by group; their records are files that all see.
+
     Args:
         folder: for the records, FOLDER/NAME.json.
         console: shows progress.
         machine: describes the machine, for the records.
         slowness: time that a computation takes here, relative to the machine of the estimates.
         release: frees memory after each job.
+        ranks: of MPI, which all run the same jobs.
     """
 
     folder: Path
@@ -95,6 +102,7 @@ class JobRunner:
     machine: Callable[[], Mapping[str, Any]] = dict
     slowness: Callable[[], float] = lambda: 1.0
     release: Callable[[], None] = lambda: None
+    ranks: Ranks = field(default_factory=Ranks)
 
     def record(self, job: Job) -> Record:
         """What is kept of a job with these settings; empty if there is nothing.
@@ -140,7 +148,8 @@ class JobRunner:
     def run(self, jobs: Sequence[Job], *, until: float | None = None) -> Outcome:
         """Run the jobs that are not done.
 
-        A job that fails or is stopped does not keep the others from running.
+        A job that fails or is stopped does not keep the others from running. All ranks return the
+        same.
 
         Args:
             until: value of `time.monotonic()` after which no further job starts. One always does,
@@ -154,8 +163,9 @@ class JobRunner:
         if len({job.name for job in jobs}) < len(jobs):
             raise ValueError("two jobs have the same name")
         failed: dict[str, UserError] = {}
+        mine = self._mine(jobs)
         with _interrupted_by_sigterm():
-            for number, job in enumerate(self.left(jobs)):
+            for number, job in enumerate(mine):
                 if number and until is not None and time.monotonic() >= until:
                     break
                 self.console.rule(job.name, align="left")
@@ -167,9 +177,31 @@ class JobRunner:
                 except Unfinished:
                     self.console.print(f"{job.name} is not finished; the same command continues it")
         records = {job.name: self.record(job) for job in jobs}
+        records |= self._found(mine, records, failed)
         done = {name: record for name, record in records.items() if "findings" in record}
         left = [job.name for job in jobs if job.name not in done and job.name not in failed]
         return Outcome(done, failed, left)
+
+    def _mine(self, jobs: Sequence[Job]) -> list[Job]:
+        """The jobs of this rank, of those that rank 0 finds not done."""
+        left = self.ranks.told([job.name for job in self.left(jobs)])[0]
+        every = [job for job in jobs if job.name in left]
+        groups = self.ranks.mine(list(dict.fromkeys(job.group for job in every)))
+        return [job for job in every if job.group in groups]
+
+    def _found(
+        self, mine: Sequence[Job], records: Mapping[str, Record], failed: dict[str, UserError]
+    ) -> dict[str, Record]:
+        """The records of the jobs that all ranks ran; their errors go to `failed`."""
+        parts = {name: [e.what, e.where, e.remedy] for name, e in failed.items()}
+        own = {"records": {job.name: records[job.name] for job in mine}, "failed": parts}
+        every = self.ranks.told(own)
+        others = {name: UserError(*e) for one in every for name, e in one["failed"].items()}
+        for name in others.keys() - failed.keys():
+            line = f"{name}: error: {others[name]}"
+            self.console.print(line, markup=False, soft_wrap=True)
+        failed |= others
+        return {name: record for one in every for name, record in one["records"].items()}
 
     def _run(self, job: Job) -> None:
         """Run a job and write its record, which of a stopped one has the time spent so far."""

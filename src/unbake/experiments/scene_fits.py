@@ -132,7 +132,8 @@ class SceneFits:
             settings = self.settings(context, seed, self.methods)
             seconds = context.pick(2.0 * count, beside, None)
             waits = count * self.config.seconds
-            jobs.append(Job(self._job(seed), settings, work, seconds, waits))
+            group = self.scene.folder
+            jobs.append(Job(self._job(seed), settings, work, seconds, waits, group=group))
         return jobs
 
     def jobs_at_equal_samples(
@@ -147,7 +148,8 @@ class SceneFits:
             count = len(methods)
             fits = _OVERHEAD * (count + 1) + count * self.config.seconds / 3
             seconds = context.pick(2.0 * count, fits, None)
-            jobs.append(Job(self._job(seed, equal=True), settings, work, seconds))
+            group, name = self.scene.folder, self._job(seed, equal=True)
+            jobs.append(Job(name, settings, work, seconds, group=group))
         return jobs
 
     def fitted(self, context: ExperimentContext, seed: int) -> Findings:

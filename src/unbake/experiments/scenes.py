@@ -189,6 +189,7 @@ class PaperScene:
             work,
             context.pick(seconds, seconds, None),
             files=[DataFolder(folder).transforms_file],
+            group=self.folder,
         )
 
 

@@ -58,6 +58,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
                 functools.partial(_measure, context, scene, pixels, spp),
                 context.pick(25.0, 30.0, None),
                 files=[_views(context, scene)],
+                group=scene.folder,
             )
         )
     return jobs

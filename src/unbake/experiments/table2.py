@@ -39,6 +39,7 @@ def _jobs(context: ExperimentContext) -> list[Job]:
             {"albedo": albedo, "pixels": pixels, "spp": spp},
             lambda albedo=albedo: _measure(context.work / "scenes", albedo, pixels, spp),
             context.pick(0.5, 1.5, None),
+            group=str(albedo),
         )
         for albedo in PUBLISHED
     ]
