@@ -9,7 +9,6 @@ import time
 
 import numpy as np
 import pytest
-
 from support import MPIEXEC, needs_mpi
 
 from unbake import ranks as module
@@ -211,6 +210,14 @@ def test_rank_0_may_take_as_long_as_it_likes_while_it_gives_signs_of_life(clock)
     ranks.announce()
     ranks._communicator.looks, clock.look = 2000, 0.5
     assert ranks.any(True) == (True,) and clock.now > 900
+
+
+def test_old_signs_of_life_count_once(clock, monkeypatch):
+    monkeypatch.setattr(Two, "Irecv", lambda world, *_, **__: world.next_sign())
+    ranks = after_steps(1, 0.1, clock, beats=True)
+    left = iter([Request(0)] * 1000)
+    ranks._communicator.next_sign = lambda: next(left, Request(None))
+    assert waits(ranks, clock) == pytest.approx(20, abs=2)
 
 
 def test_signs_of_life_end_when_all_meet_again(monkeypatch):

@@ -65,6 +65,8 @@ _LAST_RESORT = 10
 #: Seconds that a rank other than the first waits before it ends all for what happened to it, so
 #: that what happened to all is told once, by rank 0.
 _AFTER_YOU = 0.5
+#: Seconds in which `mpiexec` passes on what a rank prints before it ends it: else that may be lost.
+_PASSED_ON = 0.3
 #: Bytes of an error that other ranks are told.
 _LONGEST = 4096
 #: Waiting: this long without sleep, then with naps.
@@ -277,15 +279,12 @@ class Ranks:
 
     # --------------------------------------------------------------------- how long a rank waits
 
-    def announce(self, long: bool = True) -> None:
+    def announce(self) -> None:
         """Tell that some rank may take long until all meet again; all ranks call this.
 
         They are patient then, and more so with rank 0: a thread sends its signs of life.
-
-        Args:
-            long: False: nothing is told.
         """
-        if not long or self.size == 1 or self._announced is not None:
+        if self.size == 1 or self._announced is not None:
             return
         self._announced, self._step_began = time.monotonic(), math.nan  # this is no step
         if self.leads and self._beats:
@@ -345,13 +344,13 @@ class Ranks:
         return max(step, self._patience)
 
     def _is_alive(self) -> bool:
-        """Whether rank 0 has told so since this was asked."""
+        """Whether rank 0 has told so since this was asked the last time."""
         if self._communicator is None or self.leads or not self._beats:
             return False
-        if self._life is not None and not self._life.Test():
-            return False
-        told, sign = self._life is not None, np.empty(1, np.uint8)
-        self._life = self._communicator.Irecv(sign, source=0, tag=_ALIVE)
+        told = False
+        while self._life is None or self._life.Test():
+            told, sign = told or self._life is not None, np.empty(1, np.uint8)
+            self._life = self._communicator.Irecv(sign, source=0, tag=_ALIVE)
         return told
 
     def _note_step(self) -> None:
@@ -422,6 +421,7 @@ def _end_by(communicator: Communicator) -> NoReturn:
     """
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
+    time.sleep(_PASSED_ON)
     _end_soon()
     communicator.Abort(2)
     os._exit(2)

@@ -363,8 +363,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             readings = begun.step.read(recent)
             recent.clear()
             entry = _log_entry(readings, progress, rates[unknown])
-            show = last or progress.seconds - shown_at >= config.preview_seconds
-            ranks.announce(show or due or save or tell)
+            ranks.announce()  # rank 0 writes, and may measure for minutes
             # Scores, checkpoints and previews are not training: the clock stands still.
             if score is not None and (due or last):
                 state.publish(problem)
@@ -377,7 +376,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             ended = last and not stopped  # one that was stopped is not judged by its few steps
             _watch(watchdog, readings, monitor, saving, begun, progress, ended)
             failures = saving.save(state, progress) if last or (save and watchdog.trusts) else []
-            if show:
+            if last or progress.seconds - shown_at >= config.preview_seconds:
                 failures += _show(begun, monitor, progress, lock)
                 shown_at = progress.seconds
             for failure in () if last else failures:
