@@ -5,6 +5,7 @@ import os
 import runpy
 import subprocess
 import sys
+import time
 
 import pytest
 from support import needs_mpi
@@ -41,6 +42,42 @@ def test_two_hosts_share_a_cable_and_nothing_else(two_hosts, repository, monkeyp
         assert sorted(text.splitlines()) == ["0 host-1 1 0.5", "1 host-2 1 0.5"]
         assert all(1e6 < each < 1.3e6 for each in sent)
         assert not hosts.running(0) and not hosts.running(1)
+
+
+#: Two processes with work of their own, one of which waits for the other.
+_APART = """
+import time
+from unbake import ranks as module
+module._BEAT = 0.2
+ranks = module.Ranks.of_environment()
+ranks._patience = 2.0
+with ranks.guarded(print), ranks.apart():
+    print("begun", flush=True)
+    if ranks.leads:
+        time.sleep(60)
+    ranks.told(None)
+"""
+
+
+@needs_mpi
+@pytest.mark.slow
+def test_ranks_with_work_of_their_own_end_where_the_network_is_cut(
+    two_hosts, repository, monkeypatch
+):
+    monkeypatch.setenv("PYTHONPATH", str(repository / "src"))
+    with two_hosts["TwoHosts"]() as hosts:
+        process = hosts.start(sys.executable, "-c", _APART)
+        assert [process.stdout.readline() for _ in range(2)] == ["begun\n"] * 2
+        time.sleep(4)
+        assert process.poll() is None, "they hear of each other"
+        hosts.cut()
+        end = time.monotonic() + 40  # the remote shell takes longest to notice
+        while (left := hosts.running(0) + hosts.running(1)) and time.monotonic() < end:
+            time.sleep(0.1)
+        assert not left
+        _, errors = process.communicate()
+        assert process.returncode == 2
+        assert "rank 0: rank 1 has not been heard of for 2 s" in errors
 
 
 @needs_mpi

@@ -75,7 +75,8 @@ class Two:
 def alarms(monkeypatch):
     """Ends of the process are exits of the test, and what would end it later is noted."""
     noted = []
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    for name in ("_AFTER_YOU", "_PASSED_ON"):
+        monkeypatch.setattr(module, name, 0.0)
     monkeypatch.setattr(signal, "alarm", noted.append)
     monkeypatch.setattr(os, "_exit", lambda status: (_ for _ in ()).throw(SystemExit(status)))
     return noted
@@ -246,17 +247,17 @@ import sys, time
 from unbake import ranks as module
 module._BEAT, module._LONG = 0.1, 0.2
 ranks = module.Ranks.of_environment()
-ranks._patience, ranks._beats = 1.0, sys.argv[1] == "True"
+ranks._patience, ranks._beats = 0.6, sys.argv[1] == "True"
 for _ in range(20):
     ranks.any(True)
 ranks.announce()
 start = time.monotonic()
 if ranks.leads:
-    time.sleep(2)
+    time.sleep(1.2)
 with ranks.guarded(print):
     ranks.any(True)
     ranks.any(True)
-    print(ranks.rank, time.monotonic() - start > 1.9)
+    print(ranks.rank, time.monotonic() - start > 1.1)
 """
 
 
@@ -270,6 +271,46 @@ def test_signs_of_life_arrive(beats, repository, monkeypatch):
         assert sorted(done.stdout.splitlines()) == ["0 True", "1 True"] and not done.stderr
     else:
         assert done.returncode == 2 and "rank 1: the other ranks have not answered" in done.stdout
+
+
+#: Rank 1 works longer than the others would wait without signs of life.
+_APART = """
+import time
+from unbake import ranks as module
+module._BEAT = 0.1
+ranks = module.Ranks.of_environment()
+ranks._patience = 0.7
+with ranks.apart():
+    if not ranks.leads:
+        time.sleep(1.2)
+    print(ranks.told(ranks.rank))
+"""
+
+
+@needs_mpi
+def test_ranks_apart_wait_for_those_that_live(repository, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(repository / "src"))
+    words = [MPIEXEC, "-n", "2", sys.executable, "-c", _APART]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines() == ["[0, 1]"] * 2 and not done.stderr
+
+
+def test_ranks_apart_end_where_one_is_silent_or_the_library_fails(monkeypatch, alarms, capsys):
+    class Ended(Exception):
+        pass
+
+    monkeypatch.setattr(module, "_BEAT", 0.001)
+    monkeypatch.setattr(os, "_exit", lambda status: (_ for _ in ()).throw(Ended(status)))
+    ranks = Ranks(Two(), patience=0.02, beats=True)
+    monkeypatch.setattr(Two, "Irecv", lambda *_, **__: Request(None))
+    with pytest.raises(Ended, match="2"):
+        ranks._watch(threading.Event())
+    assert "rank 0: rank 1 has not been heard of for 0 s. See" in capsys.readouterr().err
+    monkeypatch.setattr(Two, "Isend", lambda *_, **__: fail("lost"))
+    with pytest.raises(Ended, match="2"):
+        ranks._watch(threading.Event())
+    assert "rank 0: a file: lost" in capsys.readouterr().err
+    assert len(alarms) == 2
 
 
 def test_a_connection_that_the_library_knows_is_lost_is_told(monkeypatch):

@@ -12,7 +12,6 @@ while they wait for what it does by itself, however long that takes.
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import json
 import math
@@ -56,8 +55,8 @@ PATIENCE = 120.0
 _TIMES, LEAST = 10.0, 20.0
 #: Steps that count as the first ones, and as the last ones.
 _FIRST, _LAST = 10, 100
-#: Seconds between signs of life of a rank that does something by itself, and their tag.
-_BEAT, _ALIVE = 1.0, 77
+#: Seconds between signs of life of a rank that does something by itself, and their tags.
+_BEAT, _ALIVE, _APART = 1.0, 77, 78
 #: Longer between two looks, in seconds, this process itself was stopped, which is no waiting.
 _PAUSE = 1.0
 #: Seconds in which MPI must end a process; after that the system does.
@@ -163,10 +162,8 @@ class Ranks:
         except (ImportError, RuntimeError) as error:
             what = f"several processes were started, and mpi4py cannot be loaded ({error})"
             raise UserError(what, remedy="Install it: pip install unbake[mpi]") from None
-        atexit.register(_end_soon)  # all work is done, and MPI may wait for ranks that are gone
         here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size
-        beats = MPI.Query_thread() >= MPI.THREAD_SERIALIZED
-        return Ranks(MPI.COMM_WORLD, here, beats=beats)
+        return Ranks(MPI.COMM_WORLD, here, beats=MPI.Query_thread() == MPI.THREAD_MULTIPLE)
 
     @property
     def leads(self) -> bool:
@@ -305,6 +302,59 @@ class Ranks:
             for request in sent:
                 request.Test()
 
+    @contextmanager
+    def apart(self) -> Iterator[None]:
+        """A block in which each rank works by itself, as long as it likes, until all meet.
+
+        A thread of each tells rank 0 that it lives, and hears so of it. It ends all where nothing
+        is heard any more: a rank that waits in `told` would not notice.
+        """
+        if self._communicator is None or not self._beats:
+            yield
+            return
+        stop = threading.Event()
+        thread = threading.Thread(target=self._watch, args=(stop,), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(_LAST_RESORT)
+
+    def _watch(self, stop: threading.Event) -> None:
+        """End all where one rank is not heard of any more."""
+        assert self._communicator is not None
+        try:
+            self._listen(stop)
+        except (UserError, RuntimeError) as error:  # the library may know first
+            print(f"rank {self.rank}: {_told(error)}", file=sys.stderr)
+            _end_by(self._communicator)
+
+    def _listen(self, stop: threading.Event) -> None:
+        """Send signs of life, and receive them, until one does not come for too long."""
+        assert self._communicator is not None
+        sign, others = np.zeros(1, np.uint8), range(1, self.size) if self.leads else [0]
+        signs = {rank: np.empty(1, np.uint8) for rank in others}
+        sent, coming = {}, {}
+        silent, before = dict.fromkeys(others, 0.0), time.monotonic()
+        while not stop.wait(_BEAT):
+            now = time.monotonic()
+            passed, before = min(now - before, _PAUSE + _BEAT), now
+            for rank in others:
+                if rank not in sent or sent[rank].Test():
+                    sent[rank] = self._communicator.Isend(sign, dest=rank, tag=_APART)
+                silent[rank] += passed
+                while rank not in coming or coming[rank].Test():
+                    silent[rank] = 0.0
+                    coming[rank] = self._communicator.Irecv(signs[rank], source=rank, tag=_APART)
+                if silent[rank] > self._patience:
+                    what = f"rank {rank} has not been heard of for {self._patience:.0f} s"
+                    remedy = "See whether its network is cut; the same command goes on"
+                    raise UserError(what, remedy=remedy)
+        for request in coming.values():
+            request.Cancel()
+            request.Wait()
+
     def _alone_with(self) -> Communicator:
         """The communicator, which no thread uses any more."""
         assert self._communicator is not None
@@ -415,23 +465,17 @@ class Ranks:
 
 
 def _end_by(communicator: Communicator) -> NoReturn:
-    """End all ranks, and in any case this one.
+    """End all ranks, and in any case this one; of any thread.
 
     MPI may return, and then waits for ever for ranks that do not end, or that a cut network hides.
     """
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     time.sleep(_PASSED_ON)
-    _end_soon()
+    if hasattr(signal, "SIGALRM"):
+        signal.alarm(_LAST_RESORT)
     communicator.Abort(2)
     os._exit(2)
-
-
-def _end_soon() -> None:
-    """End this process before long, whatever MPI waits for."""
-    if hasattr(signal, "SIGALRM"):
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(_LAST_RESORT)
 
 
 def _told(error: BaseException) -> str:

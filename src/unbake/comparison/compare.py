@@ -133,26 +133,27 @@ def compare(
         ranks.require_same(what_ranks_share(told, fingerprint(dataset)))
         backend.share_cores(ranks.here)
 
-    if ceiling and ranks.leads:
-        _measure_ceilings(dataset, list(chosen.values()), console)
-    ranks.told(None)  # the others find it in the data set
-    rows: dict[str, dict[str, Any]] = {}
-    errors: dict[str, UserError] = {}
-    for name in ranks.mine(list(fits)):
-        console.rule(name, align="left")
-        try:
-            run = RunFolder(out / name)
-            progress = _fitted(data, run, fits[name], clip_negative, allow_outside, console)
-            metrics = _evaluated(run, progress, evaluation, allow_outside, console)
-            rows[name] = description(fits[name]) | _numbers(run, metrics)
-        except UserError as error:
-            errors[name] = error
-            rows[name] = description(fits[name]) | {"error": str(error)}
-            console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        # Free the memory of this method for the next one.
-        gc.collect()
-        dr.flush_malloc_cache()
-    found, errors = _of_all(ranks, rows, errors)
+    with ranks.apart():
+        if ceiling and ranks.leads:
+            _measure_ceilings(dataset, list(chosen.values()), console)
+        ranks.told(None)  # the others find it in the data set
+        rows: dict[str, dict[str, Any]] = {}
+        errors: dict[str, UserError] = {}
+        for name in ranks.mine(list(fits)):
+            console.rule(name, align="left")
+            try:
+                run = RunFolder(out / name)
+                progress = _fitted(data, run, fits[name], clip_negative, allow_outside, console)
+                metrics = _evaluated(run, progress, evaluation, allow_outside, console)
+                rows[name] = description(fits[name]) | _numbers(run, metrics)
+            except UserError as error:
+                errors[name] = error
+                rows[name] = description(fits[name]) | {"error": str(error)}
+                console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+            # Free the memory of this method for the next one.
+            gc.collect()
+            dr.flush_malloc_cache()
+        found, errors = _of_all(ranks, rows, errors)
     rows = {name: found[name] for name in fits}
     if errors.keys() >= chosen.keys():
         raise Agreed.of(errors[next(iter(chosen))])

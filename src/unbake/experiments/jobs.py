@@ -162,6 +162,11 @@ class JobRunner:
         """
         if len({job.name for job in jobs}) < len(jobs):
             raise ValueError("two jobs have the same name")
+        with self.ranks.apart():
+            return self._shared(jobs, until)
+
+    def _shared(self, jobs: Sequence[Job], until: float | None) -> Outcome:
+        """Run this rank's share, and return what all found."""
         failed: dict[str, UserError] = {}
         mine = self._mine(jobs)
         with _interrupted_by_sigterm():
