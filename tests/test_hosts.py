@@ -16,7 +16,8 @@ import socket, numpy as np
 from unbake.ranks import Ranks
 ranks = Ranks.of_environment()
 mean = ranks.mean(np.full(250_000, ranks.rank, np.float32))
-print(f"{ranks.rank} {socket.gethostname()} {ranks.here} {mean[0]}", flush=True)
+line = f"{ranks.rank} {socket.gethostname()} {ranks.here} {mean[0]}\\n"
+print(line, end="", flush=True)  # in one piece
 """
 
 
@@ -52,7 +53,7 @@ module._BEAT = 0.2
 ranks = module.Ranks.of_environment()
 ranks._patience = 2.0
 with ranks.guarded(print), ranks.apart():
-    print("begun", flush=True)
+    print("begun\\n", end="", flush=True)
     if ranks.leads:
         time.sleep(60)
     ranks.told(None)

@@ -257,7 +257,7 @@ if ranks.leads:
 with ranks.guarded(print):
     ranks.any(True)
     ranks.any(True)
-    print(ranks.rank, time.monotonic() - start > 1.1)
+    sys.stdout.write(f"{ranks.rank} {time.monotonic() - start > 1.1}\\n")
 """
 
 
@@ -275,7 +275,7 @@ def test_signs_of_life_arrive(beats, repository, monkeypatch):
 
 #: Rank 1 works longer than the others would wait without signs of life.
 _APART = """
-import time
+import sys, time
 from unbake import ranks as module
 module._BEAT = 0.1
 ranks = module.Ranks.of_environment()
@@ -283,7 +283,7 @@ ranks._patience = 0.7
 with ranks.apart():
     if not ranks.leads:
         time.sleep(1.2)
-    print(ranks.told(ranks.rank))
+    sys.stdout.write(f"{ranks.told(ranks.rank)}\\n")  # a line of two processes in one piece
 """
 
 
