@@ -1,4 +1,9 @@
-"""The photographs of a fit, decoded once: in memory, or where they are many, in a mapped file."""
+"""The photographs of a fit, decoded once: in memory, or where they are many, in a mapped file.
+
+With several processes each holds some views (`shares.py`). Those are decoded by each for itself
+where they go to memory. The file is one of all views, which any number of processes can map: each
+looks at the part with its own views.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +12,10 @@ import math
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any, final
 
@@ -18,13 +24,15 @@ import numpy as np
 from ..errors import UserError
 from ..io import locked, read_object, remove_unfinished, temporary_beside, write_json
 from ..memory import require_memory
+from ..ranks import Ranks
 from .camera import Camera
 from .data_folder import DataFolder
 from .outliers import Outliers, without_outliers
+from .shares import Share, dealt
 from .views import PIXEL_BYTES, Dataset, View, read_masked
 
-#: Photographs that take more than this, in bytes, are not held in memory but in a file of the data
-#: set's folder, of which the system keeps in memory what it has room for.
+#: Photographs of a process that take more than this, in bytes, are not held in memory but in a file
+#: of the data set's folder, of which the system keeps in memory what it has room for.
 IN_MEMORY = 512 << 20
 #: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
 _COLUMNS, _WITH_BLURRED = 3, 6
@@ -42,17 +50,22 @@ _Image = tuple[Camera, np.ndarray, np.ndarray]
 @final
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """Linear RGB of all pixels of several views, row by row and view after view.
+    """Linear RGB of the pixels of several views, row by row and view after view.
+
+    With several processes, each may hold some of the views. Pixels are numbered over all views, and
+    so are the places of those to train on among them.
 
     Args:
         table: float32, shape (pixels, 3): radiance, which is the image divided by its exposure; or
             (pixels, 6): radiance, and the radiance that errors are relative to, which is blurred
-            over 5 x 5 pixels and knows the noise.
-        chosen: numbers of the pixels to train on; None: all. Where the background is hidden,
-            background pixels say nothing about the scene and only those with alpha > 0 are taken
-            (the paper: at least half of them). Pixels that are masked are never taken.
-        mean: mean radiance of the pixels to train on.
-        outliers: pixels that were too bright and are not as in the images, by view.
+            over 5 x 5 pixels and knows the noise. Of the views that this process holds.
+        chosen: numbers of the pixels to train on, of the same views; None: all. Where the
+            background is hidden, background pixels say nothing about the scene and only those with
+            alpha > 0 are taken (the paper: at least half of them). Pixels that are masked are never
+            taken.
+        mean: mean radiance of the pixels to train on, of all views.
+        outliers: pixels that were too bright and are not as in the images, by view, of all views.
+        share: what this process holds; None: all.
 
     Paper: Sec. 5.4.
     """
@@ -61,16 +74,60 @@ class Photographs:
     chosen: np.ndarray | None
     mean: float
     outliers: tuple[Outliers, ...] = ()
+    share: Share | None = None
 
     @property
     def count(self) -> int:
-        """Number of pixels to train on."""
+        """Number of pixels to train on, of all views."""
+        if self.share is not None:
+            return int(self.share.first_places[-1])
         return len(self.table if self.chosen is None else self.chosen)
+
+    @property
+    def pixels(self) -> range:
+        """Numbers of the pixels that this process holds."""
+        if self.share is None:
+            return range(len(self.table))
+        return self.share.own(self.share.first_pixels)
+
+    @property
+    def places(self) -> range:
+        """Places of the pixels that this process holds among those to train on."""
+        return range(self.count) if self.share is None else self.share.own(self.share.first_places)
 
     @property
     def smoothed(self) -> bool:
         """Whether there is a blurred copy."""
         return self.table.shape[1] == _WITH_BLURRED
+
+    def own_numbers(self, places: np.ndarray) -> np.ndarray:
+        """Numbers of pixels by their places among those to train on, of those that it holds."""
+        return places if self.chosen is None else self.chosen[places - self.places.start]
+
+    def own_rows(self, numbers: np.ndarray) -> np.ndarray:
+        """Rows of the table of pixels that this process holds, shape (n, columns)."""
+        return self.table[numbers - self.pixels.start]
+
+    def numbers(self, places: np.ndarray) -> np.ndarray:
+        """Numbers of pixels of any view, by their places; all processes ask for the same."""
+        if self.share is None:
+            return self.own_numbers(places)
+        return self.share.looked_up(places, self.share.first_places, self.own_numbers)
+
+    def radiance(self, numbers: np.ndarray) -> np.ndarray:
+        """Linear RGB of pixels of any view, shape (n, 3); all processes ask for the same."""
+        start = self.pixels.start
+
+        def look(own: np.ndarray) -> np.ndarray:
+            return self.table[own - start, :3]
+
+        if self.share is None:
+            return look(numbers)
+        return self.share.looked_up(numbers, self.share.first_pixels, look)
+
+    def joined(self, work: Callable[[], np.ndarray]) -> np.ndarray:
+        """What each process tells of the pixels that it holds, in their order; see `Ranks`."""
+        return work() if self.share is None else self.share.ranks.joined(work)
 
     @property
     def bytes(self) -> int:
@@ -101,63 +158,169 @@ class Photographs:
             (camera, pixels, (pixels[:, 3] > 0) | (not foreground_only))
             for camera, pixels in zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
         ]
-        return _fill(table, images, foreground_only)
+        return _fill(table, images, foreground_only).photographs()
 
     @staticmethod
-    def load(dataset: Dataset, clip_negative: bool, *, smoothed: bool = True) -> Photographs:
+    def load(
+        dataset: Dataset,
+        clip_negative: bool,
+        *,
+        smoothed: bool = True,
+        ranks: Ranks | None = None,
+    ) -> Photographs:
         """The training views of a data set; every image is read once, also over many fits.
 
         Args:
             clip_negative: take negative pixels as zero.
             smoothed: keep a blurred copy, too, which doubles the memory.
+            ranks: processes that deal the views among them and all call this, no more than there
+                are views; None: this one holds all.
 
         Raises:
             UserError: an image is bad, or there are too many for memory and the data set's folder
                 cannot be written to.
         """
-        views = dataset.train
-        hidden = dataset.background == "hidden"
-        some = hidden or any(view.mask is not None for view in views)
-        count = sum(view.camera.width * view.camera.height for view in views)
+        ranks = ranks or Ranks()
+        plan = _Plan.of(dataset, clip_negative, _WITH_BLURRED if smoothed else _COLUMNS, ranks.size)
+        found = ranks.together(lambda: plan.load(ranks.rank, ranks.here), math.inf)
+        if ranks.size == 1:
+            return found.photographs()
+        every = [_Told(**told) for told in ranks.told(asdict(found.told))]
+        counts = np.concatenate([told.counts for told in every])
+        share = Share(ranks, plan.first_views, np.array(plan.sizes), counts)
+        return found.photographs(every, share)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What is known of the views of a process; serializable."""
+
+    sums: list[float]  # of the pixels to train on and their channels, by view
+    counts: list[int]  # of the pixels to train on, by view
+    outliers: list[dict[str, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Decoded:
+    """Decoded views: their table and numbers, and what all processes come to know of them."""
+
+    table: np.ndarray
+    chosen: np.ndarray | None
+    told: _Told
+
+    def photographs(
+        self, every: Sequence[_Told] | None = None, share: Share | None = None
+    ) -> Photographs:
+        """The photographs that these are, or those that they are a share of.
+
+        Args:
+            every: what is known of the views of each process; None: this one holds all.
+            share: what it holds.
+        """
+        every = every or [self.told]
+        # One after the other, so that the mean is the same however views are dealt
+        total = reduce(add, (value for told in every for value in told.sums), 0.0)
+        count = sum(sum(told.counts) for told in every)
+        outliers = tuple(Outliers(**found) for told in every for found in told.outliers)
+        return Photographs(self.table, self.chosen, total / max(3 * count, 1), outliers, share)
+
+    def part(self, views: slice, pixels: slice, names: Collection[str]) -> _Decoded:
+        """Some of these views, with these pixels and names."""
+        chosen, told = self.chosen, self.told
+        if chosen is not None:
+            chosen = chosen[slice(*np.searchsorted(chosen, (pixels.start, pixels.stop)))]
+        outliers = [found for found in told.outliers if found["view"] in names]
+        told = _Told(told.sums[views], told.counts[views], outliers)
+        return _Decoded(self.table[pixels], chosen, told)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How the training views of a data set are decoded.
+
+    Args:
+        dataset: of the views.
+        clip_negative: take negative pixels as zero.
+        columns: of the table.
+        first_views: of each process, and of all; see `dealt`.
+        sizes: pixels of each view.
+    """
+
+    dataset: Dataset
+    clip_negative: bool
+    columns: int
+    first_views: np.ndarray
+    sizes: list[int]
+
+    @staticmethod
+    def of(dataset: Dataset, clip_negative: bool, columns: int, ranks: int) -> _Plan:
+        """The plan for so many processes."""
+        sizes = [view.camera.width * view.camera.height for view in dataset.train]
+        return _Plan(dataset, clip_negative, columns, dealt(sizes, ranks), sizes)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether only the foreground counts."""
+        return self.dataset.background == "hidden"
+
+    @property
+    def chooses(self) -> bool:
+        """Whether there are pixels that are not trained on, in any view."""
+        return self.hidden or any(view.mask is not None for view in self.dataset.train)
+
+    def load(self, rank: int, here: int) -> _Decoded:
+        """The views of a process.
+
+        Args:
+            rank: its number.
+            here: processes on this machine.
+        """
+        views, folder = self.dataset.train, self.dataset.folder
         remedy = "Use fewer views, or smaller images"
-        if count > MOST_PIXELS:
-            what = f"the training views have {count:,} pixels, more than {MOST_PIXELS:,}"
-            raise UserError(what, dataset.folder, remedy)
-        columns = _WITH_BLURRED if smoothed else _COLUMNS
+        if sum(self.sizes) > MOST_PIXELS:
+            what = f"the training views have {sum(self.sizes):,} pixels, more than {MOST_PIXELS:,}"
+            raise UserError(what, folder, remedy)
+        first = np.cumsum([0, *self.sizes])[self.first_views]
+        most = int(np.diff(first).max())
+        own, pixels = (
+            slice(*bounds[rank : rank + 2].tolist()) for bounds in (self.first_views, first)
+        )
         # Views are decoded one after the other
-        largest = PIXEL_BYTES * max(view.camera.width * view.camera.height for view in views)
-        need = largest + min(4 * columns * count, IN_MEMORY) + 8 * count * some
-        require_memory(need, "the photographs need", remedy, dataset.folder)
-        if 4 * columns * count <= IN_MEMORY:
-            table = np.empty((count, columns), np.float32)
-            return _decode_into(table, views, clip_negative, hidden)
-        return _cached(dataset, views, count, columns, clip_negative, hidden)
+        held = min(4 * self.columns * most, IN_MEMORY)
+        need = here * (PIXEL_BYTES * max(self.sizes) + held + 8 * most * self.chooses)
+        require_memory(need, "the photographs need", remedy, folder)
+        if 4 * self.columns * most > IN_MEMORY:
+            found = _cached(self)
+            return found.part(own, pixels, {view.name for view in views[own]})
+        table = np.empty((pixels.stop - pixels.start, self.columns), np.float32)
+        return self.decode_into(table, views[own], pixels.start)
+
+    def decode_into(self, table: np.ndarray, views: Sequence[View], first: int = 0) -> _Decoded:
+        """Put the images of views into a table, but for what is too bright in them.
+
+        Args:
+            first: number of the first pixel of the table.
+        """
+        outliers: list[dict[str, Any]] = []
+
+        def images() -> Iterator[_Image]:
+            for view in views:
+                pixels, mask = read_masked(view, self.clip_negative)
+                pixels, camera = pixels.reshape(-1, 4), view.camera
+                counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
+                if self.hidden:
+                    counted &= pixels[:, 3] > 0
+                pixels, found = without_outliers(pixels, counted, view.name, camera.width)
+                if found is not None:
+                    outliers.append(asdict(found))
+                yield camera, _in_radiance(pixels, view), counted
+
+        made = _fill(table, images(), self.chooses, first)
+        return replace(made, told=replace(made.told, outliers=outliers))
 
 
 def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:
     return np.split(pixels, np.cumsum([c.width * c.height for c in cameras])[:-1])
-
-
-def _decode_into(
-    table: np.ndarray, views: Sequence[View], clip_negative: bool, foreground_only: bool
-) -> Photographs:
-    """Put the images of views into a table, but for what is too bright in them."""
-    outliers: list[Outliers] = []
-
-    def images() -> Iterator[_Image]:
-        for view in views:
-            pixels, mask = read_masked(view, clip_negative)
-            pixels, camera = pixels.reshape(-1, 4), view.camera
-            counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
-            if foreground_only:
-                counted &= pixels[:, 3] > 0
-            pixels, found = without_outliers(pixels, counted, view.name, camera.width)
-            if found is not None:
-                outliers.append(found)
-            yield camera, _in_radiance(pixels, view), counted
-
-    some = foreground_only or any(view.mask is not None for view in views)
-    return replace(_fill(table, images(), some), outliers=tuple(outliers))
 
 
 def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
@@ -182,13 +345,14 @@ def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
     return pixels
 
 
-def _fill(table: np.ndarray, images: Iterable[_Image], some: bool) -> Photographs:
+def _fill(table: np.ndarray, images: Iterable[_Image], some: bool, first: int = 0) -> _Decoded:
     """Put images into a table one after the other; blurred, too, if it has room for that.
 
     Args:
         some: whether there are pixels that do not count.
+        first: number of the first pixel of the table.
     """
-    start, total, seen = 0, 0.0, []
+    start, sums, counts, seen = 0, [], [], []
     for camera, pixels, counted in images:
         stop = start + len(pixels)
         rgb = pixels[:, :3]
@@ -197,13 +361,13 @@ def _fill(table: np.ndarray, images: Iterable[_Image], some: bool) -> Photograph
             # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
             with np.errstate(over="ignore", invalid="ignore"):
                 table[start:stop, 3:] = _reference(rgb, counted, camera)
-        total += float((rgb[counted] if some else rgb).sum(dtype=np.float64))
+        sums.append(float((rgb[counted] if some else rgb).sum(dtype=np.float64)))
+        counts.append(int(counted.sum()) if some else len(pixels))
         if some:
-            seen.append(start + np.flatnonzero(counted))
+            seen.append(first + start + np.flatnonzero(counted))
         start = stop
     chosen = np.concatenate(seen).astype(np.uint32) if some else None
-    count = len(table) if chosen is None else len(chosen)
-    return Photographs(table, chosen, total / max(3 * count, 1))
+    return _Decoded(table, chosen, _Told(sums, counts, []))
 
 
 def _reference(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarray:
@@ -270,23 +434,17 @@ def _along(image: np.ndarray, axis: int, radius: int) -> Iterator[np.ndarray]:
 # ------------------------------------------------------------------------------- The mapped file
 
 
-def _cached(
-    dataset: Dataset,
-    views: Sequence[View],
-    count: int,
-    columns: int,
-    clip_negative: bool,
-    hidden: bool,
-) -> Photographs:
-    """Photographs in a file that is made where it is missing, or made from other images."""
+def _cached(plan: _Plan) -> _Decoded:
+    """All views in a file that is made where it is missing, or made from other images."""
+    dataset, views = plan.dataset, plan.dataset.train
     data = DataFolder(dataset.folder, dataset.allow_outside)
     masks = [view.mask for view in views if view.mask is not None]
     key = {
         "images": _stamps([view.image for view in views]),
-        "pixels": count,
-        "columns": columns,
-        "clip_negative": clip_negative,
-        "foreground_only": hidden,
+        "pixels": sum(plan.sizes),
+        "columns": plan.columns,
+        "clip_negative": plan.clip_negative,
+        "foreground_only": plan.hidden,
         **({"masks": _stamps(masks)} if masks else {}),
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": _RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
@@ -300,7 +458,7 @@ def _cached(
     try:
         with locked(data.path) as alone:
             # Another fit may have made it meanwhile
-            return _find_cache(data, key) or _write_cache(data, views, key, sweep=alone)
+            return _find_cache(data, key) or _write_cache(data, plan, key, sweep=alone)
     except OSError as error:
         raise UserError(
             f"the decoded photographs cannot be written ({error.strerror})",
@@ -319,7 +477,7 @@ def _chooses(key: dict[str, Any]) -> bool:
     return key["foreground_only"] or "masks" in key
 
 
-def _find_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
+def _find_cache(data: DataFolder, key: dict[str, Any]) -> _Decoded | None:
     """The cached photographs of these images, if there are any."""
     found = _open_cache(data, key)
     if found is None and key["columns"] < _WITH_BLURRED:
@@ -330,13 +488,13 @@ def _find_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
     return found
 
 
-def _open_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
+def _open_cache(data: DataFolder, key: dict[str, Any]) -> _Decoded | None:
     """The cached photographs, if the files are complete and as they were written."""
     try:
         if _stamp(data.cache_key) is None:
             return None
         stored = read_object(data.cache_key)
-        if stored["key"] != key or not math.isfinite(stored["mean"]):
+        if stored["key"] != key or not all(map(math.isfinite, stored["sums"])):
             return None
         shape = (key["pixels"], key["columns"])
         table, chosen = _mapped(data.cached_photographs, stored["table"], np.float32, shape), None
@@ -345,10 +503,13 @@ def _open_cache(data: DataFolder, key: dict[str, Any]) -> Photographs | None:
             chosen = _mapped(data.cached_foreground, stored["foreground"], np.uint32, shape)
             if chosen.max(initial=0) >= len(table):
                 return None
-        outliers = tuple(Outliers(**entry) for entry in stored["outliers"])
+        told = _Told(stored["sums"], stored["counts"], stored["outliers"])
+        found = _Decoded(table, chosen, told)
+        if found.photographs().count != sum(told.counts):
+            return None
     except (UserError, OSError, ValueError, KeyError, TypeError):
         return None
-    return Photographs(table, chosen, float(stored["mean"]), outliers)
+    return found
 
 
 def _mapped(path: Path, stamp: list[int], kind: type, shape: tuple[int, ...]) -> np.ndarray:
@@ -368,9 +529,7 @@ def _stamp(path: Path) -> list[int] | None:
     return [found.st_size, found.st_mtime_ns] if stat.S_ISREG(found.st_mode) else None
 
 
-def _write_cache(
-    data: DataFolder, views: Sequence[View], key: dict[str, Any], *, sweep: bool
-) -> Photographs:
+def _write_cache(data: DataFolder, plan: _Plan, key: dict[str, Any], *, sweep: bool) -> _Decoded:
     """Decode photographs into new files, which then take their names.
 
     Files are never written anew in place: other fits may have mapped them, and those that map a
@@ -392,9 +551,12 @@ def _write_cache(
         shape = (key["pixels"], key["columns"])
         table = np.lib.format.open_memmap(table_file, "w+", np.float32, shape)
         _reserve(table_file)
-        made = _decode_into(table, views, key["clip_negative"], key["foreground_only"])
+        made = plan.decode_into(table, plan.dataset.train)
         table.flush()
-        stored = {"key": key, "mean": made.mean, "table": _stamp(table_file)}
+        # A mapping that was written to stays in memory as a whole, and others look at a part.
+        made = replace(made, table=np.load(table_file, mmap_mode="r"))
+        del table
+        stored = {"key": key, **asdict(made.told), "table": _stamp(table_file)}
         if made.chosen is not None:
             with foreground_file.open("xb") as file:
                 np.save(file, made.chosen)
@@ -408,14 +570,12 @@ def _write_cache(
             foreground_file.rename(data.cached_foreground)
         table_file.rename(data.cached_photographs)
         # The key is written last: without it the rest is taken for unfinished.
-        outliers = [asdict(found) for found in made.outliers]
-        write_json(data.cache_key, stored | {"outliers": outliers}, durable=True)
+        write_json(data.cache_key, stored, durable=True)
     finally:
         for file in (table_file, foreground_file):
             file.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             data.cache.rmdir()  # if nothing was made
-    table.flags.writeable = False
     return made
 
 
