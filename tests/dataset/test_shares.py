@@ -11,6 +11,7 @@ from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
+from unbake.dataset.quick_check import _small_views
 from unbake.dataset.shares import dealt
 from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
@@ -151,6 +152,22 @@ def test_pixels_of_any_view_can_be_looked_up(dataset):
             part.radiance(numbers[ranks.rank :])
 
     on_ranks(2, differ)
+
+
+@pytest.mark.parametrize("background", ["hidden", "visible"])
+def test_small_views_are_made_by_those_that_hold_them(dataset, background):
+    made = dataset(background)
+
+    def small(ranks):
+        return _small_views(made.train, Photographs.load(made, False, ranks=ranks), [0, 1, 3, 4])
+
+    (alone,) = on_ranks(1, small)
+    assert [view.name for view in alone] == ["0", "1", "3", "4"]
+    for views in on_ranks(3, small):
+        for view, other in zip(views, alone, strict=True):
+            assert view.name == other.name
+            np.testing.assert_array_equal(view.rgb, other.rgb)
+            np.testing.assert_array_equal(view.alpha, other.alpha)
 
 
 @pytest.mark.parametrize("slopes", [False, True])
