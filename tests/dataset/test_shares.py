@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support import on_ranks
 
+from unbake.dataset import decoding
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
 from unbake.dataset.photographs import Photographs
@@ -75,9 +76,9 @@ def test_views_are_dealt_whole_and_about_equally(ranks, kind):
 @pytest.mark.parametrize("background", ["hidden", "visible"])
 def test_a_process_holds_its_views_alone(dataset, background, where, monkeypatch):
     made, read = dataset(background), []
-    decode = module.read_masked
+    decode = decoding.read_masked
     whole = Photographs.load(made, False)
-    monkeypatch.setattr(module, "read_masked", lambda *a: read.append(a[0].name) or decode(*a))
+    monkeypatch.setattr(decoding, "read_masked", lambda *a: read.append(a[0].name) or decode(*a))
     if where != "memory":
         monkeypatch.setattr(module, "IN_MEMORY", 0)
     if where == "a file that is there":
