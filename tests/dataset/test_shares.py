@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support import on_ranks
 
+from unbake import memory
 from unbake.dataset import decoding
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
@@ -106,6 +107,18 @@ def test_outliers_are_told_of_all_views(dataset, monkeypatch):
     for limit in (module.IN_MEMORY, 0):
         monkeypatch.setattr(module, "IN_MEMORY", limit)
         assert all(part.outliers == whole for part in loaded(made, 2))
+
+
+def test_processes_of_one_machine_share_its_memory(dataset, monkeypatch):
+    made = dataset()
+    monkeypatch.setattr(memory, "free_bytes", lambda: 40_000)
+    Photographs.load(made, False)
+
+    def load(ranks):
+        with pytest.raises(Agreed, match="the photographs need about 0 MB of memory"):
+            Photographs.load(made, False, ranks=ranks)
+
+    on_ranks(3, load)
 
 
 def test_an_image_that_cannot_be_read_ends_all(dataset):

@@ -363,17 +363,22 @@ class PixelSource:
         row, column = divmod(number - first, width)
         return view, column, row
 
-    def require_crops(self, count: int) -> None:
-        """Raise a `UserError` if there are no square crops of that many pixels in all views."""
-        edge = math.isqrt(count)
+    def require_crops(self, count: int, ranks: int = 1) -> None:
+        """Raise a `UserError` if there are no square crops of that many pixels in all views.
+
+        Args:
+            count: pixels of a crop.
+            ranks: how many processes each draw one for a batch.
+        """
+        edge, each = math.isqrt(count), "" if ranks == 1 else f" of each of {ranks} processes"
         if edge * edge != count:
-            what = f"a square crop cannot have {count} pixels"
-            remedy = f"Use --batch {edge**2}, or --pixel-sampling all-views"
+            what = f"a square crop{each} cannot have {count} pixels"
+            remedy = f"Use --batch {ranks * edge**2}, or --pixel-sampling all-views"
             raise UserError(what, remedy=remedy)
         short = min(min(width, height) for _, width, height in self._layout)
         if short < edge:
             what = f"a crop of {edge} x {edge} pixels is larger than the smallest photograph"
-            remedy = f"Use --batch {short**2} or less, or --pixel-sampling all-views"
+            remedy = f"Use --batch {ranks * short**2} or less, or --pixel-sampling all-views"
             raise UserError(f"{what}, whose shorter edge has {short}", remedy=remedy)
 
     @cached_property

@@ -83,10 +83,10 @@ def _small_view(view: View, photographs: Photographs, start: int, stop: int) -> 
     Args:
         start, stop: numbers of its first pixel and of that of the next view.
     """
-    alpha = None
+    first, alpha = photographs.pixels.start, None
     if photographs.chosen is not None:
         inside = slice(*np.searchsorted(photographs.chosen, (start, stop)))
         alpha = np.zeros(stop - start, np.float32)
         alpha[photographs.chosen[inside].astype(np.int64) - start] = 1
-    rgb = photographs.own_rows(np.arange(start, stop))[:, :3]
+    rgb = np.array(photographs.table[start - first : stop - first, :3])
     return small_view(view.name, view.camera, rgb, alpha)

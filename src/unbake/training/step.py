@@ -110,7 +110,7 @@ class TrainingStep:
             raise ValueError("the loss is relative to smoothed photographs, which were not made")
         crops = config.pixel_sampling == "one-view-crop"
         if crops:
-            pixels.require_crops(config.pixels)
+            pixels.require_crops(config.pixels, self._ranks.size)
         # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
         if problem.materials is not None:
