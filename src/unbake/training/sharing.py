@@ -1,7 +1,8 @@
 """Whether the processes of a fit share its photographs, or each holds all of them.
 
-Each process learns from its own views then (`dataset/shares.py`). The mean over processes is that
-over all views for terms that are means over pixels. It would be another one for what is told here.
+Processes that share them each learn from their own views (`dataset/shares.py`). The mean over
+processes then is that over all views, for terms that are means over pixels. What is no such mean,
+and would become another objective, is told here.
 """
 
 from __future__ import annotations
