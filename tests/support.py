@@ -10,10 +10,13 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import NormalDist
+from threading import Barrier
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,6 +30,7 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
 from unbake.quantities import QUANTITIES
+from unbake.ranks import Ranks
 from unbake.training.loop import fit
 from unbake.training.step import TrainingStep
 from unbake.transport.methods import method_named
@@ -127,6 +131,52 @@ def grey_photographs(cameras: list[Camera], value: float = 0.3) -> PixelSource:
     count = sum(c.width * c.height for c in cameras)
     rgb = value * np.random.default_rng(7).uniform(0.5, 1.5, (count, 3))
     return PixelSource.of(cameras, rgb, np.ones(count), foreground_only=False)
+
+
+# ------------------------------------------------------------------------- several processes
+
+
+class _Done:
+    """A request of MPI that is done."""
+
+    def Test(self) -> bool:
+        return True
+
+
+class _Member:
+    """A communicator of threads, which stand for processes."""
+
+    def __init__(self, rank: int, slots: list[np.ndarray | None], barrier: Barrier) -> None:
+        self.rank, self.size, self._slots, self._barrier = rank, len(slots), slots, barrier
+
+    def Iallgather(self, own: np.ndarray, rows: np.ndarray) -> _Done:
+        for row, array in zip(rows, self._exchanged(own), strict=True):
+            assert array.shape == row.shape and array.dtype == row.dtype
+            row[...] = array
+        return _Done()
+
+    def Iallreduce(self, own: np.ndarray, total: np.ndarray) -> _Done:
+        total[...] = sum(self._exchanged(own))
+        return _Done()
+
+    def Ibcast(self, array: np.ndarray, root: int) -> _Done:
+        array[...] = self._exchanged(array)[root]
+        return _Done()
+
+    def _exchanged(self, own: np.ndarray) -> list[np.ndarray]:
+        self._slots[self.rank] = own.copy()
+        self._barrier.wait()
+        found = list(self._slots)
+        self._barrier.wait()
+        return found
+
+
+def on_ranks(count: int, work: Callable[[Ranks], Any]) -> list[Any]:
+    """What some work comes to on each of several ranks, which are threads of this process."""
+    slots, barrier = [None] * count, Barrier(count, timeout=20)
+    ranks = [Ranks(_Member(rank, slots, barrier), here=count) for rank in range(count)]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(work, ranks))
 
 
 # ----------------------------------------------------------------------------- training steps

@@ -94,6 +94,7 @@ def test_one_process_tells_itself_what_it_knows(monkeypatch):
     alone, numbers = Ranks.of_environment(), np.ones(3, np.float32)
     assert (alone.rank, alone.size, alone.here, alone.leads) == (0, 1, 1, True)
     assert alone.mean(numbers) is numbers and alone.of_first(2.5) == 2.5
+    assert alone.joined(lambda: numbers) is numbers and alone.told("it") == ["it"]
     assert alone.any(True, False) == (True, False)
     alone.require_same({"seed": "0"})
     with pytest.raises(UserError, match="bad"):

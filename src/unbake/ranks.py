@@ -176,7 +176,7 @@ class Ranks:
         """The mean over all ranks, the same bits on each.
 
         Args:
-            numbers: float32, as many on each rank.
+            numbers: floating point, as many on each rank.
         """
         if self._communicator is None:
             return numbers
@@ -215,11 +215,20 @@ class Ranks:
         """
         if self._communicator is None:
             return [own]
-        text = json.dumps(own).encode()
-        length = np.array([len(text)], np.int64)
-        lengths = self._gathered(length, math.inf)[:, 0]
-        padded = np.frombuffer(text.ljust(int(lengths.max()), b"\0"), np.uint8)
-        return [json.loads(_text(row)) for row in self._gathered(padded, math.inf)]
+        text = np.frombuffer(json.dumps(own).encode(), np.uint8)
+        return [json.loads(row.tobytes()) for row in self._parts(text, math.inf)]
+
+    def joined(self, work: Callable[[], np.ndarray]) -> np.ndarray:
+        """The rows that each rank finds, one after the other in their order, on all.
+
+        Args:
+            work: finds rows, as many as it likes, of the same kind and shape on each rank.
+
+        Raises:
+            Agreed: it failed on some rank.
+        """
+        rows = self.together(work)
+        return rows if self._communicator is None else np.concatenate(self._parts(rows))
 
     def require_same(self, told: Mapping[str, str]) -> None:
         """Check that all ranks have the same.
@@ -244,8 +253,15 @@ class Ranks:
             what = f"the ranks do not work on the same: {'; '.join(faults)} than on rank 0"
             raise Agreed(what, remedy="Start all with the same version, options and data set")
 
-    def together(self, work: Callable[[], Result]) -> Result:
+    def together(self, work: Callable[[], Result], patience: float | None = None) -> Result:
         """Do something on each rank that may fail on some of them.
+
+        In such work ranks may tell each other something, if they begin that by this method or by
+        `joined`: one that failed before is then found out there.
+
+        Args:
+            work: to do.
+            patience: seconds to wait for the others; None: as long as this object always waits.
 
         Raises:
             Agreed: it failed on some rank; the message is that of the first one.
@@ -255,9 +271,12 @@ class Ranks:
         error, result = None, None
         try:
             result = work()
-        except UserError as failed:
-            error = failed
-        failures = np.flatnonzero(self._gathered(np.array([error is not None], np.uint8))[:, 0])
+        except Agreed:
+            raise
+        except UserError as caught:
+            error = caught
+        failed = np.array([error is not None], np.uint8)
+        failures = np.flatnonzero(self._gathered(failed, patience)[:, 0])
         if not len(failures):
             return result  # pyright: ignore[reportReturnType]
         parts = [] if error is None else [error.what, error.where or "", error.remedy or ""]
@@ -266,6 +285,14 @@ class Ranks:
         what, where, remedy = (*_text(texts[failures[0]]).split("\0"), "", "")[:3]
         alone = None if len(failures) == self.size else int(failures[0])
         raise Agreed.of(UserError(what, where or None, remedy or None), alone)
+
+    def _parts(self, own: np.ndarray, patience: float | None = None) -> list[np.ndarray]:
+        """The arrays of all ranks, which may have other numbers of rows."""
+        lengths = self._gathered(np.array([len(own)], np.int64), patience)[:, 0]
+        padded = np.zeros((int(lengths.max()), *own.shape[1:]), own.dtype)
+        padded[: len(own)] = own
+        rows = self._gathered(padded, patience)
+        return [part[:length] for part, length in zip(rows, lengths, strict=True)]
 
     def _gathered(self, array: np.ndarray, patience: float | None = None) -> np.ndarray:
         """The arrays of all ranks, one a row."""

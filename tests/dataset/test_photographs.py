@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from unbake import memory
+from unbake.dataset import decoding
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
 from unbake.dataset.outliers import told_outliers, without_outliers
@@ -209,8 +211,8 @@ def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_bot
     dataset, on_disk, monkeypatch
 ):
     made, read = dataset(), []
-    decode = module.read_masked
-    monkeypatch.setattr(module, "read_masked", lambda *a: read.append(a) or decode(*a))
+    decode = decoding.read_masked
+    monkeypatch.setattr(decoding, "read_masked", lambda *a: read.append(a) or decode(*a))
     decoded = []
     for smoothed in (False, False, True, True, False):
         found = Photographs.load(made, False, smoothed=smoothed)
@@ -228,7 +230,7 @@ def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
     def never(*arguments):
         raise AssertionError("an image was read again")
 
-    monkeypatch.setattr(module, "read_masked", never)
+    monkeypatch.setattr(decoding, "read_masked", never)
     again = Photographs.load(made, False)
     np.testing.assert_array_equal(first.table, again.table)
     assert again.mean == first.mean
@@ -280,8 +282,8 @@ def test_a_file_of_other_photographs_is_made_anew(dataset, on_disk, monkeypatch,
         (made.folder / ".cache" / "photographs.npy").unlink()
         os.mkfifo(made.folder / ".cache" / "photographs.npy")
     read = []
-    decode = module.read_masked
-    monkeypatch.setattr(module, "read_masked", lambda *a: read.append(a) or decode(*a))
+    decode = decoding.read_masked
+    monkeypatch.setattr(decoding, "read_masked", lambda *a: read.append(a) or decode(*a))
     found = Photographs.load(made, clip)
     assert len(read) == len(made.train)
     np.testing.assert_array_equal(found.table[:, :3], rgba(made)[:, :3])
@@ -300,7 +302,7 @@ def test_no_room_for_the_file_is_told_in_one_line(dataset, on_disk, monkeypatch)
         raise OSError(28, "No space left on device")
 
     made = dataset()
-    monkeypatch.setattr(module.os, "posix_fallocate", full)
+    monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(UserError, match=r"cannot be written .No space left") as caught:
         Photographs.load(made, False)
     assert "Make room" in caught.value.remedy
@@ -309,8 +311,8 @@ def test_no_room_for_the_file_is_told_in_one_line(dataset, on_disk, monkeypatch)
 
 def test_a_disk_that_is_too_small_is_told_with_both_numbers(dataset, on_disk, monkeypatch):
     made = dataset()
-    usage = module.shutil.disk_usage(made.folder)
-    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=100))
+    usage = shutil.disk_usage(made.folder)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100))
     with pytest.raises(UserError, match=r"take 0\.0 GB, 0\.0 GB are free"):
         Photographs.load(made, False)
     assert not (made.folder / ".cache").exists()
@@ -343,14 +345,14 @@ def test_a_file_that_a_fit_has_mapped_stays_as_it_is(dataset, on_disk):
 
 
 def test_two_fits_at_once_decode_once(dataset, on_disk, monkeypatch):
-    made, read, decode = dataset(), [], module.read_masked
+    made, read, decode = dataset(), [], decoding.read_masked
 
     def slowly(*arguments):
         read.append(arguments)
         time.sleep(0.1)
         return decode(*arguments)
 
-    monkeypatch.setattr(module, "read_masked", slowly)
+    monkeypatch.setattr(decoding, "read_masked", slowly)
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: Photographs.load(made, False), range(4)))
     assert len(read) == len(made.train)
@@ -416,7 +418,7 @@ def test_photographs_that_do_not_fit_the_memory_are_refused_before_they_are_read
 ):
     made = dataset()
     monkeypatch.setattr(memory, "free_bytes", lambda: 4000)
-    monkeypatch.setattr(module, "read_masked", None)
+    monkeypatch.setattr(decoding, "read_masked", None)
     with pytest.raises(UserError, match="the photographs need about 0 MB of memory, 0 MB are free"):
         Photographs.load(made, False)
 

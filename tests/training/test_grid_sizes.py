@@ -56,6 +56,11 @@ def test_extent_footprint_and_area_of_a_wall():
     assert part.extent == pytest.approx(4.04) and part.area == pytest.approx(4.0, rel=0.4)
 
 
+def test_many_photographs_from_one_place_show_no_more():
+    alone, many = (surface_seen(wall(2.0), [camera(4.0, 30.0)] * count) for count in (1, 40))
+    assert alone.area / 2 < many.area < 2 * alone.area
+
+
 def straight_fov() -> float:
     return 2 * math.degrees(math.atan(1 / 4))
 

@@ -131,6 +131,14 @@ def test_batches_that_cannot_be_shared_equally_are_refused():
         with_share(replace(config, pixels=100), 3)
 
 
+def test_batches_that_would_do_are_those_of_all_ranks(cornell):
+    _, _, step = steps_of(cornell, replace(tiny_fields(), pixels=64), Fake(0, lambda own: own), 0)
+    assert step._smaller(5) == "Lower --batch from 64 to 10, or --spp"
+    crops = replace(tiny_fields(), pixels=60, pixel_sampling="one-view-crop")
+    with pytest.raises(UserError, match=r"of each of 2 processes cannot have 30 pixels.* 50,"):
+        steps_of(cornell, crops, Fake(0, lambda own: own), 0)
+
+
 def command(*words, ranks=2):
     return [MPIEXEC, "-n", str(ranks), sys.executable, "-m", "unbake", "fit", *map(str, words)]
 

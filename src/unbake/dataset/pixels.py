@@ -281,23 +281,48 @@ class PixelSource:
         return replace(self, held=np.sort(places))
 
     def held_aside(self) -> PixelBatch | None:
-        """The pixels that are never drawn; None if there are none."""
-        return None if self.held is None else self._batch(self._numbers(self.held))
+        """The pixels that are never drawn, of all views; None if there are none.
+
+        All processes ask for them together, and each tells those that it holds.
+        """
+        if self.held is None:
+            return None
+        found, slopes = self.photographs, None
+        own = found.own_numbers(self._own_held)
+        numbers = found.joined(lambda: own)
+        colours = found.joined(lambda: found.own_rows(own))
+        if self.slopes:
+            slopes = found.joined(lambda: self._slopes(own))
+        return self._batch(numbers, colours, slopes)
+
+    def weight(self, *, crops: bool) -> float:
+        """What the loss of a batch of this process is multiplied by, where others draw theirs.
+
+        The mean over processes then is that over all pixels; see `Share.weight`.
+
+        Args:
+            crops: whether batches are drawn by `draw_crop`.
+        """
+        share, held = self.photographs.share, np.arange(0) if self.held is None else self.held
+        return 1.0 if share is None else share.weight(held, crops=crops)
 
     def draw(self, seed: int, count: int) -> PixelBatch:
-        """Draw random pixels of all views, each as likely as any other (ours).
+        """Draw random pixels of all views that this process holds, each as likely as any other.
 
-        Neighbouring pixels tell much the same, so that scattered ones learn faster at equal cost
-        than those of `draw_crop`.
+        That is ours. Neighbouring pixels tell much the same, so that scattered ones learn faster at
+        equal cost than those of `draw_crop`.
         """
-        left = self.photographs.count - len(self._before_held)
+        found = self.photographs
+        left = len(found.places) - len(self._before_held)
+        if not left:  # whatever is drawn has no weight
+            return self._own_batch(np.full(count, found.pixels.start))
         places = np.random.default_rng(seed).integers(0, left, count)
         # Places are among those left: each moves on by the number of held ones before it.
         places += np.searchsorted(self._before_held, places, "right")
-        return self._batch(self._numbers(places))
+        return self._own_batch(found.own_numbers(found.places.start + places))
 
     def draw_crop(self, seed: int, count: int) -> PixelBatch:
-        """Draw a square crop of one random view, with all its pixels.
+        """Draw a square crop of one random view that this process holds, with all its pixels.
 
         Each view is as likely as any other, and so is each place in it. Pixels that are held aside
         are replaced by others of the crop, or of all views if these are all held aside. Where the
@@ -312,6 +337,8 @@ class PixelSource:
         edge = math.isqrt(count)
         rng = np.random.default_rng(seed)
         views = self._seen_views
+        if not len(views):
+            return self.draw(seed, count)
         view = int(views[rng.integers(len(views))])
         first, width, height = self._layout[view]
         across = width - edge + 1
@@ -323,11 +350,11 @@ class PixelSource:
         row, column = np.divmod(np.arange(edge * edge), edge)
         numbers = first + (place // across + row) * width + place % across + column
         if self.held is not None:
-            held = np.isin(numbers, self._numbers(self.held))
+            held = np.isin(numbers, self.photographs.own_numbers(self._own_held))
             if held.all():
                 return self.draw(seed, count)
             numbers[held] = rng.choice(numbers[~held], int(held.sum()))
-        return self._batch(numbers)
+        return self._own_batch(numbers)
 
     def place(self, number: int) -> tuple[int, int, int]:
         """The view of a pixel, from 0, and its column and row in it."""
@@ -336,34 +363,46 @@ class PixelSource:
         row, column = divmod(number - first, width)
         return view, column, row
 
-    def require_crops(self, count: int) -> None:
-        """Raise a `UserError` if there are no square crops of that many pixels in all views."""
-        edge = math.isqrt(count)
+    def require_crops(self, count: int, ranks: int = 1) -> None:
+        """Raise a `UserError` if there are no square crops of that many pixels in all views.
+
+        Args:
+            count: pixels of a crop.
+            ranks: how many processes each draw one for a batch.
+        """
+        edge, each = math.isqrt(count), "" if ranks == 1 else f" of each of {ranks} processes"
         if edge * edge != count:
-            what = f"a square crop cannot have {count} pixels"
-            remedy = f"Use --batch {edge**2}, or --pixel-sampling all-views"
+            what = f"a square crop{each} cannot have {count} pixels"
+            remedy = f"Use --batch {ranks * edge**2}, or --pixel-sampling all-views"
             raise UserError(what, remedy=remedy)
         short = min(min(width, height) for _, width, height in self._layout)
         if short < edge:
             what = f"a crop of {edge} x {edge} pixels is larger than the smallest photograph"
-            remedy = f"Use --batch {short**2} or less, or --pixel-sampling all-views"
+            remedy = f"Use --batch {ranks * short**2} or less, or --pixel-sampling all-views"
             raise UserError(f"{what}, whose shorter edge has {short}", remedy=remedy)
 
     @cached_property
-    def _before_held(self) -> np.ndarray:
-        """How many places that are left lie before each one that is held aside."""
+    def _own_held(self) -> np.ndarray:
+        """Places that are held aside, of those that this process holds."""
         held = np.arange(0) if self.held is None else self.held
+        own = self.photographs.places
+        return held[slice(*np.searchsorted(held, (own.start, own.stop)))]
+
+    @cached_property
+    def _before_held(self) -> np.ndarray:
+        """How many of its places that are left lie before each one that is held aside."""
+        held = self._own_held - self.photographs.places.start
         return held - np.arange(len(held))
 
-    def _numbers(self, places: np.ndarray) -> np.ndarray:
-        """Numbers of pixels by their places among those to train on."""
-        chosen = self.photographs.chosen
-        return places if chosen is None else chosen[places]
-
-    def _batch(self, numbers: np.ndarray) -> PixelBatch:
-        limits = None if self.limits is None else self.limits[self.views_of(numbers)]
+    def _own_batch(self, numbers: np.ndarray) -> PixelBatch:
         slopes = self._slopes(numbers) if self.slopes else None
-        return PixelBatch.of(numbers, self.photographs.table[numbers], limits, slopes)
+        return self._batch(numbers, self.photographs.own_rows(numbers), slopes)
+
+    def _batch(
+        self, numbers: np.ndarray, colours: np.ndarray, slopes: np.ndarray | None
+    ) -> PixelBatch:
+        limits = None if self.limits is None else self.limits[self.views_of(numbers)]
+        return PixelBatch.of(numbers, colours, limits, slopes)
 
     def _slopes(self, numbers: np.ndarray) -> np.ndarray:
         """How photographs change across and down, linear RGB a pixel, shape (n, 6).
@@ -379,20 +418,21 @@ class PixelSource:
             inside = (0 < place) & (place < size - 1)
             before, after = (numbers + np.where(inside, s * step, 0) for s in (-1, 1))
             if self._counted is not None:
-                inside &= self._counted[before] & self._counted[after]
-            pair = (self.photographs.table[side, :3] for side in (after, before))
+                first_pixel = self.photographs.pixels.start
+                inside &= self._counted[before - first_pixel] & self._counted[after - first_pixel]
+            pair = (self.photographs.own_rows(side)[:, :3] for side in (after, before))
             slope = 0.5 * np.subtract(*pair)
             found[:, 3 * axis : 3 * axis + 3] = np.where(inside[:, None], slope, 0)
         return found
 
     @cached_property
     def _counted(self) -> np.ndarray | None:
-        """Whether pixels count, by number; None: all do."""
-        chosen = self.photographs.chosen
-        if chosen is None:
+        """Whether the pixels that this process holds count; None: all do."""
+        found = self.photographs
+        if found.chosen is None:
             return None
-        counted = np.zeros(len(self.photographs.table), bool)
-        counted[chosen] = True
+        counted = np.zeros(len(found.pixels), bool)
+        counted[found.chosen - found.pixels.start] = True
         return counted
 
     def views_of(self, numbers: np.ndarray) -> np.ndarray:
@@ -409,10 +449,12 @@ class PixelSource:
 
     @cached_property
     def _seen_views(self) -> np.ndarray:
-        """The views with pixels to train on."""
-        if self.photographs.chosen is None:
-            return np.arange(self.rays.views)
-        return np.unique(self.views_of(self.photographs.chosen))
+        """The views with pixels to train on, of those that this process holds."""
+        found = self.photographs
+        if found.chosen is None:
+            first, last = self.views_of(np.array([found.pixels.start, found.pixels.stop - 1]))
+            return np.arange(first, last + 1)
+        return np.unique(self.views_of(found.chosen))
 
     @cached_property
     def _found(self) -> dict[tuple[int, int], np.ndarray]:

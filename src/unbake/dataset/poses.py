@@ -53,12 +53,11 @@ def pose_problems(
         where: the data set's folder, which is named where no pixel sees a surface of the scene.
     """
     cameras = [view.camera for view in views]
-    numbers = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
+    places = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
+    numbers = photographs.numbers(places)
     sky = photographs.chosen is None and scene.environment() is not None
-    if photographs.chosen is not None:
-        numbers = photographs.chosen[numbers]
-    elif not sky:
-        numbers = numbers[photographs.table[numbers, :3].any(axis=1)]
+    if photographs.chosen is None and not sky:
+        numbers = numbers[photographs.radiance(numbers).any(axis=1)]
     seen = _seen(scene, cameras, numbers)
     share = float(seen.mean()) if len(seen) else 1.0
     if share < (_DOUBTFUL_WITH_SKY if sky else _DOUBTFUL):

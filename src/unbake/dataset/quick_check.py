@@ -11,11 +11,13 @@ from .agreement import exposures, shared_points, turning_light
 from .alignment import FEWEST_VIEWS, SHORTEST_SIDE, alignment
 from .findings import Finding, light_that_turns, misaligned, unequal_exposures
 from .photographs import Photographs
-from .small_views import SmallView, seen_by, small_view
+from .small_views import SmallView, seen_by, small_camera, small_view
 from .views import View
 
 #: Views that are looked at, spread evenly.
 _MOST_VIEWS = 16
+#: Of a small view: linear RGB and coverage.
+_CHANNELS = 4
 
 
 def quick_findings(
@@ -53,14 +55,38 @@ def _shorter_side(view: View) -> int:
 def _small_views(
     views: Sequence[View], photographs: Photographs, numbers: Sequence[int]
 ) -> list[SmallView]:
+    """Views in rising order, each made small by the process that holds it."""
     first = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)])
-    small = []
+
+    def own() -> np.ndarray:
+        found = [np.zeros((0, _CHANNELS), np.float32)]
+        for i in numbers:
+            if first[i] in photographs.pixels:
+                view = _small_view(views[i], photographs, int(first[i]), int(first[i + 1]))
+                rows = np.dstack([view.rgb, view.alpha]).reshape(-1, _CHANNELS)
+                found.append(rows.astype(np.float32))
+        return np.concatenate(found)
+
+    rows, small = photographs.joined(own), []
     for i in numbers:
-        part, alpha = slice(first[i], first[i + 1]), None
-        if photographs.chosen is not None:
-            inside = slice(*np.searchsorted(photographs.chosen, (part.start, part.stop)))
-            alpha = np.zeros(part.stop - part.start, np.float32)
-            alpha[photographs.chosen[inside].astype(np.int64) - part.start] = 1
-        rgb = np.array(photographs.table[part, :3])
-        small.append(small_view(views[i].name, views[i].camera, rgb, alpha))
+        camera = small_camera(views[i].camera)
+        count = camera.width * camera.height
+        picture = rows[:count].reshape(camera.height, camera.width, _CHANNELS)
+        small.append(SmallView(views[i].name, camera, picture[..., :3], picture[..., 3]))
+        rows = rows[count:]
     return small
+
+
+def _small_view(view: View, photographs: Photographs, start: int, stop: int) -> SmallView:
+    """A view that this process holds.
+
+    Args:
+        start, stop: numbers of its first pixel and of that of the next view.
+    """
+    first, alpha = photographs.pixels.start, None
+    if photographs.chosen is not None:
+        inside = slice(*np.searchsorted(photographs.chosen, (start, stop)))
+        alpha = np.zeros(stop - start, np.float32)
+        alpha[photographs.chosen[inside].astype(np.int64) - start] = 1
+    rgb = np.array(photographs.table[start - first : stop - first, :3])
+    return small_view(view.name, view.camera, rgb, alpha)

@@ -47,6 +47,8 @@ class SharedPoints:
 def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> SharedPoints:
     """Random points that photographs see, with their light in all other ones that do.
 
+    Processes that share the photographs look for them together.
+
     Args:
         scene: of known geometry.
         views: the training views.
@@ -54,8 +56,7 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
     """
     rng = np.random.default_rng(0)
     places = rng.integers(0, pixels.photographs.count, _PIXELS * len(views))
-    chosen = pixels.photographs.chosen
-    numbers = np.unique(places if chosen is None else chosen[places]).astype(np.uint32)
+    numbers = np.unique(pixels.photographs.numbers(places)).astype(np.uint32)
     own = pixels.views_of(numbers)
     points, normals, valid = _points(scene, pixels, numbers)
     numbers, own, points, normals = (x[valid] for x in (numbers, own, points, normals))
@@ -160,7 +161,7 @@ def _logs(
         numbers: of the pixels.
         of: the view of each.
     """
-    light = np.array(pixels.photographs.table[numbers, :3], np.float64)
+    light = pixels.photographs.radiance(numbers).astype(np.float64)
     sums = np.bincount(of, light.mean(1), len(views))
     least = _DARK * sums / np.maximum(np.bincount(of, minlength=len(views)), 1)
     limits = np.array([view.limit for view in views])

@@ -99,6 +99,7 @@ def _area(points: np.ndarray) -> float:
     A surface meets a number of boxes that grows by four as their edge is halved. They are counted
     at the smallest edge at which a box has several points on average, so that hardly any is missed.
     """
+    points = np.unique(points, axis=0)  # of cameras at one place no box parts them
     area, along = 1.0, 1
     while True:
         boxes = len(np.unique((points * along + _SHIFT).astype(int), axis=0))

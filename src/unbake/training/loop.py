@@ -45,6 +45,7 @@ from .run_folder import Origin, RunFolder
 from .run_lock import RunLock
 from .saving import Saving
 from .schedule import learning_rates
+from .sharing import kept_whole
 from .solved import Solved, read_solved
 from .state import State, initial_state
 from .step import TrainingStep
@@ -161,10 +162,10 @@ class _Begun:
     step: TrainingStep
     state: State
     restored: Progress | None  #: of the checkpoint that it goes on with
-    preview: Preview
+    preview: Preview | None  #: None on ranks that show nothing
     score: Score | None
     aside: HeldAside | None  #: None where no pixels are held aside
-    photographs: HeldOutPhotographs | None  #: None where the truth of held-out views is known
+    photographs: HeldOutPhotographs | None  #: the same, or the truth of held-out views is known
     views: list[str]  #: names of those that it learns from
 
 
@@ -179,21 +180,31 @@ def _begin(
     solved: Solved | None = None,
     ranks: Ranks | None = None,
 ) -> _Begun:
-    """Read all input, and check it; nothing is written but the cache of the data set."""
+    """Read all input, and check it; nothing is written but the cache of the data set.
+
+    Args:
+        ranks: that begin together, in work of `Ranks.together`.
+    """
+    ranks = ranks or Ranks()
     if solved is not None:
         config = with_solved_field(config, solved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     before = folder.origin() if resume else None
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = clip_negative or (before is not None and before.clip_negative)
-    pixels = pixels_of(dataset, config, clip_negative=clip_negative)
+    files = _require_same_input(config, dataset, ranks)
+    whole = kept_whole(config, dataset, ranks) if ranks.size > 1 else None
+    if whole is not None:
+        console.print(f"each process reads all photographs: {whole}", highlight=False)
+    dealing = None if whole is not None else ranks
+    pixels = pixels_of(dataset, config, clip_negative=clip_negative, ranks=dealing)
     pixels = pixels.holding_aside(config.held_aside, config.seed)
     origin = Origin(
         data=str(data.resolve()),
         mean_radiance=pixels.photographs.mean,
         clip_negative=clip_negative,
         run=uuid.uuid4().hex if before is None else before.run,
-        fingerprint=fingerprint(dataset),
+        fingerprint=files,
         warm_start=None if solved is None else warm_start(solved),
     )
     if before is not None:
@@ -216,7 +227,7 @@ def _begin(
     step = TrainingStep(problem, pixels, config, ranks)
     step.plan(state)
     restored = load_checkpoint(folder, state) if resume else None
-    preview = Preview(problem, dataset, folder)
+    preview = Preview(problem, dataset, folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
     aside, photographs = _probes(
@@ -243,17 +254,29 @@ def what_ranks_share(settings: str, files: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
+def _require_same_input(config: FitConfig, dataset: Dataset, ranks: Ranks) -> dict[str, str]:
+    """The data set's fingerprint, which all ranks must have, and the same settings.
+
+    It is compared before they share the photographs: that takes the same views on each.
+
+    Raises:
+        Agreed: they have not.
+    """
+    files = ranks.together(lambda: fingerprint(dataset), math.inf)
+    ranks.require_same(what_ranks_share(to_toml(config), files))
+    return files
+
+
 def _agree(begun: _Begun, ranks: Ranks) -> None:
-    """Check that all ranks work on the same, from the same state.
+    """Check that all ranks begin with the same state.
 
     Raises:
         Agreed: they do not.
     """
     if ranks.size == 1:
         return
-    origin, progress = begun.origin, begun.restored or Progress()
-    alike = what_ranks_share(to_toml(begun.config), origin.fingerprint)
-    ranks.require_same(alike | {"length so far": json.dumps(progress.counted())})
+    progress = begun.restored or Progress()
+    ranks.require_same({"length so far": json.dumps(progress.counted())})
     _require_same_state(begun.state, ranks)
     backend.share_cores(ranks.here, least=1)  # all is read
 
@@ -269,12 +292,16 @@ def _probes(
     pixels: PixelSource,
     step: TrainingStep,
     config: FitConfig,
-    preview: Preview,
+    preview: Preview | None,
     clip_negative: bool,
     camera: CameraModel | None,
 ) -> tuple[HeldAside | None, HeldOutPhotographs | None]:
-    """What is measured beside the training, from photographs alone."""
-    compared = [] if preview.has_truth else dataset.heldout
+    """What is measured beside the training, from photographs alone.
+
+    Args:
+        preview: None: held-out photographs are left to the rank that has one.
+    """
+    compared = [] if preview is None or preview.has_truth else dataset.heldout
     every = sum(view.camera.width * view.camera.height for view in dataset.views)
     if every > MOST_PIXELS:
         compared = []
@@ -446,7 +473,7 @@ def _show(
     begun: _Begun, monitor: Monitor, progress: Progress, lock: RunLock | None
 ) -> list[UserError]:
     """Show a preview, or return why it cannot be written; nothing without a lock."""
-    if lock is None:
+    if lock is None or begun.preview is None:
         return []
     begun.state.publish(begun.problem)
     try:

@@ -82,10 +82,9 @@ def _other_units(pixels: PixelSource, problem: Problem) -> str | None:
     if problem.environment is not None or problem.emission is not None:
         return None
     photographs = pixels.photographs
-    numbers = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
-    if photographs.chosen is not None:
-        numbers = photographs.chosen[numbers]
-    mean = float(photographs.table[numbers, :3].mean(dtype=np.float64))
+    places = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
+    numbers = photographs.numbers(places)
+    mean = float(photographs.radiance(numbers).mean(dtype=np.float64))
     table = from_numpy(mi.UInt32, numbers.astype(np.uint32))
 
     def through(pixel: mi.UInt32, offset: mi.Point2f) -> mi.Ray3f:

@@ -27,6 +27,7 @@ from ..fields.radiance import RadianceField, make_radiance
 from ..fields.registry import representation
 from ..fields.settings import NetworkConfig
 from ..fields.texture import material_numbers, material_textures
+from ..ranks import Ranks
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
 from ..transport.objective import has_radiance
@@ -229,13 +230,16 @@ def problem_of(
     )
 
 
-def pixels_of(dataset: Dataset, config: FitConfig, *, clip_negative: bool) -> PixelSource:
+def pixels_of(
+    dataset: Dataset, config: FitConfig, *, clip_negative: bool, ranks: Ranks | None = None
+) -> PixelSource:
     """The training pixels with what the settings ask of them; see `training_pixels`."""
     return training_pixels(
         dataset,
         clip_negative=clip_negative,
         smoothed=config.loss_reference == "smoothed",
         slopes=bool(config.camera.of_places),
+        ranks=ranks,
     )
 
 
@@ -309,7 +313,12 @@ def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list
 
 
 def training_pixels(
-    dataset: Dataset, *, clip_negative: bool, smoothed: bool = True, slopes: bool = False
+    dataset: Dataset,
+    *,
+    clip_negative: bool,
+    smoothed: bool = True,
+    slopes: bool = False,
+    ranks: Ranks | None = None,
 ) -> PixelSource:
     """The pixels of the training views.
 
@@ -318,6 +327,8 @@ def training_pixels(
         smoothed: keep a blurred copy of the photographs, which `loss_reference = "smoothed"` needs
             and which takes as much memory again.
         slopes: give batches the slopes of the photographs, which corrections of poses need.
+        ranks: processes that share the photographs, see `Photographs.load`; None: this one holds
+            all.
 
     Raises:
         UserError: there is no training view, an image is bad, or all pixels are black.
@@ -327,7 +338,7 @@ def training_pixels(
         raise UserError(
             "no training view", dataset.folder, f'Give frames of {TRANSFORMS} "split": "train"'
         )
-    photographs = Photographs.load(dataset, clip_negative, smoothed=smoothed)
+    photographs = Photographs.load(dataset, clip_negative, smoothed=smoothed, ranks=ranks)
     if not photographs.count:
         raise UserError("no foreground pixel in any training view", dataset.folder)
     if photographs.mean <= 0:

@@ -78,9 +78,15 @@ class TrainingStep:
     Gradients and loss terms are averaged, so that all take the same step. With `sync_every` > 1
     each takes so many steps by itself, and then their states are averaged (local SGD, Stich 2019).
 
+    Where ranks hold some views each, a rank draws from its own. Its loss terms and gradients weigh
+    as its pixels are of all (`Share.weight`). So the expectation of the mean is that of a batch of
+    all pixels for every term that is a mean over pixels. Two kinds of terms differ a little, as
+    each rank has its own number in them: means over surface points, of which a view may show
+    fewer, and weights that are a multiple of the photometric loss.
+
     Args:
         problem: what is learned; the same on all ranks.
-        pixels: to draw batches from.
+        pixels: to draw batches from; they may be the views of this rank.
         config: says the batch of all ranks together.
         ranks: that take the step together; None: there is one.
 
@@ -102,8 +108,9 @@ class TrainingStep:
         smoothed = config.loss_reference == "smoothed"
         if smoothed and not pixels.photographs.smoothed:
             raise ValueError("the loss is relative to smoothed photographs, which were not made")
-        if config.pixel_sampling == "one-view-crop":
-            pixels.require_crops(config.pixels)
+        crops = config.pixel_sampling == "one-view-crop"
+        if crops:
+            pixels.require_crops(config.pixels, self._ranks.size)
         # Dr.Jit 1.5 aborts if objects of an earlier fit are freed while this one is recorded.
         gc.collect()
         if problem.materials is not None:
@@ -129,6 +136,7 @@ class TrainingStep:
         self._own = dr.freeze(self._own_gradients) if recordable else self._own_gradients
         self._common = dr.freeze(self._step_by) if recordable else self._step_by
         self._terms: list[str] = []  # names of the loss terms, once a step was traced
+        self._weight = pixels.weight(crops=crops)  # of this rank's gradients in their mean
         self._apart = False  # whether ranks have taken steps by themselves since they were united
         self._probed = mi.load_dict({"type": "independent"})
         self._frozen_probe = dr.freeze(self._probe) if recordable else None
@@ -204,20 +212,21 @@ class TrainingStep:
         """Raise an error if a step would need more memory than there is free.
 
         This is checked once, where the method keeps whole paths in memory or the batch is large.
-        Two smaller batches are measured, and their gradients dropped.
+        Two smaller batches are measured, and their gradients dropped. Ranks on one machine share
+        its memory.
 
         Raises:
             UserError: the step would need more; it names the batch that would fit.
         """
         if self._fits_memory:
             return
-        paths, free = self._config.samples_per_pass, free_bytes()
-        large = free is not None and paths * MOST_BYTES_A_SAMPLE > free
+        paths, free, here = self._config.samples_per_pass, free_bytes(), self._ranks.here
+        large = free is not None and here * paths * MOST_BYTES_A_SAMPLE > free
         found = self.forecast(state) if large or self._path_sampler.keeps_paths else None
         if found is not None:
             what = f"a step of {paths} paths by {self._config.method} needs"
             # Dr.Jit 1.5 rounds arrays up to powers of two, of which only a part is used
-            factor = 2 if reserved_counts() else 1
+            factor = max(here, 2 if reserved_counts() else 1)
             need = factor * found.bytes(self._config.pixels)
             require_memory(need, what, lambda free: self._smaller(found.pixels(free / factor)))
         self._fits_memory = True
@@ -238,11 +247,12 @@ class TrainingStep:
         """The remedy where a step does not fit the memory.
 
         Args:
-            pixels: of a batch that would fit, if it is known.
+            pixels: of this rank's share of a batch that would fit, if it is known.
         """
-        told = "Lower --batch or --spp"
+        told, ranks = "Lower --batch or --spp", self._ranks.size
         if pixels is not None:
-            told = f"Lower --batch from {self._config.pixels} to {pixels}, or --spp"
+            whole = self._config.pixels * ranks
+            told = f"Lower --batch from {whole} to {pixels * ranks}, or --spp"
         if self._path_sampler.keeps_paths:
             told += " or path.max_depth, or use --method prb"
         return told
@@ -260,7 +270,8 @@ class TrainingStep:
         target = colours[:, :3].astype(np.float64)
         smoothed = self._config.loss_reference == "smoothed"
         reference = colours[:, 3:] if smoothed else target
-        return float((target**2 / (reference**2 + self._config.loss_epsilon)).mean())
+        loss = (target**2 / (reference**2 + self._config.loss_epsilon)).mean()
+        return float(self._ranks.mean(self._weighted(np.array([loss])))[0])
 
     @carrying()
     def replay(self, state: State, number: int) -> Replay:
@@ -399,8 +410,14 @@ class TrainingStep:
 
     def _shared_step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         """The same step on all ranks, with the mean of their gradients."""
-        own = self._own(inputs, state)
-        return self._common(from_numpy(mi.Float, self._ranks.mean(own.numpy())), state)
+        own = self._weighted(self._own(inputs, state).numpy())
+        return self._common(from_numpy(mi.Float, self._ranks.mean(own)), state)
+
+    def _weighted(self, own: np.ndarray) -> np.ndarray:
+        """Means over this rank's pixels, so that the mean over ranks is one over all pixels."""
+        if self._weight == 1:
+            return own
+        return own * own.dtype.type(self._weight) if self._weight else np.zeros_like(own)
 
     def _own_gradients(self, inputs: Inputs, state: State) -> mi.Float:
         """This rank's loss terms, then its gradients, in one array."""

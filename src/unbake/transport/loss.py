@@ -25,7 +25,7 @@ class RelativeL2:
     than one that is too bright, and the optimum is darker than the scene: with noisy photographs a
     few percent, which is as much as roughness does. A smoothed photograph has next to no such
     noise. Where it is noisy it must be larger, or else a firefly outweighs all other pixels: see
-    `dataset/photographs.py`.
+    `dataset/decoding.py`.
 
     Args:
         epsilon: added to the squared reference.

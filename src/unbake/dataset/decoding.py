@@ -1,0 +1,234 @@
+"""Photographs as a fit learns from them: decoded, in units of the scene, with a blurred copy."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import reduce
+from typing import Any, final
+
+import numpy as np
+
+from ..errors import UserError
+from .camera import Camera
+from .outliers import without_outliers
+from .shares import dealt
+from .views import Dataset, View, read_masked
+
+#: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
+COLUMNS, WITH_BLURRED = 3, 6
+#: Half the edge of the blur, in pixels.
+RADIUS = 2
+#: A mask whose response to constant and to linear images is zero, and has the variance of the noise
+#: (Immerkær 1996, Fast Noise Variance Estimation).
+_NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
+#: An image with its camera: linear RGBA, shape (pixels, 4), and whether pixels count, (pixels,).
+Image = tuple[Camera, np.ndarray, np.ndarray]
+
+
+@final
+@dataclass(frozen=True)
+class Told:
+    """What processes tell each other of their views; serializable.
+
+    Args:
+        sums: of the pixels to train on and their channels, by view.
+        counts: of the pixels to train on, by view.
+        outliers: as `Outliers` has them.
+    """
+
+    sums: list[float]
+    counts: list[int]
+    outliers: list[dict[str, Any]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """Decoded views.
+
+    Args:
+        table: as in `Photographs`.
+        chosen: the same.
+        told: what all processes come to know of them.
+    """
+
+    table: np.ndarray
+    chosen: np.ndarray | None
+    told: Told
+
+    def part(self, views: slice, pixels: slice, names: Collection[str]) -> Decoded:
+        """Some of these views, with these pixels and names."""
+        chosen, told = self.chosen, self.told
+        if chosen is not None:
+            chosen = chosen[slice(*np.searchsorted(chosen, (pixels.start, pixels.stop)))]
+        outliers = [found for found in told.outliers if found["view"] in names]
+        told = Told(told.sums[views], told.counts[views], outliers)
+        return Decoded(self.table[pixels], chosen, told)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How the training views of a data set are decoded.
+
+    Args:
+        dataset: of the views.
+        clip_negative: take negative pixels as zero.
+        columns: of the table.
+        first_views: of each process, and of all; see `dealt`.
+        sizes: pixels of each view.
+    """
+
+    dataset: Dataset
+    clip_negative: bool
+    columns: int
+    first_views: np.ndarray
+    sizes: list[int]
+
+    @staticmethod
+    def of(dataset: Dataset, clip_negative: bool, columns: int, ranks: int) -> Plan:
+        """The plan for so many processes."""
+        sizes = [view.camera.width * view.camera.height for view in dataset.train]
+        return Plan(dataset, clip_negative, columns, dealt(sizes, ranks), sizes)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether only the foreground counts."""
+        return self.dataset.background == "hidden"
+
+    @property
+    def chooses(self) -> bool:
+        """Whether there are pixels that are not trained on, in any view."""
+        return self.hidden or any(view.mask is not None for view in self.dataset.train)
+
+    def decode_into(self, table: np.ndarray, views: Sequence[View], first: int = 0) -> Decoded:
+        """Put the images of views into a table, but for what is too bright in them.
+
+        Args:
+            first: number of the first pixel of the table.
+        """
+        outliers: list[dict[str, Any]] = []
+
+        def images() -> Iterator[Image]:
+            for view in views:
+                pixels, mask = read_masked(view, self.clip_negative)
+                pixels, camera = pixels.reshape(-1, 4), view.camera
+                counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
+                if self.hidden:
+                    counted &= pixels[:, 3] > 0
+                pixels, found = without_outliers(pixels, counted, view.name, camera.width)
+                if found is not None:
+                    outliers.append(asdict(found))
+                yield camera, _in_radiance(pixels, view), counted
+
+        made = fill(table, images(), self.chooses, first)
+        return replace(made, told=replace(made.told, outliers=outliers))
+
+
+def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
+    """The pixels of a photograph, RGBA, divided by its exposure.
+
+    Errors are relative to a squared reference plus ε (`RelativeL2`). Dividing the photograph and
+    its reference by the exposure e is the same as multiplying the rendering by e, if ε is
+    multiplied by e², too: (eI − G)² / (R² + e²ε) = (I − G/e)² / (R²/e² + ε). So ε is a radiance of
+    the scene: a surface that is exposed twice weighs as much in both photographs, and a data set
+    weighs its pixels as if all had been taken alike. That a photograph of less light is noisier
+    is in the reference, which knows the noise. L_θ learns from the same pixels, in units of the
+    scene.
+    """
+    if view.exposure == 1:
+        return pixels
+    pixels = pixels.copy()
+    with np.errstate(over="ignore"):
+        pixels[:, :3] /= np.float32(view.exposure)
+    if not np.isfinite(pixels).all():
+        what = f"an exposure of {view.exposure:g} makes pixels infinite"
+        raise UserError(what, view.image, "Correct 'exposure' of its frame")
+    return pixels
+
+
+def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0) -> Decoded:
+    """Put images into a table one after the other; blurred, too, if it has room for that.
+
+    Args:
+        some: whether there are pixels that do not count.
+        first: number of the first pixel of the table.
+    """
+    start, sums, counts, seen = 0, [], [], []
+    for camera, pixels, counted in images:
+        stop = start + len(pixels)
+        rgb = pixels[:, :3]
+        table[start:stop, :3] = rgb
+        if table.shape[1] == WITH_BLURRED:
+            # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
+            with np.errstate(over="ignore", invalid="ignore"):
+                table[start:stop, 3:] = _reference(rgb, counted, camera)
+        sums.append(float((rgb[counted] if some else rgb).sum(dtype=np.float64)))
+        counts.append(int(counted.sum()) if some else len(pixels))
+        if some:
+            seen.append(first + start + np.flatnonzero(counted))
+        start = stop
+    chosen = np.concatenate(seen).astype(np.uint32) if some else None
+    return Decoded(table, chosen, Told(sums, counts, []))
+
+
+def _reference(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarray:
+    """The radiance that errors of a pixel are relative to (ours).
+
+    √(mean² + noise² + peak²): the mean of those of the 5 x 5 pixels around each one that count; the
+    standard deviation of their noise; and how much brighter the pixel is than every other of the
+    3 x 3, as fireflies are. The first two have next to nothing of the pixel's own noise in them, so
+    that errors are not weighed by their sign. Where photographs are noisy they weigh less.
+
+    Args:
+        rgb: of one view, linear, shape (pixels, 3).
+        counts: whether a pixel counts, shape (pixels,). Background that is hidden is black, and
+            says nothing about the noise of the foreground.
+    """
+    shape = (camera.height, camera.width, -1)
+    image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
+    mean = _mean_of_counted(image, weight)
+    mean = np.where(np.isnan(mean), image, mean)
+    # Pixels that do not count are no peaks, and no noise is told from them.
+    known = np.where(weight > 0, image, mean)
+    response, inside = np.zeros_like(known), np.ones_like(weight)
+    first, second = (np.full_like(known, -np.inf) for _ in range(2))
+    neighbours = zip(_NOISE.ravel(), _around(known, 1), _around(weight, 1), strict=True)
+    for share, there, counted in neighbours:
+        response += share * there
+        inside *= counted
+        np.maximum(second, np.minimum(first, there), out=second)
+        np.maximum(first, there, out=first)
+    noise = np.nan_to_num(_mean_of_counted(response**2, inside))
+    peak = np.maximum(known - second, 0)
+    return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)
+
+
+def _mean_of_counted(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The mean of those of 5 x 5 pixels around each one that have weight 1; NaN where none has."""
+    if weight.all():
+        return _window_sums(image) / np.float32((2 * RADIUS + 1) ** 2)
+    share = _window_sums(weight)
+    return _window_sums(image * weight) / np.where(share > 0, share, np.nan)
+
+
+def _window_sums(image: np.ndarray) -> np.ndarray:
+    """The sum of 5 x 5 pixels around each one, edges repeated; (height, width, channels)."""
+    for axis in (0, 1):
+        image = reduce(np.add, _along(image, axis, RADIUS))
+    return image
+
+
+def _around(image: np.ndarray, radius: int) -> Iterator[np.ndarray]:
+    """The image moved to every place of a window, row by row, edges repeated."""
+    for moved in _along(image, 0, radius):
+        yield from _along(moved, 1, radius)
+
+
+def _along(image: np.ndarray, axis: int, radius: int) -> Iterator[np.ndarray]:
+    """The image moved along an axis by -radius to radius pixels, edges repeated."""
+    padded = np.pad(image, [(radius, radius) if i == axis else (0, 0) for i in range(3)], "edge")
+    for start in range(2 * radius + 1):
+        part = slice(start, start + image.shape[axis])
+        yield padded[part] if axis == 0 else padded[:, part]
