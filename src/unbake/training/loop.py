@@ -141,8 +141,9 @@ def fit(
             folder.require_new()
             return lock
 
-        begun, lock = ranks.together(begin)
-        _agree(begun, ranks)
+        with ranks.apart():  # some may read for longer than others
+            begun, lock = ranks.together(begin)
+            _agree(begun, ranks)
         if not resume:  # here all input is known to be good, and the folder is made
             lock = ranks.together(make)
         stop = held.enter_context(deferred())
@@ -402,6 +403,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             monitor.record(_done(config, progress), entry)
             ended = last and not stopped  # one that was stopped is not judged by its few steps
             _watch(watchdog, readings, monitor, saving, begun, progress, ended)
+            ranks.announce()  # again, where ranks told each other something since
             failures = saving.save(state, progress) if last or (save and watchdog.trusts) else []
             if last or progress.seconds - shown_at >= config.preview_seconds:
                 failures += _show(begun, monitor, progress, lock)
