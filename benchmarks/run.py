@@ -33,7 +33,7 @@ from rich.console import Console  # noqa: E402
 from summary import machine_results, read, summarized, summary  # noqa: E402
 
 from unbake.acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES  # noqa: E402
-from unbake.config import method_defaults  # noqa: E402
+from unbake.config import from_toml, method_defaults, with_method  # noqa: E402
 from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 from unbake.experiments.commands import (  # noqa: E402
@@ -556,14 +556,15 @@ def plan_equal(bench: Bench, name: str, benchmark: EqualSamples) -> Planned:
     pairs = [(bench.run(benchmark.like, seed), bench.run(name, seed)) for seed in at_time.seeds]
     jobs = list(timed.jobs)
     for seed, (slow, folder) in zip(at_time.seeds, pairs, strict=True):
-        options, text = bench.settings(at_time.settings)
+        # Searches of roughness would be samples that other methods do not have.
+        options, text = bench.settings("search/steps.toml")
         words = ["compare", bench.data(at_time.data), "--methods", *benchmark.methods, *options]
         words += [*NO_SCORES, *at_time.options, "--seed", seed, "--out", folder]
 
-        def work(slow: Path = slow, words: Sequence[object] = words) -> Findings:
+        def work(slow: Path = slow, words: Sequence[object] = words, text: str = text) -> Findings:
             if not (slow / "compare.json").is_file():
                 raise Unfinished
-            steps = steps_of_equal_samples(read(slow / "compare.json"), benchmark)
+            steps = steps_of_equal_samples(read(slow / "compare.json"), benchmark, text)
             unbake(*words, "--steps", steps, until=bench.until)
             return {"steps": steps}
 
@@ -583,21 +584,22 @@ def plan_equal(bench: Bench, name: str, benchmark: EqualSamples) -> Planned:
     return Planned(jobs, write)
 
 
-def steps_of_equal_samples(at_time: dict[str, Any], benchmark: EqualSamples) -> int:
+def steps_of_equal_samples(at_time: dict[str, Any], benchmark: EqualSamples, settings: str) -> int:
     """Steps of the quick methods with the camera samples of the slow one, to the nearest step.
 
     Args:
-        at_time: content of `compare.json`, which has them all.
+        at_time: content of `compare.json`, which has the slow one.
+        settings: of the quick ones, TOML.
 
     Raises:
         UserError: the slow method failed.
         ValueError: the quick methods trace different numbers of samples in a step.
     """
-    rows = at_time["methods"]
-    slow = rows[benchmark.slow]
+    slow = at_time["methods"][benchmark.slow]
     if "error" in slow:
         raise UserError(f"{benchmark.slow} failed: {slow['error']}", benchmark.like)
-    each = {rows[method]["samples"] // rows[method]["steps"] for method in benchmark.methods}
+    config = from_toml(settings)
+    each = {with_method(config, method).samples_per_step for method in benchmark.methods}
     if len(each) > 1:
         raise ValueError(f"steps of {each} samples cannot have the same length")
     return round(slow["samples"] / each.pop())

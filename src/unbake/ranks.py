@@ -199,9 +199,15 @@ class Ranks:
         """The number that rank 0 has."""
         if self._communicator is None:
             return number
-        array = np.array([number], np.float64)
+        return float(self.as_first(np.array([number], np.float64))[0])
+
+    def as_first(self, numbers: np.ndarray) -> np.ndarray:
+        """The array that rank 0 has; of the same type and shape on each."""
+        if self._communicator is None:
+            return numbers
+        array = np.array(numbers)
         self._exchange(lambda all_: all_.Ibcast(array, root=0))
-        return float(array[0])
+        return array
 
     def mine(self, jobs: Sequence[Job]) -> Sequence[Job]:
         """The jobs of this rank, of a list that all have: every so many, dealt like cards."""

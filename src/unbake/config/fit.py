@@ -18,6 +18,7 @@ from ..transport.methods import KEPT_PATHS, METHODS, PATH_REPLAY, Method
 from .camera import CameraConfig
 from .flag import Flag
 from .objective import ObjectiveConfig
+from .search import RoughnessSearchConfig
 from .tables import update
 
 ChosenEstimator = Literal["all-pairs", "split-halves", "two-pass"]
@@ -306,6 +307,7 @@ class FitConfig:
     path: PathConfig = field(default_factory=PathConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    roughness_search: RoughnessSearchConfig = field(default_factory=RoughnessSearchConfig)
 
     checkpoint_seconds: float = 60.0  #: time between checkpoints
     preview_seconds: float = 30.0  #: time between preview pictures

@@ -13,6 +13,7 @@ from ..fields.settings import GridConfig, GuideConfig, NetworkConfig
 from ..quantities import QUANTITIES
 from ..transport.methods import method_named
 from .fit import FitConfig, LightingConfig, PresetName, RegularizationConfig
+from .search import RoughnessSearchConfig
 
 
 def _paper() -> FitConfig:
@@ -38,6 +39,7 @@ def _paper() -> FitConfig:
         loss_epsilon=0.01,
         lighting=LightingConfig(resolution=128, learning_rate=5e-4, initial_radiance=1.0),
         regularization=RegularizationConfig(albedo_smoothness=0.0),
+        roughness_search=RoughnessSearchConfig(times=0),
         **_networks(grid),
     )
 

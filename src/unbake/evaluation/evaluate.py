@@ -156,7 +156,7 @@ def _evaluate(
     metrics |= {
         "steps": recovered.progress.step,
         # Not what the checkpoint says: version 0.1 counts one of two passes.
-        "samples": recovered.progress.step * recovered.config.samples_per_step,
+        "samples": recovered.progress.samples,
         "seconds": round(recovered.progress.seconds, 2),
         "convergence": _convergence(recovered, folder),
         "warm_start": None if origin.warm_start is None else asdict(origin.warm_start),

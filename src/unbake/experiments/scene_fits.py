@@ -178,7 +178,11 @@ class SceneFits:
         config, dataset = self._config(seed), Dataset.load(self.scene.captured(context))
         own = [MethodVariant.of(name).settings(config) for name in methods]
         steps = steps_of(samples, [with_defaults(settings, dataset) for settings in own])
-        config = dataclasses.replace(config, steps=steps, seconds=0.0, score_seconds=0.0)
+        # Searches of roughness would be samples that other methods do not have.
+        search = dataclasses.replace(config.roughness_search, times=0)
+        config = dataclasses.replace(
+            config, steps=steps, seconds=0.0, score_seconds=0.0, roughness_search=search
+        )
         return self._compared(context, self._equal_runs(context, seed, steps), methods, config)
 
     def _compared(

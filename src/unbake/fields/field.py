@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -70,6 +70,10 @@ class Field(Protocol):
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
         """Use these arrays from now on; gradients arrive in the very arrays given."""
         ...
+
+    def shared(self) -> Set[str]:
+        """Names of the parameters that many points share, wherever they are; here none."""
+        return frozenset()
 
     def prepare(self) -> None:
         """Prepare evaluations inside virtual calls and loops; needed after each `assign`."""

@@ -99,7 +99,7 @@ class Materials(Mapping[str, Field]):
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, engine: Engine | None = None
     ) -> Material:
         """The materials at surface interactions; see `Field.evaluate` for the engines."""
-        return self.evaluate_at(self._locate(si, valid), engine)
+        return self.evaluate_at(self.locate(si, valid), engine)
 
     def evaluate_at(self, point: SurfacePoint, engine: Engine | None = None) -> Material:
         """The materials at points given in all coordinates that fields use."""
@@ -116,7 +116,7 @@ class Materials(Mapping[str, Field]):
         """One quantity alone, for points where no BSDF is evaluated."""
         if name != "albedo":
             return self.evaluate(si, valid)[name]
-        return _bounded(QUANTITIES[name], self[name].evaluate(self._locate(si, valid)))
+        return _bounded(QUANTITIES[name], self[name].evaluate(self.locate(si, valid)))
 
     def evaluate_near(
         self, si: mi.SurfaceInteraction3f, valid: mi.Bool, sample: mi.Point2f, radius: float
@@ -166,7 +166,8 @@ class Materials(Mapping[str, Field]):
         near.uv = si.uv + offset
         return near
 
-    def _locate(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> SurfacePoint:
+    def locate(self, si: mi.SurfaceInteraction3f, valid: mi.Bool) -> SurfacePoint:
+        """Surface interactions in all coordinates that fields use, but for the albedo."""
         position = self.domain.to_unit(si.p, valid)
         number = self._number(si.shape) if self.numbers else mi.UInt32(0)
         piece = None if self.pieces is None else self.pieces.at(si, valid)

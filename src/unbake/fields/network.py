@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import drjit as dr
@@ -66,6 +66,10 @@ class Network(Field):
     def prepare(self) -> None:
         """Lay the layers out for cooperative vectors."""
         self.perceptron.prepare()
+
+    def shared(self) -> Set[str]:
+        """The numbers of pieces and colours, if there are any."""
+        return frozenset() if self.pieces is None else self.pieces.parameters().keys()
 
     def evaluate(
         self,

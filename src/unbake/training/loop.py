@@ -41,6 +41,7 @@ from .path_depth import told_depth, with_path_depth
 from .plausibility import data_warnings
 from .preview import Preview
 from .problem import Problem, pixels_of, problem_of
+from .roughness_search import RoughnessSearch
 from .run_folder import Origin, RunFolder
 from .run_lock import RunLock
 from .saving import Saving
@@ -354,6 +355,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
     watchdog = Watchdog(state, begun.step, progress, begun.views)
+    search = RoughnessSearch(problem, config, begun.step, ranks)
     failures: list[UserError] = []  # to write what was due last
     stopped = False
     with Monitor(log, console, total, events) as monitor:
@@ -367,10 +369,11 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
         while not last:
             # Rates depend on how much is done: on steps, or on time where time is the limit.
             done = _done(config, progress) / total
-            rates = watchdog.rates(learning_rates(config, progress.step, done))
+            rates = learning_rates(config, progress.step, done)
+            rates = watchdog.rates(search.rates(rates, progress.step, done))
             recent.append(begun.step(state, progress.step, rates))
             progress.step += 1
-            progress.samples = progress.step * config.samples_per_step
+            progress.samples += config.samples_per_step
             # This clock does not wait for the machine, so that slow steps are saved in time, too.
             save = saving.due(time.perf_counter() - clock)
             # What depends on a clock is the same on all ranks from here on: as rank 0 says.
@@ -383,6 +386,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 dr.sync_thread()
                 progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
+            now = _done(config, progress) / total
+            progress.samples += search.search_between(done, now, state, progress.step)
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
             if not (full or last or due or save or tell):
                 continue

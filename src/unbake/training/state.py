@@ -76,6 +76,14 @@ class State:
                 dr.enable_grad(value)
                 optimizer.state[key] = (value, promoted, rate, (*map(_same, extra), None))
 
+    def replace(self, values: Mapping[str, mi.Float | mi.TensorXf]) -> None:
+        """Use these values of some of φ from now on; moments stay as they are."""
+        for key, value in values.items():
+            _, promoted, rate, extra = self.phi.state[key]
+            value = _same(value)
+            dr.enable_grad(value)
+            self.phi.state[key] = (value, promoted, rate, extra)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """All numbers by name: parameters, the optimisers' moments and counts, and the scale."""
         arrays = {}

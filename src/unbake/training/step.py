@@ -18,13 +18,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..dataset.pixels import CameraRays, PixelBatch, PixelSource
+from ..dataset.pixels import CameraRays, PixelBatch, PixelSource, RayBatch
 from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..ranks import Ranks
+from ..transport.by_roughness import by_roughness
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
@@ -345,6 +346,51 @@ class TrainingStep:
             dr.eval(halves)
         return halves
 
+    @carrying()
+    def by_roughness(
+        self, state: State, seed: int, count: int, spp: int, nodes: Sequence[float]
+    ) -> np.ndarray:
+        """Some random pixels as functions of the roughness of what they see.
+
+        Args:
+            seed: decides pixels and samples.
+            count: of pixels.
+            spp: camera samples of each.
+            nodes: values of roughness.
+
+        Returns:
+            Those of the pixels that can be told so, and whose numbers are finite, as rows of
+            `by_roughness.row_type`.
+        """
+        problem, sampler = self._problem, self._probed
+        assert problem.radiance is not None
+        of_pixels, of_samples = np.random.SeedSequence(seed).generate_state(2)
+        with dr.suspend_grad():
+            state.publish(problem)
+            pixels = self._pixels.draw(int(of_pixels), count)
+            inputs = replace(self._inputs(0), pixels=pixels)
+            sampler.seed(dr.opaque(mi.UInt32, int(of_samples)), count * spp)
+            placed = self._placed(inputs)
+            batch = pixels.batch(placed, sampler, spp)
+            target, loss, _ = self._compared(inputs, batch, placed)
+            weight = loss.weight(target) * (1 if loss.trust is None else loss.trust)
+            if batch.clipped is not None:
+                weight = dr.select(batch.clipped, 0, weight)
+            chosen, rows = by_roughness(
+                problem.scene_view,
+                problem.radiance,
+                problem.guide,
+                batch.ray,
+                sampler,
+                spp,
+                nodes,
+                hide_emitters=problem.hide_emitters,
+            )
+            rows["target"] = np.array(target).T[chosen]
+            rows["weight"] = self._weight * np.array(weight).T[chosen]
+            rows["gain"] = 1 if loss.gain is None else np.array(loss.gain).T[chosen]
+        return rows[np.isfinite(rows.view(np.float32).reshape(len(rows), -1)).all(1)]
+
     def place(self, pixel: int) -> tuple[int, int, int]:
         """The training view of a pixel, from 0, and its column and row in it."""
         return self._pixels.place(pixel)
@@ -471,8 +517,8 @@ class TrainingStep:
         scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
         state.publish(self._problem)
         sampler.seed(inputs.seed, pixels.count * config.spp)
-        poses, placed = self._problem.poses, self._placed(inputs)
-        rays = inputs.rays if poses is None else dr.detach(placed)
+        placed = self._placed(inputs)
+        rays = inputs.rays if self._problem.poses is None else dr.detach(placed)
         batch = pixels.batch(rays, sampler, config.spp)
         with path_sampler.prepared():
             primal = None
@@ -481,34 +527,53 @@ class TrainingStep:
                     again = pixels.batch(rays, sampler, config.spp)
                     image = path_sampler.image(scene, again.ray, sampler)
                     primal = pixel_means(image, config.spp)
-            smoothed = config.loss_reference == "smoothed"
-            reference, target = batch.smoothed if smoothed else None, batch.target
-            if poses is not None:
-                target = poses.target(scene, placed, pixels, batch)
-            gain = None
-            camera = self._problem.camera
-            if camera is not None:
-                target, reference, gain = self._through_camera(camera, inputs, target, reference)
-            outliers, roots, trust = self._problem.outliers, None, None
-            if outliers is not None:
-                roots = outliers.roots(inputs.rays, pixels.numbers(), inputs.blocks)
-                trust = dr.square(roots)
-            pairs = config.chosen_estimator == "all-pairs"
-            loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain, trust, pairs)
+            target, loss, roots = self._compared(inputs, batch, placed)
             subset = _subset(config, inputs)
             terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
             terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))
+            camera, poses = self._problem.camera, self._problem.poses
             if camera is not None and camera.has_response and config.camera.smoothness:
                 value = camera.roughness_of_response()
                 terms["response_smoothness"] = config.camera.smoothness * value
             if poses is not None:
                 sigma, count = config.camera.pose_sigma, self._pixels.photographs.count
                 terms["pose_prior"] = poses.prior(sigma, terms.get(PHOTOMETRIC), count)
-            if outliers is not None and PHOTOMETRIC in terms:
+            outliers = self._problem.outliers
+            if outliers is not None and roots is not None and PHOTOMETRIC in terms:
                 terms["outliers"] = outliers.cost(roots, terms[PHOTOMETRIC])
             total = sum(terms.values())
             dr.backward(total if state.scale is None else total * state.scale)
         return terms
+
+    def _compared(
+        self, inputs: Inputs, batch: RayBatch, placed: CameraRays
+    ) -> tuple[mi.Color3f, RelativeL2, mi.Float | None]:
+        """What pixels are compared with, by what is known of the cameras by now, and how.
+
+        Args:
+            placed: camera rays of all pixels, which may pass gradients to corrections of poses.
+
+        Returns:
+            The photographs as light, linear RGB, one lane a pixel; the loss; and the roots of what
+            errors are multiplied by, where outliers are to be found.
+        """
+        config, problem, pixels = self._config, self._problem, inputs.pixels
+        smoothed = config.loss_reference == "smoothed"
+        reference, target = batch.smoothed if smoothed else None, batch.target
+        if problem.poses is not None:
+            target = problem.poses.target(inputs.scene, placed, pixels, batch)
+        gain = None
+        if problem.camera is not None:
+            target, reference, gain = self._through_camera(
+                problem.camera, inputs, target, reference
+            )
+        roots, trust = None, None
+        if problem.outliers is not None:
+            roots = problem.outliers.roots(inputs.rays, pixels.numbers(), inputs.blocks)
+            trust = dr.square(roots)
+        pairs = config.chosen_estimator == "all-pairs"
+        loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain, trust, pairs)
+        return target, loss, roots
 
     def _regularization(
         self, inputs: Inputs, ray: mi.Ray3f, photometric: mi.Float | None

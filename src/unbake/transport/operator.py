@@ -75,7 +75,7 @@ def bounce(
     # opposite of what it should: it lets every ray pass.)
     opacity = vertex.opacity if scene_view.has_chains else mi.Float(1)
     solid = dr.rcp(opacity)
-    mixture = None if guide is None else _mixture(guide, vertex)
+    mixture = None if guide is None else mixture_at(guide, vertex)
 
     # -------------------------------- Emitter sampling --------------------------------
 
@@ -126,7 +126,7 @@ def bounce(
     return Bounce(direct, weight, following, choice)
 
 
-def _mixture(guide: LightGuide, vertex: Vertex) -> Mixture:
+def mixture_at(guide: LightGuide, vertex: Vertex) -> Mixture:
     """The guide and the BSDF; it alone where it has directions without a density (a coating)."""
     dense = vertex.valid & ~mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Delta)
     return guide.mixture(guide.cell(vertex.si.p, vertex.n, vertex.valid), dense)

@@ -1,0 +1,33 @@
+"""How roughness is searched for. Needs neither Mitsuba nor Dr.Jit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..errors import POSITIVE, require_ranges
+
+
+@dataclass(frozen=True)
+class RoughnessSearchConfig:
+    """How roughness is searched for, beside the steps of a fit (ours).
+
+    Of methods with L_θ; see `training/roughness_search.py`.
+    """
+
+    times: int = 8  #: searches, evenly from `first` to `last`; 0: none
+    first: float = 0.4  #: fraction of the fit after which the first one comes
+    last: float = 0.95  #: and the last one; the rest is left for albedo to follow
+    share: float = 0.0625  #: camera samples of each one, of those that all steps of the fit take
+    pixels: int = 1 << 18  #: that are sampled, at most
+    spp: int = 128  #: camera samples of each pixel
+    cells: int = 4  #: along an edge of the scene's cube, in each of which albedo has its own factor
+    colours: int = 6  #: along each channel of albedo, the same
+    steps: int = 150  #: of Adam, on what was sampled
+    rate: float = 0.5  #: of these, as a multiple of the field's own
+    rate_between: float = 0.0  #: of the fit's steps after the first search, the same
+
+    def __post_init__(self) -> None:
+        ranges = {"times": (0, 1000), "first": (0, 1), "last": (0, 1)}
+        ranges |= {"share": (POSITIVE, 100), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
+        ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
+        require_ranges(self, ranges | {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)})

@@ -1,0 +1,303 @@
+"""Roughness by search: albedo follows at once, where steps of gradients would wait for it (ours).
+
+Photographs show roughness as a little more light here and a little less there, which a little less
+albedo here and a little more there explains nearly as well. Steps move both by themselves. Where
+roughness is wrong, albedo has adapted to it: the slope that is left is small beside the noise of a
+step, and the two move together only slowly.
+
+Reflected light is linear in albedo. So the best albedo for a given roughness is known without steps
+(variable projection, Golub and Pereyra 1973). A few times in a fit, many samples of some pixels are
+taken as functions of roughness (`transport/by_roughness.py`). Albedo has a factor in each group of
+pixels that are near, of one piece of surface and of one colour; the best factor is found for each
+roughness. What is left is the photometric loss of each pixel as a curve over roughness. The field
+of roughness then descends on these curves. No light is transported meanwhile, and the curves have
+far less noise than a step.
+
+What the field shares between points descends, its numbers of pieces and of colours: noise of the
+photographs is the same for all samples, and a network would learn it. After the first search, steps
+leave roughness alone; from the second one on, the mean of what searches find is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..config import FitConfig
+from ..errors import UserError
+from ..fields.arrays import from_numpy
+from ..fields.domain import SurfacePoint
+from ..fields.field import Field
+from ..fields.pieces import Piece
+from ..memory import lacks_memory
+from ..quantities import QUANTITIES
+from ..ranks import Ranks
+from ..transport.by_roughness import row_type
+from .problem import Problem
+from .state import State
+from .step import TrainingStep, without_garbage_collection
+
+#: Values of roughness at which pixels are known; curves are cubic between them, in their logarithm.
+NODES = (0.1, 0.16, 0.24, 0.33, 0.43, 0.55, 0.7, 0.9)
+#: Camera samples that are traced at once.
+_AT_ONCE = 1 << 18
+#: Fewer pixels tell nothing: a fit of some dozen steps does not search.
+_FEWEST = 1024
+#: Tells the random numbers of searches from those of steps, which start at the same seed.
+_SEED = 0x524F5547
+#: The rate that is left at the end of a descent.
+_FINAL_RATE = 0.05
+#: The part of a mean group's knowledge of its albedo that says: it is as it is.
+_CAUTION = 1e-3
+#: Factors of albedo are no larger.
+_LARGEST_FACTOR = 4.0
+
+
+class RoughnessSearch:
+    """The searches of a fit.
+
+    Args:
+        problem: what is learned.
+        config: of the fit.
+        step: of the same fit; samples pixels.
+        ranks: that sample an equal share each.
+    """
+
+    def __init__(
+        self, problem: Problem, config: FitConfig, step: TrainingStep, ranks: Ranks
+    ) -> None:
+        self._problem, self._config, self._step, self._ranks = problem, config, step, ranks
+        search, materials = config.roughness_search, problem.materials
+        self._field = None
+        if materials is not None and problem.radiance is not None:
+            field = materials.get("roughness")
+            self._field = field if field is not None and field.shared() else None
+        # A single search is the last one.
+        self._places = np.sort(np.linspace(search.last, search.first, search.times))
+
+    def due(self, before: float, now: float) -> bool:
+        """Whether a search lies between two fractions of a fit that are done, the second included.
+
+        A fit that goes on does so after its last step, whose searches were done.
+        """
+        between = (before < self._places) & (self._places <= now)
+        return self._field is not None and bool(between.any())
+
+    def rates(self, rates: dict[str, float], step: int, done: float) -> dict[str, float]:
+        """The learning rates of a step, after a fraction of the fit."""
+        held = self._field is not None and (self._places <= done).any()
+        if not held or not self._pixels(step, done):
+            return rates
+        between = self._config.roughness_search.rate_between
+        return rates | {"roughness": rates["roughness"] * between}
+
+    def _pixels(self, step: int, done: float) -> int:
+        """How many pixels a search samples after a step and a fraction of the fit; 0: none."""
+        search, of_steps = self._config.roughness_search, self._config.samples_per_step
+        pixels = round(search.share * step / done * of_steps / search.spp)
+        return min(pixels, search.pixels) if pixels >= _FEWEST else 0
+
+    def search_between(self, before: float, now: float, state: State, number: int) -> int:
+        """Search, if that is due, and leave in the state what was found.
+
+        Args:
+            before: fraction of the fit that was done before the present step.
+            now: the same after it.
+            number: of the step; with the settings' seed it decides all random numbers.
+
+        Returns:
+            How many camera samples were traced, by all ranks.
+
+        Raises:
+            UserError: there is no memory for it.
+        """
+        pixels = self._pixels(number, now) if self.due(before, now) else 0
+        if not pixels:
+            return 0
+        try:
+            with without_garbage_collection():
+                # The first ones are of an L_θ that is not there yet.
+                part = 1 / max(1, int((self._places <= now).sum()) - 1)
+                return self._search(state, number, -(-pixels // self._ranks.size), part)
+        except (RuntimeError, MemoryError) as error:
+            if not lacks_memory(error):
+                raise
+            what = "no memory for a search of roughness"
+            raise UserError(what, "roughness_search.times", "Set it to 0") from None
+
+    def _search(self, state: State, number: int, pixels: int, part: float) -> int:
+        """The search after a step.
+
+        Args:
+            pixels: of this rank.
+            part: of the way to what is found that is gone.
+        """
+        search, materials, field = (
+            self._config.roughness_search,
+            self._problem.materials,
+            self._field,
+        )
+        assert materials is not None and field is not None
+        self._step.unite(state)
+        self._ranks.announce()  # it takes longer than a step
+        most = max(1, _AT_ONCE // search.spp)
+        batches = -(-pixels // most)
+        each = -(-pixels // batches)
+        entropy = [self._config.seed, _SEED, number, self._ranks.rank]
+        seeds = np.random.SeedSequence(entropy).generate_state(batches)
+
+        def sample() -> np.ndarray:
+            parts = [
+                self._step.by_roughness(state, int(seed), each, search.spp, NODES) for seed in seeds
+            ]
+            rows = np.concatenate(parts)
+            return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
+
+        rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
+        if len(rows):
+            curves = Curves.of(rows, search.cells, search.colours, "albedo" in materials)
+            own = self._config.material_settings["roughness"].learning_rate
+            found = descend(field, curves, search.rate * own, search.steps)
+            named = {f"roughness.{key}": self._of_first(x) for key, x in found.items()}
+            state.replace({k: dr.lerp(dr.detach(state.phi[k]), x, part) for k, x in named.items()})
+        state.publish(self._problem)
+        return batches * each * search.spp * self._ranks.size
+
+    def _of_first(self, array: mi.Float | mi.TensorXf) -> mi.Float | mi.TensorXf:
+        """What rank 0 has found: sums of many threads differ in their last bits."""
+        if self._ranks.size == 1:
+            return array
+        found = from_numpy(mi.Float, self._ranks.as_first(array.numpy()))
+        return mi.TensorXf(found, array.shape) if dr.is_tensor_v(array) else found
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Photometric losses of pixels as functions of the roughness at a point of each.
+
+    Args:
+        point: of each pixel.
+        losses: at the nodes, pixel by pixel, each with the albedo that is the best one there.
+        slopes: by the logarithm of roughness, the same.
+        nodes: their logarithms.
+    """
+
+    point: SurfacePoint
+    losses: mi.Float
+    slopes: mi.Float
+    nodes: mi.Float
+
+    @staticmethod
+    def of(rows: np.ndarray, cells: int, colours: int, albedo: bool) -> Curves:
+        """The curves of sampled pixels.
+
+        Args:
+            rows: of `row_type`, of those of all ranks.
+            cells: along an edge of the unit cube, in each of which albedo has its own factor.
+            colours: along each channel of albedo, the same.
+            albedo: whether it is unknown.
+        """
+        losses = losses_by_roughness(rows, groups(rows, cells, colours))
+        nodes = np.log(NODES)
+        slopes = np.gradient(losses, nodes, axis=1)
+        slopes[:, 1:-1] = (losses[:, 2:] - losses[:, :-2]) / (nodes[2:] - nodes[:-2])
+
+        def arrays(name: str) -> list[mi.Float]:
+            return [from_numpy(mi.Float, np.ascontiguousarray(x)) for x in rows[name].T]
+
+        number = from_numpy(mi.UInt32, np.ascontiguousarray(rows["piece"]))
+        point = SurfacePoint(
+            mi.Point3f(arrays("position")),
+            piece=Piece(number, from_numpy(mi.Float, np.ascontiguousarray(rows["strength"]))),
+            albedo=mi.Color3f(arrays("albedo")) if albedo else None,
+        )
+        flat = (from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes))
+        return Curves(point, *flat)
+
+    def at(self, roughness: mi.Float) -> mi.Float:
+        """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
+        inside = dr.clip(roughness, NODES[0], NODES[-1])
+        span = mi.UInt32(0)
+        for node in NODES[1:-1]:
+            span += dr.select(dr.detach(roughness) >= node, mi.UInt32(1), mi.UInt32(0))
+        left, right = (dr.gather(mi.Float, self.nodes, span + i) for i in (0, 1))
+        first = dr.arange(mi.UInt32, dr.width(roughness)) * len(NODES) + span
+        a, b = (dr.gather(mi.Float, self.losses, first + i) for i in (0, 1))
+        width = right - left
+        p, q = (width * dr.gather(mi.Float, self.slopes, first + i) for i in (0, 1))
+        t = (dr.log(inside) - left) / width
+        return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
+
+
+def groups(rows: np.ndarray, cells: int, colours: int) -> np.ndarray:
+    """The group of each pixel in which albedo has one factor, from 0, shape (n,)."""
+    bright = np.sqrt(np.clip(rows["albedo"], 0, 1))
+    columns = [
+        np.floor(rows["position"] * cells),
+        rows["piece"][:, None],
+        np.minimum(np.floor(bright * colours), colours - 1),
+    ]
+    every = np.concatenate(columns, 1).astype(np.int64)
+    return np.unique(every, axis=0, return_inverse=True)[1].ravel()
+
+
+def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """The squared errors of pixels at each node, with the best albedo for it.
+
+    The error of a pixel is w (γ (S + g · D) − I)², without bias: squares are products of different
+    samples. In each group and channel the factor g is the one with the smallest sum of errors.
+
+    Args:
+        rows: of `row_type`.
+        group: of each pixel, from 0, shape (n,).
+
+    Returns:
+        Means over channels, shape (n, nodes).
+    """
+    count = group.max() + 1
+    target, weight, gain = (
+        rows[name][:, None].astype(np.float64) for name in ("target", "weight", "gain")
+    )
+    plain, coloured, plain2, mixed, coloured2 = (
+        rows[name].astype(np.float64)
+        for name in ("plain", "coloured", "plain2", "mixed", "coloured2")
+    )
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        found = np.stack([np.bincount(group, column, count) for column in flat.T], 1)
+        return found.reshape(count, *values.shape[1:])
+
+    square = weight * gain**2
+    wanted = sums(weight * gain * target * coloured - square * mixed)
+    known = sums(square * coloured2)
+    caution = _CAUTION * np.maximum(known.mean(0, keepdims=True), 0) + 1e-30
+    factor = (wanted + caution) / np.maximum(known + caution, caution)
+    factor = np.clip(factor, 0, _LARGEST_FACTOR)[group]
+    image = gain * (plain + factor * coloured)
+    image2 = gain**2 * (plain2 + factor * (2 * mixed + factor * coloured2))
+    return (weight * (image2 - target * (2 * image - target))).mean(2)
+
+
+def descend(field: Field, curves: Curves, rate: float, steps: int) -> dict[str, Any]:
+    """Let a field descend on curves by Adam.
+
+    Returns:
+        The parameters that moved, which are those that points share.
+    """
+    quantity = QUANTITIES["roughness"]
+    first = {key: type(value)(dr.detach(value)) for key, value in field.parameters().items()}
+    optimizer = mi.ad.Adam(rate, {key: first[key] for key in field.shared()})
+    for number in range(steps):
+        now = rate * _FINAL_RATE ** (number / steps)
+        optimizer.set_learning_rate({key: dr.opaque(mi.Float, now) for key in optimizer})
+        field.assign(first | dict(optimizer.items()))
+        value = field.evaluate(curves.point)[0]
+        roughness = dr.fma(value, quantity.upper - quantity.lower, quantity.lower)
+        dr.backward(dr.mean(curves.at(roughness)))
+        optimizer.step()
+    return {key: dr.detach(value) for key, value in optimizer.items()}

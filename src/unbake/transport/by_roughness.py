@@ -1,0 +1,228 @@
+"""Pixels as functions of the roughness of what they see, from one set of samples (ours).
+
+At x₁ the light that T(L_θ) gathers is sampled once. The BSDF is then evaluated for several values
+of roughness, and with albedo as it is and none, because reflected light is linear in albedo:
+
+    pixel(r, g) ≈ S(r) + g · D(r)
+
+where S is what is reflected without albedo, D what albedo adds, and g a factor of the albedo. The
+samples are the same for all r, so that what differs between two values of r has little noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..fields.guide import LightGuide
+from ..fields.materials import Material, carry
+from ..fields.radiance import RadianceField
+from .operator import attach_albedo, mixture_at
+from .path_sample import reflected_radiance
+from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
+
+#: Roughness of the lobe that looks for highlights sharper than those that the BSDF has by now.
+_SHARP = 0.2
+
+
+def row_type(nodes: int) -> np.dtype:
+    """A pixel as a function of roughness r and of a factor g of the albedo, S(r) + g · D(r).
+
+    Products are means over all pairs of different samples of a pixel: their expectation is the
+    product of the expected values. Where the pixel is seen is told by its first sample.
+
+    Args:
+        nodes: how many values of r there are.
+    """
+    of_nodes = ("f4", (nodes, 3))
+    return np.dtype(
+        [
+            ("position", "f4", 3),  # in the unit cube of fields
+            ("piece", "u4"),  # of surface, by number
+            ("strength", "f4"),  # of that piece
+            ("albedo", "f4", 3),  # as it is by now, linear RGB; zero where it is not unknown
+            ("target", "f4", 3),  # the photograph as light, linear RGB radiance
+            ("weight", "f4", 3),  # of squared errors
+            ("gain", "f4", 3),  # by which light is multiplied before it is compared
+            ("plain", *of_nodes),  # S, linear RGB radiance
+            ("coloured", *of_nodes),  # D
+            ("plain2", *of_nodes),  # S · S
+            ("mixed", *of_nodes),  # S · D
+            ("coloured2", *of_nodes),  # D · D
+        ]
+    )
+
+
+@dataclass
+class _Light:
+    """Light at x₁ from one direction a lane."""
+
+    direction: mi.Vector3f  # local
+    active: mi.Bool
+    incident: mi.Color3f  # radiance, MIS weighted, over the density of the direction
+
+
+def by_roughness(
+    scene_view: SceneView,
+    radiance: RadianceField,
+    guide: LightGuide | None,
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    spp: int,
+    nodes: Sequence[float],
+    *,
+    hide_emitters: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sample some pixels; within `carrying`.
+
+    Args:
+        scene_view: with a field of roughness, and pieces of surface. Where that of albedo is none,
+            D is zero.
+        ray: camera rays, world space, `spp` consecutive lanes a pixel.
+        sampler: seeded for as many lanes.
+        nodes: values of roughness.
+
+    Returns:
+        The pixels all of whose samples meet one piece of surface, and no light on the way: their
+        places among all, and rows of `row_type` without what they are compared with.
+
+    Paper: Eq. 1, Eq. 12.
+    """
+    materials = scene_view.materials
+    assert materials is not None
+    with dr.suspend_grad():
+        x = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
+        point = materials.locate(x.si, x.valid)
+        assert point.piece is not None
+        material = materials.evaluate_at(point)
+        albedo = mi.Color3f(material["albedo"]) if "albedo" in material else dr.zeros(mi.Color3f)
+        piece, strength = point.piece.number, point.piece.strength
+        dr.eval(material, albedo, point.position, piece, strength)
+        first = dr.arange(mi.UInt32, dr.width(x.valid)) // spp * spp
+        counted = x.valid & (dr.max(x.emitted) <= 0) & scene_view.is_optimized(x.si.shape)
+        counted &= dr.gather(mi.UInt32, piece, first) == piece
+        chosen = np.flatnonzero(np.array(counted).reshape(-1, spp).all(1))
+        rows = np.zeros(len(chosen), row_type(len(nodes)))
+        lanes = chosen * spp
+        rows["piece"], rows["strength"] = np.array(piece)[lanes], np.array(strength)[lanes]
+        rows["position"] = np.array(point.position).T[lanes]
+        rows["albedo"] = np.broadcast_to(np.array(albedo).T, (dr.width(x.valid), 3))[lanes]
+        lights = _lights(scene_view, radiance, guide, x, material, sampler)
+        for number, node in enumerate(nodes):
+            r = dr.opaque(mi.Float, node)
+            plain = whole = _reflected(x, lights, material, r, dr.opaque(mi.Float, 1))
+            if "albedo" in material:
+                plain = _reflected(x, lights, material, r, dr.opaque(mi.Float, 0))
+            dr.eval(plain, whole)
+            for name, values in _moments(plain, whole - plain, spp).items():
+                rows[name][:, number] = values[chosen]
+    return chosen, rows
+
+
+def _carrying(
+    x: Vertex, material: Material, roughness: mi.Float, factor: mi.Float | None = None
+) -> mi.SurfaceInteraction3f:
+    """The interaction at x₁ with this roughness, and with albedo times a factor."""
+    si, material = mi.SurfaceInteraction3f(x.si), {**material, "roughness": roughness}
+    if factor is not None and "albedo" in material:
+        material["albedo"] = factor * mi.Color3f(material["albedo"])
+    carry(si, material)
+    return si
+
+
+def _lights(
+    scene_view: SceneView,
+    radiance: RadianceField,
+    guide: LightGuide | None,
+    x: Vertex,
+    material: Material,
+    sampler: mi.Sampler,
+) -> list[_Light]:
+    """Light from an emitter, from where a bounce would look, and from where a sharp lobe would.
+
+    The three are combined by MIS; see `operator.bounce`.
+    """
+    scene, bsdf, active, ctx = scene_view.scene, x.bsdf, x.valid, mi.BSDFContext()
+    roughness = mi.Float(material["roughness"])
+    own = _carrying(x, material, roughness)
+    sharp = _carrying(x, material, dr.minimum(roughness, _SHARP))
+    opacity = x.opacity if scene_view.has_chains else mi.Float(1)
+    solid = dr.rcp(opacity)
+    mixture = None
+    if guide is not None:
+        guide.prepare()
+        mixture = mixture_at(guide, x)
+
+    def density(wo: mi.Vector3f) -> mi.Float:
+        """That of both samples of direction together."""
+        found = bsdf.pdf(ctx, own, wo, active) * solid
+        if mixture is not None:
+            found = mixture.pdf(found, x.si.to_world(wo))
+        return found + bsdf.pdf(ctx, sharp, wo, active) * solid
+
+    ds, light = scene.sample_emitter_direction(own, sampler.next_2d(), True, active)
+    towards, lit = x.si.to_local(ds.d), active & (ds.pdf != 0)
+    weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, density(towards)))
+    found = [_Light(towards, lit, dr.select(lit, light * weight * solid, 0))]
+    for si, guided_too in ((own, mixture), (sharp, None)):
+        number, square = sampler.next_1d(), sampler.next_2d()
+        guided = mi.Bool(False)
+        if guided_too is not None:
+            guided, number = guided_too.decide(number)
+        bs, _ = bsdf.sample(ctx, si, number * opacity, square, active)
+        on = active & (bs.pdf > 0)
+        on &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
+        wo = bs.wo
+        if guided_too is not None:
+            looked = guided_too.guide.sample(guided_too.cell, square)
+            wo = dr.select(guided, x.si.to_local(looked), wo)
+            on = active & (guided | on)
+        pdf = density(wo)
+        on &= pdf > 0
+        ray = x.si.spawn_ray(x.si.to_world(wo))
+        evaluate(sampler, ray, wo, on, pdf)
+        origin = Scattering(x.si, pdf, mi.Bool(False))
+        y = attach_albedo(scene_view, find_vertex(scene_view, ray, on, sampler, origin=origin))
+        incident = y.emitted + y.throughput * reflected_radiance(radiance, y)[0]
+        # Values of cut-outs have their opacity in them, by which they were met.
+        found.append(_Light(wo, on, dr.select(on, incident * solid / pdf, 0)))
+    evaluate(sampler, found)
+    return found
+
+
+def _reflected(
+    x: Vertex, lights: Sequence[_Light], material: Material, roughness: mi.Float, factor: mi.Float
+) -> mi.Color3f:
+    """What is reflected towards the camera, with this roughness and albedo times a factor."""
+    si = _carrying(x, material, roughness, factor)
+    total = mi.Color3f(0)
+    for light in lights:
+        value = x.bsdf.eval(mi.BSDFContext(), si, light.direction, light.active)
+        total += dr.select(light.active, value * light.incident, 0)
+    return x.throughput * total
+
+
+def _moments(plain: mi.Color3f, coloured: mi.Color3f, spp: int) -> dict[str, np.ndarray]:
+    """Means over a pixel's samples, and over products of pairs of these, each of shape (n, 3)."""
+
+    def mean(colour: mi.Color3f) -> np.ndarray:
+        return np.stack([np.array(dr.block_sum(c, spp) / spp) for c in colour], 1)
+
+    def pairs(a: mi.Color3f, b: mi.Color3f) -> np.ndarray:
+        found = []
+        for u, v in zip(a, b, strict=True):
+            products = dr.block_sum(u, spp) * dr.block_sum(v, spp) - dr.block_sum(u * v, spp)
+            found.append(np.array(products / (spp * (spp - 1))))
+        return np.stack(found, 1)
+
+    return {
+        "plain": mean(plain),
+        "coloured": mean(coloured),
+        "plain2": pairs(plain, plain),
+        "mixed": pairs(plain, coloured),
+        "coloured2": pairs(coloured, coloured),
+    }

@@ -1,0 +1,279 @@
+"""Searches of roughness: what they sample, the curves they descend on, and their place in a fit."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import MPIEXEC, TINY_FIT, built_in_cameras, needs_mpi
+
+from unbake.config import FitConfig, RoughnessSearchConfig, preset, read_toml, to_toml
+from unbake.dataset.pixels import PixelBatch, PixelSource
+from unbake.fields.field import FieldSpec
+from unbake.fields.network import Network
+from unbake.fields.settings import GridConfig, NetworkConfig, PieceConfig
+from unbake.quantities import QUANTITIES
+from unbake.ranks import Ranks
+from unbake.training.problem import make_problem
+from unbake.training.roughness_search import (
+    NODES,
+    Curves,
+    RoughnessSearch,
+    descend,
+    groups,
+    losses_by_roughness,
+)
+from unbake.training.run_folder import RunFolder
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
+from unbake.transport.by_roughness import row_type
+
+SEARCH = RoughnessSearchConfig()
+SMALL = NetworkConfig(
+    GridConfig(levels=2, table_log2=8, base_resolution=2),
+    width=8,
+    hidden=1,
+    pieces=PieceConfig(most=64, colours=2),
+)
+SETTINGS = replace(
+    TINY_FIT,
+    materials={name: {"neural": SMALL} for name in QUANTITIES},
+    roughness_search=replace(SEARCH, share=50.0, spp=2),
+)
+
+
+def started(built_in, config=SETTINGS):
+    """A fresh fit of two views, whose photographs tell the number of each pixel."""
+    cameras = built_in_cameras("cornell", 8, views=2)
+    count = sum(camera.width * camera.height for camera in cameras)
+    rgb = np.repeat(np.arange(1, count + 1)[:, None] / count, 3, 1)
+    pixels = PixelSource.of(cameras, rgb, np.ones(count), foreground_only=False)
+    problem = make_problem(built_in("cornell"), "visible", config, 0.2)
+    return problem, pixels, TrainingStep(problem, pixels, config), initial_state(problem)
+
+
+# ------------------------------------------------------------------------------------- samples
+
+
+@pytest.mark.parametrize("guided", [True, False], ids=["guide", "no guide"])
+def test_pixels_at_the_present_roughness_are_those_of_steps(built_in, guided):
+    config = SETTINGS if guided else replace(SETTINGS, guide=replace(SETTINGS.guide, cells=0))
+    problem, pixels, step, state = started(built_in, config)
+    flat = {key: type(x)(x) * 0 for key, x in state.phi.items() if key == "roughness.grid"}
+    state.replace(flat)  # a network without inputs: roughness is the same everywhere
+    state.publish(problem)
+    point = problem.materials.locate(dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False))
+    value = float(problem.materials.evaluate_at(point)["roughness"][0])
+    rows = step.by_roughness(state, 3, 512, 512, (value, 0.9))
+    number = np.round(rows["target"][:, 0] * pixels.photographs.count).astype(int) - 1
+    one = {n: i for i, n in enumerate(number)}  # drawn with replacement: one of each pixel
+    chosen = np.fromiter(one.values(), int)
+    assert len(one) > 50
+    image = rows["plain"] + rows["coloured"]
+    steps = _rendered(step, state, pixels)[number[chosen]]
+    errors = image[chosen, 0] - steps
+    assert abs(errors.mean()) < 0.02 * steps.mean()
+    assert np.abs(errors).mean() < 0.15 * steps.mean()
+    # Another roughness is another picture, by more than that.
+    assert np.abs(image[chosen, 1] - image[chosen, 0]).mean() > 0.02 * steps.mean()
+
+
+def _rendered(step, state, pixels):
+    """All pixels as steps render them, shape (pixels, 3)."""
+    table = pixels.photographs.table
+    batch = PixelBatch.of(np.arange(len(table)), table)
+    both = [step.probe(state, pixels.rays, batch, seed).mean(1) for seed in range(100)]
+    return np.mean(both, 0)
+
+
+def test_products_of_pairs_have_no_noise_of_their_own(built_in):
+    _, _, step, state = started(built_in)
+    few, many = (step.by_roughness(state, 3, 512, spp, (0.4,)) for spp in (2, 256))
+    few = few[np.isin(few["target"][:, 0], many["target"][:, 0])]  # the same pixels
+    # Squares of means of few samples would be larger by their variance.
+    assert few["coloured2"].mean() == pytest.approx(many["coloured2"].mean(), rel=0.02)
+    assert (few["coloured"] ** 2).mean() > 1.03 * many["coloured2"].mean()
+
+
+def test_photographs_of_clipped_channels_do_not_count(built_in):
+    _, pixels, *_ = started(built_in)
+    clipped = replace(pixels, limits=np.array([0.25, 9.0], np.float32))
+    problem = make_problem(built_in("cornell"), "visible", SETTINGS, 0.2)
+    step = TrainingStep(problem, clipped, SETTINGS)
+    rows = step.by_roughness(initial_state(problem), 3, 512, 4, (0.4,))
+    first = rows["target"][:, 0] <= 0.5
+    over = first & (rows["target"][:, 0] >= 0.25)
+    assert over.any() and (rows["weight"][over] == 0).all()
+    assert (rows["weight"][~over] > 0).all()
+
+
+# -------------------------------------------------------------------------------------- curves
+
+
+def made_up(count=400, true=(0.24, 0.55), noise=0.0):
+    """Rows of two pieces of surface, in whose photographs albedo differs from what it is by now."""
+    rng = np.random.default_rng(1)
+    rows = np.zeros(count, row_type(len(NODES)))
+    rows["piece"], rows["strength"] = np.arange(count) % 2, 1
+    rows["position"] = rng.uniform(0, 1, (count, 3))
+    rows["albedo"], rows["weight"], rows["gain"] = 0.5, 1, 1
+    sharp = rng.uniform(0.2, 1, (count, 1, 1))  # how much of a highlight a pixel shows
+    nodes = np.array(NODES)[None, :, None]
+    rows["plain"] = sharp * np.exp(-3 * nodes)
+    rows["coloured"] = rng.uniform(0.5, 1, (count, 1, 3)) * (1 + 0 * nodes)
+    rows["plain2"], rows["coloured2"] = rows["plain"] ** 2, rows["coloured"] ** 2
+    rows["mixed"] = rows["plain"] * rows["coloured"]
+    r = np.array(true)[rows["piece"]][:, None]
+    factor = np.array([0.8, 1.3])[rows["piece"]][:, None]
+    rows["target"] = sharp[:, 0] * np.exp(-3 * r) + factor * rows["coloured"][:, 0]
+    rows["target"] += noise * rng.standard_normal((count, 3))
+    return rows
+
+
+def test_albedo_follows_for_each_roughness():
+    rows = made_up()
+    losses = losses_by_roughness(rows, groups(rows, 2, 6))
+    for piece, node in ((0, NODES.index(0.24)), (1, NODES.index(0.55))):
+        found = losses[rows["piece"] == piece].mean(0)
+        assert found.argmin() == node
+        assert abs(found[node]) < 1e-6 < 1e-2 * np.delete(found, node).min()
+    # With albedo as it is, another roughness explains the photographs better.
+    alone = losses_by_roughness(rows, np.arange(len(rows)))
+    assert alone.shape == losses.shape
+    fixed = ((rows["plain"] + rows["coloured"] - rows["target"][:, None]) ** 2).mean(2)
+    assert fixed[rows["piece"] == 1].mean(0).argmin() != NODES.index(0.55)
+
+
+def test_gains_belong_to_renderings():
+    rows = made_up()
+    told = losses_by_roughness(rows, groups(rows, 2, 6))
+    rows["gain"] = 4
+    rows["target"] *= 4
+    rows["weight"] /= 16
+    np.testing.assert_allclose(losses_by_roughness(rows, groups(rows, 2, 6)), told, atol=1e-6)
+
+
+def test_groups_are_near_of_one_piece_and_of_one_colour():
+    rows = np.zeros(5, row_type(1))
+    rows["position"][1] = 0.9
+    rows["piece"][2] = 7
+    rows["albedo"][3] = 0.8
+    found = groups(rows, 2, 6)
+    assert len(set(found[:4])) == 4 and found[4] == found[0]
+
+
+def test_curves_pass_through_their_nodes_and_are_flat_beyond():
+    rows = made_up()
+    losses = losses_by_roughness(rows, groups(rows, 2, 6))
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    for number, node in enumerate(NODES):
+        found = np.array(curves.at(dr.full(mi.Float, node, len(rows))))
+        np.testing.assert_allclose(found, losses[:, number], atol=1e-5)
+    for outside, end in ((0.02, 0), (1.0, -1)):
+        roughness = dr.opaque(mi.Float, outside, len(rows))
+        dr.enable_grad(roughness)
+        found = curves.at(roughness)
+        np.testing.assert_allclose(np.array(found), losses[:, end], atol=1e-5)
+        dr.backward(found)
+        assert (np.array(dr.grad(roughness)) == 0).all()
+
+
+def test_a_field_descends_to_the_true_roughness_of_each_piece():
+    rows = made_up(noise=0.02)
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    before = {key: np.array(x.array) for key, x in field.parameters().items()}
+    found = descend(field, curves, 0.02, 200)
+    assert set(found) == set(field.shared()) == {"pieces.0", "colours"}
+    after = field.parameters() | found
+    for key, x in after.items():
+        assert (np.array(x.array) == before[key]).all() == (key not in found)
+    field.assign(after)
+    quantity = QUANTITIES["roughness"]
+    value = np.array(field.evaluate(curves.point)[0]) * (quantity.upper - quantity.lower)
+    value += quantity.lower
+    for piece, true in enumerate((0.24, 0.55)):
+        assert value[rows["piece"] == piece].mean() == pytest.approx(true, abs=0.04)
+
+
+# --------------------------------------------------------------------------------------- a fit
+
+
+def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
+    problem, _, step, state = started(built_in)
+    search = RoughnessSearch(problem, SETTINGS, step, Ranks())
+    assert not search.due(0.0, 0.39)
+    assert search.due(0.39, 0.4) and not search.due(0.4, 0.45)
+    assert search.due(0.9, 1.0)
+    rates = {"albedo": 1.0, "roughness": 1.0}
+    assert search.rates(rates, 39, 0.39) == rates
+    assert search.rates(rates, 40, 0.4) == {"albedo": 1.0, "roughness": 0.0}
+    before = {key: np.array(x.array) for key, x in state.phi.items()}
+    assert search.search_between(0.1, 0.2, state, 4) == 0
+    samples = search.search_between(0.3, 0.5, state, 4)
+    assert samples == pytest.approx(50 * 4 / 0.5 * SETTINGS.samples_per_step, rel=0.01)
+    moved = {k for k, x in state.phi.items() if (np.array(x.array) != before[k]).any()}
+    assert moved == {"roughness.pieces.0", "roughness.colours"}
+
+
+def test_fits_of_few_samples_do_not_search(built_in):
+    config = replace(SETTINGS, roughness_search=SEARCH)
+    problem, _, step, state = started(built_in, config)
+    search = RoughnessSearch(problem, config, step, Ranks())
+    rates = {"albedo": 1.0, "roughness": 1.0}
+    assert search.search_between(0.3, 0.5, state, 4) == 0
+    assert search.rates(rates, 4, 0.5) == rates
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"method": "prb"}, {"method": "direct"}, {"quantities": ("albedo",)}],
+    ids=["prb", "direct", "albedo alone"],
+)
+def test_nothing_is_searched_where_there_is_nothing_to_search_with(built_in, change):
+    config = replace(SETTINGS, **change)
+    problem, _, step, _ = started(built_in, config)
+    search = RoughnessSearch(problem, config, step, Ranks())
+    assert not search.due(0.0, 1.0)
+    rates = {"albedo": 1.0, "roughness": 1.0}
+    assert search.rates(rates, 90, 0.9) == rates
+
+
+def test_a_fit_tells_the_samples_of_its_searches(cornell, tmp_path, unbake):
+    settings, out = tmp_path / "settings.toml", tmp_path / "run"
+    settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20)))
+    assert unbake("fit", cornell, "--settings", settings, "--out", out).status == 0
+    of_steps = 20 * 16 * SETTINGS.spp
+    told = RunFolder(out).log()[-1]["samples"]
+    assert told == pytest.approx(of_steps * (1 + SEARCH.times * 50), rel=0.01)
+    assert unbake("evaluate", out).status == 0
+    found = json.loads((out / "evaluation" / "metrics.json").read_text())
+    assert found["samples"] == told
+
+
+@needs_mpi
+def test_ranks_search_together(cornell, tmp_path):
+    settings, out = tmp_path / "settings.toml", tmp_path / "run"
+    settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20)))
+    command = [MPIEXEC, "-n", "2", sys.executable, "-m", "unbake", "fit", cornell]
+    command += ["--settings", settings, "--out", out]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr  # which also tells that their states are equal
+    told = RunFolder(out).log()[-1]["samples"]
+    assert told == pytest.approx(20 * 16 * SETTINGS.spp * (1 + SEARCH.times * 50), rel=0.01)
+
+
+def test_older_runs_and_the_papers_settings_do_not_search(tmp_path):
+    assert preset("paper").roughness_search.times == preset("release").roughness_search.times == 0
+    text = to_toml(FitConfig())
+    start = text.index("[roughness_search]")
+    table = text[start:].partition("\n[")[0]
+    file = tmp_path / "config.toml"
+    file.write_text(text)
+    assert read_toml(file).roughness_search == SEARCH
+    file.write_text(text.replace(table, ""))
+    assert read_toml(file).roughness_search.times == 0
