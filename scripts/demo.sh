@@ -47,7 +47,7 @@ discard_unless_done capture data
 stage capture "$OUT/data/transforms.json" "$UNBAKE" capture demo --out "$OUT/data"
 discard_unless_done fit-ours ours
 stage fit-ours "$OUT/ours/log.jsonl" "$UNBAKE" fit "$OUT/data" --out "$OUT/ours"
-# Both methods draw the same number of samples a step, so equal steps are equal samples.
+# As many steps. Searches of roughness are samples that ours has beside them: see the last lines.
 steps=$(last_logged "$OUT/ours" step)
 discard_unless_done fit-direct direct
 stage fit-direct "$OUT/direct/log.jsonl" \
