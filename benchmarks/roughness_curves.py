@@ -44,7 +44,12 @@ def main() -> None:
     from unbake.training.checkpoint import load_checkpoint
     from unbake.training.problem import pixels_of
     from unbake.training.recovered import open_run
-    from unbake.training.roughness_search import NODES, groups, losses_by_roughness
+    from unbake.training.roughness_search import (
+        NODES,
+        groups,
+        losses_by_roughness,
+        squared_errors,
+    )
     from unbake.training.step import TrainingStep
     from unbake.training.truth_fit import TrueMaps
 
@@ -70,7 +75,7 @@ def main() -> None:
     part = part[1].ravel()
     eliminated = losses_by_roughness(rows, groups(rows, search.cells, search.colours))
     losses = {
-        "fitted": with_albedo_as_it_is(rows),
+        "fitted": squared_errors(rows, np.ones(3)),
         "eliminated": eliminated,
     }
     rng, found = np.random.default_rng(0), []
@@ -101,14 +106,6 @@ def numbers_of(targets: np.ndarray, table: np.ndarray) -> np.ndarray:
     number = np.empty(kind.max() + 1, np.int64)
     number[kind[: len(table)]] = np.arange(len(table))
     return number[kind[len(table) :]]
-
-
-def with_albedo_as_it_is(rows: np.ndarray) -> np.ndarray:
-    """The squared errors of pixels at each node, without bias; shape (n, nodes)."""
-    target = rows["target"][:, None].astype(np.float64)
-    image2 = rows["plain2"] + 2 * rows["mixed"] + rows["coloured2"]
-    error = image2 - target * (2 * (rows["plain"] + rows["coloured"]) - target)
-    return (rows["weight"][:, None] * error).mean(2)
 
 
 def minimum(losses: np.ndarray, nodes: tuple[float, ...]) -> float:

@@ -54,8 +54,13 @@ def mpiexec() -> str:
 def start(words: list[str], ranks: int = 1) -> subprocess.Popen[str]:
     """A command of `unbake`, in a process group of its own; of several ranks that of `mpiexec`."""
     several = [mpiexec(), "-n", str(ranks)] if ranks > 1 else []
+    return in_group_of_its_own([*several, sys.executable, "-m", "unbake", *words])
+
+
+def in_group_of_its_own(words: list[str]) -> subprocess.Popen[str]:
+    """A command in a process group of its own, whose output is read, and which signals reach."""
     return subprocess.Popen(
-        [*several, sys.executable, "-m", "unbake", *words],
+        words,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

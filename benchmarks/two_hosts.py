@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 import psutil
-from small_run import default_signals, mpiexec
+from small_run import in_group_of_its_own, mpiexec
 
 CABLE = "cable0"
 ADDRESSES = ("10.213.77.1", "10.213.77.2")
@@ -92,15 +92,8 @@ class TwoHosts:
         hosts = ("-hosts", ",".join(ADDRESSES), "-ppn", "1")
         cores = (("taskset", "-c", str(core)) if core_each else () for core in (0, 1))
         first, second = (("-n", "1", *core, *words) for core in cores)
-        return subprocess.Popen(
-            self._words(0, mpiexec(), *launcher, *hosts, *first, ":", *second),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            preexec_fn=default_signals,
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
-        )
+        words = self._words(0, mpiexec(), *launcher, *hosts, *first, ":", *second)
+        return in_group_of_its_own(words)
 
     def shape(self, bits: float | None) -> None:
         """Limit what each host sends in a second, in bits; None: by nothing.

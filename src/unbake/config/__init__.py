@@ -29,7 +29,7 @@ from .fit import (
 from .flag import Flag
 from .objective import ObjectiveConfig
 from .presets import QUALITIES, preset, with_method, with_quality
-from .search import RoughnessSearchConfig
+from .roughness_search import RoughnessSearchConfig
 from .tables import update
 from .toml import from_toml, read_toml, to_tables, to_toml
 

@@ -18,7 +18,7 @@ from ..transport.methods import KEPT_PATHS, METHODS, PATH_REPLAY, Method
 from .camera import CameraConfig
 from .flag import Flag
 from .objective import ObjectiveConfig
-from .search import RoughnessSearchConfig
+from .roughness_search import RoughnessSearchConfig
 from .tables import update
 
 ChosenEstimator = Literal["all-pairs", "split-halves", "two-pass"]

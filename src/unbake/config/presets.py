@@ -13,7 +13,7 @@ from ..fields.settings import GridConfig, GuideConfig, NetworkConfig
 from ..quantities import QUANTITIES
 from ..transport.methods import method_named
 from .fit import FitConfig, LightingConfig, PresetName, RegularizationConfig
-from .search import RoughnessSearchConfig
+from .roughness_search import RoughnessSearchConfig
 
 
 def _paper() -> FitConfig:

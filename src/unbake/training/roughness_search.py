@@ -76,21 +76,20 @@ class RoughnessSearch:
         if materials is not None and problem.radiance is not None:
             field = materials.get("roughness")
             self._field = field if field is not None and field.shared() else None
-        # A single search is the last one.
-        self._places = np.sort(np.linspace(search.last, search.first, search.times))
+        # A single search is the last one; there is none where there is nothing to search.
+        times = 0 if self._field is None else search.times
+        self._places = np.sort(np.linspace(search.last, search.first, times))
 
     def due(self, before: float, now: float) -> bool:
         """Whether a search lies between two fractions of a fit that are done, the second included.
 
         A fit that goes on does so after its last step, whose searches were done.
         """
-        between = (before < self._places) & (self._places <= now)
-        return self._field is not None and bool(between.any())
+        return bool(((before < self._places) & (self._places <= now)).any())
 
     def rates(self, rates: dict[str, float], step: int, done: float) -> dict[str, float]:
         """The learning rates of a step, after a fraction of the fit."""
-        held = self._field is not None and (self._places <= done).any()
-        if not held or not self._pixels(step, done):
+        if not (self._places <= done).any() or not self._pixels(step, done):
             return rates
         between = self._config.roughness_search.rate_between
         return rates | {"roughness": rates["roughness"] * between}
@@ -203,16 +202,17 @@ class Curves:
         """
         losses = losses_by_roughness(rows, groups(rows, cells, colours))
         nodes = np.log(NODES)
-        slopes = np.gradient(losses, nodes, axis=1)
-        slopes[:, 1:-1] = (losses[:, 2:] - losses[:, :-2]) / (nodes[2:] - nodes[:-2])
+        places = np.arange(len(nodes))
+        left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
+        slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
 
         def arrays(name: str) -> list[mi.Float]:
-            return [from_numpy(mi.Float, np.ascontiguousarray(x)) for x in rows[name].T]
+            return [from_numpy(mi.Float, column) for column in rows[name].T]
 
-        number = from_numpy(mi.UInt32, np.ascontiguousarray(rows["piece"]))
+        number = from_numpy(mi.UInt32, rows["piece"])
         point = SurfacePoint(
             mi.Point3f(arrays("position")),
-            piece=Piece(number, from_numpy(mi.Float, np.ascontiguousarray(rows["strength"]))),
+            piece=Piece(number, from_numpy(mi.Float, rows["strength"])),
             albedo=mi.Color3f(arrays("albedo")) if albedo else None,
         )
         flat = (from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes))
@@ -248,23 +248,18 @@ def groups(rows: np.ndarray, cells: int, colours: int) -> np.ndarray:
 def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
     """The squared errors of pixels at each node, with the best albedo for it.
 
-    The error of a pixel is w (γ (S + g · D) − I)², without bias: squares are products of different
-    samples. In each group and channel the factor g is the one with the smallest sum of errors.
+    In each group and channel the factor of the albedo is the one with the smallest sum of errors.
 
     Args:
         rows: of `row_type`.
         group: of each pixel, from 0, shape (n,).
 
     Returns:
-        Means over channels, shape (n, nodes).
+        As of `squared_errors`.
     """
     count = group.max() + 1
     target, weight, gain = (
         rows[name][:, None].astype(np.float64) for name in ("target", "weight", "gain")
-    )
-    plain, coloured, plain2, mixed, coloured2 = (
-        rows[name].astype(np.float64)
-        for name in ("plain", "coloured", "plain2", "mixed", "coloured2")
     )
 
     def sums(values: np.ndarray) -> np.ndarray:
@@ -273,13 +268,31 @@ def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
         return found.reshape(count, *values.shape[1:])
 
     square = weight * gain**2
-    wanted = sums(weight * gain * target * coloured - square * mixed)
-    known = sums(square * coloured2)
+    wanted = sums(weight * gain * target * rows["coloured"] - square * rows["mixed"])
+    known = sums(square * rows["coloured2"])
     caution = _CAUTION * np.maximum(known.mean(0, keepdims=True), 0) + 1e-30
     factor = (wanted + caution) / np.maximum(known + caution, caution)
-    factor = np.clip(factor, 0, _LARGEST_FACTOR)[group]
-    image = gain * (plain + factor * coloured)
-    image2 = gain**2 * (plain2 + factor * (2 * mixed + factor * coloured2))
+    return squared_errors(rows, np.clip(factor, 0, _LARGEST_FACTOR)[group])
+
+
+def squared_errors(rows: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """The squared errors of pixels at each node, with albedo times a factor g.
+
+    The error of a pixel is w (γ (S + g · D) − I)², without bias: squares are products of different
+    samples.
+
+    Args:
+        rows: of `row_type`.
+        factor: float64, of a shape that broadcasts to (n, nodes, 3).
+
+    Returns:
+        Means over channels, shape (n, nodes).
+    """
+    target, weight, gain = (
+        rows[name][:, None].astype(np.float64) for name in ("target", "weight", "gain")
+    )
+    image = gain * (rows["plain"] + factor * rows["coloured"])
+    image2 = gain**2 * (rows["plain2"] + factor * (2 * rows["mixed"] + factor * rows["coloured2"]))
     return (weight * (image2 - target * (2 * image - target))).mean(2)
 
 

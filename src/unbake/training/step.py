@@ -368,7 +368,7 @@ class TrainingStep:
         with dr.suspend_grad():
             state.publish(problem)
             pixels = self._pixels.draw(int(of_pixels), count)
-            inputs = replace(self._inputs(0), pixels=pixels)
+            inputs = replace(self._inputs(0, 1), pixels=pixels)  # one pixel, which is not used
             sampler.seed(dr.opaque(mi.UInt32, int(of_samples)), count * spp)
             placed = self._placed(inputs)
             batch = pixels.batch(placed, sampler, spp)
