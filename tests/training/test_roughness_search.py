@@ -26,6 +26,7 @@ from unbake.training.roughness_search import (
     descend,
     groups,
     losses_by_roughness,
+    precision,
 )
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
@@ -33,6 +34,8 @@ from unbake.training.step import TrainingStep
 from unbake.transport.by_roughness import row_type
 
 SEARCH = RoughnessSearchConfig()
+#: With which a fit of few samples has enough of them for a search.
+SHARE = 200.0
 SMALL = NetworkConfig(
     GridConfig(levels=2, table_log2=8, base_resolution=2),
     width=8,
@@ -42,7 +45,7 @@ SMALL = NetworkConfig(
 SETTINGS = replace(
     TINY_FIT,
     materials={name: {"neural": SMALL} for name in QUANTITIES},
-    roughness_search=replace(SEARCH, share=50.0, spp=2),
+    roughness_search=replace(SEARCH, share=SHARE, spp=2),
 )
 
 
@@ -182,22 +185,65 @@ def test_curves_pass_through_their_nodes_and_are_flat_beyond():
         assert (np.array(dr.grad(roughness)) == 0).all()
 
 
-def test_a_field_descends_to_the_true_roughness_of_each_piece():
-    rows = made_up(noise=0.02)
+def descended(rows, count=200, **settings):
+    """A field that descended on curves of rows, what it has found, and its roughness at pixels."""
     curves = Curves.of(rows, 2, 6, albedo=True)
     field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
-    before = {key: np.array(x.array) for key, x in field.parameters().items()}
-    found = descend(field, curves, 0.02, 200)
-    assert set(found) == set(field.shared()) == {"pieces.0", "colours"}
-    after = field.parameters() | found
-    for key, x in after.items():
-        assert (np.array(x.array) == before[key]).all() == (key not in found)
-    field.assign(after)
+    before = {key: type(x)(x) for key, x in field.parameters().items()}
+    found = descend(field, curves, replace(SEARCH, steps=count, **settings), 0.02)
+    field.assign(before | found)
     quantity = QUANTITIES["roughness"]
     value = np.array(field.evaluate(curves.point)[0]) * (quantity.upper - quantity.lower)
-    value += quantity.lower
+    return field, found, value + quantity.lower
+
+
+def test_a_field_descends_to_the_true_roughness_of_each_piece():
+    rows = made_up(noise=0.02)
+    rows["weight"] /= 0.02**2
+    field, found, value = descended(rows)
+    assert set(found) == set(field.shared()) == {"pieces.0", "colours"}
     for piece, true in enumerate((0.24, 0.55)):
         assert value[rows["piece"] == piece].mean() == pytest.approx(true, abs=0.04)
+
+
+def test_only_what_points_share_moves():
+    rows = made_up()
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    before = {key: np.array(x.array) for key, x in field.parameters().items()}
+    found = descend(field, Curves.of(rows, 2, 6, albedo=True), SEARCH, 0.02)
+    for key, x in (field.parameters() | found).items():
+        assert (np.array(x.array) == before[key]).all() == (key not in found)
+
+
+def test_pieces_of_which_photographs_tell_little_are_like_the_others():
+    def apart(weight, **settings):
+        rows = made_up()
+        rows["weight"] *= weight
+        _, _, value = descended(rows, **settings)
+        one, other = (value[rows["piece"] == piece].mean() for piece in (0, 1))
+        return other - one
+
+    assert apart(1e4) == pytest.approx(0.55 - 0.24, abs=0.05)
+    assert apart(1e-4) < 0.05 < apart(1e-4, piece_spread=1e3, brightness_spread=1e3)
+
+
+def test_errors_have_the_variance_1_however_bright_pixels_are():
+    rows = made_up(count=40_000, true=(0.24, 0.24))
+    rng = np.random.default_rng(3)
+    r, deviation = np.full(len(rows), 0.24), rng.uniform(0.01, 1, (len(rows), 1))
+    image = (rows["plain"] + rows["coloured"])[:, NODES.index(0.24)]
+    rows["target"] = image + deviation * rng.standard_normal((len(rows), 3))
+    # Weights tell brightnesses apart, whatever they are.
+    rows["weight"] = deviation**-0.5
+    rows["weight"][: len(rows) // 4, 1] = 0  # of clipped channels
+    found = precision(rows, r)
+    errors = found * rows["weight"] * (image - rows["target"]) ** 2
+    assert (found[: len(rows) // 4, 1] == 1).all() and (errors[: len(rows) // 4, 1] == 0).all()
+    for low, high in ((0.01, 0.2), (0.2, 0.5), (0.5, 1)):
+        chosen = (deviation[:, 0] >= low) & (deviation[:, 0] < high)
+        for channel in (0, 2):
+            assert errors[chosen, channel].mean() == pytest.approx(1, rel=0.1)
+    assert errors[len(rows) // 4 :, 1].mean() == pytest.approx(1, rel=0.05)
 
 
 # --------------------------------------------------------------------------------------- a fit
@@ -215,7 +261,7 @@ def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
     before = {key: np.array(x.array) for key, x in state.phi.items()}
     assert search.search_between(0.1, 0.2, state, 4) == 0
     samples = search.search_between(0.3, 0.5, state, 4)
-    assert samples == pytest.approx(50 * 4 / 0.5 * SETTINGS.samples_per_step, rel=0.01)
+    assert samples == pytest.approx(SHARE * 4 / 0.5 * SETTINGS.samples_per_step, rel=0.01)
     moved = {k for k, x in state.phi.items() if (np.array(x.array) != before[k]).any()}
     assert moved == {"roughness.pieces.0", "roughness.colours"}
 
@@ -249,7 +295,7 @@ def test_a_fit_tells_the_samples_of_its_searches(cornell, tmp_path, unbake):
     assert unbake("fit", cornell, "--settings", settings, "--out", out).status == 0
     of_steps = 20 * 16 * SETTINGS.spp
     told = RunFolder(out).log()[-1]["samples"]
-    assert told == pytest.approx(of_steps * (1 + SEARCH.times * 50), rel=0.01)
+    assert told == pytest.approx(of_steps * (1 + SEARCH.times * SHARE), rel=0.01)
     assert unbake("evaluate", out).status == 0
     found = json.loads((out / "evaluation" / "metrics.json").read_text())
     assert found["samples"] == told
@@ -264,7 +310,7 @@ def test_ranks_search_together(cornell, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr  # which also tells that their states are equal
     told = RunFolder(out).log()[-1]["samples"]
-    assert told == pytest.approx(20 * 16 * SETTINGS.spp * (1 + SEARCH.times * 50), rel=0.01)
+    assert told == pytest.approx(20 * 16 * SETTINGS.spp * (1 + SEARCH.times * SHARE), rel=0.01)
 
 
 def test_older_runs_and_the_papers_settings_do_not_search(tmp_path):

@@ -14,20 +14,27 @@ class RoughnessSearchConfig:
     Of methods with L_θ; see `training/roughness_search.py`.
     """
 
-    times: int = 8  #: searches, evenly from `first` to `last`; 0: none
+    times: int = 4  #: searches, evenly from `first` to `last`; 0: none
     first: float = 0.4  #: fraction of the fit after which the first one comes
     last: float = 0.95  #: and the last one; the rest is left for albedo to follow
-    share: float = 0.0625  #: camera samples of each one, of those that all steps of the fit take
-    pixels: int = 1 << 18  #: that are sampled, at most
-    spp: int = 128  #: camera samples of each pixel
+    share: float = 0.25  #: camera samples of each one, of those that all steps of the fit take
+    pixels: int = 1 << 19  #: that are sampled, at most
+    spp: int = 32  #: camera samples of each pixel
     cells: int = 4  #: along an edge of the scene's cube, in each of which albedo has its own factor
     colours: int = 6  #: along each channel of albedo, the same
-    steps: int = 150  #: of Adam, on what was sampled
-    rate: float = 0.5  #: of these, as a multiple of the field's own
+    steps: int = 300  #: of Adam, on what was sampled
+    rate: float = 1.25  #: of these, as a multiple of the field's own
+    #: Expected standard deviations, before bounds: of what a piece has of its own, between its
+    #: neighbouring brightnesses, and between neighbouring colours of what all pieces share
+    piece_spread: float = 1.5
+    brightness_spread: float = 0.25
+    colour_spread: float = 1.0
     rate_between: float = 0.0  #: of the fit's steps after the first search, the same
 
     def __post_init__(self) -> None:
         ranges = {"times": (0, 1000), "first": (0, 1), "last": (0, 1)}
-        ranges |= {"share": (POSITIVE, 100), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
+        ranges |= {"share": (POSITIVE, 1000), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
         ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
-        require_ranges(self, ranges | {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)})
+        ranges |= {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)}
+        spreads = ("piece_spread", "brightness_spread", "colour_spread")
+        require_ranges(self, ranges | dict.fromkeys(spreads, (POSITIVE, 1e6)))

@@ -75,6 +75,19 @@ class Field(Protocol):
         """Names of the parameters that many points share, wherever they are; here none."""
         return frozenset()
 
+    def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
+        """How much numbers that points share differ, in units of outputs before their bounds.
+
+        Args:
+            point: points of the pieces that are asked for.
+
+        Returns:
+            `pieces`: the numbers of these pieces, beside what others have, too; `brightnesses`:
+            differences between those of a piece that follow each other; `colours`: the same of what
+            all pieces share. Here none.
+        """
+        return {}
+
     def prepare(self) -> None:
         """Prepare evaluations inside virtual calls and loops; needed after each `assign`."""
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
+import numpy as np
 
-from .arrays import first_value, sigmoid
+from .arrays import first_value, from_numpy, sigmoid
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
 from .settings import DenseGridConfig, features_of
@@ -29,7 +30,7 @@ class DenseGrid(Field):
     def __init__(self, settings: DenseGridConfig, spec: FieldSpec) -> None:
         self.outputs = spec.outputs
         self.bounded = spec.bounded
-        corners = settings.cells + 1
+        self._corners = corners = settings.cells + 1
         features = features_of(spec.outputs)
         # A hash grid of one level whose table has room for every corner hashes nothing.
         self.grid = nn.HashGridEncoding(
@@ -63,6 +64,22 @@ class DenseGrid(Field):
         inside = [dr.minimum(x, _LAST) for x in point.position]
         outputs = list(self.grid(inside))[: self.outputs]
         return [sigmoid(x) for x in outputs] if self.bounded else outputs
+
+    def differences(self) -> list[mi.Float]:
+        """Values of outputs at corners less those of the neighbours before them, by axis."""
+        corners, found = self._corners, []
+        for axis in range(3):
+            apart = corners**axis
+            here = np.arange(corners**3, dtype=np.uint32)
+            here = here[here // apart % corners < corners - 1]
+            for output in range(self.outputs):
+                one, other = (
+                    from_numpy(mi.UInt32, number * self.grid.n_output_features + output)
+                    for number in (here, here + np.uint32(apart))
+                )
+                values = mi.Float(self.grid.data)
+                found.append(dr.gather(mi.Float, values, other) - dr.gather(mi.Float, values, one))
+        return found
 
     def cost(self) -> Cost:
         """Eight corners."""

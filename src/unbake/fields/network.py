@@ -71,6 +71,10 @@ class Network(Field):
         """The numbers of pieces and colours, if there are any."""
         return frozenset() if self.pieces is None else self.pieces.parameters().keys()
 
+    def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
+        """Those of the numbers of pieces and colours, if there are any."""
+        return {} if self.pieces is None else self.pieces.deviations(point)
+
     def evaluate(
         self,
         point: SurfacePoint,

@@ -81,8 +81,30 @@ class PieceValues:
         shared = self._colours.evaluate(SurfacePoint(colour))
         return [dr.fma(self._settings.gain, x, y) for x, y in zip(shared, found, strict=True)]
 
+    def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
+        """See `Field.deviations`."""
+        assert point.piece is not None
+        bins, gain = self._settings.brightnesses, self._settings.gain
+        strength = dr.zeros(mi.Float, self._settings.most)
+        number = dr.minimum(point.piece.number, self._settings.most - 1)
+        dr.scatter(strength, gain * point.piece.strength, number)
+        every = dr.arange(mi.UInt32, self._settings.most * bins)
+        of_pieces = [
+            values * dr.gather(mi.Float, strength, every // bins) for values in self._values
+        ]
+        here = dr.arange(mi.UInt32, self._settings.most * (bins - 1))
+        here += here // (bins - 1)  # all but the last one of a piece
+        found = {"pieces": of_pieces, "brightnesses": [_differences(v, here, 1) for v in of_pieces]}
+        if self._colours is not None:
+            found["colours"] = [gain * x for x in self._colours.differences()]
+        return {name: dr.concat(arrays) for name, arrays in found.items()}
+
     @property
     def features(self) -> int:
         """Numbers that are looked up at a point."""
         outputs = len(self._values)
         return (2 + (8 if self._colours is not None else 0)) * outputs
+
+
+def _differences(values: mi.Float, here: mi.UInt32, apart: int) -> mi.Float:
+    return dr.gather(mi.Float, values, here + apart) - dr.gather(mi.Float, values, here)

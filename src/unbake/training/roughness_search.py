@@ -14,7 +14,10 @@ of roughness then descends on these curves. No light is transported meanwhile, a
 far less noise than a step.
 
 What the field shares between points descends, its numbers of pieces and of colours: noise of the
-photographs is the same for all samples, and a network would learn it. After the first search, steps
+photographs is the same for all samples, and a network would learn it. Of most numbers photographs
+tell little, too. So the most probable ones are sought: squared errors are in units of their
+variance, which the pixels themselves tell, by how bright they are, and numbers of one piece, or of
+like colours, are expected to differ as little as the settings say. After the first search, steps
 leave roughness alone; from the second one on, the mean of what searches find is kept.
 """
 
@@ -27,7 +30,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import FitConfig
+from ..config import FitConfig, RoughnessSearchConfig
 from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..fields.domain import SurfacePoint
@@ -46,13 +49,15 @@ NODES = (0.1, 0.16, 0.24, 0.33, 0.43, 0.55, 0.7, 0.9)
 #: Camera samples that are traced at once.
 _AT_ONCE = 1 << 18
 #: Fewer pixels tell nothing: a fit of some dozen steps does not search.
-_FEWEST = 1024
+_FEWEST = 1 << 14
 #: Tells the random numbers of searches from those of steps, which start at the same seed.
 _SEED = 0x524F5547
 #: The rate that is left at the end of a descent.
 _FINAL_RATE = 0.05
 #: The part of a mean group's knowledge of its albedo that says: it is as it is.
 _CAUTION = 1e-3
+#: Brightnesses of pixels, in each of which errors have one variance.
+_BRIGHTNESSES = 32
 #: Factors of albedo are no larger.
 _LARGEST_FACTOR = 4.0
 
@@ -158,9 +163,12 @@ class RoughnessSearch:
 
         rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
         if len(rows):
-            curves = Curves.of(rows, search.cells, search.colours, "albedo" in materials)
+            albedo = "albedo" in materials
+            present = _roughness(field, _points(rows, albedo)).numpy()
+            rows["weight"] *= precision(rows, present)
+            curves = Curves.of(rows, search.cells, search.colours, albedo)
             own = self._config.material_settings["roughness"].learning_rate
-            found = descend(field, curves, search.rate * own, search.steps)
+            found = descend(field, curves, search, search.rate * own)
             named = {f"roughness.{key}": self._of_first(x) for key, x in found.items()}
             state.replace({k: dr.lerp(dr.detach(state.phi[k]), x, part) for k, x in named.items()})
         state.publish(self._problem)
@@ -206,17 +214,8 @@ class Curves:
         left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
         slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
 
-        def arrays(name: str) -> list[mi.Float]:
-            return [from_numpy(mi.Float, column) for column in rows[name].T]
-
-        number = from_numpy(mi.UInt32, rows["piece"])
-        point = SurfacePoint(
-            mi.Point3f(arrays("position")),
-            piece=Piece(number, from_numpy(mi.Float, rows["strength"])),
-            albedo=mi.Color3f(arrays("albedo")) if albedo else None,
-        )
         flat = (from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes))
-        return Curves(point, *flat)
+        return Curves(_points(rows, albedo), *flat)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
@@ -231,6 +230,54 @@ class Curves:
         p, q = (width * dr.gather(mi.Float, self.slopes, first + i) for i in (0, 1))
         t = (dr.log(inside) - left) / width
         return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
+
+
+def _points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
+    """Where pixels are seen; whether their albedo is unknown, and so told."""
+
+    def arrays(name: str) -> list[mi.Float]:
+        return [from_numpy(mi.Float, column) for column in rows[name].T]
+
+    number = from_numpy(mi.UInt32, rows["piece"])
+    return SurfacePoint(
+        mi.Point3f(arrays("position")),
+        piece=Piece(number, from_numpy(mi.Float, rows["strength"])),
+        albedo=mi.Color3f(arrays("albedo")) if albedo else None,
+    )
+
+
+def _roughness(field: Field, point: SurfacePoint) -> mi.Float:
+    """What a field says of points."""
+    quantity = QUANTITIES["roughness"]
+    return dr.fma(field.evaluate(point)[0], quantity.upper - quantity.lower, quantity.lower)
+
+
+def precision(rows: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Factors of weights with which errors of pixels have the variance 1, however bright they are.
+
+    Pixels with about the same weight are of one brightness: weights are those of smoothed
+    photographs, by default, and do not follow their noise. The variance is the mean squared error
+    in each of `_BRIGHTNESSES` such sets of equal size.
+
+    Args:
+        rows: of `row_type`.
+        roughness: of pixels as it is by now, shape (n,).
+
+    Returns:
+        Shape (n, 3). Where a weight is zero it is 1.
+    """
+    every = np.arange(len(rows))
+    nearest = np.abs(np.log(NODES) - np.log(np.maximum(roughness, 1e-6))[:, None]).argmin(1)
+    image = rows["gain"] * (rows["plain"] + rows["coloured"])[every, nearest]
+    errors = rows["weight"] * (image - rows["target"]) ** 2
+    found = np.ones_like(errors)
+    for channel in range(3):
+        counted = np.flatnonzero(rows["weight"][:, channel] > 0)
+        order = counted[np.argsort(rows["weight"][counted, channel], kind="stable")]
+        for chosen in np.array_split(order, _BRIGHTNESSES):
+            if len(chosen):
+                found[chosen, channel] = 1 / max(errors[chosen, channel].mean(), 1e-12)
+    return found
 
 
 def groups(rows: np.ndarray, cells: int, colours: int) -> np.ndarray:
@@ -296,21 +343,37 @@ def squared_errors(rows: np.ndarray, factor: np.ndarray) -> np.ndarray:
     return (weight * (image2 - target * (2 * image - target))).mean(2)
 
 
-def descend(field: Field, curves: Curves, rate: float, steps: int) -> dict[str, Any]:
-    """Let a field descend on curves by Adam.
+def descend(
+    field: Field, curves: Curves, settings: RoughnessSearchConfig, rate: float
+) -> dict[str, Any]:
+    """Let a field descend on curves by Adam, towards the most probable numbers.
+
+    Args:
+        field: of roughness.
+        curves: of errors in units of their variance.
+        settings: how many steps there are, and how like each other numbers are expected to be.
+        rate: of the first step.
 
     Returns:
         The parameters that moved, which are those that points share.
     """
-    quantity = QUANTITIES["roughness"]
+    spread = {
+        "pieces": settings.piece_spread,
+        "brightnesses": settings.brightness_spread,
+        "colours": settings.colour_spread,
+    }
     first = {key: type(value)(dr.detach(value)) for key, value in field.parameters().items()}
     optimizer = mi.ad.Adam(rate, {key: first[key] for key in field.shared()})
-    for number in range(steps):
-        now = rate * _FINAL_RATE ** (number / steps)
+    # Both are logarithms of probabilities, times -2. Errors of a pixel are a mean over channels,
+    # because most of their noise is the same.
+    share = dr.opaque(mi.Float, len(NODES) / dr.width(curves.losses))
+    for number in range(settings.steps):
+        now = rate * _FINAL_RATE ** (number / settings.steps)
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, now) for key in optimizer})
         field.assign(first | dict(optimizer.items()))
-        value = field.evaluate(curves.point)[0]
-        roughness = dr.fma(value, quantity.upper - quantity.lower, quantity.lower)
-        dr.backward(dr.mean(curves.at(roughness)))
+        loss = dr.mean(curves.at(_roughness(field, curves.point)))
+        for key, values in field.deviations(curves.point).items():
+            loss += share * dr.sum(dr.square(values / dr.opaque(mi.Float, spread[key])))
+        dr.backward(loss)
         optimizer.step()
     return {key: dr.detach(value) for key, value in optimizer.items()}
