@@ -409,3 +409,18 @@ def test_a_texel_that_is_not_touched_stays(tmp_path):
 def test_bitmaps_beyond_an_array_are_an_error():
     with pytest.raises(UserError, match="30 bitmaps of 8192 x 8192 pixels"):
         bitmaps_of(8192, ["x"] * 30, 3)
+
+
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_a_dense_grid_tells_differences_of_neighbouring_corners(outputs):
+    grid = DenseGrid(DenseGridConfig(3), FieldSpec(outputs))
+    values = np.random.default_rng(0).random(len(grid.grid.data)).astype(np.float32)
+    grid.assign({"corners": mi.Float(values)})
+    corners = values.reshape(4, 4, 4, -1)  # z, y, x
+    expected = [
+        np.diff(corners[..., output], axis=axis).ravel()
+        for axis in (2, 1, 0)
+        for output in range(outputs)
+    ]
+    for found, wanted in zip(grid.differences(), expected, strict=True):
+        np.testing.assert_allclose(np.array(found), wanted, atol=1e-6)

@@ -40,3 +40,8 @@ def read_small(array: mi.Float, index: mi.UInt32, active: bool | mi.Bool = True)
     `Local` has none.
     """
     return dr.gather(mi.Float, array, index, active, mode=dr.ReduceMode.Local)
+
+
+def differences(values: mi.Float, here: mi.UInt32, apart: int) -> mi.Float:
+    """Values so far behind others, less those."""
+    return dr.gather(mi.Float, values, here + apart) - dr.gather(mi.Float, values, here)

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
-import numpy as np
 
-from .arrays import first_value, from_numpy, sigmoid
+from .arrays import differences, first_value, sigmoid
 from .domain import SurfacePoint
 from .field import Cost, Engine, Field, FieldSpec
 from .settings import DenseGridConfig, features_of
@@ -67,18 +66,16 @@ class DenseGrid(Field):
 
     def differences(self) -> list[mi.Float]:
         """Values of outputs at corners less those of the neighbours before them, by axis."""
-        corners, found = self._corners, []
+        corners, features = self._corners, self.grid.n_output_features
+        values, found = mi.Float(self.grid.data), []
         for axis in range(3):
             apart = corners**axis
-            here = np.arange(corners**3, dtype=np.uint32)
-            here = here[here // apart % corners < corners - 1]
-            for output in range(self.outputs):
-                one, other = (
-                    from_numpy(mi.UInt32, number * self.grid.n_output_features + output)
-                    for number in (here, here + np.uint32(apart))
-                )
-                values = mi.Float(self.grid.data)
-                found.append(dr.gather(mi.Float, values, other) - dr.gather(mi.Float, values, one))
+            here = dr.arange(mi.UInt32, corners * corners * (corners - 1))
+            here += here // (apart * (corners - 1)) * apart  # all but the last ones of the axis
+            found += [
+                differences(values, here * features + output, apart * features)
+                for output in range(self.outputs)
+            ]
         return found
 
     def cost(self) -> Cost:

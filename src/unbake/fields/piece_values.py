@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .arrays import differences
 from .domain import SurfacePoint, bounded
 from .field import FieldSpec
 from .grid import DenseGrid
@@ -94,7 +95,7 @@ class PieceValues:
         ]
         here = dr.arange(mi.UInt32, self._settings.most * (bins - 1))
         here += here // (bins - 1)  # all but the last one of a piece
-        found = {"pieces": of_pieces, "brightnesses": [_differences(v, here, 1) for v in of_pieces]}
+        found = {"pieces": of_pieces, "brightnesses": [differences(v, here, 1) for v in of_pieces]}
         if self._colours is not None:
             found["colours"] = [gain * x for x in self._colours.differences()]
         return {name: dr.concat(arrays) for name, arrays in found.items()}
@@ -104,7 +105,3 @@ class PieceValues:
         """Numbers that are looked up at a point."""
         outputs = len(self._values)
         return (2 + (8 if self._colours is not None else 0)) * outputs
-
-
-def _differences(values: mi.Float, here: mi.UInt32, apart: int) -> mi.Float:
-    return dr.gather(mi.Float, values, here + apart) - dr.gather(mi.Float, values, here)

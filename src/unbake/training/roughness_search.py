@@ -357,7 +357,7 @@ def descend(
     Returns:
         The parameters that moved, which are those that points share.
     """
-    spread = {
+    spreads = {
         "pieces": settings.piece_spread,
         "brightnesses": settings.brightness_spread,
         "colours": settings.colour_spread,
@@ -366,14 +366,15 @@ def descend(
     optimizer = mi.ad.Adam(rate, {key: first[key] for key in field.shared()})
     # Both are logarithms of probabilities, times -2. Errors of a pixel are a mean over channels,
     # because most of their noise is the same.
-    share = dr.opaque(mi.Float, len(NODES) / dr.width(curves.losses))
+    pixels = dr.width(curves.losses) // len(NODES)
+    weights = {key: dr.opaque(mi.Float, spread**-2 / pixels) for key, spread in spreads.items()}
     for number in range(settings.steps):
         now = rate * _FINAL_RATE ** (number / settings.steps)
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, now) for key in optimizer})
         field.assign(first | dict(optimizer.items()))
         loss = dr.mean(curves.at(_roughness(field, curves.point)))
         for key, values in field.deviations(curves.point).items():
-            loss += share * dr.sum(dr.square(values / dr.opaque(mi.Float, spread[key])))
+            loss += weights[key] * dr.sum(dr.square(values))
         dr.backward(loss)
         optimizer.step()
     return {key: dr.detach(value) for key, value in optimizer.items()}
