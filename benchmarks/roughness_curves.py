@@ -60,7 +60,7 @@ def main() -> None:
     each = 2048
     rows = np.concatenate(
         [
-            step.by_roughness(run.state, seed, each, args.spp, NODES)
+            step.by_roughness(run.state, (seed, seed), each, args.spp, NODES)
             for seed in range(-(-args.pixels // each))
         ]
     )

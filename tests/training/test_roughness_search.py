@@ -71,7 +71,7 @@ def test_pixels_at_the_present_roughness_are_those_of_steps(built_in, guided):
     state.publish(problem)
     point = problem.materials.locate(dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False))
     value = float(problem.materials.evaluate_at(point)["roughness"][0])
-    rows = step.by_roughness(state, 3, 512, 512, (value, 0.9))
+    rows = step.by_roughness(state, (3, 4), 512, 512, (value, 0.9))
     number = np.round(rows["target"][:, 0] * pixels.photographs.count).astype(int) - 1
     one = {n: i for i, n in enumerate(number)}  # drawn with replacement: one of each pixel
     chosen = np.fromiter(one.values(), int)
@@ -95,8 +95,11 @@ def _rendered(step, state, pixels):
 
 def test_products_of_pairs_have_no_noise_of_their_own(built_in):
     _, _, step, state = started(built_in)
-    few, many = (step.by_roughness(state, 3, 512, spp, (0.4,)) for spp in (2, 256))
+    many = step.by_roughness(state, (3, 0), 512, 256, (0.4,))
+    every = [step.by_roughness(state, (3, seed), 512, 2, (0.4,)) for seed in range(1, 13)]
+    few = np.concatenate(every)
     few = few[np.isin(few["target"][:, 0], many["target"][:, 0])]  # the same pixels
+    assert not np.array_equal(every[0]["coloured"][:50], every[1]["coloured"][:50])
     # Squares of means of few samples would be larger by their variance.
     assert few["coloured2"].mean() == pytest.approx(many["coloured2"].mean(), rel=0.02)
     assert (few["coloured"] ** 2).mean() > 1.03 * many["coloured2"].mean()
@@ -107,7 +110,7 @@ def test_photographs_of_clipped_channels_do_not_count(built_in):
     clipped = replace(pixels, limits=np.array([0.25, 9.0], np.float32))
     problem = make_problem(built_in("cornell"), "visible", SETTINGS, 0.2)
     step = TrainingStep(problem, clipped, SETTINGS)
-    rows = step.by_roughness(initial_state(problem), 3, 512, 4, (0.4,))
+    rows = step.by_roughness(initial_state(problem), (3, 4), 512, 4, (0.4,))
     first = rows["target"][:, 0] <= 0.5
     over = first & (rows["target"][:, 0] >= 0.25)
     assert over.any() and (rows["weight"][over] == 0).all()

@@ -14,10 +14,10 @@ class RoughnessSearchConfig:
     Of methods with L_θ; see `training/roughness_search.py`.
     """
 
-    times: int = 4  #: searches, evenly from `first` to `last`; 0: none
+    times: int = 2  #: searches, evenly from `first` to `last`; 0: none
     first: float = 0.4  #: fraction of the fit after which the first one comes
-    last: float = 0.85  #: and the last one; the rest is left for albedo to follow
-    share: float = 0.125  #: camera samples of each one, of those that all steps of the fit take
+    last: float = 0.75  #: and the last one; the rest is left for albedo to follow
+    share: float = 0.25  #: camera samples of each one, of those that all steps of the fit take
     pixels: int = 1 << 18  #: that are sampled, at most
     spp: int = 16  #: camera samples of each pixel
     cells: int = 4  #: along an edge of the scene's cube, in each of which albedo has its own factor

@@ -152,11 +152,11 @@ class RoughnessSearch:
         batches = -(-pixels // most)
         each = -(-pixels // batches)
         entropy = [self._config.seed, _SEED, number, self._ranks.rank]
-        seeds = np.random.SeedSequence(entropy).generate_state(batches)
+        seeds = np.random.SeedSequence(entropy).generate_state(2 * batches).reshape(batches, 2)
 
         def sample() -> np.ndarray:
             parts = [
-                self._step.by_roughness(state, int(seed), each, search.spp, NODES) for seed in seeds
+                self._step.by_roughness(state, pair, each, search.spp, NODES) for pair in seeds
             ]
             rows = np.concatenate(parts)
             return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
@@ -164,7 +164,7 @@ class RoughnessSearch:
         rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
         if len(rows):
             albedo = "albedo" in materials
-            present = _roughness(field, _points(rows, albedo)).numpy()
+            present = _roughness(field, points(rows, albedo)).numpy()
             rows["weight"] *= precision(rows, present)
             curves = Curves.of(rows, search.cells, search.colours, albedo)
             own = self._config.material_settings["roughness"].learning_rate
@@ -215,7 +215,7 @@ class Curves:
         slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
 
         flat = (from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes))
-        return Curves(_points(rows, albedo), *flat)
+        return Curves(points(rows, albedo), *flat)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
@@ -232,8 +232,13 @@ class Curves:
         return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
 
 
-def _points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
-    """Where pixels are seen; whether their albedo is unknown, and so told."""
+def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
+    """Where pixels are seen.
+
+    Args:
+        rows: of `row_type`.
+        albedo: whether it is unknown, and so told.
+    """
 
     def arrays(name: str) -> list[mi.Float]:
         return [from_numpy(mi.Float, column) for column in rows[name].T]

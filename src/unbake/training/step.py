@@ -348,12 +348,12 @@ class TrainingStep:
 
     @carrying()
     def by_roughness(
-        self, state: State, seed: int, count: int, spp: int, nodes: Sequence[float]
+        self, state: State, seeds: Sequence[int], count: int, spp: int, nodes: Sequence[float]
     ) -> np.ndarray:
         """Some random pixels as functions of the roughness of what they see.
 
         Args:
-            seed: decides pixels and samples.
+            seeds: the first decides pixels, the second their samples.
             count: of pixels.
             spp: camera samples of each.
             nodes: values of roughness.
@@ -364,12 +364,12 @@ class TrainingStep:
         """
         problem, sampler = self._problem, self._probed
         assert problem.radiance is not None
-        of_pixels, of_samples = np.random.SeedSequence(seed).generate_state(2)
+        of_pixels, of_samples = map(int, seeds)
         with dr.suspend_grad():
             state.publish(problem)
-            pixels = self._pixels.draw(int(of_pixels), count)
+            pixels = self._pixels.draw(of_pixels, count)
             inputs = replace(self._inputs(0, 1), pixels=pixels)  # one pixel, which is not used
-            sampler.seed(dr.opaque(mi.UInt32, int(of_samples)), count * spp)
+            sampler.seed(dr.opaque(mi.UInt32, of_samples), count * spp)
             placed = self._placed(inputs)
             batch = pixels.batch(placed, sampler, spp)
             target, loss, _ = self._compared(inputs, batch, placed)

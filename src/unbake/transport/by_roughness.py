@@ -208,21 +208,22 @@ def _reflected(
 
 def _moments(plain: mi.Color3f, coloured: mi.Color3f, spp: int) -> dict[str, np.ndarray]:
     """Means over a pixel's samples, and over products of pairs of these, each of shape (n, 3)."""
+    colours = {"plain": plain, "coloured": coloured}
+    sums = {name: [dr.block_sum(c, spp) for c in colour] for name, colour in colours.items()}
+    dr.eval(sums)
 
-    def mean(colour: mi.Color3f) -> np.ndarray:
-        return np.stack([np.array(dr.block_sum(c, spp) / spp) for c in colour], 1)
+    def mean(name: str) -> np.ndarray:
+        return np.stack([np.array(total) for total in sums[name]], 1) / spp
 
-    def pairs(a: mi.Color3f, b: mi.Color3f) -> np.ndarray:
-        found = []
-        for u, v in zip(a, b, strict=True):
-            products = dr.block_sum(u, spp) * dr.block_sum(v, spp) - dr.block_sum(u * v, spp)
-            found.append(np.array(products / (spp * (spp - 1))))
-        return np.stack(found, 1)
+    def pairs(a: str, b: str) -> np.ndarray:
+        of_samples = zip(colours[a], colours[b], sums[a], sums[b], strict=True)
+        found = [np.array(u * v - dr.block_sum(x * y, spp)) for x, y, u, v in of_samples]
+        return np.stack(found, 1) / (spp * (spp - 1))
 
     return {
-        "plain": mean(plain),
-        "coloured": mean(coloured),
-        "plain2": pairs(plain, plain),
-        "mixed": pairs(plain, coloured),
-        "coloured2": pairs(coloured, coloured),
+        "plain": mean("plain"),
+        "coloured": mean("coloured"),
+        "plain2": pairs("plain", "plain"),
+        "mixed": pairs("plain", "coloured"),
+        "coloured2": pairs("coloured", "coloured"),
     }
