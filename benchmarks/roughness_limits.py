@@ -1,0 +1,253 @@
+"""What holds a fit's roughness back: one part after the other is replaced by the truth.
+
+    python benchmarks/roughness_limits.py --runs RUN [RUN ...] [--pixels 262144] [--spp 16]
+        --out FILE.json
+
+The roughness of pixels that searches see is compared with their true one:
+
+- as it was fitted, and with the network's part replaced by its mean in each piece and colour;
+- with the tables of pieces and colours fitted to the true roughness, and with all numbers so:
+  what tables, and the whole field, can represent;
+- after one more search of all these samples with the default settings, and as the mean of four
+  searches of a quarter each;
+- after a search of made-up photographs of the true materials under the run's own radiance field,
+  so that L_theta and albedo can be exact; without noise, and with that of the photographs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "src"))
+os.environ["PYTHONPATH"] = str(ROOT / "src")
+
+from roughness_curves import numbers_of  # noqa: E402
+
+from unbake import backend  # noqa: E402
+from unbake.io import write_json  # noqa: E402
+from unbake.machine import machine  # noqa: E402
+
+#: Pixels that are sampled at once.
+EACH = 2048
+#: Samples of made-up photographs, as a multiple of those that a search compares with them.
+CLEANER = 4
+#: Searches whose mean is compared with one of all their samples.
+PARTS = 4
+#: Steps towards the truth, their rate, and the part of it that is left at the end.
+STEPS, RATE, FINAL_RATE = 400, 0.02, 0.03
+#: The rate of numbers of the network, as a part of that of the tables.
+NETWORK_RATE = 0.25
+#: Factors of albedo that lead to the true one are no larger.
+LARGEST_FACTOR = 3.0
+#: Bins of a channel of albedo, in which the network's part is averaged.
+COLOURS = 6
+
+
+def main() -> None:
+    """Take runs apart, and tell the PSNR of each variant."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=Path, nargs="+", required=True, help="folders of fits")
+    parser.add_argument("--pixels", type=int, default=1 << 18)
+    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    args = parser.parse_args()
+    backend.activate()
+    found = [limits_of(run, args.pixels, args.spp) for run in args.runs]
+    write_json(args.out, {"machine": machine(), "spp": args.spp, "rows": found})
+
+
+def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
+    """The PSNRs of a run's variants in dB, by name, and what the run is.
+
+    Args:
+        pixels: how many are sampled; those that searches cannot use are left out.
+        spp: camera samples of each.
+    """
+    from unbake.training.checkpoint import load_checkpoint
+    from unbake.training.recovered import open_run
+    from unbake.training.roughness_search import NODES, precision
+
+    run = open_run(folder)
+    progress = load_checkpoint(run.folder, run.state)
+    run.state.publish(run.problem)
+    rows, many, true = sampled(run, pixels, spp)
+    roughness, albedo = true[:, 0], true[:, 1:]
+    shared = Shared(run, rows, roughness)
+    told = {
+        "as fitted": shared.score({}),
+        "network by its means": psnr(shared.without_network(), roughness),
+        "tables at the truth": shared.score(shared.towards_truth(shared.field.shared())),
+        "all at the truth": shared.score(shared.towards_truth(shared.fitted)),
+    }
+    weight = rows["weight"].copy()
+    rows["weight"] = weight * precision(rows, shared.values)
+    parts = [shared.searched(part) for part in np.array_split(rows, PARTS)]
+    mean = {key: sum(part[key] for part in parts) / PARTS for key in parts[0]}
+    told |= {"one search": shared.score(shared.searched(rows)), "searches": shared.score(mean)}
+    clean = made_up(many, roughness, albedo, NODES)
+    deviation = 1 / np.sqrt(np.maximum(rows["weight"], 1e-12))
+    noisy = clean + deviation * np.random.default_rng(0).standard_normal(clean.shape)
+    for name, target in (("made-up and noisy", noisy), ("made-up photographs", clean)):
+        rows["target"] = target
+        rows["weight"] = weight * precision(rows, roughness)
+        told[name] = shared.score(shared.searched(rows))
+    name = run.dataset.folder.name
+    for key, value in told.items():
+        print(f"{name}: {key}: {value:.2f} dB", flush=True)
+    about = {"data": name, "steps": progress.step if progress else 0, "pixels": len(rows)}
+    return about | {"roughness_psnr": told}
+
+
+def sampled(run: Any, pixels: int, spp: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of the same pixels from `spp` and from more samples, and their true materials.
+
+    Returns:
+        Two arrays of `row_type`, shape (n,), and roughness and albedo, shape (n, 4).
+    """
+    from unbake.training.problem import pixels_of
+    from unbake.training.roughness_search import NODES
+    from unbake.training.step import TrainingStep, without_garbage_collection
+    from unbake.training.truth_fit import TrueMaps
+
+    photographs = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
+    step = TrainingStep(run.problem, photographs, run.config)
+    table = photographs.photographs.table[:, :3]
+    maps = TrueMaps.load(run.dataset, ("roughness", "albedo"))
+    truth = np.full((len(table), 4), np.nan, np.float32)
+    truth[maps.numbers] = maps.values
+
+    def sample(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        with without_garbage_collection():
+            few, many = (
+                step.by_roughness(run.state, (number, 2 * number + i), EACH, count, NODES)
+                for i, count in enumerate((spp, CLEANER * spp))
+            )
+        kinds = [numbers_of(rows["target"], table) for rows in (few, many)]
+        same, chosen, its = np.intersect1d(*kinds, return_indices=True)
+        return few[chosen], many[its], truth[same]
+
+    batches = [sample(number) for number in range(-(-pixels // EACH))]
+    few, many, true = (np.concatenate(part) for part in zip(*batches, strict=True))
+    known = np.isfinite(true).all(1)
+    return few[known], many[known], true[known]
+
+
+class Shared:
+    """The numbers that points share in a run's field of roughness, and others in their place.
+
+    Args:
+        run: whose fields are those of its checkpoint.
+        rows: of `row_type`.
+        truth: roughness of these pixels, shape (n,).
+    """
+
+    def __init__(self, run: Any, rows: np.ndarray, truth: np.ndarray) -> None:
+        import drjit as dr
+
+        from unbake.config import RoughnessSearchConfig
+        from unbake.training.roughness_search import points
+
+        self.field = run.problem.materials["roughness"]
+        self._rows, self._truth, self._point = rows, truth, points(rows, albedo=True)
+        self._settings = RoughnessSearchConfig()
+        self._rate = run.config.material_settings["roughness"].learning_rate * self._settings.rate
+        parameters = self.field.parameters()
+        self.fitted = {key: type(x)(dr.detach(x)) for key, x in parameters.items()}
+        self.values = self._values().numpy()
+
+    def _values(self) -> Any:
+        from unbake.quantities import QUANTITIES
+
+        quantity = QUANTITIES["roughness"]
+        span = quantity.upper - quantity.lower
+        return self.field.evaluate(self._point)[0] * span + quantity.lower
+
+    def score(self, changed: dict[str, Any]) -> float:
+        """The PSNR with some numbers changed."""
+        self.field.assign(self.fitted | changed)
+        found = psnr(self._values().numpy(), self._truth)
+        self.field.assign(self.fitted)
+        return found
+
+    def towards_truth(self, names: Iterable[str]) -> dict[str, Any]:
+        """Some of the numbers, fitted to the true roughness."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from unbake.fields.arrays import from_numpy
+
+        optimizer = mi.ad.Adam(RATE, {key: self.fitted[key] for key in names})
+        shared, goal = self.field.shared(), from_numpy(mi.Float, self._truth)
+        for number in range(STEPS):
+            now = RATE * FINAL_RATE ** (number / STEPS)
+            rates = {key: now if key in shared else NETWORK_RATE * now for key in optimizer}
+            optimizer.set_learning_rate({key: dr.opaque(mi.Float, r) for key, r in rates.items()})
+            self.field.assign(self.fitted | dict(optimizer.items()))
+            dr.backward(dr.mean(dr.square(self._values() - goal)))
+            optimizer.step()
+        self.field.assign(self.fitted)
+        return {key: dr.detach(x) for key, x in optimizer.items()}
+
+    def searched(self, rows: np.ndarray) -> dict[str, Any]:
+        """What a search finds; the variance of errors, times weight, is 1."""
+        from unbake.training.roughness_search import Curves, descend
+
+        settings = self._settings
+        curves = Curves.of(rows, settings.cells, settings.colours, albedo=True)
+        found = descend(self.field, curves, settings, self._rate)
+        self.field.assign(self.fitted)
+        return found
+
+    def without_network(self) -> np.ndarray:
+        """Values with what the network adds replaced by its mean in each piece and colour."""
+        from unbake.quantities import QUANTITIES
+
+        quantity = QUANTITIES["roughness"]
+        span = quantity.upper - quantity.lower
+        unit = np.clip((self.values - quantity.lower) / span, 1e-6, 1 - 1e-6)
+        tables = self.field.pieces.evaluate(self._point)[0].numpy()
+        network = np.log(unit / (1 - unit)) - tables
+        colour = np.sqrt(np.clip(self._rows["albedo"], 0, 1)) * COLOURS
+        columns = [self._rows["piece"][:, None], np.minimum(colour, COLOURS - 1)]
+        kind = np.concatenate(columns, 1).astype(np.int64)
+        group = np.unique(kind, axis=0, return_inverse=True)[1].ravel()
+        mean = np.bincount(group, network) / np.bincount(group)
+        return quantity.lower + span / (1 + np.exp(-(tables + mean[group])))
+
+
+def psnr(values: np.ndarray, truth: np.ndarray) -> float:
+    """In dB, of values between 0 and 1."""
+    return float(-10 * np.log10(np.square(values - truth).mean()))
+
+
+def made_up(
+    rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray, nodes: tuple[float, ...]
+) -> np.ndarray:
+    """Photographs of pixels with these materials, as light that is compared, shape (n, 3).
+
+    Args:
+        rows: of `row_type`; linear in the logarithm of roughness between nodes.
+        roughness: shape (n,).
+        albedo: linear RGB, shape (n, 3).
+    """
+    places, every = np.log(nodes), np.arange(len(rows))
+    x = np.clip(np.log(np.maximum(roughness, 1e-3)), places[0], places[-1])
+    left = np.clip(np.searchsorted(places, x) - 1, 0, len(places) - 2)
+    part = ((x - places[left]) / (places[left + 1] - places[left]))[:, None]
+    factor = np.clip(albedo / np.maximum(rows["albedo"], 1e-3), 0, LARGEST_FACTOR)
+    images = [
+        rows["plain"][every, i] + factor * rows["coloured"][every, i] for i in (left, left + 1)
+    ]
+    return rows["gain"] * (images[0] * (1 - part) + images[1] * part)
+
+
+if __name__ == "__main__":
+    main()
