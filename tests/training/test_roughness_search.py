@@ -257,7 +257,7 @@ def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
     search = RoughnessSearch(problem, SETTINGS, step, Ranks())
     assert not search.due(0.0, 0.39)
     assert search.due(0.39, 0.4) and not search.due(0.4, 0.45)
-    assert search.due(0.8, 0.9) and not search.due(0.9, 1.0)
+    assert search.due(0.7, 0.8) and not search.due(0.8, 1.0)
     rates = {"albedo": 1.0, "roughness": 1.0}
     assert search.rates(rates, 39, 0.39) == rates
     assert search.rates(rates, 40, 0.4) == {"albedo": 1.0, "roughness": 0.0}

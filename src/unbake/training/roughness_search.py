@@ -152,7 +152,8 @@ class RoughnessSearch:
         batches = -(-pixels // most)
         each = -(-pixels // batches)
         entropy = [self._config.seed, _SEED, number, self._ranks.rank]
-        seeds = np.random.SeedSequence(entropy).generate_state(2 * batches).reshape(batches, 2)
+        words = np.random.SeedSequence(entropy).generate_state(2 * batches).tolist()
+        seeds = zip(words[::2], words[1::2], strict=True)
 
         def sample() -> np.ndarray:
             parts = [
