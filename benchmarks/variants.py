@@ -1,10 +1,11 @@
 """Held-out scores of fits with several settings files, over seeds, one fit after the other.
 
     python benchmarks/variants.py --data DATA [DATA ...] --settings A.toml B.toml --out FILE.json
-        [--seeds 0 1 2] [--steps 2400 | --seconds 120] [--methods ours]
+        [--seeds 0 1 2] [--steps 2400 | --seconds 120] [--methods ours] [--go-on]
 
-The fits of a seed follow each other, and the file is written after each seed. Scores are PSNRs in
-dB of linear RGB by `unbake evaluate`, mean over held-out views; seconds are those of training.
+The fits of a seed follow each other, and the file is written after each seed. With --go-on, seeds
+that it has already are kept. Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
+held-out views; seconds are those of training.
 """
 
 from __future__ import annotations
@@ -15,10 +16,9 @@ import json
 import os
 import sys
 import tempfile
-from collections import defaultdict
-from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 SRC = str(ROOT / "src")
@@ -50,25 +50,52 @@ def main() -> None:
     length.add_argument("--steps", type=int, default=2400)
     length.add_argument("--seconds", type=float, help="of training, instead of steps")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--go-on", action="store_true", help="keep the seeds that the file has")
     args = parser.parse_args()
     backend.activate()
-    stop = ["--steps", args.steps]
-    if args.seconds is not None:
-        stop = ["--seconds", args.seconds]
-    found: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
-    described_data = {data.name: described(data) for data in args.data}
-    for number, seed in enumerate(args.seeds, 1):
-        for data, method, settings in product(args.data, args.methods, args.settings):
-            scores = fit(data, settings, method, ["--seed", seed, *stop])
-            found[data.name, method, settings.stem].append(scores)
+    stop = ("steps", args.steps) if args.seconds is None else ("seconds", args.seconds)
+    about = {
+        "machine": machine(),
+        "length": dict([stop]),
+        "data": {data.name: described(data) for data in args.data},
+    }
+    seeds, found = started(args.out, about) if args.go_on else ([], {})
+    kinds = list(product(args.data, args.methods, args.settings))
+    names = [(data.name, method, settings.stem) for data, method, settings in kinds]
+    if seeds and found.keys() != set(names):
+        raise SystemExit(f"{args.out} is of other data sets, methods or settings")
+    for seed in args.seeds:
+        if seed in seeds:
+            continue
+        for name, (data, method, settings) in zip(names, kinds, strict=True):
+            scores = fit(data, settings, method, seed, stop)
+            found.setdefault(name, []).append(scores)
             told = ", ".join(f"{key} {value:.2f}" for key, value in scores.items())
             print(f"{data.name}, {method}, {settings.stem}, seed {seed}: {told}", flush=True)
+        seeds.append(seed)
         rows = [
-            {"data": data, "method": method, "settings": settings} | across_seeds(runs, runs[0])
-            for (data, method, settings), runs in found.items()
+            dict(zip(("data", "method", "settings"), name, strict=True))
+            | across_seeds(found[name], found[name][0])
+            | {"runs": found[name]}
+            for name in names
         ]
-        result = {"machine": machine(), "seeds": args.seeds[:number]}
-        write_json(args.out, result | {"data": described_data, "rows": rows})
+        write_json(args.out, about | {"seeds": seeds, "rows": rows})
+
+
+def started(
+    file: Path, about: dict[str, Any]
+) -> tuple[list[int], dict[tuple[str, str, str], list[dict[str, float]]]]:
+    """The seeds of a file, and the scores of each: by data, method and settings.
+
+    Args:
+        about: what must be the same.
+    """
+    before = json.loads(file.read_text(encoding="utf-8"))
+    for key, value in about.items():
+        if before[key] != value:
+            raise SystemExit(f"{file}: {key}: {before[key]} is not {value}")
+    rows = before["rows"]
+    return before["seeds"], {(r["data"], r["method"], r["settings"]): r["runs"] for r in rows}
 
 
 def described(data: Path) -> dict[str, int]:
@@ -79,12 +106,15 @@ def described(data: Path) -> dict[str, int]:
     return views | {"width": width, "height": height, "spp": dataset.render.get("spp", 0)}
 
 
-def fit(data: Path, settings: Path, method: str, options: Sequence[object]) -> dict[str, float]:
-    """Scores, steps, samples and seconds of a fit."""
+def fit(
+    data: Path, settings: Path, method: str, seed: int, stop: tuple[str, float]
+) -> dict[str, float]:
+    """Scores, steps, samples and seconds of a fit, that stops after so many steps or seconds."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         log = Path(folder) / "log.txt"
-        words = ("fit", data, "--out", run, "--settings", settings, "--method", method, *options)
+        words = ["fit", data, "--out", run, "--settings", settings, "--method", method]
+        words += ["--seed", seed, f"--{stop[0]}", stop[1]]
         # A fit that learned nothing fails, and is judged as it is: one that left no run is told by
         # the evaluation.
         with contextlib.suppress(UserError):
