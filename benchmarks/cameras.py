@@ -72,6 +72,7 @@ BALANCE = Fault({"white_balance": 1.0}, ("--white-balance", "per-image"))
 VIGNETTING = Fault({"vignetting": 0.4}, ("--vignetting", "radial"))
 JPEG = Fault({"format": "jpeg", "electrons": 10000.0, "read_noise": 5.0})
 MESH = Fault({"decimate": 0.1})
+NOISE = Fault({"electrons": 200.0, "read_noise": 4.0})
 CONTRAST = Fault({"response": "contrast"}, ("--response", "monotone"))
 
 
@@ -92,6 +93,8 @@ FAULTS = {
     "response, exposures told": together(CONTRAST, TOLD),
     "response and exposure": together(CONTRAST, EXPOSURE),
     "jpeg": JPEG,
+    "noise": NOISE,
+    "noise, told": together(NOISE, Fault({"tell_noise": True})),
     "mesh": MESH,
     "all, exposures told": together(BALANCE, VIGNETTING, CONTRAST, JPEG, MESH, TOLD),
     "all": together(BALANCE, VIGNETTING, CONTRAST, JPEG, MESH, EXPOSURE),

@@ -29,10 +29,10 @@ import numpy as np  # noqa: E402
 from export_process import export_measured  # noqa: E402
 
 from unbake.experiments.commands import unbake  # noqa: E402
-from unbake.exports.mitsuba import write_ply  # noqa: E402
 from unbake.exports.tessellate import Triangles  # noqa: E402
 from unbake.io import read_object, write_json, write_text  # noqa: E402
 from unbake.machine import machine  # noqa: E402
+from unbake.scene.triangles import write_mesh  # noqa: E402
 
 SHARED = 5
 ROOM = """<scene version="3.0.0">
@@ -95,7 +95,8 @@ def write_room(folder: Path, meshes: int, triangles: int) -> Path:
         centre = 10.4 * (x + 0.5) / columns - 5.2, 8.4 * (y + 0.5) / (meshes / columns) - 4.2
         own = i % 2 == 0
         file = folder / "meshes" / f"boulder-{i}.ply"
-        write_ply(file, boulder(i, (*centre, -1.5 + 0.5 * (i % 3)), 0.17, along, own))
+        stone = boulder(i, (*centre, -1.5 + 0.5 * (i % 3)), 0.17, along, own)
+        write_mesh(file, *stone.arrays)
         material = f"own-{i}" if own else f"shared-{i // (2 * SHARED)}"
         shapes.append(
             f'  <shape type="ply" id="boulder-{i}"><string name="filename" '

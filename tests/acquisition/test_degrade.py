@@ -10,7 +10,7 @@ import pytest
 from unbake.acquisition.decimate import decimated
 from unbake.acquisition.degrade import degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings
-from unbake.dataset.views import Dataset, read_masked
+from unbake.dataset.views import Dataset, SensorNoise, read_masked
 from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.imaging.srgb import to_srgb
@@ -158,6 +158,22 @@ def test_large_meshes_lose_triangles(cornell, degraded, monkeypatch):
     # Two boxes of ten triangles, beside walls
     assert counts[0] - counts[1] == pytest.approx(10, abs=3)
     assert truth["triangles"] == 0.5 and len(truth["displaced"]["meshes"]) == 6
+
+
+def test_noise_that_is_told_is_that_of_photographs(degraded):
+    """Squares of errors, in units of the variance that the data set tells."""
+    noisy, _ = degraded(electrons=200.0, read_noise=4.0, exposure=1.0, tell_noise=True)
+    clean, _ = degraded(clip=0.01, exposure=1.0)
+    for one, other in zip(noisy.views, clean.views, strict=True):
+        assert one.noise == SensorNoise(1 / 200, 4 / 200) and other.noise is None
+        found, true = (read_masked(v)[0][..., :3].astype(float) for v in (one, other))
+        # Neither clipped, nor so dark that noise is cut off below zero.
+        known = (true > 0.15) & (true < 0.7)
+        errors = (found - true)[known] ** 2 / one.noise.variance(true[known])
+        assert errors.mean() == pytest.approx(1, abs=0.1)
+    for settings in ({}, {"electrons": 200.0, "response": "gamma"}):
+        with pytest.raises(UserError, match="tell_noise"):
+            DegradeSettings(tell_noise=True, **settings)
 
 
 def test_the_command_says_where_it_wrote(cornell, unbake, tmp_path):

@@ -18,7 +18,7 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.outliers import told_outliers, without_outliers
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
-from unbake.dataset.views import Dataset, View
+from unbake.dataset.views import Dataset, SensorNoise, View
 from unbake.errors import UserError
 from unbake.transport.loss import RelativeL2
 
@@ -205,6 +205,30 @@ def test_the_reference_knows_the_noise(deviation):
     # The optimum of a constant under the loss: relative to the photograph itself it is too dark.
     ours, itself = (np.average(image.ravel(), weights=w) - 2 for w in weights(found))
     assert itself < -(deviation**2) / 2 and abs(ours) < 0.2 * abs(itself)
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_noise_that_is_known_is_not_told_from_neighbours(dataset, where, monkeypatch):
+    if where == "disk":
+        monkeypatch.setattr(module, "IN_MEMORY", 0)
+    made, exposure = dataset("visible"), 4.0
+    told = Photographs.load(made, False, smoothed=True).table.copy()
+    known = [replace(view, noise=SensorNoise(0.5, 0.25)) for view in made.views]
+    found = Photographs.load(replace(made, views=known), False, smoothed=True).table.copy()
+    np.testing.assert_array_equal(found[:, :3], told[:, :3])
+    # Nothing but the noise differs: what is left of the squares is the mean and the peak.
+    quiet = [replace(view, noise=SensorNoise()) for view in made.views]
+    still = Photographs.load(replace(made, views=quiet), False, smoothed=True).table.copy()
+    y, x = 2, 3
+    mean = told[: WIDTH * HEIGHT, :3].reshape(HEIGHT, WIDTH, 3)[y - 2 : y + 3, x - 2 : x + 3]
+    mean, at = mean.mean((0, 1)), y * WIDTH + x
+    added = found[at, 3:] ** 2 - still[at, 3:] ** 2
+    np.testing.assert_allclose(added, 0.5 * mean + 0.25**2, rtol=1e-3)
+    # Of values that are divided by the exposure.
+    exposed = [replace(view, exposure=exposure) for view in known]
+    divided = Photographs.load(replace(made, views=exposed), False, smoothed=True).table
+    added = divided[at, 3:] ** 2 - (still[at, 3:] / exposure) ** 2
+    np.testing.assert_allclose(added, (0.5 * mean + 0.25**2) / exposure**2, rtol=1e-3)
 
 
 def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_both(

@@ -22,7 +22,6 @@ from unbake.dataset.pixels import CameraRays
 from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
 from unbake.exports import export as exporting
-from unbake.exports.mitsuba import write_ply
 from unbake.exports.observed import Views, filled
 from unbake.exports.parts import parsed_principled, read_parts
 from unbake.exports.tessellate import Triangles
@@ -30,6 +29,7 @@ from unbake.exports.textures import file_names
 from unbake.exports.unwrap import make_atlases, unique_share
 from unbake.imaging.metrics import psnr
 from unbake.imaging.pictures import read_exr, tonemap, write_exr
+from unbake.scene.triangles import write_mesh
 from unbake.training.loop import fit
 from unbake.training.recovered import Recovered, load_run
 from unbake.transport.render import render_materials
@@ -106,9 +106,10 @@ def mixed(tmp_path_factory) -> Path:
     rng = np.random.default_rng(3)
     write_exr(folder / "metal.exr", rng.random((4, 4)))
     # Without texture coordinates; the second one with a triangle that has no area.
-    write_ply(folder / "a" / "part.ply", triangle((-1, 0.9, 0.3), (0, 0.9, 0.3), (-0.5, 0.9, 1)))
+    first = triangle((-1, 0.9, 0.3), (0, 0.9, 0.3), (-0.5, 0.9, 1))
+    write_mesh(folder / "a" / "part.ply", *first.arrays)
     bent = triangle((0, 1, 0.3), (0.6, 1, 0.3), (0.3, 0.9, 1), extra=[(0, 1, 1)])
-    write_ply(folder / "b" / "part.ply", bent)
+    write_mesh(folder / "b" / "part.ply", *bent.arrays)
     (folder / "scene.xml").write_text(SCENE)
     return folder / "scene.xml"
 
@@ -212,7 +213,7 @@ def test_parts_are_where_mitsuba_has_them(mixed, tmp_path):
     original = parsed_principled(mixed, mixed.parent).instantiate(merge=False)
     scene = {"type": "scene"}
     for i, part in enumerate(read_parts(mixed, mixed.parent).parts):
-        write_ply(tmp_path / f"{i}.ply", part.triangles)
+        write_mesh(tmp_path / f"{i}.ply", *part.triangles.arrays)
         flat = part.triangles.normals is None
         ply = {"type": "ply", "filename": str(tmp_path / f"{i}.ply"), "face_normals": flat}
         scene[f"shape{i}"] = ply

@@ -22,7 +22,7 @@ from unbake.config import CameraConfig, from_toml, read_toml, to_toml
 from unbake.dataset.fingerprint import changed, fingerprint
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays
-from unbake.dataset.views import Dataset
+from unbake.dataset.views import Dataset, SensorNoise
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.settings import EvaluationSettings
@@ -105,6 +105,44 @@ def test_values_that_no_camera_has_are_refused(cornell, tmp_path, key, value):
     data = shutil.copytree(cornell, tmp_path / "data")
     edit_frames(data, lambda frame, number: frame.update({key: value}))
     with pytest.raises(UserError, match=f"'{key}' is not a number from 1e-12 to 1e"):
+        Dataset.load(data)
+
+
+def test_noise_is_read_and_saved_again(cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    content["noise"] = {"shot": 0.001, "read": 0.002}
+    content["frames"][1]["noise"] = {"read": 0.004}
+    content["frames"][2]["noise"] = None
+    (data / "transforms.json").write_text(json.dumps(content))
+    prints = []
+    for _ in range(2):
+        dataset = Dataset.load(data)
+        assert [view.noise for view in dataset.views[:3]] == [
+            SensorNoise(0.001, 0.002),
+            SensorNoise(0, 0.004),
+            None,
+        ]
+        prints.append(fingerprint(dataset))
+        dataset.save(data)
+    assert "noise" not in json.loads((data / "transforms.json").read_text())
+    assert prints[0] == prints[1] != fingerprint(Dataset.load(cornell))
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [
+        (0.1, "no table of 'shot' and 'read'"),
+        ({}, "no table of 'shot' and 'read'"),
+        ({"shot": 0.1, "gain": 2}, "no table of 'shot' and 'read'"),
+        ({"shot": -1}, "'shot' is not a number from 1e-12 to 1e"),
+        ({"read": "loud"}, "'read' is not a number from 1e-12 to 1e"),
+    ],
+)
+def test_noise_that_no_camera_has_is_refused(cornell, tmp_path, noise, said):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    edit_frames(data, lambda frame, number: frame.update(noise=noise))
+    with pytest.raises(UserError, match=said):
         Dataset.load(data)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
-from ..dataset.views import Dataset, View, read_masked
+from ..dataset.views import Dataset, SensorNoise, View, read_masked
 from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
@@ -115,6 +115,7 @@ def degrade(
                 mask=folder.mask(view.name) if masked else None,
                 exposure=truth.exposure if settings.tell_exposures else gain,
                 clipped=_clipped(settings),
+                noise=_noise(settings),
             )
             _write_photograph(degraded.image, pixels, dataset.background, settings)
             if degraded.mask is not None:
@@ -216,6 +217,13 @@ def _clipped(settings: DegradeSettings) -> float | None:
     if settings.white is None:
         return None
     return float(from_srgb(np.array(_JPEG_WHITE / 255))) if settings.format == "jpeg" else 1.0
+
+
+def _noise(settings: DegradeSettings) -> SensorNoise | None:
+    """What is told of the noise of photographs."""
+    if not settings.tell_noise:
+        return None
+    return SensorNoise(1 / settings.electrons, settings.read_noise / settings.electrons)
 
 
 def _write_photograph(

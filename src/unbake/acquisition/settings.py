@@ -121,6 +121,7 @@ class DegradeSettings:
     tell_exposures: Annotated[
         bool, Flag("Write the true exposures to the frames, as EXIF would tell them")
     ] = False
+    tell_noise: Annotated[bool, Flag("Write the noise of the sensor to the frames")] = False
     seed: Annotated[int, Flag("Seed of all random numbers")] = 0
 
     def __post_init__(self) -> None:
@@ -146,6 +147,10 @@ class DegradeSettings:
             raise UserError(
                 "needs electrons", "read_noise", "Give electrons at white, such as 10000"
             )
+        if self.tell_noise and (not self.electrons or self.response != "srgb"):
+            what = "needs noise, and a response that is decoded without an error"
+            remedy = "Give electrons at white, such as 10000, and the response srgb"
+            raise UserError(what, "tell_noise", remedy)
 
     @property
     def white(self) -> float | None:

@@ -40,6 +40,8 @@ def in_file(plan: Plan) -> Decoded:
     }
     if any(view.exposure != 1 for view in views):
         key["exposures"] = [view.exposure for view in views]
+    if any(view.noise is not None for view in views):
+        key["noise"] = [None if view.noise is None else asdict(view.noise) for view in views]
     data.require_own_cache()
     found = _find_cache(data, key)
     if found is not None:

@@ -13,7 +13,7 @@ from ..errors import UserError
 from .camera import Camera
 from .outliers import without_outliers
 from .shares import dealt
-from .views import Dataset, View, read_masked
+from .views import Dataset, SensorNoise, View, read_masked
 
 #: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
 COLUMNS, WITH_BLURRED = 3, 6
@@ -22,8 +22,9 @@ RADIUS = 2
 #: A mask whose response to constant and to linear images is zero, and has the variance of the noise
 #: (Immerkær 1996, Fast Noise Variance Estimation).
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
-#: An image with its camera: linear RGBA, shape (pixels, 4), and whether pixels count, (pixels,).
-Image = tuple[Camera, np.ndarray, np.ndarray]
+#: An image with its camera: linear RGBA, shape (pixels, 4), and whether pixels count, (pixels,);
+#: then its noise, if that is known.
+Image = tuple[Camera, np.ndarray, np.ndarray, SensorNoise | None]
 
 
 @final
@@ -120,7 +121,8 @@ class Plan:
                 pixels, found = without_outliers(pixels, counted, view.name, camera.width)
                 if found is not None:
                     outliers.append(asdict(found))
-                yield camera, _in_radiance(pixels, view), counted
+                noise = None if view.noise is None else view.noise.divided(view.exposure)
+                yield camera, _in_radiance(pixels, view), counted, noise
 
         made = fill(table, images(), self.chooses, first)
         return replace(made, told=replace(made.told, outliers=outliers))
@@ -156,14 +158,14 @@ def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0)
         first: number of the first pixel of the table.
     """
     start, sums, counts, seen = 0, [], [], []
-    for camera, pixels, counted in images:
+    for camera, pixels, counted, noise in images:
         stop = start + len(pixels)
         rgb = pixels[:, :3]
         table[start:stop, :3] = rgb
         if table.shape[1] == WITH_BLURRED:
             # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
             with np.errstate(over="ignore", invalid="ignore"):
-                table[start:stop, 3:] = _reference(rgb, counted, camera)
+                table[start:stop, 3:] = _reference(rgb, counted, camera, noise)
         sums.append(float((rgb[counted] if some else rgb).sum(dtype=np.float64)))
         counts.append(int(counted.sum()) if some else len(pixels))
         if some:
@@ -173,7 +175,9 @@ def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0)
     return Decoded(table, chosen, Told(sums, counts, []))
 
 
-def _reference(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarray:
+def _reference(
+    rgb: np.ndarray, counts: np.ndarray, camera: Camera, sensor: SensorNoise | None
+) -> np.ndarray:
     """The radiance that errors of a pixel are relative to (ours).
 
     √(mean² + noise² + peak²): the mean of those of the 5 x 5 pixels around each one that count; the
@@ -185,6 +189,7 @@ def _reference(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarra
         rgb: of one view, linear, shape (pixels, 3).
         counts: whether a pixel counts, shape (pixels,). Background that is hidden is black, and
             says nothing about the noise of the foreground.
+        sensor: whose noise it is; None: it is told from the neighbours of a pixel.
     """
     shape = (camera.height, camera.width, -1)
     image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
@@ -200,7 +205,10 @@ def _reference(rgb: np.ndarray, counts: np.ndarray, camera: Camera) -> np.ndarra
         inside *= counted
         np.maximum(second, np.minimum(first, there), out=second)
         np.maximum(first, there, out=first)
-    noise = np.nan_to_num(_mean_of_counted(response**2, inside))
+    if sensor is None:
+        noise = np.nan_to_num(_mean_of_counted(response**2, inside))
+    else:
+        noise = sensor.variance(mean)
     peak = np.maximum(known - second, 0)
     return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)
 

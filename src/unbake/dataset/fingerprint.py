@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ _CHUNK = 1 << 20  # bytes
 def fingerprint(dataset: Dataset) -> dict[str, str]:
     """SHA-256 of the parts of a data set: `photographs`, `poses`, `views` and `scene`.
 
-    `photographs` are the image files with their masks, exposures and limits, `poses` the cameras
+    `photographs` are the image files with masks, exposures, limits and noise, `poses` the cameras
     with their intrinsics, `views` the names and splits, and `scene` the scene with its meshes,
     textures and included files. Where the folder lies does not count. Files are read, not decoded:
     about a second for a gigabyte on each core.
@@ -37,6 +38,9 @@ def fingerprint(dataset: Dataset) -> dict[str, str]:
     known = [[view.exposure, view.clipped] for view in views]
     if any(pair != [1, None] for pair in known):
         photographs = [photographs, known]
+    noise = [None if view.noise is None else asdict(view.noise) for view in views]
+    if any(noise):
+        photographs = [photographs, noise]
     return {"photographs": _of_values(photographs)} | _of_geometry(dataset)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, final
@@ -38,6 +38,8 @@ _MEASURABLE = (1e-12, 1e12)
 _MEANT = {
     "exposure": "the photograph is radiance times this number, 1 by default",
     "clipped": "from this value on the photograph says only that it is as bright at least",
+    "shot": "the variance of the noise of a decoded value x is shot · x + read²",
+    "read": "the variance of the noise of a decoded value x is shot · x + read²",
 }
 #: Bytes of the name of a view, which files of results are named after.
 _LONGEST_NAME = 200
@@ -49,6 +51,27 @@ _NEED_HDR = (
 )
 _CODED = "Code values of the sRGB curve are read from PNG, JPEG and TIFF files"
 _REPLACE = f"Write the image again, or remove its frame from {TRANSFORMS}"
+
+
+@final
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of decoded values x of a photograph, with the variance shot · x + read².
+
+    A sensor that counts e electrons at x = 1, with a read noise of r electrons, has shot = 1 / e
+    and read = r / e.
+    """
+
+    shot: float = 0.0
+    read: float = 0.0
+
+    def divided(self, exposure: float) -> SensorNoise:
+        """The noise of values that were divided by a number."""
+        return SensorNoise(self.shot / exposure, self.read / exposure)
+
+    def variance(self, values: np.ndarray) -> np.ndarray:
+        """The variance of values that are known without noise, of the same shape."""
+        return np.float32(self.shot) * np.maximum(values, 0) + np.float32(self.read**2)
 
 
 @final
@@ -70,6 +93,7 @@ class View:
         exposure: the photograph is radiance times this number.
         clipped: value of the decoded photograph from which on a channel says "at least that much";
             None: it says what it says.
+        noise: of the decoded photograph; None: it is told from neighbouring pixels.
     """
 
     name: str
@@ -81,6 +105,7 @@ class View:
     mask: Path | None = None
     exposure: float = 1.0
     clipped: float | None = None
+    noise: SensorNoise | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image", Path(self.image))
@@ -412,7 +437,20 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
         mask=mask,
         exposure=_positive(frame, "exposure", where) or 1.0,
         clipped=clipped,
+        noise=_noise(frame if "noise" in frame else top, where),
     )
+
+
+def _noise(table: dict[str, Any], where: str) -> SensorNoise | None:
+    """The key of a frame, or of all; None where the table has none, or null."""
+    told = table.get("noise")
+    if told is None:
+        return None
+    if not isinstance(told, dict) or not told or told.keys() - {"shot", "read"}:
+        remedy = 'It is a table such as {"shot": 0.001, "read": 0.002}'
+        raise UserError("'noise' is no table of 'shot' and 'read'", where, remedy)
+    there = f"{where}: 'noise'"
+    return SensorNoise(**{key: _positive(told, key, there) or 0.0 for key in told})
 
 
 def _positive(table: dict[str, Any], key: str, where: str) -> float | None:
@@ -488,6 +526,7 @@ def _frame(data: DataFolder, view: View) -> dict[str, Any]:
         **({} if view.mask is None else {"mask_path": data.relative(view.mask)}),
         **({} if view.exposure == 1 else {"exposure": view.exposure}),
         **({} if view.clipped is None else {"clipped": view.clipped}),
+        **({} if view.noise is None else {"noise": asdict(view.noise)}),
     }
 
 

@@ -17,6 +17,7 @@ from ..io import write_atomically
 from ..quantities import QUANTITIES
 from ..scene.emitters import ENVIRONMENTS, STRENGTHS
 from ..scene.parse import ParsedScene, is_reference, referenced, write
+from ..scene.triangles import write_mesh
 from .bake import Baked, bake_texture, make_texture
 from .lights import Light
 from .parts import Part
@@ -176,7 +177,7 @@ def _replace_shapes(
     ):
         file = folder / _MESHES / f"{stem}.ply"
         triangles = placed.get(id(part), part.triangles)
-        write_ply(file, triangles)
+        write_mesh(file, *triangles.arrays)
         node = mi.parser.SceneNode()
         node.type = mi.ObjectType.Shape
         node.props.set_plugin_name("ply")
@@ -189,30 +190,6 @@ def _replace_shapes(
         scene.append_to_root(f"exported shape {number}", node)
         names[f"{_MESHES}/{stem}.ply"] = part.name
     return names
-
-
-def write_ply(path: Path, mesh: Triangles) -> None:
-    """Write a binary PLY file with positions, normals and texture coordinates, if there are any."""
-    columns = {"x": mesh.positions[:, 0], "y": mesh.positions[:, 1], "z": mesh.positions[:, 2]}
-    if mesh.normals is not None:
-        columns |= {f"n{axis}": mesh.normals[:, i] for i, axis in enumerate("xyz")}
-    if mesh.uv is not None:
-        columns |= {axis: mesh.uv[:, i] for i, axis in enumerate("uv")}
-    vertices = np.stack(list(columns.values()), -1).astype("<f4")
-    faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<u4", 3)]))
-    faces["count"], faces["corners"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in columns]
-    header += [f"element face {len(faces)}", "property list uchar uint vertex_indices"]
-    text = "\n".join([*header, "end_header\n"]).encode()
-
-    def save(target: Path) -> None:
-        with target.open("wb") as file:
-            file.write(text)
-            file.write(np.ascontiguousarray(vertices).tobytes())
-            file.write(faces.tobytes())
-
-    write_atomically(path, save)
 
 
 def _name_shapes(path: Path, names: dict[str, str]) -> None:

@@ -22,6 +22,11 @@ class Triangles:
     normals: np.ndarray | None  #: (n, 3), unit; None: faces are flat
     uv: np.ndarray | None  #: (n, 2), Mitsuba's texture coordinates; None: there are none
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
+        """All four, as functions for meshes take them."""
+        return self.positions, self.faces, self.normals, self.uv
+
     def moved(self, matrix: np.ndarray) -> Triangles:
         """The same after an affine map (4, 4); a mirroring one turns the triangles around."""
         linear = matrix[:3, :3].astype(np.float64)

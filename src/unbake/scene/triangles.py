@@ -7,6 +7,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from ..io import write_atomically
+
 
 def mesh_of(
     positions: np.ndarray,
@@ -50,5 +52,10 @@ def write_mesh(
     normals: np.ndarray | None = None,
     uv: np.ndarray | None = None,
 ) -> None:
-    """Write a mesh as binary PLY; see `mesh_of`."""
-    mesh_of(positions, faces, normals, uv, name=file.stem).write_ply(str(file))
+    """Write a mesh as binary PLY; see `mesh_of`.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    mesh = mesh_of(positions, faces, normals, uv, name=file.stem)
+    write_atomically(file, lambda path: mesh.write_ply(str(path)), what="mesh")
