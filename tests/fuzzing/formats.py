@@ -127,6 +127,15 @@ def _nerfstudio() -> Sequence[bytes]:
     return [json.dumps(content).encode()]
 
 
+def _told_data_sets() -> Sequence[bytes]:
+    """A data set of the first version, and one that tells what photographs are."""
+    (first,) = _files("data/transforms.json")()
+    told = json.loads(first)
+    told |= {"noise": {"shot": 0.001, "read": 0.002}, "clipped": 4.0}
+    told["frames"][0] |= {"exposure": 2.0, "noise": {"shot": 0.002}, "clipped": None}
+    return [first, json.dumps(told).encode()]
+
+
 def _load_data(folder: Path) -> None:
     from unbake.dataset.views import Dataset
 
@@ -398,6 +407,43 @@ def _load_signed_run(folder: Path) -> None:
         _load_run(folder)
 
 
+@cache
+def _solved() -> dict[str, bytes]:
+    """The files of a solved radiance field, a small one, by name."""
+    from tempfile import TemporaryDirectory
+
+    from unbake.fields.domain import Domain
+    from unbake.fields.radiance import make_radiance
+    from unbake.fields.settings import DenseGridConfig
+    from unbake.scene.geometry import RAYS
+    from unbake.training.solved import write_solved
+
+    settings, domain = DenseGridConfig(3), Domain((0.0, 0.5, 1.0), 2.0)
+    radiance = make_radiance("grid", settings, domain, scale=1.0, seed=0)
+    told = {
+        "representation": "grid",
+        "settings": {"cells": 3},
+        "domain": {"centre": [0.0, 0.5, 1.0], "extent": 2.0},
+        "scale": 1.0,
+        "geometry": [0.5] * RAYS,
+    }
+    manifest = {"format": 1, "scene": "room.xml", "radiance": told, "measurements": [{"step": 60}]}
+    with TemporaryDirectory() as folder:
+        write_solved(Path(folder), radiance, manifest)
+        return {file.name: file.read_bytes() for file in Path(folder).iterdir()}
+
+
+def _solved_folder(folder: Path) -> None:
+    for name, content in _solved().items():
+        (folder / name).write_bytes(content)
+
+
+def _read_solved(folder: Path) -> None:
+    from unbake.training.solved import read_solved
+
+    read_solved(folder)
+
+
 _LOG = "".join(
     json.dumps(row) + "\n"
     for row in (
@@ -428,7 +474,7 @@ def _read_searches(folder: Path) -> None:
 
 FORMATS: dict[str, Format] = {
     "transforms.json": Format(
-        "transforms.json", _files("data/transforms.json"), mutations.JSON, _load_data, _data_set, 3
+        "transforms.json", _told_data_sets, mutations.JSON, _load_data, _data_set, 3
     ),
     "cameras": Format("cameras.json", _texts(CAMERAS), mutations.JSON, _read_cameras, weight=3),
     "emission.json": Format(
@@ -451,6 +497,14 @@ FORMATS: dict[str, Format] = {
     "metrics.json": Format(
         "run/evaluation/metrics.json", _files("run/evaluation/metrics.json"), mutations.JSON,
         _report, _run, 0.6, ("page.html",),
+    ),
+    "solve.json": Format(
+        "solve.json", lambda: [_solved()["solve.json"]], mutations.JSON, _read_solved,
+        _solved_folder,
+    ),
+    "solved field": Format(
+        "radiance.safetensors", lambda: [_solved()["radiance.safetensors"]],
+        mutations.SAFETENSORS, _read_solved, _solved_folder, 0.5,
     ),
     "rates.json": Format("rates.json", _texts(_SEARCHES), mutations.JSON, _read_searches),
     "checkpoint": Format(

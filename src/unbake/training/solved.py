@@ -28,15 +28,17 @@ from ..config.tables import update
 from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..fields.domain import Domain
-from ..fields.radiance import RadianceField, make_radiance
+from ..fields.radiance import EXTRA, OUTPUTS, RadianceField, make_radiance
 from ..fields.registry import representation
-from ..fields.settings import FieldSettings
+from ..fields.settings import FieldSettings, SizedSettings
 from ..formats import check_format
 from ..io import read_object, require_file, write_atomically, write_json
 from ..scene.geometry import RAYS, probe
 
 #: Format of `solve.json`.
 FORMAT = 1
+#: Numbers by which a small grid may be told to be larger than it is.
+_SLACK = 1 << 20
 MANIFEST, FIELD = "solve.json", "radiance.safetensors"
 #: What reading a damaged manifest raises.
 _DAMAGED = (KeyError, IndexError, TypeError, ValueError, OverflowError, UserError)
@@ -108,11 +110,15 @@ def read_solved(folder: Path | str) -> Solved:
         sound = len(centre) == 3 and len(geometry) == RAYS and min(extent, scale) > 0
         if not sound or not all(map(math.isfinite, (*centre, extent, scale, *geometry))):
             raise ValueError("a number is none that it can have")
+        found = load(content)
+        wanted = settings.numbers(OUTPUTS, EXTRA) if isinstance(settings, SizedSettings) else 0
+        if wanted > 2 * sum(x.size for x in found.values()) + _SLACK:
+            raise ValueError(f"{FIELD} has fewer numbers than its settings ask for")
         radiance = make_radiance(
             form, settings, Domain(cast(Any, centre), extent), scale=scale, seed=0
         )
         steps = int(manifest["measurements"][-1]["step"])
-        found, fresh = load(content), radiance.parameters()
+        fresh = radiance.parameters()
     except (*_DAMAGED, SafetensorError) as error:
         raise UserError(f"is no field that can be read ({error})", folder, _AGAIN) from None
     if {k: v.shape for k, v in found.items()} != {k: tuple(v.shape) for k, v in fresh.items()}:
