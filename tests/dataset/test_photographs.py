@@ -15,7 +15,7 @@ from unbake import memory
 from unbake.dataset import decoding
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
-from unbake.dataset.outliers import told_outliers, without_outliers
+from unbake.dataset.hot_pixels import told_hot_pixels, without_hot_pixels
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.dataset.views import Dataset, SensorNoise, View
@@ -447,7 +447,7 @@ def test_photographs_that_do_not_fit_the_memory_are_refused_before_they_are_read
         Photographs.load(made, False)
 
 
-# ------------------------------------------------------------------------------------- Outliers
+# ----------------------------------------------------------------------------------- Hot pixels
 
 
 @pytest.mark.parametrize("where", ["memory", "disk"])
@@ -469,12 +469,12 @@ def test_a_pixel_that_is_far_too_bright_is_told_and_made_as_dark_as_others(
     made = Dataset(tmp_path, tmp_path / "s.xml", "visible", views, {}, None)
     for _ in range(2):  # decoded, and from the cache
         found = Photographs.load(made, False)
-        pixel, limit = found.table[7 * 20 + 11], found.outliers[0].limit
+        pixel, limit = found.table[7 * 20 + 11], found.hot_pixels[0].limit
         assert 0.8 < limit < 0.9 and 0.4 < found.mean < 0.6
         np.testing.assert_allclose(pixel[:3], [limit, limit / 2, 0], rtol=1e-5)
         assert found.table[:, 3:].max() < 1
-        assert [o.view for o in found.outliers] == ["0", "1", "2", "4"]
-        line = told_outliers(found.outliers)
+        assert [o.view for o in found.hot_pixels] == ["0", "1", "2", "4"]
+        line = told_hot_pixels(found.hot_pixels)
         assert line.startswith(
             "4 pixels are over 10,000 times as bright as the others: "
             f"0 at (11, 7): 1e+08, taken as {limit:.3g}; 1 at (11, 7)"
@@ -482,22 +482,22 @@ def test_a_pixel_that_is_far_too_bright_is_told_and_made_as_dark_as_others(
         assert line.endswith("; and 1 more")
 
 
-def test_a_lamp_in_a_dark_room_is_no_outlier():
+def test_a_lamp_in_a_dark_room_is_no_hot_pixel():
     rng = np.random.default_rng(1)
     pixels = np.c_[rng.uniform(0.001, 0.01, (4096, 3)), np.ones(4096)].astype(np.float32)
     pixels[:3, :3] = 50
-    kept, found = without_outliers(pixels, np.ones(4096, bool), "a", 64)
+    kept, found = without_hot_pixels(pixels, np.ones(4096, bool), "a", 64)
     assert kept is pixels and found is None
     # Nor is the background that is not trained on, nor anything in a black photograph
     pixels[3, :3] = 1e9
     counted = np.arange(4096) != 3
-    assert without_outliers(pixels, counted, "a", 64)[1] is None
+    assert without_hot_pixels(pixels, counted, "a", 64)[1] is None
     pixels[4:, :3] = 0
-    assert without_outliers(pixels, np.ones(4096, bool), "a", 64)[1] is None
+    assert without_hot_pixels(pixels, np.ones(4096, bool), "a", 64)[1] is None
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_limit_beyond_32_bits_is_none():
     """NumPy would warn of an overflow, with a line of our source."""
     pixels = np.full((4096, 4), 3e37, np.float32)
-    assert without_outliers(pixels, np.ones(4096, bool), "a", 64)[1] is None
+    assert without_hot_pixels(pixels, np.ones(4096, bool), "a", 64)[1] is None

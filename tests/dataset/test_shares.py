@@ -97,16 +97,16 @@ def test_a_process_holds_its_views_alone(dataset, background, where, monkeypatch
         assert part.share.ranks.rank == rank
 
 
-def test_outliers_are_told_of_all_views(dataset, monkeypatch):
+def test_hot_pixels_are_told_of_all_views(dataset, monkeypatch):
     made = dataset("visible", masked=False)
     pixels = np.array(mi.Bitmap(str(made.train[3].image)))
     pixels[4, 5, :3] = 1e9
     mi.Bitmap(pixels).write(str(made.train[3].image))
-    whole = Photographs.load(made, False).outliers
+    whole = Photographs.load(made, False).hot_pixels
     assert [found.view for found in whole] == ["3"]
     for limit in (module.IN_MEMORY, 0):
         monkeypatch.setattr(module, "IN_MEMORY", limit)
-        assert all(part.outliers == whole for part in loaded(made, 2))
+        assert all(part.hot_pixels == whole for part in loaded(made, 2))
 
 
 def test_processes_of_one_machine_share_its_memory(dataset, monkeypatch):

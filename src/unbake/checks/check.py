@@ -27,7 +27,7 @@ from ..dataset.findings import (
     named,
     unequal_exposures,
 )
-from ..dataset.outliers import told_outliers, without_outliers
+from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
 from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, seen_by, small_camera, small_view
@@ -200,9 +200,9 @@ def _checked(
     counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
     if hidden:
         counted &= pixels[:, 3] > 0
-    cleaned, outliers = without_outliers(pixels, counted, view.name, camera.width)
-    if outliers is not None and (told := told_outliers([outliers])):
-        result.warn("outliers", told, None, "Remove them where they are no light that is seen")
+    cleaned, hot_pixels = without_hot_pixels(pixels, counted, view.name, camera.width)
+    if hot_pixels is not None and (told := told_hot_pixels([hot_pixels])):
+        result.warn("hot pixels", told, None, "Remove them where they are no light that is seen")
     alpha = cleaned[:, 3] * counted if hidden else counted
     light = cleaned[:, :3] if view.exposure == 1 else cleaned[:, :3] / np.float32(view.exposure)
     small = small_view(view.name, camera, light, alpha)

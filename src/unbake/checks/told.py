@@ -11,7 +11,7 @@ from .check import CheckedView, DataCheck
 
 #: The checks in the order in which they are told, and those that each row stands for.
 _ROWS = {
-    "files": ("files", "scene", "masks", "outliers"),
+    "files": ("files", "scene", "masks", "hot pixels"),
     "geometry": ("geometry", "units"),
     "alignment": ("alignment",),
     "exposure": ("exposure",),

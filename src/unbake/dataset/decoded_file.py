@@ -94,7 +94,7 @@ def _open_cache(data: DataFolder, key: dict[str, Any]) -> Decoded | None:
             chosen = _mapped(data.cached_foreground, stored["foreground"], np.uint32, shape)
             if chosen.max(initial=0) >= len(table):
                 return None
-        told = Told(stored["sums"], stored["counts"], stored["outliers"])
+        told = Told(stored["sums"], stored["counts"], stored["hot_pixels"])
         found = Decoded(table, chosen, told)
         if len(table if chosen is None else chosen) != sum(told.counts):
             return None

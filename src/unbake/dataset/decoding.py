@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UserError
 from .camera import Camera
-from .outliers import without_outliers
+from .hot_pixels import without_hot_pixels
 from .shares import dealt
 from .views import Dataset, SensorNoise, View, read_masked
 
@@ -35,12 +35,12 @@ class Told:
     Args:
         sums: of the pixels to train on and their channels, by view.
         counts: of the pixels to train on, by view.
-        outliers: as `Outliers` has them.
+        hot_pixels: as `HotPixels` has them.
     """
 
     sums: list[float]
     counts: list[int]
-    outliers: list[dict[str, Any]]
+    hot_pixels: list[dict[str, Any]]
 
 
 @final
@@ -63,8 +63,8 @@ class Decoded:
         chosen, told = self.chosen, self.told
         if chosen is not None:
             chosen = chosen[slice(*np.searchsorted(chosen, (pixels.start, pixels.stop)))]
-        outliers = [found for found in told.outliers if found["view"] in names]
-        told = Told(told.sums[views], told.counts[views], outliers)
+        hot_pixels = [found for found in told.hot_pixels if found["view"] in names]
+        told = Told(told.sums[views], told.counts[views], hot_pixels)
         return Decoded(self.table[pixels], chosen, told)
 
 
@@ -109,7 +109,7 @@ class Plan:
         Args:
             first: number of the first pixel of the table.
         """
-        outliers: list[dict[str, Any]] = []
+        hot_pixels: list[dict[str, Any]] = []
 
         def images() -> Iterator[Image]:
             for view in views:
@@ -118,14 +118,14 @@ class Plan:
                 counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
                 if self.hidden:
                     counted &= pixels[:, 3] > 0
-                pixels, found = without_outliers(pixels, counted, view.name, camera.width)
+                pixels, found = without_hot_pixels(pixels, counted, view.name, camera.width)
                 if found is not None:
-                    outliers.append(asdict(found))
+                    hot_pixels.append(asdict(found))
                 noise = None if view.noise is None else view.noise.divided(view.exposure)
                 yield camera, _in_radiance(pixels, view), counted, noise
 
         made = fill(table, images(), self.chooses, first)
-        return replace(made, told=replace(made.told, outliers=outliers))
+        return replace(made, told=replace(made.told, hot_pixels=hot_pixels))
 
 
 def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:

@@ -21,7 +21,7 @@ from ..ranks import Ranks
 from .camera import Camera
 from .decoded_file import in_file
 from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Told, fill
-from .outliers import Outliers
+from .hot_pixels import HotPixels
 from .shares import Share
 from .views import PIXEL_BYTES, Dataset
 
@@ -49,7 +49,7 @@ class Photographs:
             alpha > 0 are taken (the paper: at least half of them). Pixels that are masked are never
             taken.
         mean: mean radiance of the pixels to train on, of all views.
-        outliers: pixels that were too bright and are not as in the images, by view, of all views.
+        hot_pixels: pixels that were too bright and are not as in the images, by view, of all views.
         share: what this process holds; None: all.
 
     Paper: Sec. 5.4.
@@ -58,7 +58,7 @@ class Photographs:
     table: np.ndarray
     chosen: np.ndarray | None
     mean: float
-    outliers: tuple[Outliers, ...] = ()
+    hot_pixels: tuple[HotPixels, ...] = ()
     share: Share | None = None
 
     @property
@@ -215,8 +215,8 @@ def _made(
     # One after the other, so that the mean is the same however views are dealt
     total = reduce(add, (value for told in every for value in told.sums), 0.0)
     count = sum(sum(told.counts) for told in every)
-    outliers = tuple(Outliers(**found) for told in every for found in told.outliers)
-    return Photographs(decoded.table, decoded.chosen, total / max(3 * count, 1), outliers, share)
+    hot_pixels = tuple(HotPixels(**found) for told in every for found in told.hot_pixels)
+    return Photographs(decoded.table, decoded.chosen, total / max(3 * count, 1), hot_pixels, share)
 
 
 def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:

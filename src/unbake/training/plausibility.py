@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..dataset.outliers import told_outliers
+from ..dataset.hot_pixels import told_hot_pixels
 from ..dataset.pixels import PixelSource
 from ..dataset.poses import pose_warnings
 from ..dataset.quick_check import quick_findings
@@ -50,8 +50,8 @@ def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> li
         found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
         units = None if found else _other_units(pixels, problem)
     response = untold_response(dataset.train, problem.camera)
-    outliers = told_outliers(pixels.photographs.outliers)
-    return [line for line in (*found, units, response, outliers) if line]
+    hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
+    return [line for line in (*found, units, response, hot_pixels) if line]
 
 
 def untold_response(views: Sequence[View], camera: CameraModel | None) -> str | None:

@@ -1,4 +1,4 @@
-"""Pixels of photographs that are too bright to be measurements, such as fireflies of a renderer.
+"""Hot pixels: too bright to be measurements, as of a sensor or as fireflies of a renderer.
 
 One such pixel is most of the mean radiance of all photographs, and of every batch that it is in.
 """
@@ -12,25 +12,25 @@ import numpy as np
 
 from ..errors import printable
 
-#: A pixel is an outlier if it is so many times as bright as the brightest of the others. A lamp
+#: A pixel is hot if it is so many times as bright as the brightest of the others. A lamp
 #: that is seen in a dark room is some hundred times as bright as the room.
 EXTREME = 1e4
-#: How many of the brightest pixels of a view may be outliers: a share, but some of a small view.
+#: How many of the brightest pixels of a view may be hot: a share, but some of a small view.
 _SHARE, _LEAST = 1e-3, 8
 #: Views that are told; of more there is the number.
 _TOLD = 3
 
 
 @dataclass(frozen=True)
-class Outliers:
-    """The outliers of a view.
+class HotPixels:
+    """The hot pixels of a view.
 
     Args:
         view: its name.
-        count: of outliers.
+        count: of hot pixels.
         column, row: of the brightest, from the top left.
         value: of the brightest: its largest channel, linear.
-        limit: what the largest channel of outliers was set to.
+        limit: what the largest channel of hot pixels was set to.
     """
 
     view: str
@@ -41,10 +41,10 @@ class Outliers:
     limit: float
 
 
-def without_outliers(
+def without_hot_pixels(
     pixels: np.ndarray, counted: np.ndarray, view: str, width: int
-) -> tuple[np.ndarray, Outliers | None]:
-    """The pixels of a view, the outliers as dark as the brightest of the others.
+) -> tuple[np.ndarray, HotPixels | None]:
+    """The pixels of a view, the hot ones as dark as the brightest of the others.
 
     Args:
         pixels: linear RGB and alpha, row by row, shape (pixels, 4).
@@ -53,7 +53,7 @@ def without_outliers(
         width: of the view, in pixels.
 
     Returns:
-        The same array if there are no outliers; else a copy, with the outliers' hue as it was.
+        The same array if there are no hot pixels; else a copy, with their hue as it was.
     """
     brightness = pixels[:, :3].max(axis=1)
     known = brightness[counted]
@@ -68,11 +68,11 @@ def without_outliers(
     pixels = pixels.copy()
     pixels[over, :3] *= limit / brightness[over, None]
     value = float(brightness[row * width + column])
-    return pixels, Outliers(view, int(over.sum()), column, row, value, limit)
+    return pixels, HotPixels(view, int(over.sum()), column, row, value, limit)
 
 
-def told_outliers(found: Iterable[Outliers]) -> str | None:
-    """One line on the outliers of all views; None where there are none."""
+def told_hot_pixels(found: Iterable[HotPixels]) -> str | None:
+    """One line on the hot pixels of all views; None where there are none."""
     views = list(found)
     if not views:
         return None
