@@ -93,6 +93,41 @@ def test_other_images_of_a_room_hold_code_values(captured, photographed, tmp_pat
         assert np.abs(codes(mine).astype(int) - codes(known)).max() <= 1
 
 
+def test_exposures_of_a_room_are_those_that_it_tells(photographed, tmp_path):
+    told, cam = [], photographed / "ldr" / "cam"
+    cam.mkdir()
+    np.save(cam / "exposure.npy", np.array([0.5, 2.0, 4.0]))
+    np.save(cam / "crf.npy", np.zeros((3, 1024)))
+    import_data(photographed, tmp_path / "data", images=photographed / "ldr", tell=told.append)
+    assert [view.exposure for view in Dataset.load(tmp_path / "data").views] == [0.5, 2.0, 4.0]
+    assert any("by the source" in line for line in told)
+    assert any("--response monotone" in line for line in told)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.array([1.0, 2.0]),
+        np.array([1.0, 2.0, 0.0]),
+        np.array([1.0, np.nan, 1.0]),
+        np.array(["a", "b", "c"]),
+        np.array([1.0, None, {}], object),
+        b"",
+        b"\x93NUMPY\x01\x00v\x00",
+    ],
+    ids=["too few", "zero", "NaN", "text", "objects", "empty", "cut"],
+)
+def test_exposures_that_cannot_be_are_refused(photographed, tmp_path, wrong):
+    (photographed / "ldr" / "cam").mkdir()
+    file = photographed / "ldr" / "cam" / "exposure.npy"
+    if isinstance(wrong, bytes):
+        file.write_bytes(wrong)
+    else:
+        np.save(file, wrong)
+    with pytest.raises(ImportFaults, match="is not 3 positive numbers"):
+        import_data(photographed, tmp_path / "data", images=photographed / "ldr", tell=quiet)
+
+
 def test_a_rendered_room_comes_back(captured, rendered, tmp_path, unbake, monkeypatch):
     monkeypatch.chdir(tmp_path)
     block = re.search(

@@ -1,4 +1,4 @@
-"""How much light photographs took, from their EXIF or from a table."""
+"""How much light photographs took, from their source, their EXIF or from a table."""
 
 from __future__ import annotations
 
@@ -25,13 +25,16 @@ _SAME = 1e-6
 
 
 def exposures_of(shots: Sequence[Shot]) -> tuple[dict[str, float], str]:
-    """Exposures by the names of photographs, from their EXIF, and a line that tells of them.
+    """Exposures by the names of photographs, and a line that tells of them.
 
-    An exposure is seconds x ISO / 100 / f-number², relative to the geometric mean over the
-    photographs, so that the product of all is 1. There are none where a photograph does not tell
-    seconds and ISO, or where all are the same. An f-number that none of them tells, as with old
-    lenses, is taken to be the same.
+    They are what the source says. Else EXIF tells: an exposure is seconds x ISO / 100 / f-number²,
+    relative to the geometric mean over the photographs, so that the product of all is 1. There are
+    none where a photograph does not tell seconds and ISO, or where all are the same. An f-number
+    that none of them tells, as with old lenses, is taken to be the same.
     """
+    said = {shot.name: shot.exposure for shot in shots if shot.exposure is not None}
+    if said:
+        return said, f"exposures: {_spread(said)}, by the source"
     taken = [shot for shot in shots if shot.coded or shot.raw]
     if not taken:
         return {}, "exposures: not told, photographs are taken for radiance in one unit"

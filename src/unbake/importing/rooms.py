@@ -6,6 +6,7 @@ Rooms that were photographed have their cameras in text files:
     cam.txt                 number of cameras; for each: position, a point it looks at, up
     K_list.txt              the same number; for each: the three rows of its intrinsics
     Image/000_0001.exr      photographs by number, with radiance; or .png with code values
+    Image/cam/exposure.npy  of IRIS, beside code values: the exposure of each photograph
 
 Rooms that were rendered have a folder for each split:
 
@@ -33,6 +34,10 @@ from .lens import Lens
 from .source import Shot, Source, image_header, with_suffix
 
 _MESH, _POSES, _LENSES, _IMAGES = "scene.obj", "cam.txt", "K_list.txt", "Image"
+_EXPOSURES, _RESPONSE = Path("cam", "exposure.npy"), Path("cam", "crf.npy")
+#: The least exposure.
+_LEAST = 1e-9
+_UNKNOWN_RESPONSE = f"response: {_RESPONSE} is not used; a fit finds it with --response monotone"
 _SPLITS = {"train": "train", "val": "heldout"}
 #: The cosine of view direction and up, at most: they are perpendicular but for rounding.
 _SKEWED = 0.01
@@ -57,9 +62,11 @@ def read_room(folder: Path, images: Path | None, allow_outside: bool, faults: Fa
     mesh = folder / _MESH if (folder / _MESH).is_file() else None
     shots: list[Shot] = []
     if not _has_split(folder / "train"):
+        root = images or folder / _IMAGES
         with faults.collected():
-            shots += _photographed(folder, images, allow_outside, faults)
-        return Source("FIPT", tuple(shots), mesh=mesh)
+            shots += _photographed(folder, root, allow_outside, faults)
+        notes = (_UNKNOWN_RESPONSE,) if (root / _RESPONSE).is_file() else ()
+        return Source("FIPT", tuple(shots), notes, mesh)
     if images is not None:
         faults.add("a room with train and val has no other folder of images", images)
     for name, split in _SPLITS.items():
@@ -73,22 +80,35 @@ def _has_split(folder: Path) -> bool:
     return (folder / TRANSFORMS).is_file() and (folder / _IMAGES).is_dir()
 
 
-def _photographed(
-    folder: Path, images: Path | None, allow_outside: bool, faults: Faults
-) -> list[Shot]:
+def _photographed(folder: Path, root: Path, allow_outside: bool, faults: Faults) -> list[Shot]:
     poses, lenses = _rows(folder / _POSES), _rows(folder / _LENSES)
     if len(poses) != len(lenses):
         what = f"{len(poses)} cameras in {_POSES}, {len(lenses)} in {_LENSES}"
         raise UserError(what, folder)
-    root, shots = images or folder / _IMAGES, []
+    exposures, shots = _exposures(root, len(poses)), []
     for index, (pose, rows) in enumerate(zip(poses, lenses, strict=True)):
         name = f"{index:03d}_0001"
         with faults.collected(name):
             image = _image(root, name, allow_outside)
             header = image_header(image)
             lens = _pinhole(rows, header.width, header.height)
-            shots.append(Shot(image.name, None, image, lens, _looking(*pose)))
+            told = None if exposures is None else exposures[index]
+            shots.append(Shot(image.name, None, image, lens, _looking(*pose), exposure=told))
     return shots
+
+
+def _exposures(root: Path, count: int) -> list[float] | None:
+    """The exposures of so many photographs; None where they are not told."""
+    file = root / _EXPOSURES
+    if not file.is_file():
+        return None
+    try:
+        told = np.load(file, mmap_mode="r", allow_pickle=False)
+        if told.shape == (count,) and (_LEAST <= told).all() and (told <= 1 / _LEAST).all():
+            return [float(value) for value in told]
+    except (OSError, ValueError, TypeError, EOFError):
+        pass
+    raise UserError(f"the file is not {count} positive numbers, one for each camera", file)
 
 
 def _rendered(

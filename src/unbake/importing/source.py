@@ -32,6 +32,7 @@ class Shot:
         lens: of the photograph.
         to_world: camera to world, (4, 4) float64, OpenGL axes, in the frame of the mesh.
         mask: a file, zero where pixels do not count; None: all count.
+        exposure: the photograph is radiance times this number; None: the source does not say.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Shot:
     lens: Lens
     to_world: np.ndarray
     mask: Path | None = None
+    exposure: float | None = None
 
     @property
     def coded(self) -> bool:
