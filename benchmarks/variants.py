@@ -88,12 +88,15 @@ def started(
     """The seeds of a file, and the scores of each: by data, method and settings.
 
     Args:
+        file: has no seeds where it is missing.
         about: what must be the same.
     """
+    if not file.is_file():
+        return [], {}
     before = json.loads(file.read_text(encoding="utf-8"))
     for key, value in about.items():
-        if before[key] != value:
-            raise SystemExit(f"{file}: {key}: {before[key]} is not {value}")
+        if before.get(key) != value:
+            raise SystemExit(f"{file}: {key}: {before.get(key)} is not {value}")
     rows = before["rows"]
     return before["seeds"], {(r["data"], r["method"], r["settings"]): r["runs"] for r in rows}
 

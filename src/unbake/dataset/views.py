@@ -450,10 +450,12 @@ def _noise(table: dict[str, Any], where: str) -> SensorNoise | None:
         remedy = 'It is a table such as {"shot": 0.001, "read": 0.002}'
         raise UserError("'noise' is no table of 'shot' and 'read'", where, remedy)
     there = f"{where}: 'noise'"
-    return SensorNoise(**{key: _positive(told, key, there) or 0.0 for key in told})
+    return SensorNoise(**{key: _positive(told, key, there, or_zero=True) or 0.0 for key in told})
 
 
-def _positive(table: dict[str, Any], key: str, where: str) -> float | None:
+def _positive(
+    table: dict[str, Any], key: str, where: str, *, or_zero: bool = False
+) -> float | None:
     """A positive number of single precision; None where the table has none, or null."""
     if table.get(key) is None:
         return None
@@ -462,7 +464,7 @@ def _positive(table: dict[str, Any], key: str, where: str) -> float | None:
         found = number(table, key, where)
     except UserError:
         found = math.nan
-    if not low <= found <= high:
+    if not (low <= found <= high or (or_zero and found == 0)):
         what = f"{key!r} is not a number from {low:g} to {high:g}"
         raise UserError(what, where, f"Correct it, or remove it: {_MEANT[key]}")
     return found
