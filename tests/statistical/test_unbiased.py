@@ -96,7 +96,7 @@ def test_all_pairs_have_less_noise_than_halves():
     assert pairs < 0.9 * halves
 
 
-@pytest.mark.parametrize("name", ["all pairs", "split halves"])
+@pytest.mark.parametrize("name", ["all pairs", "split halves", "two passes"])
 def test_the_value_is_the_squared_error_of_the_expected_image(name):
     value, _ = made_up(ESTIMATORS[name])
     naive_value, _ = made_up(ESTIMATORS["naive"])

@@ -247,6 +247,34 @@ def test_a_short_fit_of_skipped_steps_does_not_end_well(begun, monkeypatch):
         dog.read([reading(np.nan, 1.0)] * 4 + [reading(0.5)] * 2, last=True)
 
 
+# ------------------------------------------------------------------------------ the verdict
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "learned"),
+    [
+        ([2.0, 1.0] * 4, [1.0, 0.5] * 4, True),
+        ([2.0, 1.0] * 4, [2.0, 1.0] * 4, False),
+        ([2.0, 1.0] * 4, [9.0, 8.0] * 4, False),
+        # Most batches are better, one is lost in noise.
+        ([2.0, 1.0] * 4, [0.2, 0.1] * 3 + [0.2, 30.0], True),
+        # The noise of paths is so large that the batches do not tell.
+        ([2.0, 1.0, -1.0, 4.0] * 2, [-3.0, 7.0, 1.5, 2.0] * 2, True),
+        ([2.0, 1.0, -1.0, 4.0] * 2, [12.0, 17.0, 8.0, 21.0] * 2, False),
+        # Hardly anything changed, with or without a sign.
+        ([2.0, 1.0] * 4, [2.02, 0.995, 2.0, 1.01] * 2, False),
+    ],
+)
+def test_only_what_the_batches_tell_is_said_of_a_fit(begun, monkeypatch, before, now, learned):
+    dog, state, progress, _ = watching(begun)
+    progress.step, progress.untrained = LONG_ENOUGH, tuple(before)
+    monkeypatch.setattr(type(state), "moved", lambda _: True)
+    monkeypatch.setattr(Watchdog, "_looked_at_again", lambda *_: [reading(x) for x in now])
+    told = dog.verdict({"albedo": 0.01, "roughness": 0.01})
+    assert (told is None) == learned, told
+    assert learned or "no better than by the untrained fields" in told
+
+
 # ------------------------------------------------------------------------------- whole fits
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from statistics import median
+from statistics import median, stdev
 from typing import final
 
 from ..errors import UserError
@@ -37,10 +37,12 @@ _FAR = 10.0
 LONG_ENOUGH = 200
 #: Where the loss falls by less than this share, most batches must agree that it falls.
 _CLEARLY, _MOST = 0.01, 0.8
+#: Where the change of the loss has a standard error of more than this share, as with noisy paths,
+#: nothing is said unless the loss has risen by two of them.
+_NOISY, _SURE = 0.1, 2.0
 #: Parameters are of the order of one: those that moved by less have not learned anything.
 _STANDING = 1e-3
-#: A fit is worse than none where its loss is so many times that of black pictures. (That of noisy
-#: renderings is higher than that of their expectation, with an estimator of two passes.)
+#: A fit is worse than none where its loss is so many times that of black pictures.
 _WORSE_THAN_BLACK = 100.0
 _LOOK = "Look at the learning rates, the lights and the cameras"
 
@@ -150,8 +152,11 @@ class Watchdog:
         if not pairs:
             return None
         start, end = (sum(losses) / len(pairs) for losses in zip(*pairs, strict=True))
-        better = sum(b < a for a, b in pairs)
-        if start - end > _CLEARLY * abs(start) or better > _MOST * len(pairs):
+        fallen, better = start - end, sum(b < a for a, b in pairs)
+        if fallen > _CLEARLY * abs(start) or better > _MOST * len(pairs):
+            return None
+        error = stdev([a - b for a, b in pairs]) / math.sqrt(len(pairs)) if len(pairs) > 1 else 0
+        if error > _NOISY * abs(start) and fallen > -_SURE * error:
             return None
         return (
             "nothing was learned: the photographs are explained no better than by the untrained "

@@ -95,8 +95,8 @@ def squared_error(
     The gradient 2 (I − G) ∂I of a squared error is biased if both factors come from the same noisy
     samples. Without `primal` no sample of a pixel is multiplied by itself: the expectation of
     (Iᵢ − G)(Iⱼ − G) for two independent samples is the squared error of the expected image, and so
-    for its gradient. With `primal`, an estimate from other random numbers, the factors are that one
-    and ∂I.
+    for its gradient. With `primal`, an estimate from other random numbers, the value is the product
+    of the errors of the two estimates, and the factors of the gradient are that one's error and ∂I.
 
     Of a clipped channel only a shortfall counts: an estimate above G has no error and no gradient.
     Single samples fall short of G too often, so that such channels always have halves, whose
@@ -126,8 +126,9 @@ def squared_error(
         if gain is not None:
             image, primal = image * gain, primal * dr.detach(gain)
         error = one_sided(dr.detach(primal) - target, clipped)
-        # The value is the squared error of the primal image, the gradient 2 (primal − G) ∂I.
-        squared = dr.square(error) + 2 * error * (image - dr.detach(image))
+        # The value is the product of the errors of both passes, the gradient 2 (primal − G) ∂I.
+        product = error * one_sided(dr.detach(image) - target, clipped)
+        squared = product + 2 * dr.detach(error) * (image - dr.detach(image))
     elif not pairs:
         squared = _of_halves(samples, target, spp, clipped, gain)
     else:
