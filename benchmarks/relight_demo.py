@@ -1,27 +1,30 @@
 """How well recovered materials look under light that no photograph showed, by method.
 
     python benchmarks/relight_demo.py --work FOLDER --out FILE.json [--scenes demo still]
-        [--data NAME=FOLDER ...] [--methods ours direct prb] [--steps 1200] [--batch PIXELS]
-        [--seed 0] [--spp 128] [--resolution 128]
+        [--data NAME=FOLDER ...] [--methods ours direct prb] [--steps 1200 | --seconds 60]
+        [--batch PIXELS] [--seeds 0] [--spp 128] [--resolution 128]
 
 `demo`, a room, is lit by two lamps in other places and colours than its own; `still`, a few
 objects, by a sunny sky from another side than the hazy one of its photographs. --data takes
 captures of other scenes: rooms are lit by a warm and a cold ball where two of the training cameras
-stood, objects by the sunny sky. Each method is
-fitted to the photographs, with default settings and the same number of steps. Its materials are
-rendered from the held-out cameras under the new light, and compared with a capture of the true
-scene under it. So are materials before the first step, `untrained`. What is done in the folder is
-kept: data sets, runs, scores.
+stood, objects by the sunny sky. Each method is fitted to the photographs, with default settings and
+the same number of steps or seconds of training. Its materials are rendered from the held-out
+cameras under the new light, and compared with a capture of the true scene under it. So are
+materials before the first step, `untrained`, those of the first seed. The fits of a seed follow
+each other, and the file is written after each seed. What is done in the folder is kept: data sets,
+runs, scores.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
 import shutil
 import sys
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +42,13 @@ from views import of_size  # noqa: E402
 
 from unbake.config.light import LightConfig  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402
+from unbake.errors import UserError  # noqa: E402
 from unbake.evaluation.evaluate import evaluate  # noqa: E402
 from unbake.evaluation.rendering import relight  # noqa: E402
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings  # noqa: E402
 from unbake.evaluation.turntable import axis_of, up_of  # noqa: E402
 from unbake.experiments.commands import unbake  # noqa: E402
+from unbake.experiments.seeds import across_seeds  # noqa: E402
 from unbake.imaging.pictures import write_exr  # noqa: E402
 from unbake.io import read_object, write_json, write_text  # noqa: E402
 from unbake.machine import machine  # noqa: E402
@@ -61,55 +66,75 @@ RADIUS = 0.03
 
 
 def main() -> None:
-    """Fit, relight, print every score, and write the result after each method."""
+    """Fit, relight, print every score, and write the result after each seed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--work", type=Path, required=True, help="folder of data sets and runs")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--scenes", nargs="*", choices=("demo", "still"), default=["demo", "still"])
     parser.add_argument("--data", nargs="+", default=[], help="NAME=FOLDER, captured data sets")
     parser.add_argument("--methods", nargs="+", default=["ours", "direct", "prb"])
-    parser.add_argument("--steps", type=int, default=1200)
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=int, default=1200)
+    length.add_argument("--seconds", type=float, help="of training, instead of steps")
     parser.add_argument("--batch", type=int, help="pixels of a step (default: that of fits)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--spp", type=int, default=128, help="samples per pixel of relit pictures")
     parser.add_argument("--true-spp", type=int, default=TRUE_SAMPLES)
     parser.add_argument("--resolution", type=int, default=128)
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
+    stop = ("steps", args.steps) if args.seconds is None else ("seconds", args.seconds)
     found: dict[str, Any] = {
         "machine": machine(),
-        "steps": args.steps,
-        "seeds": [args.seed],
+        **dict([stop]),
         "batch": args.batch,
         "spp": args.spp,
+        "seeds": [],
         "scenes": {},
     }
     given = {name: Path(folder) for name, _, folder in (x.partition("=") for x in args.data)}
-    for scene in [*args.scenes, *given]:
-        data = given.get(scene, args.work / scene)
+    data = {name: args.work / name for name in args.scenes} | given
+    for scene, folder in data.items():
         truth = args.work / f"{scene}-truth"
-        if scene not in given and not data.exists():
-            unbake("capture", scene, "--out", data, "--resolution", args.resolution)
-        light = light_of(scene, data, args.work)
+        if scene not in given and not folder.exists():
+            unbake("capture", scene, "--out", folder, "--resolution", args.resolution)
         if not truth.exists():
-            capture_truth(scene, data, truth, light, args.true_spp, args.resolution)
-        rows: dict[str, Any] = {}
-        found["scenes"][scene] = {"data": described(truth), "methods": rows}
-        for method in [*args.methods, UNTRAINED]:
-            run = args.work / f"{scene}-{method}"
+            light = light_of(scene, folder, args.work)
+            capture_truth(scene, folder, truth, light, args.true_spp, args.resolution)
+        found["scenes"][scene] = {"data": described(truth), "methods": {}}
+    scores: dict[tuple[str, str], list[dict[str, float | None]]] = {}
+    for seed in args.seeds:
+        for scene, method in product(data, [*args.methods, UNTRAINED]):
+            if method == UNTRAINED and seed != args.seeds[0]:
+                continue
+            run = args.work / f"{scene}-{method}-{seed}"
             if not run.exists():
-                chosen = "ours" if method == UNTRAINED else method
-                steps = 0 if method == UNTRAINED else args.steps
-                options = ["--method", chosen, "--steps", steps, "--seed", args.seed]
-                options += [] if args.batch is None else ["--batch", args.batch]
-                unbake("fit", data, "--out", run, *options)
+                fit(data[scene], run, method, args.batch, seed, stop)
             kept = args.work / f"{run.name}-scores-{args.spp}.json"
             if not kept.exists():
+                light = light_of(scene, data[scene], args.work)
+                truth = args.work / f"{scene}-truth"
                 write_json(kept, measure(run, args.work, light, truth, args.spp))
-            rows[method] = row = read_object(kept)
-            write_json(args.out, found)
+            row = read_object(kept)
+            scores.setdefault((scene, method), []).append(row)
             told = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if k.endswith("_psnr"))
-            print(f"{scene}, {method}: {told}", flush=True)
+            print(f"{scene}, {method}, seed {seed}: {told}", flush=True)
+        found["seeds"].append(seed)
+        for (scene, method), rows in scores.items():
+            found["scenes"][scene]["methods"][method] = across_seeds(rows, rows[0])
+        write_json(args.out, found)
+
+
+def fit(
+    data: Path, run: Path, method: str, batch: int | None, seed: int, stop: tuple[str, float]
+) -> None:
+    """Fit a method to photographs, for so many steps or seconds; `untrained` takes no step."""
+    name, until = ("steps", 0) if method == UNTRAINED else stop
+    options = ["--method", "ours" if method == UNTRAINED else method, f"--{name}", until]
+    options += [] if batch is None else ["--batch", batch]
+    # A fit that learned nothing fails, and is judged as it is; one that left no run fails later.
+    with contextlib.suppress(UserError):
+        unbake("fit", data, "--out", run, "--seed", seed, *options)
 
 
 def light_of(scene: str, data: Path, work: Path) -> LightConfig:

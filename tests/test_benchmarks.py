@@ -492,12 +492,13 @@ def test_the_export_of_a_large_room_is_measured(repository, tmp_path):
 @pytest.mark.slow
 def test_other_scenes_are_compared_under_other_light(repository, cornell, tmp_path):
     words = ["--steps", 2, "--spp", 2, "--true-spp", 4, "--resolution", 8, "--batch", 64]
-    words += ["--methods", "direct", "--scenes", "--data", f"box={cornell}"]
+    words += ["--methods", "direct", "--scenes", "--data", f"box={cornell}", "--seeds", 0, 1]
     out = tmp_path / "relit.json"
     done = call(repository, "relight_demo.py", *words, "--work", tmp_path, "--out", out)
     assert done.returncode == 0, done.stderr[-3000:]
     (scene,) = read(out)["scenes"].values()
     assert scene["methods"].keys() == {"direct", "untrained"}
+    assert read(out)["seeds"] == [0, 1] and "albedo_psnr_sd" in scene["methods"]["direct"]
     assert all(np.isfinite(row["relit_render_psnr"]) for row in scene["methods"].values())
 
 
@@ -514,4 +515,4 @@ def test_materials_are_compared_under_other_light(repository, tmp_path):
         assert scene["methods"].keys() == {"direct", "untrained"}
         assert all(np.isfinite(row["relit_render_psnr"]) for row in scene["methods"].values())
         assert scene["data"] == {"views": 4, "width": 8, "height": 8, "true_spp": 4}
-    assert len(list((work / "still-direct-relit").glob("*.png"))) == 4
+    assert len(list((work / "still-direct-0-relit").glob("*.png"))) == 4
