@@ -137,6 +137,17 @@ def test_meshes_are_displaced_by_smooth_noise(cornell, degraded):
     assert np.abs(near - moved).max() < 2e-3
 
 
+def test_a_mesh_that_cannot_be_written_is_told_and_nothing_is_left(cornell, tmp_path, monkeypatch):
+    def full(mesh, path):
+        raise RuntimeError("No space left on device")
+
+    monkeypatch.setattr(mi.Mesh, "write_ply", full)
+    out = tmp_path / "degraded"
+    with pytest.raises(UserError, match="the mesh cannot be written"):
+        degrade(cornell, out, DegradeSettings(displace=0.01), tell=lambda line: None)
+    assert not out.exists()
+
+
 def test_large_meshes_lose_triangles(cornell, degraded, monkeypatch):
     pytest.importorskip("pycolmap", reason="fewer triangles need pycolmap")
     angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.linspace(-1, 1, 17))

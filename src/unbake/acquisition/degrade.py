@@ -31,6 +31,7 @@ from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
 from ..scene import free_space
 from ..scene.parse import ParsedScene, parse, write
+from ..scene.triangles import save_mesh
 from .decimate import FEWEST, decimated
 from .settings import DegradeSettings
 
@@ -287,8 +288,7 @@ def _change_meshes(
             params.update()
             dr.eval(params["vertex_positions"])
         file = folder.scene / "meshes" / f"changed-{number}.ply"
-        file.parent.mkdir(exist_ok=True)
-        mesh.write_ply(str(file))
+        save_mesh(file, mesh)
         for key in ("shape_index", "flip_tex_coords", "to_world"):
             if key in node.props:
                 del node.props[key]

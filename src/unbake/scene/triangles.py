@@ -57,5 +57,13 @@ def write_mesh(
     Raises:
         UserError: the file cannot be written.
     """
-    mesh = mesh_of(positions, faces, normals, uv, name=file.stem)
+    save_mesh(file, mesh_of(positions, faces, normals, uv, name=file.stem))
+
+
+def save_mesh(file: Path, mesh: mi.Mesh) -> None:
+    """Write a mesh of Mitsuba as binary PLY, wholly or not at all.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     write_atomically(file, lambda path: mesh.write_ply(str(path)), what="mesh")
