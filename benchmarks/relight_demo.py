@@ -2,7 +2,7 @@
 
     python benchmarks/relight_demo.py --work FOLDER --out FILE.json [--scenes demo still]
         [--data NAME=FOLDER ...] [--methods ours direct prb] [--steps 1200 | --seconds 60]
-        [--batch PIXELS] [--seeds 0] [--spp 128] [--resolution 128]
+        [--batch PIXELS] [--seeds 0] [--spp 128] [--resolution 128] [--picture FILE.png]
 
 `demo`, a room, is lit by two lamps in other places and colours than its own; `still`, a few
 objects, by a sunny sky from another side than the hazy one of its photographs. --data takes
@@ -11,8 +11,9 @@ stood, objects by the sunny sky. Each method is fitted to the photographs, with 
 the same number of steps or seconds of training. Its materials are rendered from the held-out
 cameras under the new light, and compared with a capture of the true scene under it. So are
 materials before the first step, `untrained`, those of the first seed. The fits of a seed follow
-each other, and the file is written after each seed. What is done in the folder is kept: data sets,
-runs, scores.
+each other, and the file is written after each seed. A picture has a row for each scene, of one
+held-out view: the truth, and what each method made of it with the first seed. What is done in the
+folder is kept: data sets, runs, scores.
 """
 
 from __future__ import annotations
@@ -49,7 +50,15 @@ from unbake.evaluation.settings import EvaluationSettings, RenderSettings  # noq
 from unbake.evaluation.turntable import axis_of, up_of  # noqa: E402
 from unbake.experiments.commands import unbake  # noqa: E402
 from unbake.experiments.seeds import across_seeds  # noqa: E402
-from unbake.imaging.pictures import write_exr  # noqa: E402
+from unbake.imaging.pictures import (  # noqa: E402
+    fitting_exposure,
+    montage,
+    read_exr,
+    sample,
+    tonemap,
+    write_exr,
+    write_png,
+)
 from unbake.io import read_object, write_json, write_text  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 
@@ -67,21 +76,7 @@ RADIUS = 0.03
 
 def main() -> None:
     """Fit, relight, print every score, and write the result after each seed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="folder of data sets and runs")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    parser.add_argument("--scenes", nargs="*", choices=("demo", "still"), default=["demo", "still"])
-    parser.add_argument("--data", nargs="+", default=[], help="NAME=FOLDER, captured data sets")
-    parser.add_argument("--methods", nargs="+", default=["ours", "direct", "prb"])
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--steps", type=int, default=1200)
-    length.add_argument("--seconds", type=float, help="of training, instead of steps")
-    parser.add_argument("--batch", type=int, help="pixels of a step (default: that of fits)")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--spp", type=int, default=128, help="samples per pixel of relit pictures")
-    parser.add_argument("--true-spp", type=int, default=TRUE_SAMPLES)
-    parser.add_argument("--resolution", type=int, default=128)
-    args = parser.parse_args()
+    args = arguments()
     args.work.mkdir(parents=True, exist_ok=True)
     stop = ("steps", args.steps) if args.seconds is None else ("seconds", args.seconds)
     found: dict[str, Any] = {
@@ -101,7 +96,7 @@ def main() -> None:
         if not truth.exists():
             light = light_of(scene, folder, args.work)
             capture_truth(scene, folder, truth, light, args.true_spp, args.resolution)
-        found["scenes"][scene] = {"data": described(truth), "methods": {}}
+        found["scenes"][scene] = {"data": described(folder, truth), "methods": {}}
     scores: dict[tuple[str, str], list[dict[str, float | None]]] = {}
     for seed in args.seeds:
         for scene, method in product(data, [*args.methods, UNTRAINED]):
@@ -123,6 +118,44 @@ def main() -> None:
         for (scene, method), rows in scores.items():
             found["scenes"][scene]["methods"][method] = across_seeds(rows, rows[0])
         write_json(args.out, found)
+    if args.picture is not None:
+        runs = [f"{method}-{args.seeds[0]}" for method in (*args.methods, UNTRAINED)]
+        rows = [pictured(args.work, scene, runs) for scene in data]
+        write_png(args.picture, montage(rows))
+
+
+def arguments() -> argparse.Namespace:
+    """The words of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True, help="folder of data sets and runs")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--scenes", nargs="*", choices=("demo", "still"), default=["demo", "still"])
+    parser.add_argument("--data", nargs="+", default=[], help="NAME=FOLDER, captured data sets")
+    parser.add_argument("--methods", nargs="+", default=["ours", "direct", "prb"])
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=int, default=1200)
+    length.add_argument("--seconds", type=float, help="of training, instead of steps")
+    parser.add_argument("--batch", type=int, help="pixels of a step (default: that of fits)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--spp", type=int, default=128, help="samples per pixel of relit pictures")
+    parser.add_argument("--true-spp", type=int, default=TRUE_SAMPLES)
+    parser.add_argument("--resolution", type=int, default=128)
+    parser.add_argument("--picture", type=Path, help="PNG file to write")
+    return parser.parse_args()
+
+
+def pictured(work: Path, scene: str, runs: Sequence[str]) -> list[np.ndarray]:
+    """The middle one of a scene's held-out views under the new light: the truth, and each run's.
+
+    Returns:
+        sRGB bytes, shape (h, w, 3) each.
+    """
+    heldout = Dataset.load(work / f"{scene}-truth").heldout
+    view = heldout[len(heldout) // 2]
+    files = [work / f"{scene}-{run}-relit" / f"{view.name}.exr" for run in runs]
+    made = [read_exr(file)[..., :3] for file in (view.image, *files)]
+    exposure = fitting_exposure([sample(made[0].mean(-1))])
+    return [tonemap(picture, exposure) for picture in made]
 
 
 def fit(
@@ -132,9 +165,13 @@ def fit(
     name, until = ("steps", 0) if method == UNTRAINED else stop
     options = ["--method", "ours" if method == UNTRAINED else method, f"--{name}", until]
     options += [] if batch is None else ["--batch", batch]
-    # A fit that learned nothing fails, and is judged as it is; one that left no run fails later.
+    # What was cut off is done again.
+    unfinished = run.with_name(f"{run.name}-unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    # A fit that learned nothing fails, and is judged as it is; one that left no run fails here.
     with contextlib.suppress(UserError):
-        unbake("fit", data, "--out", run, "--seed", seed, *options)
+        unbake("fit", data, "--out", unfinished, "--seed", seed, *options)
+    unfinished.rename(run)
 
 
 def light_of(scene: str, data: Path, work: Path) -> LightConfig:
@@ -216,12 +253,18 @@ def capture_truth(
     )
 
 
-def described(truth: Path) -> dict[str, int]:
-    """The pictures that are compared."""
-    dataset = Dataset.load(truth)
-    camera = dataset.heldout[0].camera
-    size = {"width": camera.width, "height": camera.height}
-    return {"views": len(dataset.heldout), **size, "true_spp": dataset.render["spp"]}
+def described(data: Path, truth: Path) -> dict[str, int]:
+    """The photographs of a fit, and the pictures that are compared."""
+    photographs, compared = Dataset.load(data), Dataset.load(truth)
+    camera = compared.heldout[0].camera
+    return {
+        "train": len(photographs.train),
+        "spp": photographs.render.get("spp", 0),
+        "views": len(compared.heldout),
+        "width": camera.width,
+        "height": camera.height,
+        "true_spp": compared.render["spp"],
+    }
 
 
 def measure(
