@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from unbake.dataset.camera import Camera
-from unbake.dataset.pixels import CameraRays, PixelSource
+from unbake.dataset.pixels import CameraRays, PixelSource, crop_edges, largest_crop
 from unbake.errors import UserError
 
 SIZES = [(5, 3), (4, 4), (1, 7), (6, 2)]
@@ -257,11 +257,48 @@ def test_seeds_decide_the_crop():
 def test_a_crop_larger_than_a_view_is_told_in_one_line():
     made = crop_source()
     made.require_crops(9)
-    with pytest.raises(UserError, match="4 x 4 pixels is larger than the smallest photo") as caught:
+    with pytest.raises(UserError, match="4 x 4 pixels is larger than a photograph") as caught:
         made.require_crops(16)
-    assert "--batch 9 or less" in str(caught.value) and "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"cannot have 8 pixels\. Use --batch 4, or"):
-        made.require_crops(8)
+    assert "--batch 9, or" in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(UserError, match=r"of each of 4 processes of 3 x 4 .* Use --batch 36, or"):
+        made.require_crops(12, 4)
+    with pytest.raises(UserError, match=r"cannot have 7 pixels: .* Use --batch 6, or"):
+        made.require_crops(7)
+    with pytest.raises(UserError, match=r"with --resume, as many processes as before"):
+        made.require_crops(7)
+
+
+def test_crops_are_as_near_to_squares_as_their_pixels_allow():
+    edges = {1: (1, 1), 2: (1, 2), 9: (3, 3), 12: (3, 4), 2048: (32, 64), 16384: (128, 128)}
+    assert {count: crop_edges(count) for count in edges} == edges
+    assert crop_edges(3) is None and crop_edges(10) is None and largest_crop(11) == 9
+    batches = [16384 // ranks for ranks in (1, 2, 4, 8, 16, 32, 64)]
+    assert all(crop_edges(count) for count in batches)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_crops_that_are_no_squares_lie_along_the_longer_edge_of_the_view(hidden):
+    alpha = [np.ones((h, w)) for w, h in CROP_SIZES]
+    alpha[0][:, :2] = 0
+    made, views = crop_source(alpha if hidden else None), [0, 1, 3]
+    vars(made)["_seen_views"] = np.array(views)  # the others are too small
+    first = np.cumsum([0, *(w * h for w, h in CROP_SIZES)])
+    seen = set()
+    for seed in range(400):
+        numbers = made.draw_crop(seed, 8).read()[0].astype(int)
+        (view,) = set(np.searchsorted(first, numbers, "right") - 1)
+        width, height = CROP_SIZES[view]
+        rows, columns = (2, 4) if width > height else (4, 2)
+        row, column = np.divmod(numbers - first[view], width)
+        y, x = np.mgrid[row[0] : row[0] + rows, column[0] : column[0] + columns]
+        assert np.array_equal(row, y.ravel()) and np.array_equal(column, x.ravel())
+        assert row.max() < height and column.max() < width
+        if hidden:
+            assert alpha[view][row, column].sum() >= 4
+        seen.add((view, row[0], column[0]))
+    places = {v: (w - 3) * (h - 1) for v, (w, h) in enumerate(CROP_SIZES) if w > h}
+    places[1] = (CROP_SIZES[1][1] - 3) * (CROP_SIZES[1][0] - 1)
+    assert len(seen) == sum(places.values())
 
 
 # ----------------------------------------------------------------------------------- held aside

@@ -134,9 +134,24 @@ def test_batches_that_cannot_be_shared_equally_are_refused():
 def test_batches_that_would_do_are_those_of_all_ranks(cornell):
     _, _, step = steps_of(cornell, replace(tiny_fields(), pixels=64), Fake(0, lambda own: own), 0)
     assert step._smaller(5) == "Lower --batch from 64 to 10, or --spp"
-    crops = replace(tiny_fields(), pixels=60, pixel_sampling="one-view-crop")
-    with pytest.raises(UserError, match=r"of each of 2 processes cannot have 30 pixels.* 50,"):
+    crops = replace(tiny_fields(), pixels=62, pixel_sampling="one-view-crop")
+    with pytest.raises(UserError, match=r"of each of 2 processes cannot have 31 pixels.* 60,"):
         steps_of(cornell, crops, Fake(0, lambda own: own), 0)
+    crops = replace(crops, pixels=64)
+    _, _, step = steps_of(cornell, crops, Fake(0, lambda own: own), 0)
+    assert step._smaller(11) == "Lower --batch from 64 to 18, or --spp"
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 4, 8])
+def test_crops_are_shared_by_any_number_of_processes_that_a_power_of_two_has(cornell, ranks):
+    class Several(Fake):
+        def __init__(self):
+            super().__init__(0, lambda own: own)
+            self.size = ranks
+
+    crops = replace(tiny_fields(), pixels=64, pixel_sampling="one-view-crop", method="direct")
+    _, terms, _ = steps_of(cornell, crops, Several(), 1)
+    assert np.isfinite(terms["photometric"])
 
 
 def command(*words, ranks=2):

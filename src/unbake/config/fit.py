@@ -260,8 +260,8 @@ class FitConfig:
             metavar="STEPS",
         ),
     ] = 1
-    #: Which pixels: random ones of all views (ours), or a random square crop of a random view, half
-    #: of it foreground at least (Sec. 5.4).
+    #: Which pixels: random ones of all views (ours), or a random crop of a random view, half of it
+    #: foreground at least (Sec. 5.4). A crop is as near to a square as its pixels allow.
     pixel_sampling: Annotated[
         PixelSampling, Flag("Where the pixels of a step lie: anywhere, or in one crop of one view")
     ] = "all-views"

@@ -322,10 +322,11 @@ class PixelSource:
         return self._own_batch(found.own_numbers(found.places.start + places))
 
     def draw_crop(self, seed: int, count: int) -> PixelBatch:
-        """Draw a square crop of one random view that this process holds, with all its pixels.
+        """Draw a crop of one random view that this process holds, with all its pixels.
 
-        Each view is as likely as any other, and so is each place in it. Pixels that are held aside
-        are replaced by others of the crop, or of all views if these are all held aside. Where the
+        It is a square, or a rectangle along the longer edge of the view; see `crop_edges`. Each
+        view is as likely as any other, and so is each place in it. Pixels that are held aside are
+        replaced by others of the crop, or of all views if these are all held aside. Where the
         background is hidden, at least half of the crop are foreground pixels; in a view that has no
         such place, it is one of those with the most of them, and a view without any is never drawn.
 
@@ -334,20 +335,20 @@ class PixelSource:
 
         Paper: Sec. 5.4.
         """
-        edge = math.isqrt(count)
         rng = np.random.default_rng(seed)
         views = self._seen_views
         if not len(views):
             return self.draw(seed, count)
         view = int(views[rng.integers(len(views))])
         first, width, height = self._layout[view]
-        across = width - edge + 1
-        places = self._places(view, edge)
+        rows, columns = _crop_in(width, height, count)
+        across = width - columns + 1
+        places = self._places(view, count)
         if places is None:
-            place = int(rng.integers(across * (height - edge + 1)))
+            place = int(rng.integers(across * (height - rows + 1)))
         else:
             place = int(places[rng.integers(len(places))])
-        row, column = np.divmod(np.arange(edge * edge), edge)
+        row, column = np.divmod(np.arange(count), columns)
         numbers = first + (place // across + row) * width + place % across + column
         if self.held is not None:
             held = np.isin(numbers, self.photographs.own_numbers(self._own_held))
@@ -364,22 +365,32 @@ class PixelSource:
         return view, column, row
 
     def require_crops(self, count: int, ranks: int = 1) -> None:
-        """Raise a `UserError` if there are no square crops of that many pixels in all views.
+        """Raise a `UserError` if there are no crops of that many pixels in all views.
 
         Args:
             count: pixels of a crop.
             ranks: how many processes each draw one for a batch.
         """
-        edge, each = math.isqrt(count), "" if ranks == 1 else f" of each of {ranks} processes"
-        if edge * edge != count:
-            what = f"a square crop{each} cannot have {count} pixels"
-            remedy = f"Use --batch {ranks * edge**2}, or --pixel-sampling all-views"
-            raise UserError(what, remedy=remedy)
-        short = min(min(width, height) for _, width, height in self._layout)
-        if short < edge:
-            what = f"a crop of {edge} x {edge} pixels is larger than the smallest photograph"
-            remedy = f"Use --batch {ranks * short**2} or less, or --pixel-sampling all-views"
-            raise UserError(f"{what}, whose shorter edge has {short}", remedy=remedy)
+        each = "" if ranks == 1 else f" of each of {ranks} processes"
+        remedy = "or --pixel-sampling all-views; with --resume, as many processes as before"
+        edges = crop_edges(count)
+        if edges is None:
+            what = f"a crop{each} cannot have {count} pixels: no edge would be half of the other"
+            raise UserError(
+                f"{what} or more", remedy=f"Use --batch {ranks * largest_crop(count)}, {remedy}"
+            )
+
+        def fits(pixels: int) -> bool:
+            return all(
+                rows <= height and columns <= width
+                for _, width, height in self._layout
+                for rows, columns in [_crop_in(width, height, pixels)]
+            )
+
+        if not fits(count):
+            fewer = next(n for n in range(count, 0, -1) if crop_edges(n) and fits(n))
+            what = f"a crop{each} of {edges[0]} x {edges[1]} pixels is larger than a photograph"
+            raise UserError(what, remedy=f"Use --batch {ranks * fewer}, {remedy}")
 
     @cached_property
     def _own_held(self) -> np.ndarray:
@@ -460,21 +471,44 @@ class PixelSource:
     def _found(self) -> dict[tuple[int, int], np.ndarray]:
         return {}
 
-    def _places(self, view: int, edge: int) -> np.ndarray | None:
+    def _places(self, view: int, pixels: int) -> np.ndarray | None:
         """Where a crop of a view may lie, row by row; None: anywhere."""
         chosen = self.photographs.chosen
         if chosen is None:
             return None
-        if (view, edge) not in self._found:
+        if (view, pixels) not in self._found:
             first, width, height = self._layout[view]
+            rows, columns = _crop_in(width, height, pixels)
             start, stop = np.searchsorted(chosen, [first, first + width * height])
             mask = np.zeros((height + 1, width + 1), np.int64)
             inner = np.zeros(height * width, np.int64)
             inner[chosen[start:stop].astype(int) - first] = 1
             mask[1:, 1:] = inner.reshape(height, width)
             sums = mask.cumsum(0).cumsum(1)
-            count = sums[edge:, edge:] - sums[:-edge, edge:] - sums[edge:, :-edge]
-            count += sums[:-edge, :-edge]
-            least = min((edge * edge + 1) // 2, count.max())
-            self._found[view, edge] = np.flatnonzero(count >= least).astype(np.uint32)
-        return self._found[view, edge]
+            count = sums[rows:, columns:] - sums[:-rows, columns:] - sums[rows:, :-columns]
+            count += sums[:-rows, :-columns]
+            least = min((pixels + 1) // 2, count.max())
+            self._found[view, pixels] = np.flatnonzero(count >= least).astype(np.uint32)
+        return self._found[view, pixels]
+
+
+def crop_edges(count: int) -> tuple[int, int] | None:
+    """The shorter and the longer edge of a crop of so many pixels, as near to each other as can be.
+
+    None where the longer one would be more than twice the shorter one.
+    """
+    short = next(edge for edge in range(math.isqrt(count), 0, -1) if count % edge == 0)
+    return (short, count // short) if count <= 2 * short**2 else None
+
+
+def largest_crop(count: int) -> int:
+    """The most pixels that a crop can have, of so many."""
+    return next(pixels for pixels in range(count, 0, -1) if crop_edges(pixels))
+
+
+def _crop_in(width: int, height: int, count: int) -> tuple[int, int]:
+    """Rows and columns of a crop of a view of that size."""
+    edges = crop_edges(count)
+    if edges is None:
+        raise ValueError(f"there are no crops of {count} pixels")
+    return edges if width >= height else edges[::-1]

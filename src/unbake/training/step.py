@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..dataset.pixels import CameraRays, PixelBatch, PixelSource, RayBatch
+from ..dataset.pixels import CameraRays, PixelBatch, PixelSource, RayBatch, largest_crop
 from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..fields.camera import CameraModel
@@ -92,7 +92,7 @@ class TrainingStep:
         ranks: that take the step together; None: there is one.
 
     Raises:
-        UserError: the batch cannot be shared equally, or is no square where crops are drawn.
+        UserError: the batch cannot be shared equally, or crops cannot have its pixels.
 
     Paper: Eq. 11, Eq. 14, Sec. 4, 5.4, 6.
     """
@@ -253,6 +253,8 @@ class TrainingStep:
         told, ranks = "Lower --batch or --spp", self._ranks.size
         if pixels is not None:
             whole = self._config.pixels * ranks
+            if self._config.pixel_sampling == "one-view-crop":
+                pixels = largest_crop(pixels)
             told = f"Lower --batch from {whole} to {pixels * ranks}, or --spp"
         if self._path_sampler.keeps_paths:
             told += " or path.max_depth, or use --method prb"
@@ -625,8 +627,8 @@ def with_share(config: FitConfig, ranks: int) -> FitConfig:
     """
     if config.pixels % ranks:
         fewer = max(config.pixels // ranks, 1) * ranks
-        what = f"a batch of {config.pixels} pixels cannot be shared equally by {ranks} ranks"
-        raise UserError(what, "--batch", f"Use --batch {fewer}, or another number of ranks")
+        what = f"a batch of {config.pixels} pixels cannot be shared equally by {ranks} processes"
+        raise UserError(what, "--batch", f"Use --batch {fewer}, or another number of processes")
     return replace(config, pixels=config.pixels // ranks)
 
 
