@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from support import MPIEXEC, needs_mpi
 
 from unbake import ranks as module
 from unbake.errors import UserError
-from unbake.ranks import SIZES, Agreed, Ranks, alone
+from unbake.ranks import SIZES, Agreed, Ranks, alone, started
 
 
 class Request:
@@ -101,6 +102,77 @@ def test_one_process_tells_itself_what_it_knows(monkeypatch):
         alone.together(lambda: fail("bad"))
     with pytest.raises(UserError, match="bad"), alone.guarded(print):
         fail("bad")
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """Set what launchers tell, and nothing else of theirs; whether the input is a terminal."""
+
+    def told(terminal=False, **sizes):
+        for name in SIZES:
+            monkeypatch.delenv(name, raising=False)
+        for name, size in sizes.items():
+            monkeypatch.setenv(name, str(size))
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: terminal))
+
+    return told
+
+
+@pytest.mark.parametrize(
+    ("sizes", "several"),
+    [
+        ({}, 1),
+        ({"PMI_SIZE": 4}, 4),
+        ({"OMPI_COMM_WORLD_SIZE": 4, "PMI_SIZE": 1}, 4),
+        # mpiexec starts one process by srun on each of two machines, which starts four.
+        ({"PMI_SIZE": 8, "SLURM_STEP_NUM_TASKS": 2}, 8),
+        ({"SLURM_STEP_NUM_TASKS": 4}, 4),
+        ({"SLURM_STEP_NUM_TASKS": 4, "terminal": True}, 1),
+        ({"SLURM_NTASKS": 4}, 1),  # of an allocation, in whose script one process runs
+        ({"PMI_SIZE": "none"}, 1),
+    ],
+)
+def test_launchers_tell_how_many_they_started(environment, sizes, several):
+    environment(**sizes)
+    assert started() == several
+
+
+def test_processes_that_their_mpi_takes_for_one_each_are_refused(environment, monkeypatch):
+    world = Two()
+    world.Split_type = lambda kind: SimpleNamespace(size=2)
+    mpi = SimpleNamespace(
+        COMM_WORLD=world,
+        COMM_TYPE_SHARED=0,
+        THREAD_MULTIPLE=3,
+        Query_thread=lambda: 3,
+        get_vendor=lambda: ("Some MPI", (5, 0)),
+    )
+    monkeypatch.setitem(sys.modules, "mpi4py", SimpleNamespace(MPI=mpi))
+    environment(PMI_SIZE=2)
+    assert Ranks.of_environment().size == 2
+    world.size = 1
+    assert_foreign()
+    environment(OMPI_COMM_WORLD_SIZE=2, PMI_SIZE=1)
+    assert_foreign()
+    environment(SLURM_STEP_NUM_TASKS=2)
+    assert_foreign()
+
+
+def assert_foreign():
+    with pytest.raises(
+        UserError, match=r"^2 processes .*, but Some MPI of mpi4py knows of 1\. .*pmi2"
+    ):
+        Ranks.of_environment()
+
+
+@needs_mpi
+def test_processes_of_another_mpi_are_refused(repository):
+    more = {"OMPI_COMM_WORLD_SIZE": "2", "PYTHONPATH": str(repository / "src")}
+    words = [sys.executable, "-m", "unbake", "fit", "data", "--out", "run"]
+    run = {"capture_output": True, "text": True, "timeout": 60, "env": alone() | more}
+    done = subprocess.run(words, **run)
+    assert done.returncode == 2 and "2 processes were started, but" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def fail(what):

@@ -20,6 +20,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -45,8 +46,10 @@ _OF_LAUNCHERS = (
     "SLURM_STEP",
     "SLURM_PROCID",
 )
-#: What they tell a process: how many there are.
-SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
+#: What Slurm tells each process that `srun` starts: how many there are.
+_OF_STEP = "SLURM_STEP_NUM_TASKS"
+#: What all of them tell a process: how many there are.
+SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE", _OF_STEP)
 #: Seconds that a rank waits for the others while they read input, in the first steps, which compile
 #: kernels, and where rank 0 writes and measures.
 PATIENCE = 120.0
@@ -77,6 +80,18 @@ _LONG, _LONG_NAP = 5.0, 0.05
 def alone() -> dict[str, str]:
     """The environment, for a process that is not to take itself for one of several."""
     return {name: value for name, value in os.environ.items() if not name.startswith(_OF_LAUNCHERS)}
+
+
+def started() -> int:
+    """How many processes `mpiexec` or Slurm started together with this one, as they tell it."""
+    told = {name: os.environ.get(name, "") for name in SIZES}
+    sizes = {name: int(size) for name, size in told.items() if size.isdecimal()}
+    of_step = sizes.pop(_OF_STEP, 1)  # where mpiexec starts processes by srun, these are fewer
+    several = max(sizes.values(), default=1)
+    if several > 1:
+        return several
+    # A shell of `srun --pty` is alone, however many tasks its step has.
+    return 1 if sys.stdin is not None and sys.stdin.isatty() else of_step
 
 
 class Communicator(Protocol):
@@ -152,16 +167,23 @@ class Ranks:
         """The ranks that `mpiexec` or Slurm started.
 
         Raises:
-            UserError: there are several, and mpi4py is missing.
+            UserError: there are several, and mpi4py is missing, or does not know of the others.
         """
-        sizes = (os.environ.get(name, "") for name in SIZES)
-        if max((int(size) for size in sizes if size.isdecimal()), default=1) < 2:
+        several = started()
+        if several < 2:
             return Ranks()
         try:
-            from mpi4py import MPI
+            with warnings.catch_warnings():  # mpi4py 4.1 warns of another mpiexec, as is told here
+                warnings.simplefilter("ignore", RuntimeWarning)
+                from mpi4py import MPI
         except (ImportError, RuntimeError) as error:
             what = f"several processes were started, and mpi4py cannot be loaded ({error})"
             raise UserError(what, remedy="Install it: pip install unbake[mpi]") from None
+        if MPI.COMM_WORLD.size < several:  # each would do all of the work by itself
+            library, known = MPI.get_vendor()[0], MPI.COMM_WORLD.size
+            what = f"{several} processes were started, but {library} of mpi4py knows of {known}"
+            own = f"Start them by the mpiexec of {library} or by srun --mpi=pmi2"
+            raise UserError(what, remedy=f"{own}, or build mpi4py for the MPI of this machine")
         here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).size
         return Ranks(MPI.COMM_WORLD, here, beats=MPI.Query_thread() == MPI.THREAD_MULTIPLE)
 
