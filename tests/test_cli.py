@@ -8,12 +8,13 @@ import subprocess
 import sys
 from dataclasses import fields
 from html.parser import HTMLParser
-from inspect import signature
+from inspect import getsource, signature
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support import MPIEXEC, needs_mpi
 
 from unbake import cli
 from unbake.cli.flags import flags, options, with_options
@@ -191,6 +192,60 @@ def test_the_help_groups_commands_by_task_at_any_width(unbake, monkeypatch):
 def test_the_version_is_told(unbake):
     outcome = unbake("--version")
     assert (outcome.status, outcome.out) == (0, f"unbake {VERSION}\n")
+
+
+#: Whether several processes share the work of a command. A new one must say so here.
+SHARED = {
+    "capture": False,
+    "import": False,
+    "data": False,
+    "fit": True,
+    "evaluate": False,
+    "report": False,
+    "export": False,
+    "render": False,
+    "relight": False,
+    "view": False,
+    "solve": False,
+    "compare": True,
+    "bench": False,
+    "degrade": False,
+    "reproduce": True,
+    "doctor": False,
+}
+
+
+def test_it_is_said_of_every_command_whether_processes_share_it():
+    assert set(COMMANDS) == set(SHARED) and {c for c in SHARED if SHARED[c]} == cli.SHARED
+    for command, function in cli.COMMANDS.items():
+        assert ("_ranks()" in getsource(function)) == SHARED[command], command
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_several_processes_are_refused_by_commands_that_do_not_share_work(
+    command, unbake, monkeypatch
+):
+    def called(*_, **__):
+        raise UserError("called")
+
+    monkeypatch.setenv("PMI_SIZE", "3")
+    monkeypatch.setitem(sys.modules, "mpi4py", None)
+    assert unbake(command, "--help").status == 0
+    monkeypatch.setattr(cli.tyro.extras, "subcommand_cli_from_dict", called)
+    outcome = unbake(command)
+    refused = f"error: 3 processes were started, and unbake {command} takes one. Run it without "
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("error: called" if SHARED[command] else refused)
+
+
+@needs_mpi
+def test_several_processes_are_refused_in_one_line(tmp_path):
+    out = tmp_path / "data"
+    words = [MPIEXEC, "-n", "2", sys.executable, "-m", "unbake", "capture", "cube", "--out", out]
+    run = {"capture_output": True, "text": True, "timeout": 60}
+    done = subprocess.run(words, env=os.environ | {"PYTHONPATH": SOURCE}, **run)
+    assert done.returncode == 2 and not done.stdout and not out.exists()
+    assert done.stderr.count("\n") == 1 and "2 processes were started" in done.stderr
 
 
 @pytest.mark.parametrize(

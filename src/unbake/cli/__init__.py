@@ -30,7 +30,7 @@ from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
 from ..memory import NO_MEMORY, lacks_memory
-from ..ranks import Ranks
+from ..ranks import Agreed, Ranks, started
 from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
 from ..version import VERSION
@@ -120,6 +120,7 @@ def main() -> None:
         # Tyro 1.0 keeps the line breaks of some arguments' texts.
         command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
     try:
+        _require_one_process(words)
         with wrapped_help(words):
             status = tyro.extras.subcommand_cli_from_dict(
                 dict(COMMANDS), prog="unbake", description=_DESCRIPTION
@@ -1012,6 +1013,26 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
 }
 #: All commands by name.
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+
+
+#: Those whose work several processes share. All others are refused to several: each process would
+#: do all of the work, and write the same files.
+SHARED = frozenset({"fit", "compare", "reproduce"})
+
+
+def _require_one_process(words: list[str]) -> None:
+    """Raise a `UserError` where several processes were started for a command that is of one."""
+    command, several = words[0], started()
+    if command not in COMMANDS.keys() - SHARED or several < 2 or {"-h", "--help"} & {*words}:
+        return
+    try:
+        ranks = Ranks.of_environment()
+    except UserError:  # they do not know of each other, and each tells it
+        ranks = Ranks()
+    with ranks.guarded(_say):
+        what = f"{several} processes were started, and unbake {command} takes one"
+        remedy = f"Run it without mpiexec; processes share {', '.join(sorted(SHARED))}"
+        raise Agreed(what, remedy=remedy)
 
 
 def _overview() -> str:
