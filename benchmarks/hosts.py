@@ -8,9 +8,10 @@ limited; its counters tell what went through. The kernel's delay is not lengthen
 
 `exchange` times an Allreduce of the bytes that fits exchange, beside what the model of `scaling.py`
 says. `steps` times fits of a data set by one process and by one on each host, in turns, with a core
-each. `cuts` pulls the cable of small fits, and stops processes of others, at random instants: all
-processes must end by themselves, on both hosts, with a message and a status, and the next fit must
-go on at the newest checkpoint. The exit status is 1 if one does not.
+and a thread each, beside what that model makes of the measured step of one process. `cuts` pulls
+the cable of small fits, and stops processes of others, at random instants: all processes must end
+by themselves, on both hosts, with a message and a status, and the next fit must go on at the newest
+checkpoint. The exit status is 1 if one does not.
 
 Each writes its part of the file. Root's rights on Linux are needed.
 """
@@ -42,8 +43,14 @@ sys.path.insert(0, SRC)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
 
 from kill import GOES_ON, last_logged, until  # noqa: E402
-from ranks import WARM_UP, ms_per_step  # noqa: E402
-from scaling import seconds_a_byte_exchanged, seconds_to_exchange  # noqa: E402
+from ranks import ALONE, SEVERAL, WARM_UP, ms_per_step  # noqa: E402
+from scaling import (  # noqa: E402
+    NETWORKS,
+    computing,
+    seconds_a_byte_exchanged,
+    seconds_of_step,
+    seconds_to_exchange,
+)
 from small_run import mpiexec, prepare  # noqa: E402
 from two_hosts import TwoHosts, why_not  # noqa: E402
 
@@ -162,6 +169,9 @@ def allreduce(sizes: list[int]) -> None:
 
 def steps(hosts: TwoHosts, data: Path, work: Path, rounds: int, length: int) -> dict[str, Any]:
     """Milliseconds a step of one process, and of one on each host, with one core each."""
+    presets = json.loads(SCALING.read_text(encoding="utf-8"))["presets"]
+    (preset,) = (row for row in presets if row["preset"] == "cpu")
+    in_memory = seconds_a_byte_exchanged()
     work.mkdir(parents=True, exist_ok=True)
     times: dict[str, list[float]] = {}
     cases = {
@@ -174,7 +184,7 @@ def steps(hosts: TwoHosts, data: Path, work: Path, rounds: int, length: int) -> 
     for number, (name, (local, every, rate)) in itertools.product(range(rounds), cases.items()):
         with tempfile.TemporaryDirectory(dir=work) as folder:
             run = Path(folder) / "run"
-            words = [sys.executable, "-m", "unbake", "fit", str(data), "--out", str(run)]
+            words = [*(ALONE if local == 1 else SEVERAL), "fit", str(data), "--out", str(run)]
             words += ["--steps", str(length), "--sync-every", str(every), "--seed", str(number)]
             if local:
                 start = [mpiexec(), "-n", "2"] if local > 1 else []
@@ -192,7 +202,19 @@ def steps(hosts: TwoHosts, data: Path, work: Path, rounds: int, length: int) -> 
         # Fits of a round ran one after the other, under about the same load of the machine.
         ratios = [a / b for a, b in zip(one, found, strict=True)]
         row = {"case": name, "ms_per_step": statistics.median(found), "all": found}
-        rows.append(row | {"times_one": statistics.median(ratios)})
+        row |= {"times_one": statistics.median(ratios)}
+        local, every, rate = cases[name]
+        row["efficiency"] = row["times_one"] / (local or 2)
+        if rate is not None:
+            latency = NETWORKS[RATE][1]
+            alone, several = (
+                seconds_of_step(preset, ranks, every, in_memory, rate / 8, latency)
+                for ranks in (1, 2)
+            )
+            # What cores compute is as long as measured here: the model is of two cores together.
+            compute = computing(preset, 2)
+            row["modelled"] = statistics.median(one) * compute / alone + 1e3 * (several - compute)
+        rows.append(row)
     return {"data": data.name, "steps": length, "warm_up": WARM_UP, "rounds": rounds, "rows": rows}
 
 

@@ -3,9 +3,10 @@
     python benchmarks/scaling.py --data DATA --out FILE.json [--presets cpu paper release]
 
 Measured here, alone on the machine: the time of a step by the size of the batch, which is a + b
-times its pixels (least squares; small batches of the large presets, whose steps take seconds on a
-CPU); bytes of gradients and of states; how long these take from Dr.Jit to NumPy and back; and an
-Allreduce between two processes of this machine, which needs no network.
+times its pixels (least squares with a and b of 0 or more, and what the line leaves of each; small
+batches of the large presets, whose steps take seconds on a CPU); bytes of gradients and of states;
+how long these take from Dr.Jit to NumPy and back, as the median of several times after the first
+ones; and an Allreduce between two processes of this machine, which needs no network.
 
 A step of N processes, one a machine, with the preset's batch B is then
 
@@ -15,6 +16,8 @@ with s the bytes that are exchanged in a step, d the seconds a byte takes to Num
 of the Allreduce in memory, w the bandwidth of a network and t its latency. With `--sync-every` H, s
 is the bytes of a state over H. That is what a ring needs; computation and exchange do not overlap,
 as in `unbake fit`. Bandwidths and latencies of networks are assumed, and told in the result.
+`paying` is the largest N up to 1,024 whose efficiency is a half or more: the step of one process
+over N times that of N.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +57,14 @@ NETWORKS = {
 }
 RANKS = [2**i for i in range(11)]
 SYNC_EVERY = (1, 20)
+#: The least efficiency that pays.
+LEAST = 0.5
 #: Batches whose steps are timed, in pixels, and how often; the first steps compile.
-BATCHES = {"cpu": (128, 256, 512, 1024, 2048), "paper": (64, 128, 256), "release": (64, 128, 256)}
+BATCHES = dict.fromkeys(("cpu", "paper", "release"), (64, 128, 256, 512, 1024))
 TIMES = {"cpu": 60, "paper": 6, "release": 6}
 WARM_UP = {"cpu": 20, "paper": 4, "release": 4}
+#: Copies of a state that are timed, after the first ones.
+COPIES, COPIES_BEFORE = 9, 3
 #: Of arrays that are exchanged between two processes of this machine.
 BYTES = 1 << 26
 
@@ -79,7 +87,8 @@ def main() -> None:
     backend.activate()
     for preset in args.presets:
         found = measured(args.data, preset)
-        rows.append(found | {"modelled": modelled(found, each)})
+        paid = paying(found, each)
+        rows.append(found | {"modelled": modelled(found, each), "paying": paid})
         shown = {key: value for key, value in found.items() if key != "batches"}
         print(json.dumps(shown), flush=True)
     result = {"machine": machine(), "data": args.data.name, "seconds_a_byte_exchanged": each}
@@ -98,7 +107,7 @@ def measured(data: Path, preset_name: str) -> dict[str, Any]:
     from unbake.training.schedule import learning_rates
 
     dataset, config, batches = Dataset.load(data), preset(preset_name), []
-    gradients, numbers, copies = 0, 0, 0.0
+    gradients, numbers, copies = 0, 0, []
     for pixels in BATCHES[preset_name]:
         # Crops of one view are squares; the time of a step does not depend on where pixels lie.
         settings = dataclasses.replace(config, pixels=pixels, pixel_sampling="all-views")
@@ -113,25 +122,39 @@ def measured(data: Path, preset_name: str) -> dict[str, Any]:
         print(f"{preset_name}, {pixels} pixels: {1e3 * seconds:.1f} ms a step", flush=True)
         state = fit.state
         gradients = 4 * sum(dr.width(v.array) for _, o in state.optimizers() for v in o.values())
-        start = time.perf_counter()
-        flat = state.numbers()
-        state.assign_numbers(flat)
-        dr.sync_thread()
-        copies, numbers = time.perf_counter() - start, flat.nbytes
+        for number in range(COPIES_BEFORE + COPIES):
+            start = time.perf_counter()
+            flat = state.numbers()
+            state.assign_numbers(flat)
+            dr.sync_thread()
+            if number >= COPIES_BEFORE:
+                copies.append(time.perf_counter() - start)
+            numbers = flat.nbytes
         del fit, state
-    slope, fixed = np.polyfit(
-        [b["pixels"] for b in batches], [b["seconds"] for b in batches], 1
-    ).tolist()
+    fixed, slope = line([b["pixels"] for b in batches], [b["seconds"] for b in batches])
+    for batch in batches:
+        batch["residual"] = batch["seconds"] - fixed - slope * batch["pixels"]
     return {
         "preset": preset_name,
         "batch": config.pixels,
         "batches": batches,
-        "fixed_seconds": max(fixed, 0.0),
+        "fixed_seconds": fixed,
         "seconds_a_pixel": slope,
         "gradient_bytes": gradients,
         "state_bytes": numbers,
-        "seconds_a_byte_copied": copies / numbers,
+        "seconds_a_byte_copied": statistics.median(copies) / numbers,
+        "largest_residual": max(abs(b["residual"]) / b["seconds"] for b in batches),
     }
+
+
+def line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+    """Intercept and slope by least squares, neither of them below 0; x is positive."""
+    slope, intercept = np.polyfit(x, y, 1).tolist()
+    if slope < 0:
+        return max(statistics.mean(y), 0.0), 0.0
+    if intercept < 0:
+        return 0.0, max(float(np.dot(x, y) / np.dot(x, x)), 0.0)
+    return intercept, slope
 
 
 def modelled(found: dict[str, Any], exchanged: float) -> list[dict[str, Any]]:
@@ -139,18 +162,57 @@ def modelled(found: dict[str, Any], exchanged: float) -> list[dict[str, Any]]:
     rows = []
     for network, (bandwidth, latency) in NETWORKS.items():
         for every in SYNC_EVERY:
-            size = found["gradient_bytes"] if every == 1 else found["state_bytes"] / every
             for ranks in RANKS:
-                seconds = found["fixed_seconds"]
-                seconds += found["seconds_a_pixel"] * found["batch"] / ranks
-                if ranks > 1:
-                    seconds += size * found["seconds_a_byte_copied"]
-                    seconds += seconds_to_exchange(
-                        size, ranks, exchanged, bandwidth, latency / every
-                    )
+                seconds = seconds_of_step(found, ranks, every, exchanged, bandwidth, latency)
                 row = {"network": network, "sync_every": every, "ranks": ranks}
                 rows.append(row | {"seconds": seconds})
     return rows
+
+
+def paying(found: dict[str, Any], exchanged: float) -> list[dict[str, Any]]:
+    """The largest number of processes that is half as efficient as one, or more."""
+    rows = []
+    for network, (bandwidth, latency) in NETWORKS.items():
+        for every in SYNC_EVERY:
+            one, *more = (
+                seconds_of_step(found, ranks, every, exchanged, bandwidth, latency)
+                for ranks in range(1, RANKS[-1] + 1)
+            )
+            good = [n for n, seconds in enumerate(more, 2) if one >= LEAST * n * seconds]
+            row = {"network": network, "sync_every": every}
+            rows.append(row | {"ranks": max(good, default=1)})
+    return rows
+
+
+def computing(found: dict[str, Any], ranks: int) -> float:
+    """Seconds of a step without what is exchanged."""
+    return found["fixed_seconds"] + found["seconds_a_pixel"] * found["batch"] / ranks
+
+
+def seconds_of_step(
+    found: dict[str, Any],
+    ranks: int,
+    every: int,
+    exchanged: float,
+    bandwidth: float,
+    latency: float,
+) -> float:
+    """Seconds of a step of so many processes.
+
+    Args:
+        found: as `measured` gives it.
+        ranks: processes.
+        every: steps between exchanges.
+        exchanged: seconds a byte of an exchange in memory.
+        bandwidth: of the network, in bytes a second.
+        latency: of a message, in seconds.
+    """
+    seconds = computing(found, ranks)
+    if ranks > 1:
+        size = found["gradient_bytes"] if every == 1 else found["state_bytes"] / every
+        seconds += size * found["seconds_a_byte_copied"]
+        seconds += seconds_to_exchange(size, ranks, exchanged, bandwidth, latency / every)
+    return seconds
 
 
 def seconds_to_exchange(

@@ -473,6 +473,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "millions": unit("{} M", 1e-6),
     "thousands": unit("{} k", 1e-3),
     "megabytes": unit("{} MB"),
+    "plus_minus": lambda row, key, digits=1: plus_minus(row, key, digits) or "—",
 }
 
 

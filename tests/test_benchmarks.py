@@ -523,3 +523,61 @@ def test_materials_are_compared_under_other_light(repository, tmp_path):
 
     # Two rows of the truth, direct and untrained, with two pixels between and around them.
     assert read_png(tmp_path / "relit.png").shape == (2 * (8 + 2) + 2, 3 * (8 + 2) + 2, 3)
+
+
+# -------------------------------------------------------------------- several processes, modelled
+
+
+def test_lines_neither_begin_nor_fall_below_zero(benchmarks):
+    line = benchmarks("scaling")["line"]
+    assert line([1, 2, 3], [12, 14, 16]) == pytest.approx((10, 2))
+    # An intercept below 0 is 0, and the slope is the best one through there.
+    intercept, slope = line([1, 2, 4], [1, 4, 10])
+    assert intercept == 0 and slope == pytest.approx((1 + 8 + 40) / (1 + 4 + 16))
+    assert line([1, 2, 3], [3, 2, 1]) == pytest.approx((2, 0))
+
+
+def test_the_most_processes_that_pay_are_half_as_efficient_as_one(benchmarks):
+    module = benchmarks("scaling")
+    found = {"fixed_seconds": 1.0, "seconds_a_pixel": 0.01, "batch": 900, "gradient_bytes": 0}
+    found |= {"state_bytes": 0, "seconds_a_byte_copied": 0.0}
+    # 1 + 9 / N over (10 / N) is a half where N is 11; latencies hardly count.
+    assert {row["ranks"] for row in module["paying"](found, 0.0)} == {10}
+    found["fixed_seconds"] = 0.0
+    rows = module["paying"](found, 0.0)
+    assert all(row["ranks"] == 1024 for row in rows if row["network"].startswith("NVLink"))
+    rows = module["modelled"](found | {"gradient_bytes": 125e6}, 0.0)
+    (two,) = (row for row in rows if row["network"] == "1 Gbit/s" and row["sync_every"] == 1
+              and row["ranks"] == 2)  # fmt: skip
+    assert two["seconds"] == pytest.approx(4.5 + 1, abs=1e-3)
+
+
+def test_ranks_are_told_by_seed_and_as_means_with_their_efficiency(benchmarks):
+    module = benchmarks("ranks")
+    rows = []
+    for seed, one, two in ((0, 90.0, 60.0), (1, 80.0, 50.0)):
+        for ranks, every, each in ((1, 1, one), (2, 1, two), (2, 10, 40.0)):
+            scores = dict.fromkeys(module["SCORES"], 20.0 + seed)
+            row = {"ranks": ranks, "sync_every": every, "seed": seed, "ms_per_step": each}
+            rows.append(row | scores | {"loss": 0.1 * ranks})
+            rows[-1] |= module["efficiency"](rows, rows[-1])
+    assert [row["efficiency"] for row in rows[:3]] == pytest.approx([1, 0.75, 90 / 80])
+    one, two, ten = module["cases_of"](rows)
+    assert (one["ranks"], two["sync_every"], ten["sync_every"]) == (1, 1, 10)
+    assert two["efficiency"] == pytest.approx((0.75 + 0.8) / 2) and two["seeds"] == 2
+    assert two["loss"] == pytest.approx(0.2) and two["albedo_psnr_sd"] == pytest.approx(0.5**0.5)
+    assert module["efficiency"](rows[1:2], rows[1]) == {}
+
+
+def test_one_process_computes_with_a_thread_a_core_when_all_is_read(benchmarks, monkeypatch):
+    from unbake.training import loop
+
+    agreed, shared = [], []
+    monkeypatch.setattr(loop, "_agree", lambda *begun: agreed.append(begun))
+    module = benchmarks("one_process")
+    monkeypatch.setattr(
+        module["backend"], "share_cores", lambda *words, **more: shared.append((words, more))
+    )
+    module["compute_with_a_thread_a_core"]()
+    loop._agree("begun", "ranks")
+    assert agreed == [("begun", "ranks")] and shared == [((1,), {"least": 1})]

@@ -60,6 +60,35 @@ def test_another_result_makes_another_page(writer, tmp_path):
     assert "77.7" in text
 
 
+def test_efficiencies_and_models_of_several_processes_have_their_place(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+
+    def changed(name, change):
+        content = json.loads((results / name).read_text())
+        change(content)
+        (results / name).write_text(json.dumps(content))
+
+    keys = ("albedo_psnr", "roughness_psnr", "render_psnr", "ms_per_step", "efficiency", "loss")
+    case = {"ranks": 2, "sync_every": 10, "seeds": 3, "loss_sd": 0.0025} | dict.fromkeys(keys, 0.75)
+    changed("ranks.json", lambda found: found.update(cases=[case]))
+    efficient = {"efficiency": 0.625, "modelled": 44.4}
+    changed("hosts.json", lambda found: [row.update(efficient) for row in found["steps"]["rows"]])
+
+    def paying(found):
+        for preset in found["presets"]:
+            rows = [{"network": n, "sync_every": e} for n in found["networks"] for e in (1, 20)]
+            preset.update(paying=[row | {"ranks": 321} for row in rows], largest_residual=0.07)
+
+    changed("scaling.json", paying)
+    text = writer["page"]("docs/machines.md", results=results)
+    assert "| 2 | 10 | 3 | 0.8 | 0.8 | 0.8 | 0.7500 ± 0.0025 | 0.8 | 0.75 |\n" in text
+    assert "| two hosts, 1 Gbit/s | 93 | 44 | 0.82 | 0.62 |\n" in text
+    assert text.count(" | 321 |\n") == 24 and "within 7 % (`cpu`)" in text
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert all(len({line.count("|") for line in table.splitlines()}) == 1 for table in tables)
+
+
 def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     """Of several seeds, with the true materials, and of views that see what training did not."""
     results = tmp_path / "results"

@@ -511,4 +511,5 @@ def _crop_in(width: int, height: int, count: int) -> tuple[int, int]:
     edges = crop_edges(count)
     if edges is None:
         raise ValueError(f"there are no crops of {count} pixels")
-    return edges if width >= height else edges[::-1]
+    short, long = edges
+    return (short, long) if width >= height else (long, short)
