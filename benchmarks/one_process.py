@@ -27,7 +27,7 @@ def compute_with_a_thread_a_core() -> None:
     agree = loop._agree
 
     def agreed(*begun: object) -> None:
-        agree(*begun)  # pyright: ignore[reportArgumentType]
+        agree(*begun)
         backend.share_cores(1, least=1)
 
     loop._agree = agreed

@@ -1,6 +1,9 @@
 """Fits of several ranks: the same step on all, and runs that do not tell how many there were."""
 
 import json
+import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,12 +21,13 @@ from unbake.config import to_toml
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.ranks import Ranks
-from unbake.training.checkpoint import state_digest
+from unbake.training.checkpoint import newest_progress, state_digest
 from unbake.training.problem import pixels_of, problem_of
 from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep, with_share
+from unbake.transport.methods import METHODS
 
 
 class Fake(Ranks):
@@ -165,7 +169,8 @@ def run(words, **more):
 @pytest.fixture
 def settings(tmp_path):
     file = tmp_path / "settings.toml"
-    file.write_text(to_toml(replace(tiny_fields(), method="direct", pixels=64)))
+    config = replace(tiny_fields(), method="direct", pixels=64, checkpoint_seconds=1)
+    file.write_text(to_toml(config))
     return file
 
 
@@ -203,15 +208,7 @@ def test_all_end_with_one_that_is_killed(cornell, settings, tmp_path):
     words = command(cornell, "--out", out, "--settings", settings, "--steps", 200_000)
     program = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        checkpoints = out / "checkpoints"
-        while not list(checkpoints.glob("step-*")) and program.poll() is None:
-            time.sleep(0.1)
-        ranks = [
-            child
-            for child in psutil.Process(program.pid).children(recursive=True)
-            if "unbake" in child.cmdline()
-        ]
-        assert len(ranks) == 2
+        ranks = until_saved(program, out)
         ranks[1].send_signal(signal.SIGKILL)
         _, left = psutil.wait_procs(ranks, timeout=2)
         assert not left
@@ -220,5 +217,95 @@ def test_all_end_with_one_that_is_killed(cornell, settings, tmp_path):
         program.kill()
     done = run([*command("--resume", cornell, "--out", out, "--steps", 1, ranks=2)])
     assert done.returncode in (0, 130), done.stderr
-    manifest = max(checkpoints.glob("step-*")) / "manifest.json"
+    manifest = max((out / "checkpoints").glob("step-*")) / "manifest.json"
     assert json.loads(manifest.read_text())["step"] > 0
+
+
+def until_saved(program, out):
+    """Wait for the first checkpoint of a fit of two; its ranks, in their order."""
+    while not list((out / "checkpoints").glob("step-*")) and program.poll() is None:
+        time.sleep(0.1)
+    children = psutil.Process(program.pid).children(recursive=True)
+    ranks = [child for child in children if "unbake" in child.cmdline()]
+    assert len(ranks) == 2
+    return sorted(ranks, key=lambda rank: rank.environ()["PMI_RANK"])
+
+
+@needs_mpi
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_signal_to_one_rank_ends_all_after_the_step_with_a_checkpoint(
+    cornell, settings, tmp_path, number
+):
+    out = tmp_path / "run"
+    words = command(cornell, "--out", out, "--settings", settings, "--steps", 200_000)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **pipes) as program:
+        try:
+            ranks = until_saved(program, out)
+            ranks[number].send_signal(signal.SIGTERM)
+            _, left = psutil.wait_procs(ranks, timeout=10)
+            assert not left
+            text, errors = program.communicate(timeout=10)
+        finally:
+            program.kill()
+    assert program.returncode == (143, 130)[number], errors  # the first one tells it
+    stopped = re.search(r"stopped at step (\d+); go on with --resume", text)
+    assert newest_progress(RunFolder(out)).step == int(stopped[1])
+
+
+#: A command whose disk is full, of the first of two ranks.
+_FULL = """
+import errno, os, sys
+def full(number):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+os.fsync = full
+from unbake.__main__ import main
+main()
+"""
+
+
+@needs_mpi
+def test_a_full_disk_of_the_first_rank_ends_all_in_one_line(cornell, settings, tmp_path, unbake):
+    out = tmp_path / "run"
+    first = unbake("fit", cornell, "--out", out, "--settings", settings, "--steps", 4)
+    assert first.status == 0, first.err
+    more = ["fit", str(cornell), "--out", str(out), "--resume", "--steps", "8"]
+    several = [MPIEXEC, "-n", "1", sys.executable, "-c", _FULL, *more, ":"]
+    done = run([*several, "-n", "1", sys.executable, "-m", "unbake", *more])
+    own = [line for line in done.stderr.splitlines() if not line.startswith("Abort(2)")]  # MPICH's
+    assert done.returncode == 2 and len([line for line in own if line]) == 1, done.stderr
+    assert own[0].startswith("rank 0: ") and "No space left on device" in own[0]
+    assert "next:" not in done.stdout
+    assert newest_progress(RunFolder(out)).step == 4 and not list(out.rglob("*.tmp"))
+
+
+@needs_mpi
+def test_an_image_that_only_one_rank_cannot_read_is_told_with_its_name(cornell, settings, tmp_path):
+    data, out = tmp_path / "data", tmp_path / "run"
+    shutil.copytree(cornell, data)
+    image = Dataset.load(data).train[1].image
+    content = image.read_bytes()
+    image.write_bytes(content[: len(content) // 2])
+    done = run(command(data, "--out", out, "--settings", settings, "--steps", 4))
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert "rank 1: " in done.stderr and image.name in done.stderr
+    assert not out.exists()
+
+
+@needs_mpi
+def test_a_fit_of_one_rank_is_that_of_no_mpi_bit_by_bit(cornell, tiny, tmp_path, repository):
+    program = [sys.executable, str(repository / "benchmarks" / "one_process.py"), "fit"]
+    found = []
+    for name, start in (("alone", []), ("ranks", [MPIEXEC, "-n", "1"])):
+        out = tmp_path / name
+        words = [*start, *program, str(cornell), "--out", str(out), "--settings", str(tiny)]
+        # With one thread sums have one order.
+        done = run(
+            words, preexec_fn=lambda: os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+        )
+        assert done.returncode == 0, done.stderr
+        (state,) = out.glob("checkpoints/step-*/state.safetensors")
+        log = [line for line in RunFolder(out).log() if "photometric" in line]
+        terms = [{k: v for k, v in line.items() if k in METHODS["ours"].terms} for line in log]
+        found.append((state.read_bytes(), terms))
+    assert found[0] == found[1] and len(found[0][1]) >= 2
