@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -104,6 +105,18 @@ def lacks_memory(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+@contextmanager
+def lack_told() -> Iterator[None]:
+    """A block in which running out of memory is a `UserError`."""
+    try:
+        yield
+    except (MemoryError, RuntimeError, ImportError) as error:  # Dr.Jit raises the second
+        if not lacks_memory(error):
+            raise
+        what, _, remedy = NO_MEMORY.partition(". ")
+        raise UserError(what, remedy=remedy) from None
 
 
 def size(count: float) -> str:

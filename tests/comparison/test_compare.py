@@ -284,6 +284,27 @@ def test_a_method_that_fails_is_recorded_and_the_others_go_on(compare, tmp_path,
     assert "error" not in result(tmp_path)["methods"]["ours"]
 
 
+def test_a_method_without_memory_fails_alone_and_a_mistake_ends_all(compare, tmp_path, monkeypatch):
+    real = module.fit
+
+    def failing(error):
+        def fit(data, run, config, **named):
+            if config.method == "ours":
+                raise error
+            return real(data, run, config, **named)
+
+        return fit
+
+    monkeypatch.setattr(module, "fit", failing(RuntimeError("jit_malloc(): out of memory!")))
+    outcome = compare("ours", "direct", steps=3)
+    assert outcome.status == 1 and "error: out of memory. Lower the resolution" in outcome.out
+    assert result(tmp_path)["methods"]["ours"]["error"].startswith("out of memory. Lower")
+    assert result(tmp_path)["methods"]["direct"]["steps"] == 3
+    monkeypatch.setattr(module, "fit", failing(RuntimeError("a mistake")))
+    with pytest.raises(RuntimeError, match="a mistake"):
+        compare("ours", "direct", steps=3)
+
+
 def test_rows_and_errors_of_all_ranks_come_together():
     told = [
         {"rows": {"a": {"steps": 3}}, "errors": {}},

@@ -51,6 +51,15 @@ def test_a_job_that_fails_is_recorded_and_runs_again(runner, tmp_path):
     assert "error" not in record(tmp_path, "a") and record(tmp_path, "a")["machine"] == {"cores": 2}
 
 
+def test_a_job_that_runs_out_of_memory_fails_alone(runner, tmp_path):
+    done = []
+    failed = runner.run([failing("a", MemoryError()), noted(done, "b")])
+    assert done == ["b"] and list(failed.failed) == ["a"]
+    assert record(tmp_path, "a")["error"].startswith("out of memory. Lower")
+    with pytest.raises(RuntimeError, match="a mistake"):
+        runner.run([failing("c", RuntimeError("a mistake"))])
+
+
 def test_a_job_that_is_stopped_goes_on_and_its_time_adds_up(runner, tmp_path):
     done, sleeping = [], 0.05
 

@@ -28,6 +28,7 @@ from ..evaluation.settings import EvaluationSettings
 from ..evaluation.yardsticks import can_have_ceiling, find_ceiling, measure_ceiling
 from ..io import write_json
 from ..machine import machine
+from ..memory import lack_told
 from ..ranks import Agreed, Ranks
 from ..report.page import write_report
 from ..training.checkpoint import Progress
@@ -91,9 +92,10 @@ def compare(
     """Fit, evaluate and report several methods, one after the other.
 
     The runs are in `out`/NAME. Finished runs are kept, interrupted ones continue. A method that
-    fails is recorded with its error. One more run, `out`/untrained, has the fields that all methods
-    start from: where the truth is grey, a method that learns nothing would seem to win. Where the
-    data set has true maps, the ceiling of each method's fields is measured first.
+    fails is recorded with its error, also where it runs out of memory. One more run,
+    `out`/untrained, has the fields that all methods start from: where the truth is grey, a method
+    that learns nothing would seem to win. Where the data set has true maps, the ceiling of each
+    method's fields is measured first.
 
     Args:
         data: folder of the data set.
@@ -143,8 +145,9 @@ def compare(
             console.rule(name, align="left")
             try:
                 run = RunFolder(out / name)
-                progress = _fitted(data, run, fits[name], clip_negative, allow_outside, console)
-                metrics = _evaluated(run, progress, evaluation, allow_outside, console)
+                with lack_told():
+                    progress = _fitted(data, run, fits[name], clip_negative, allow_outside, console)
+                    metrics = _evaluated(run, progress, evaluation, allow_outside, console)
                 rows[name] = description(fits[name]) | _numbers(run, metrics)
             except UserError as error:
                 errors[name] = error

@@ -21,6 +21,7 @@ from rich.console import Console
 
 from ..errors import UserError
 from ..io import write_json
+from ..memory import lack_told
 from ..ranks import Ranks
 from ..signals import cleaned_up, interrupt
 
@@ -220,7 +221,8 @@ class JobRunner:
 
         with cleaned_up(keep):
             try:
-                record["findings"] = job.work()
+                with lack_told():
+                    record["findings"] = job.work()
             except UserError as error:
                 record["error"] = str(error)
                 raise
