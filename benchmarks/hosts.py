@@ -70,7 +70,9 @@ SECONDS, FEWEST, MOST = 8.0, 5, 40
 MESSAGES = 100
 #: Training time, in seconds, that cuts fall into, and seconds after which a process hangs.
 _TRAINING, _HANGS = 3.0, 240.0
-_TOLD = re.compile(r"^rank \d+: the other ranks have not answered for \d+ s\..*--resume$", re.M)
+_TOLD = re.compile(
+    r"^process \d+: the other processes have not answered for \d+ s\..*--resume$", re.M
+)
 
 
 def main() -> None:

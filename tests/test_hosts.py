@@ -78,7 +78,7 @@ def test_ranks_with_work_of_their_own_end_where_the_network_is_cut(
         assert not left
         _, errors = process.communicate()
         assert process.returncode == 2
-        assert "rank 0: rank 1 has not been heard of for 2 s" in errors
+        assert "process 0: process 1 has not been heard of for 2 s" in errors
 
 
 @needs_mpi

@@ -191,7 +191,7 @@ def test_means_and_answers_are_those_of_all():
 def test_ranks_with_other_input_are_named():
     Ranks(Two(others=[None])).require_same({"settings": "a", "data set": "b"})
     other = np.zeros(64, np.uint8)
-    with pytest.raises(Agreed, match="other settings on rank 1; other data set on rank 1"):
+    with pytest.raises(Agreed, match="other settings on process 1; other data set on process 1"):
         Ranks(Two(others=[other])).require_same({"settings": "a", "data set": "b"})
 
 
@@ -199,7 +199,7 @@ def test_ranks_with_other_input_are_named():
 def test_an_error_of_one_rank_is_told_on_all(rank):
     gathered = [np.uint8([rank == 0]), error_of("no memory", "a file", "Mend it")]
     work = int if rank == 0 else lambda: fail("no memory")
-    with pytest.raises(Agreed, match=r"^a file: rank 1: no memory\. Mend it$"):
+    with pytest.raises(Agreed, match=r"^a file: process 1: no memory\. Mend it$"):
         Ranks(Two(rank, gathered)).together(work)
 
 
@@ -343,7 +343,10 @@ def test_signs_of_life_arrive(beats, repository, monkeypatch):
     if beats:
         assert sorted(done.stdout.splitlines()) == ["0 True", "1 True"] and not done.stderr
     else:
-        assert done.returncode == 2 and "rank 1: the other ranks have not answered" in done.stdout
+        assert (
+            done.returncode == 2
+            and "process 1: the other processes have not answered" in done.stdout
+        )
 
 
 #: Rank 1 works longer than the others would wait without signs of life.
@@ -378,11 +381,11 @@ def test_ranks_apart_end_where_one_is_silent_or_the_library_fails(monkeypatch, a
     monkeypatch.setattr(Two, "Irecv", lambda *_, **__: Request(None))
     with pytest.raises(Ended, match="2"):
         ranks._watch(threading.Event())
-    assert "rank 0: rank 1 has not been heard of for 0 s. See" in capsys.readouterr().err
+    assert "process 0: process 1 has not been heard of for 0 s. See" in capsys.readouterr().err
     monkeypatch.setattr(Two, "Isend", lambda *_, **__: fail("lost"))
     with pytest.raises(Ended, match="2"):
         ranks._watch(threading.Event())
-    assert "rank 0: a file: lost" in capsys.readouterr().err
+    assert "process 0: a file: lost" in capsys.readouterr().err
     assert len(alarms) == 2
 
 
@@ -400,7 +403,7 @@ def test_what_fails_on_one_rank_alone_ends_all(rank, alarms):
     world, told = Two(rank), []
     with pytest.raises(SystemExit, match="2"), Ranks(world).guarded(told.append):
         fail("disk full")
-    assert told == [f"rank {rank}: a file: disk full. Mend it"] and world.status == 2
+    assert told == [f"process {rank}: a file: disk full. Mend it"] and world.status == 2
     assert len(alarms) == 1 and 1 < alarms[0] < 60
 
 
@@ -420,7 +423,7 @@ def test_an_error_of_one_rank_is_one_line_with_the_remedy(error, told):
     world, said = Two(1), []
     with pytest.raises(SystemExit, match="2"), Ranks(world).guarded(said.append):
         raise error
-    assert len(said) == 1 and said[0].startswith(f"rank 1: {told}") and "\n" not in said[0]
+    assert len(said) == 1 and said[0].startswith(f"process 1: {told}") and "\n" not in said[0]
 
 
 def test_what_all_know_of_is_told_by_the_first_and_ends_the_others():

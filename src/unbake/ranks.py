@@ -131,7 +131,7 @@ class Agreed(UserError):
     @staticmethod
     def of(error: UserError, rank: int | None = None) -> Agreed:
         """The error of one rank, or the same one of all."""
-        what = error.what if rank is None else f"rank {rank}: {error.what}"
+        what = error.what if rank is None else f"process {rank}: {error.what}"
         return Agreed(what, error.where, error.remedy)
 
 
@@ -276,9 +276,9 @@ class Ranks:
         for number, name in enumerate(told):
             others = np.flatnonzero((rows[:, number] != rows[0, number]).any(-1))
             if len(others):
-                faults.append(f"other {name} on rank {', '.join(map(str, others))}")
+                faults.append(f"other {name} on process {', '.join(map(str, others))}")
         if faults:
-            what = f"the ranks do not work on the same: {'; '.join(faults)} than on rank 0"
+            what = f"the processes do not work on the same: {'; '.join(faults)} than on process 0"
             raise Agreed(what, remedy="Start all with the same version, options and data set")
 
     def together(self, work: Callable[[], Result], patience: float | None = None) -> Result:
@@ -382,7 +382,7 @@ class Ranks:
         try:
             self._listen(stop)
         except (UserError, RuntimeError) as error:  # the library may know first
-            print(f"rank {self.rank}: {_told(error)}", file=sys.stderr)
+            print(f"process {self.rank}: {_told(error)}", file=sys.stderr)
             _end_by(self._communicator)
 
     def _listen(self, stop: threading.Event) -> None:
@@ -403,7 +403,7 @@ class Ranks:
                     silent[rank] = 0.0
                     coming[rank] = self._communicator.Irecv(signs[rank], source=rank, tag=_APART)
                 if silent[rank] > self._patience:
-                    what = f"rank {rank} has not been heard of for {self._patience:.0f} s"
+                    what = f"process {rank} has not been heard of for {self._patience:.0f} s"
                     remedy = "See whether its network is cut; the same command goes on"
                     raise UserError(what, remedy=remedy)
         for request in coming.values():
@@ -432,7 +432,7 @@ class Ranks:
             request = begin(self._alone_with())
             self._wait(request, self._limit() if patience is None else patience)
         except RuntimeError as error:  # the library knows that a rank is gone
-            what = f"the connection to the other ranks is lost ({error})"
+            what = f"the connection to the other processes is lost ({error})"
             raise UserError(" ".join(what.split()), remedy=_GO_ON) from None
         self._announced = None
 
@@ -481,7 +481,7 @@ class Ranks:
             if waited > _LONG and self._is_alive():
                 waited = _LONG
             if waited > patience:
-                what = f"the other ranks have not answered for {patience:.0f} s"
+                what = f"the other processes have not answered for {patience:.0f} s"
                 raise UserError(what, remedy=_GO_ON)
             if waited > _AWAKE:
                 time.sleep(_NAP if waited < _LONG else _LONG_NAP)
@@ -515,7 +515,7 @@ class Ranks:
                 raise
             if not self.leads:
                 time.sleep(_AFTER_YOU)
-            say(f"rank {self.rank}: {_told(error)}")
+            say(f"process {self.rank}: {_told(error)}")
             _end_by(self._alone_with())
 
 

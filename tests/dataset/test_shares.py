@@ -126,7 +126,7 @@ def test_an_image_that_cannot_be_read_ends_all(dataset):
     made.train[4].image.write_bytes(b"no image")
 
     def load(ranks):
-        with pytest.raises(Agreed, match="rank 2: ") as caught:
+        with pytest.raises(Agreed, match="process 2: ") as caught:
             ranks.together(lambda: Photographs.load(made, False, ranks=ranks))
         return caught.value.where
 
@@ -140,7 +140,7 @@ def test_what_fails_on_one_rank_before_others_ask_it_is_told_by_all():
         return ranks.joined(lambda: np.zeros(3))
 
     def begin(ranks):
-        with pytest.raises(Agreed, match="rank 1: bad"):
+        with pytest.raises(Agreed, match="process 1: bad"):
             ranks.together(lambda: work(ranks))
 
     on_ranks(3, begin)
@@ -162,7 +162,7 @@ def test_pixels_of_any_view_can_be_looked_up(dataset):
 
     def differ(ranks):
         part = Photographs.load(made, False, ranks=ranks)
-        with pytest.raises(Agreed, match="other pixels to look at on rank 1"):
+        with pytest.raises(Agreed, match="other pixels to look at on process 1"):
             part.radiance(numbers[ranks.rank :])
 
     on_ranks(2, differ)

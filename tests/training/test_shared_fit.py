@@ -197,7 +197,7 @@ def test_ranks_with_other_settings_are_refused(cornell, settings, tmp_path):
     wrong += ["--seed", "1", ":", *wrong[1:]]
     refused = run(wrong)
     assert refused.returncode == 2
-    assert "do not work on the same: other settings on rank 1" in refused.stderr
+    assert "do not work on the same: other settings on process 1" in refused.stderr
     assert not (tmp_path / "other").exists() and refused.stderr.count("\n") == 1
 
 
@@ -274,7 +274,7 @@ def test_a_full_disk_of_the_first_rank_ends_all_in_one_line(cornell, settings, t
     done = run([*several, "-n", "1", sys.executable, "-m", "unbake", *more])
     own = [line for line in done.stderr.splitlines() if not line.startswith("Abort(2)")]  # MPICH's
     assert done.returncode == 2 and len([line for line in own if line]) == 1, done.stderr
-    assert own[0].startswith("rank 0: ") and "No space left on device" in own[0]
+    assert own[0].startswith("process 0: ") and "No space left on device" in own[0]
     assert "next:" not in done.stdout
     assert newest_progress(RunFolder(out)).step == 4 and not list(out.rglob("*.tmp"))
 
@@ -288,7 +288,7 @@ def test_an_image_that_only_one_rank_cannot_read_is_told_with_its_name(cornell, 
     image.write_bytes(content[: len(content) // 2])
     done = run(command(data, "--out", out, "--settings", settings, "--steps", 4))
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
-    assert "rank 1: " in done.stderr and image.name in done.stderr
+    assert "process 1: " in done.stderr and image.name in done.stderr
     assert not out.exists()
 
 

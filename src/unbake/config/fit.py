@@ -248,15 +248,17 @@ class FitConfig:
             tell_default=False,
         ),
     ] = 0.0
-    #: Batch size in pixels (Table 1).
-    pixels: Annotated[int, Flag("Pixels in a step", name="batch")] = 1024
+    #: Batch size in pixels (Table 1), of all processes of a fit together.
+    pixels: Annotated[
+        int, Flag("Pixels in a step; with mpiexec, of all processes together", name="batch")
+    ] = 1024
     #: Steps that each of several ranks takes by itself before their states are averaged (local SGD;
     #: ours). 1: gradients are averaged in each step.
     sync_every: Annotated[
         int,
         Flag(
             "With mpiexec: steps that each process takes by itself, until all average what they "
-            "learned; for slow networks. 1: they take every step together",
+            "learned, 20 at most; for slow networks. 1: they take every step together",
             metavar="STEPS",
         ),
     ] = 1
