@@ -422,7 +422,7 @@ def test_a_contender_is_a_method_and_maybe_a_representation():
     chosen = bitmap.settings(shared)
     assert (chosen.method, chosen.representation) == ("prb", "bitmap")
     # Those are settings of ours alone, which the others refuse.
-    assert (chosen.bounces, chosen.prior) == (1, "extra-bounce")
+    assert (chosen.bounces, chosen.prior) == (0, "extra-bounce")
 
 
 @pytest.mark.slow

@@ -93,6 +93,21 @@ def test_a_method_has_the_rates_that_were_found_for_it(table, monkeypatch):
     assert set(defaults("ours").rate_factors.values()) == {1.0}
 
 
+def test_objects_have_two_bounces_before_the_radiance_field_and_rooms_one():
+    for method in ("ours", "no-prior"):
+        assert defaults(method).bounces == 1 and defaults(method, "object").bounces == 2
+    # Those without a radiance field, or of the paper's ablation, have what they are by name.
+    for method in ("direct", "with-stop-gradient", "prb"):
+        assert defaults(method, "object").bounces == 1
+    assert defaults("ours", "object", bounces=1).bounces == 1
+    for name in ("paper", "release", "release-lighting"):
+        assert with_method_defaults(preset(name), "object").bounces == 1
+    # Settings of a run that was started have a number; another method has its own again.
+    started = defaults("direct", "object")
+    other = with_method_defaults(MethodVariant.of("ours").settings(started), "object")
+    assert other.bounces == 2
+
+
 def test_what_a_user_says_stays(table):
     found = defaults("prb", rate_factors={"roughness": 1.5}, estimator="two-pass")
     assert found.rate_factors["roughness"] == 1.5 and found.rate_factors["albedo"] == 2.0

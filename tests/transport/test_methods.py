@@ -214,7 +214,7 @@ def test_a_method_that_attaches_every_edge_is_recorded_and_replayed(built_in, ra
         EXTRA: Attached(scene=True, lhs=True, rhs=True),
         LHS: LIGHT,
     }
-    register_method(Method("all", "every edge", row, takes_options=True))
+    register_method(Method("all", "every edge", row, takes_bounces=True, takes_prior=True))
     settings = replace(TINY_FIT, method="all", bounces=2, radiance_spp=radiance_spp)
     step, state = start(built_in, settings)
     before = {k: np.array(v).copy() for _, adam in state.optimizers() for k, v in adam.items()}

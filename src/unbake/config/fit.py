@@ -154,6 +154,9 @@ OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
 
 #: Bounces that can be differentiated before the radiance field takes over.
 MOST_BOUNCES = 16
+#: Those that a fit chooses for an object, whose light comes from outside: an error of L_θ is then
+#: seen over two bounces, and a second one costs little. In rooms there is one, as in the paper.
+BOUNCES_OF_OBJECTS = 2
 
 
 # Choices for the help of the command line, from the tables that settings name rows of.
@@ -206,10 +209,14 @@ class FitConfig:
             choices=_methods,
         ),
     ] = "ours"
-    #: Sec. 6.3; `ours` only.
+    #: k of Sec. 6.3, of methods with L_θ along one bounce or a few; 0: see `chosen_bounces`.
     bounces: Annotated[
-        int, Flag("Differentiable bounces of ours before the radiance field is asked")
-    ] = 1
+        int,
+        Flag(
+            "Differentiable bounces of ours before the radiance field is asked; 0: 2 where "
+            "photographs hide the background, else 1"
+        ),
+    ] = 0
     #: Sec. 4.2; `ours` only.
     prior: Annotated[
         PriorName, Flag("Where ours takes the residual: extra-bounce is at x2 as well as at x1")
@@ -339,15 +346,17 @@ class FitConfig:
             fewer += [f"spp to {spp}"] if spp else []
             raise UserError(what, "pixels", f"Lower {' or '.join(fewer)}")
         require(
-            1 <= self.bounces <= MOST_BOUNCES,
+            0 <= self.bounces <= MOST_BOUNCES,
             "bounces",
-            f"1 to {MOST_BOUNCES} (every bounce is kept in memory; prb follows longer paths)",
+            f"0 to {MOST_BOUNCES} (every bounce is kept in memory; prb follows longer paths)",
             self.bounces,
         )
         require(self.method in METHODS, "method", f"one of {', '.join(METHODS)}", self.method)
-        if not METHODS[self.method].takes_options:
-            require(self.bounces == 1, "bounces", f"1 for the method {self.method}", self.bounces)
-            only = f"extra-bounce for the method {self.method}"
+        method, of_method = METHODS[self.method], f"for the method {self.method}"
+        if not method.takes_bounces:
+            require(self.bounces in (0, 1), "bounces", f"1 {of_method}", self.bounces)
+        if not method.takes_prior:
+            only = f"extra-bounce {of_method}"
             require(self.prior == "extra-bounce", "prior", only, self.prior)
         if self.estimator == "all-pairs":
             wanted = (
@@ -426,6 +435,15 @@ class FitConfig:
         if self.estimator == "auto":
             return "two-pass" if self.follows_paths else "split-halves"
         return self.estimator
+
+    @property
+    def chosen_bounces(self) -> int:
+        """Differentiable bounces before L_θ is asked.
+
+        With `bounces = 0` there is one. A fit that starts chooses by the kind of scene where the
+        settings leave it open; see `training.defaults.with_method_defaults`.
+        """
+        return self.bounces or 1
 
     @property
     def one_pass(self) -> ChosenEstimator:

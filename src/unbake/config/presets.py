@@ -25,6 +25,7 @@ def _paper() -> FitConfig:
     grid = GridConfig(levels=16, features=2, table_log2=17, base_resolution=2, growth=2.0)
     return FitConfig(
         preset="paper",
+        bounces=1,
         steps=18_000,
         pixels=16_384,
         pixel_sampling="one-view-crop",
@@ -109,9 +110,9 @@ def with_quality(config: FitConfig, name: str) -> FitConfig:
 def with_method(config: FitConfig, name: str) -> FitConfig:
     """The settings with another method, without what belongs to the method that they name.
 
-    Settings of a run that was started have the rates, the estimator and the schedule of its method
-    filled in. Another method has its own, which a fit chooses when it starts. What a user gives in
-    settings that leave some of it open stays.
+    Settings of a run that was started have the rates, the estimator, the schedule and the bounces
+    of its method filled in. Another method has its own, which a fit chooses when it starts. What a
+    user gives in settings that leave some of it open stays.
 
     Args:
         config: settings, as a user gives them or of a run.
@@ -122,12 +123,16 @@ def with_method(config: FitConfig, name: str) -> FitConfig:
     """
     if name == config.method:
         return config
-    if not method_named(name).takes_options:
-        config = dataclasses.replace(config, bounces=1, prior="extra-bounce")
+    method = method_named(name)
+    if not method.takes_bounces:
+        config = dataclasses.replace(config, bounces=0)
+    if not method.takes_prior:
+        config = dataclasses.replace(config, prior="extra-bounce")
     if None not in config.rate_factors.values():
         own = preset(config.preset)
         config = dataclasses.replace(
             config,
+            bounces=own.bounces,
             rate_factors={},
             estimator="auto",
             final_learning_rate=own.final_learning_rate,

@@ -196,7 +196,7 @@ def description(config: FitConfig) -> dict:
         "unknown": config.unknown,
         "quantities": list(config.quantities) if config.learns_materials else [],
         "method": config.method,
-        "bounces": config.bounces,
+        "bounces": config.chosen_bounces,
         "prior": config.prior,
         "representation": config.representation if config.learns_materials else None,
         "radiance": config.radiance_representation if cached else None,

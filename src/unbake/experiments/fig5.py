@@ -107,7 +107,7 @@ def _measure(
             if "error" in row:
                 continue
             config = MethodVariant.of(curve.variant).settings(shared)
-            if METHODS[config.method].takes_options:
+            if METHODS[config.method].takes_prior:
                 config = replace(config, prior=curve.prior)
             try:
                 with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, curve.symbolic):

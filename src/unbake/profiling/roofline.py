@@ -85,7 +85,7 @@ def roofline(problem: Problem, pixels: PixelSource, state: State, config: FitCon
 
 
 def _work(problem: Problem, state: State, config: FitConfig) -> Work:
-    needs = requirements(config.chosen_method.terms, config.bounces)
+    needs = requirements(config.chosen_method.terms, config.chosen_bounces)
     arrays = [a for _, adam in state.optimizers() for a in adam.values()]
     adam = Work(0, 0, 4 * _ADAM_FLOATS * sum(dr.width(a) for a in arrays))
     work = adam + _of_the_image(problem, needs).times(config.samples_per_pass)

@@ -6,11 +6,12 @@ from dataclasses import replace
 from typing import TypeVar
 
 from ..config import FitConfig
-from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
+from ..config.fit import BOUNCES_OF_OBJECTS, OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults, method_defaults
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
 from ..quantities import QUANTITIES
+from ..transport.methods import METHODS
 from ..transport.objective import has_radiance
 from .grid_sizes import with_grid_sizes
 from .path_depth import with_path_depth
@@ -37,7 +38,7 @@ def with_data_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
 
 
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
-    """The settings with the method's own learning rates, estimator and schedule.
+    """The settings with the method's own learning rates, estimator, schedule and bounces.
 
     Factors of learning rates, an estimator and a schedule that are given stay. Factors of materials
     were found with networks: other representations keep the fields' own rates. A method without L_θ
@@ -66,6 +67,7 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
         estimator = config.one_pass if estimator == "all-pairs" else estimator
     return replace(
         config,
+        bounces=config.bounces or own_bounces(config, kind),
         rate_factors=factors,
         estimator=estimator,
         final_learning_rate=_first_known(
@@ -73,6 +75,12 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
         ),
         warm_up=_first_known(config.warm_up, found.warm_up, own_warm_up(config)),
     )
+
+
+def own_bounces(config: FitConfig, kind: SceneKind) -> int:
+    """The differentiable bounces of a method where the settings leave them open."""
+    takes = METHODS[config.method].takes_bounces
+    return BOUNCES_OF_OBJECTS if takes and kind == "object" else 1
 
 
 def own_warm_up(config: FitConfig) -> int:

@@ -640,7 +640,7 @@ def _context(problem: Problem, config: FitConfig) -> SamplerContext:
         radiance=problem.radiance,
         hide_emitters=problem.hide_emitters,
         spp=config.spp,
-        bounces=config.bounces,
+        bounces=config.chosen_bounces,
         max_depth=config.path.chosen_depth,
         rr_depth=config.path.rr_depth,
         read_by_scene=problem.read_by_scene,

@@ -42,7 +42,8 @@ class Method:
         sampler: name of the path sampler (`samplers.py`).
         follows_paths: whether paths are followed to their end, `path.max_depth`. All light is then
             in the image, and there is no radiance field.
-        takes_options: whether the settings `bounces` and `prior` change it.
+        takes_bounces: whether the setting `bounces` changes it.
+        takes_prior: whether the setting `prior` does.
     """
 
     name: str
@@ -50,7 +51,8 @@ class Method:
     terms: Mapping[str, Attached]
     sampler: str = BOUNCES
     follows_paths: bool = False
-    takes_options: bool = False
+    takes_bounces: bool = False
+    takes_prior: bool = False
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"\w[\w.-]*", self.name):
@@ -109,12 +111,14 @@ for _method in (
         "ours",
         "radiometric prior at two vertices and LHS loss",
         {PHOTOMETRIC: _SCENE, PRIOR: _LHS, EXTRA: _LHS, LHS: _LHS},
-        takes_options=True,
+        takes_bounces=True,
+        takes_prior=True,
     ),
     Method(
         "no-prior",
         "ours, the radiance field learned from photographs alone",
         {PHOTOMETRIC: _SCENE, LHS: _LHS},
+        takes_bounces=True,
     ),
     Method("direct", "direct illumination only", {PHOTOMETRIC: _SCENE}),
     Method(
