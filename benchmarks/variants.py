@@ -5,7 +5,7 @@
 
 The fits of a seed follow each other, and the file is written after each seed. With --go-on, seeds
 that it has already are kept. Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
-held-out views; seconds are those of training.
+held-out views, with those of the untrained fields; seconds are those of training.
 """
 
 from __future__ import annotations
@@ -125,6 +125,8 @@ def fit(
         unbake("evaluate", run, "--train-views", 0, log=log)
         metrics = json.loads(RunFolder(run).metrics_file.read_text(encoding="utf-8"))
     scores = {key: metrics["heldout"][key] for key in SCORES}
+    untrained = metrics["yardsticks"]["untrained"]
+    scores |= {f"untrained_{key}": untrained[key] for key in SCORES if key in untrained}
     return scores | {key: metrics[key] for key in LENGTH}
 
 

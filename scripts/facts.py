@@ -166,6 +166,43 @@ class Facts:
         """Time of a step as a multiple of that of ours with the same materials."""
         return benchmark_tables.ratio(self.step(name, method, materials, spp), self.result(name))
 
+    def in_time(self) -> list[Row]:
+        """Ours beside PRB after the same training time, a row a scene, by `benchmarks/variants.py`.
+
+        Rows have `data`, `seconds`, `seeds` and `views`, the row of each method by its name, and
+        the `note` of their result: what has changed since, or None.
+        """
+        rows = []
+        for name in ("demo-in-time", "rooms", "objects"):
+            found = self.result(name) if self.has(name) else {"rows": []}
+            by_scene: dict[str, Row] = {}
+            for row in found["rows"]:
+                by_scene.setdefault(row["data"], {})[row["method"]] = row
+            rows += [
+                {
+                    "data": data,
+                    "seconds": found["length"]["seconds"],
+                    "seeds": len(found["seeds"]),
+                    "views": found["data"][data]["train"],
+                    "note": found.get("note"),
+                }
+                | methods
+                for data, methods in by_scene.items()
+            ]
+        return rows
+
+    def behind_in_time(self) -> list[str]:
+        """Where PRB is ahead of ours in `in_time` by more than seeds differ, in words."""
+        told = []
+        for word, key in KEYS.items():
+            for row in self.in_time():
+                ours, prb = row["ours"], row["prb"]
+                spread = math.hypot(*(x.get(f"{key}_sd") or 0.0 for x in (ours, prb)))
+                difference = above(ours[key] - prb[key], spread)
+                if difference.startswith("−"):
+                    told.append(f"{word} of `{row['data']}` ({difference})")
+        return told
+
     def older(self, *names: str) -> str:
         """A warning where results were made before every method had settings of its own.
 
@@ -473,6 +510,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "millions": unit("{} M", 1e-6),
     "thousands": unit("{} k", 1e-3),
     "megabytes": unit("{} MB"),
+    "code": "`{}`".format,
     "plus_minus": lambda row, key, digits=1: plus_minus(row, key, digits) or "—",
 }
 

@@ -157,23 +157,38 @@ def test_a_search_that_finds_split_halves_better_is_told(writer, tmp_path):
     assert "| two passes, as in Mitsuba; split halves for rooms | no |" in page
 
 
-def test_the_headline_is_of_the_better_estimator_and_of_equal_schedules(writer, tmp_path):
+def test_where_a_rival_is_ahead_is_told_beyond_the_spread_alone(writer, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(ROOT / "benchmarks" / "results", results)
-    content = json.loads((results / "rivals-demo.json").read_text())
-    rows = content["methods"]
-    rows["ours"] |= {"albedo_psnr": 40.0, "albedo_psnr_sd": 0.0}
-    curve = [{"seconds": 0.0, "albedo_psnr": 0.0, "roughness_psnr": 0.0}]
-    end = {"seconds": 50.0, "albedo_psnr": 40.0, "roughness_psnr": 40.0}
-    rows["ours"]["per_seed"] = [{"seed": seed, "score": [*curve, end]} for seed in (0, 1)]
-    for name, psnr in (("prb", 10.0), ("prb-neural-all-pairs", 20.0)):
-        rows[name] |= {"albedo_psnr": psnr, "albedo_psnr_sd": 0.0, "seconds": 50.0}
-        score = [*curve, end | {"albedo_psnr": psnr}]
-        rows[name]["per_seed"] = [{"seed": seed, "score": score} for seed in (0, 1)]
-    (results / "rivals-demo.json").write_text(json.dumps(content))
+    content = json.loads((results / "rooms.json").read_text())
+    for row in content["rows"]:
+        ahead = row["method"] == "prb" and row["data"] == "kitchen"
+        row |= {"albedo_psnr": 30.0 if ahead else 20.0, "albedo_psnr_sd": 1.0}
+        row |= {"roughness_psnr": 21.0 if ahead else 20.0, "roughness_psnr_sd": 1.0}
+        row |= {"render_psnr": 20.0, "render_psnr_sd": 1.0}
+    (results / "rooms.json").write_text(json.dumps(content))
     readme = " ".join(writer["page"]("README.md", results=results).split())
-    assert "ahead by +20.0 dB in albedo" in readme
-    assert "ours has after 25.0 ± 0.0 s, 2 times sooner" in readme
+    told = readme.partition("beyond the spread of seeds: ")[2].partition(" - **")[0]
+    assert "albedo of `kitchen` (−10.0 dB)" in told and "roughness of `kitchen`" not in told
+    assert "| 30.0 ± 1.0 |" in readme
+
+
+def test_what_has_changed_since_a_result_is_told_with_its_scenes(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    for name in ("rooms", "demo-in-time"):
+        content = json.loads((results / f"{name}.json").read_text())
+        content.pop("note", None)
+        if name == "rooms":
+            content["note"] = "with something else"
+        (results / f"{name}.json").write_text(json.dumps(content))
+    readme, page = (
+        " ".join(writer["page"](name, results=results).split())
+        for name in ("README.md", "docs/comparison.md")
+    )
+    assert "`staircase`, `veach-ajar`: with something else." in readme
+    assert "`demo`, `kitchen`" not in readme
+    assert page.count("Default settings, with something else; about") == 1
 
 
 def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, tmp_path):
@@ -243,7 +258,7 @@ def test_step_times_of_version_0_1_are_marked(writer, tmp_path):
     written = writer["pages"](results=results)
     for page, name in (("comparison.md", "methods-demo"), ("performance.md", machine)):
         assert f"`{name}.json`" in " ".join(written[ROOT / "docs" / page].split())
-    assert f"`{machine}.json`" in " ".join(written[ROOT / "README.md"].split())
+    assert "`methods-demo.json`" in " ".join(written[ROOT / "README.md"].split())
 
     with_depth = json.loads((results / "methods-demo.json").read_text())
     for row in with_depth["rows"]:
