@@ -109,6 +109,14 @@ def test_saving_leaves_one_file_and_replaces_it_whole(folder):
     ]
 
 
+def test_light_that_is_unknown_is_kept(folder):
+    assert Dataset.load(folder).light == "known"
+    assert "light" not in json.loads((folder / "transforms.json").read_text())
+    change(folder, set_top("light", "unknown"))
+    Dataset.load(folder).save(folder)
+    assert Dataset.load(folder).light == "unknown"
+
+
 def test_files_outside_the_folder_are_not_saved(folder, tmp_path):
     with pytest.raises(UserError, match="lies outside the data folder"):
         Dataset.load(folder).save(tmp_path / "elsewhere")
@@ -185,6 +193,8 @@ NAN_POSE = [[float("nan")] * 4] * 4
         (set_top("scene", "/etc/passwd"), "lies outside the data folder"),
         (set_top("background", "black"), "unknown background 'black'"),
         (set_top("background", ["hidden"]), "unknown background"),
+        (set_top("light", "guessed"), "unknown light 'guessed'"),
+        (set_top("light", None), "unknown light None"),
         (set_top("render", []), "'render' is not an object"),
         (set_top("coverage", "most"), "'coverage' is not a number"),
         (set_top("coverage", 1.5), "'coverage' is not a number from 0 to 1"),

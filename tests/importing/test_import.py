@@ -320,6 +320,21 @@ def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
 # -------------------------------------------------------------------------------------------- light
 
 
+def test_light_that_nobody_gave_is_unknown_and_every_command_says_so(
+    nerfstudio, meshes, tmp_path, unbake
+):
+    data = tmp_path / "data"
+    given = [word for mesh in meshes for word in ("--mesh", mesh)]
+    command = f"next: unbake fit {data} --unknown materials+lighting --out RUN"
+    assert command in unbake("import", nerfstudio, *given, "--out", data).out
+    assert Dataset.load(data).light == "unknown"
+    assert command in unbake("data", "check", data).out
+    content = json.loads((data / "transforms.json").read_text())
+    del content["light"]
+    (data / "transforms.json").write_text(json.dumps(content))
+    assert f"next: unbake fit {data} --out RUN" in unbake("data", "check", data).out
+
+
 def test_known_lights_take_the_place_of_the_unknown_environment(
     nerfstudio, meshes, tmp_path, monkeypatch
 ):
@@ -331,7 +346,9 @@ def test_known_lights_take_the_place_of_the_unknown_environment(
     )
     light = LightConfig(lights=lights)
     import_data(nerfstudio, "data", meshes, light=light, tell=quiet)
-    scene = parse(Dataset.load("data").scene).instantiate()
+    dataset = Dataset.load("data")
+    assert dataset.light == "known"
+    scene = parse(dataset.scene).instantiate()
     assert scene.environment() is None and len(scene.emitters()) == 1
     assert len(list(Path("data/scene/meshes").iterdir())) == len(meshes)
     lights.write_text("<scene version='3.0.0'>")

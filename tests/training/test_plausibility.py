@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from support import TINY_FIT
 
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.config import update
 from unbake.dataset.views import Dataset
 from unbake.fields.camera import CameraModel
@@ -14,12 +16,22 @@ from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training import plausibility
 from unbake.training.fresh_fit import begin_fit
 from unbake.training.plausibility import data_warnings, untold_response
+from unbake.training.run_folder import RunFolder
 
 
 def told(folder, config=TINY_FIT):
     dataset = Dataset.load(folder)
     fit = begin_fit(dataset, config)
     return data_warnings(dataset, fit.pixels, fit.problem)
+
+
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory):
+    """A data set under an environment whose light is said to be unknown, to be read alone."""
+    data = tmp_path_factory.mktemp("sky") / "data"
+    small = CaptureSettings(views=2, held_out=1, resolution=16, spp=8, max_depth=6)
+    replace(capture("still", data, small, tell=lambda line: None), light="unknown").save(data)
+    return data
 
 
 @pytest.fixture
@@ -58,6 +70,29 @@ def test_dark_and_bright_surfaces_are_not_doubted(factor, times):
 def test_where_lights_are_unknown_any_brightness_is_good(times):
     lighting = update(TINY_FIT, {"unknown": "emission"})
     assert told(times(1e6), lighting) == []
+
+
+def test_a_placeholder_that_is_taken_for_the_light_is_told(sky):
+    (line,) = told(sky, update(TINY_FIT, {"unknown": "materials"}))
+    assert line.startswith("the data set says that its light is unknown, and what stands for it")
+    assert told(sky) == told(sky, update(TINY_FIT, {"unknown": "lighting"})) == []
+
+
+def test_light_that_is_unknown_is_recovered_unless_the_user_says_otherwise(
+    sky, cornell, tiny, unbake, tmp_path
+):
+    line = "the data set says that its light is unknown: it is recovered with the materials"
+    for data, words, unknown in (
+        (sky, (), "materials+lighting"),
+        (sky, ("--unknown", "materials"), "materials"),
+        (sky, ("--unknown", "lighting"), "lighting"),
+        (cornell, (), "materials"),
+    ):
+        run = tmp_path / "-".join((data.parent.name, *words))
+        outcome = unbake("fit", data, "--out", run, "--settings", tiny, "--steps", 0, *words)
+        assert outcome.status == 0, outcome
+        assert RunFolder(run).settings().unknown == unknown
+        assert (line in outcome.out) == (data == sky and not words)
 
 
 def test_what_direct_light_does_not_reach_is_lit_by_whole_paths(cornell, monkeypatch):

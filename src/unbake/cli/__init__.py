@@ -227,8 +227,7 @@ def import_(
             print(f"  {printable(fault, _LONGEST)}", file=sys.stderr)
         raise UserError(f"{error.count}, listed above", source, error.remedy) from None
     took = f"{time.perf_counter() - start:.0f} s"
-    unknown = " --unknown materials+lighting" if known is None else ""
-    _say(f"wrote {out} in {took}; next: unbake fit {_word(out)}{unknown} --out RUN")
+    _say(f"wrote {out} in {took}; next: {_fit_of(out, light_known=known is not None)}")
 
 
 def data(
@@ -275,7 +274,8 @@ def data(
         _say(f"wrote {write_check(result, out, clip_negative=clip_negative)}")
     kinds = {kind: result.count(kind) for kind in ("error", "warning", "hint")}
     told = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in kinds.items() if n)
-    ready = f"next: unbake fit {_word(folder)} --out RUN"
+    known = result.dataset is None or result.dataset.light == "known"
+    ready = f"next: {_fit_of(folder, light_known=known)}"
     _say(f"{told or 'nothing is wrong'}; {ready if result.usable else 'a fit makes no sense yet'}")
     return 0 if result.usable else 2
 
@@ -1059,6 +1059,12 @@ def _word(path: Path) -> str:
     """A path as a word of a command that a shell reads."""
     text = str(path)
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
+
+
+def _fit_of(data: Path, *, light_known: bool) -> str:
+    """The command that fits a data set."""
+    unknown = "" if light_known else " --unknown materials+lighting"
+    return f"unbake fit {_word(data)}{unknown} --out RUN"
 
 
 def _say(line: str) -> None:

@@ -32,7 +32,7 @@ from ..memory import lack_told
 from ..ranks import Agreed, Ranks
 from ..report.page import write_report
 from ..training.checkpoint import Progress
-from ..training.defaults import with_data_defaults, with_defaults
+from ..training.defaults import told_unknown, with_data_defaults, with_defaults
 from ..training.loop import fit, what_ranks_share
 from ..training.run_folder import RunFolder, require_no_link
 from .method_variant import MethodVariant
@@ -124,12 +124,14 @@ def compare(
     console, ranks = console or Console(highlight=False), ranks or Ranks()
     if not ranks.leads:
         console = Console(quiet=True)
-    data, out = Path(data), Path(out)
+    data, out, given = Path(data), Path(out), config
 
     dataset, config, fits = ranks.together(
         lambda: _checked(data, variants, out, config, evaluation, allow_outside)
     )
     chosen = {name: settings for name, settings in fits.items() if name != UNTRAINED}
+    if (recovered := told_unknown(given, dataset)) is not None:
+        console.print(recovered, highlight=False, soft_wrap=True)
     if ranks.size > 1:
         told = json.dumps({name: to_toml(settings) for name, settings in fits.items()})
         ranks.require_same(what_ranks_share(told, fingerprint(dataset)))

@@ -26,7 +26,7 @@ Estimator = Literal["auto", ChosenEstimator]
 Reference = Literal["smoothed", "photograph"]
 PixelSampling = Literal["all-views", "one-view-crop"]
 PriorName = Literal["one-bounce", "extra-bounce"]
-Unknown = Literal["materials", "lighting", "materials+lighting", "emission"]
+Unknown = Literal["auto", "materials", "lighting", "materials+lighting", "emission"]
 Precision = Literal["single", "half"]
 PresetName = Literal["cpu", "paper", "release", "release-lighting"]
 
@@ -187,10 +187,11 @@ class FitConfig:
         Unknown,
         Flag(
             "What to recover: materials (the --quantities), lighting (the environment map), "
-            "materials+lighting, or emission (colour and strength of the lights)",
+            "materials+lighting, emission (colour and strength of the lights), or auto: materials, "
+            "and lighting with them where the data set says that its light is unknown",
             metavar="WHAT",
         ),
-    ] = "materials"
+    ] = "auto"
     #: Of materials (Sec. 5.1).
     quantities: Annotated[
         tuple[str, ...],
@@ -477,8 +478,11 @@ class FitConfig:
 
     @property
     def learns_materials(self) -> bool:
-        """Whether quantities of the materials are unknown."""
-        return self.unknown in ("materials", "materials+lighting")
+        """Whether quantities of the materials are unknown.
+
+        They are with `unknown = "auto"`, which a fit that starts replaces by what the data set says.
+        """
+        return self.unknown in ("auto", "materials", "materials+lighting")
 
     @property
     def learns_environment(self) -> bool:

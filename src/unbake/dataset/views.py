@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,8 @@ from unbake.scene import free_space
 from unbake.transport.light_by_depth import depth_of_light, light_of_depth
 
 BACKGROUNDS = ("visible", "hidden")
+#: What is known of the light of the scene: all, or nothing, and a placeholder stands for it.
+LIGHTS = ("known", "unknown")
 #: How photographs hold radiance: as it is, or as code values of the sRGB curve.
 ENCODINGS = ("linear", "srgb")
 
@@ -158,6 +160,8 @@ class Dataset:
             depth 1, 2, … at most (Mitsuba's meaning: 2 is direct illumination), not decreasing;
             deeper paths add nothing. Empty if unknown.
         allow_outside: whether files may lie outside the folder.
+        light: "known" where the light of the scene is the true one; "unknown" where a constant
+            environment stands for what nobody knows.
     """
 
     folder: Path
@@ -168,6 +172,7 @@ class Dataset:
     coverage: float | None
     light_by_depth: tuple[float, ...] = ()
     allow_outside: bool = False
+    light: str = "known"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
@@ -236,9 +241,12 @@ class Dataset:
         if not any(view.split == "train" for view in views):
             raise UserError("no view has the split 'train'", file, "There is nothing to learn from")
         render, seen = _provenance(top, file)
-        light = _light_by_depth(top, file)
-        background = _background(top, file)
-        return cls(data.path, scene, background, views, render, seen, light, allow_outside)
+        by_depth = _light_by_depth(top, file)
+        background = _one_of(top, "background", BACKGROUNDS, file)
+        light = _one_of(top, "light", LIGHTS, file)
+        return cls(
+            data.path, scene, background, views, render, seen, by_depth, allow_outside, light
+        )
 
     def save(self, folder: str | Path) -> None:
         """Write `transforms.json` into a folder, atomically; images are not touched.
@@ -253,6 +261,7 @@ class Dataset:
         content = {
             "scene": data.relative(self.scene),
             "background": self.background,
+            **({} if self.light == "known" else {"light": self.light}),
             "render": self.render,
             "coverage": self.coverage,
             "light_by_depth": list(self.light_by_depth),
@@ -532,11 +541,13 @@ def _frame(data: DataFolder, view: View) -> dict[str, Any]:
     }
 
 
-def _background(top: dict[str, Any], file: Path) -> str:
-    background = top.get("background", "visible")
-    if background not in BACKGROUNDS:
-        raise UserError(f"unknown background {background!r}", file, "It is 'visible' or 'hidden'")
-    return background
+def _one_of(top: dict[str, Any], key: str, names: Sequence[str], file: Path) -> str:
+    """A word at the top of the file, the first of its names where it is missing."""
+    word = top.get(key, names[0])
+    if word not in names:
+        remedy = f"It is {' or '.join(map(repr, names))}"
+        raise UserError(f"unknown {key} {word!r}", file, remedy)
+    return word
 
 
 def _provenance(top: dict[str, Any], file: Path) -> tuple[dict[str, Any], float | None]:

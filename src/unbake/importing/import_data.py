@@ -112,6 +112,7 @@ def import_data(
             )
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
+            | ({"light": "unknown"} if light is None else {})
             | _clipped(found.shots)
             | {"frames": frames}
         )

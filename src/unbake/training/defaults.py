@@ -34,7 +34,33 @@ def with_data_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     Raises:
         UserError: the scene cannot be loaded.
     """
+    config = with_unknown(config, dataset)
     return with_grid_sizes(with_path_depth(config, dataset), dataset)
+
+
+def with_unknown(config: FitConfig, dataset: Dataset) -> FitConfig:
+    """The settings with what is unknown, as the data set says of its light, if they leave it open.
+
+    Args:
+        config: settings as a user gives them; others than `unknown = "auto"` are returned as is.
+        dataset: of the fit.
+    """
+    if config.unknown != "auto":
+        return config
+    known = dataset.light == "known"
+    return replace(config, unknown="materials" if known else "materials+lighting")
+
+
+def told_unknown(given: FitConfig, dataset: Dataset) -> str | None:
+    """A line where the data set decides that lighting is unknown; None where it does not.
+
+    Args:
+        given: settings before `with_unknown`.
+        dataset: of the fit.
+    """
+    if given.unknown != "auto" or dataset.light == "known":
+        return None
+    return "the data set says that its light is unknown: it is recovered with the materials"
 
 
 def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:

@@ -31,7 +31,7 @@ from ..ranks import Ranks
 from ..signals import deferred
 from ..version import VERSION
 from .checkpoint import Progress, load_checkpoint, state_digest
-from .defaults import with_defaults
+from .defaults import told_unknown, with_defaults
 from .event_log import EventLog
 from .first_gains import begin_cameras
 from .held_aside import ERROR, ErrorCurve, HeldAside, HeldOutPhotographs
@@ -192,6 +192,7 @@ def _begin(
         config = with_solved_field(config, solved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     before = folder.origin() if resume else None
+    recovered = None if resume else told_unknown(config, dataset)
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = clip_negative or (before is not None and before.clip_negative)
     files = _require_same_input(config, dataset, ranks)
@@ -219,7 +220,8 @@ def _begin(
     odd = [] if solved is None else start_radiance(problem, solved)
     for warning in [*odd, *data_warnings(dataset, pixels, problem)]:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-
+    if recovered is not None:
+        console.print(recovered, highlight=False, soft_wrap=True)
     if solved is not None:
         console.print(told_start(solved, config), highlight=False, soft_wrap=True)
     if config.follows_paths:

@@ -49,9 +49,20 @@ def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> li
         fitted = problem.camera is not None and problem.camera.has_exposures
         found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
         units = None if found else _other_units(pixels, problem)
+    light = _placeholder(dataset, problem)
     response = untold_response(dataset.train, problem.camera)
     hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
-    return [line for line in (*found, units, response, hot_pixels) if line]
+    return [line for line in (*found, units, light, response, hot_pixels) if line]
+
+
+def _placeholder(dataset: Dataset, problem: Problem) -> str | None:
+    """A line if an environment that only stands for the unknown light is taken for the true one."""
+    if dataset.light == "known" or problem.environment is not None:
+        return None
+    return (
+        "the data set says that its light is unknown, and what stands for it in the scene is taken "
+        "for the true light. Leave out --unknown, and lighting is recovered with the materials"
+    )
 
 
 def untold_response(views: Sequence[View], camera: CameraModel | None) -> str | None:
