@@ -241,8 +241,20 @@ def test_exposures_come_from_exif(captured, nerfstudio, meshes, tmp_path):
     assert np.allclose(found / found[0], absolute / absolute[0], rtol=1e-4)
     assert np.prod(found) == pytest.approx(1)
     assert any("1.0 stops apart), by EXIF" in line for line in told)
-    content = json.loads((tmp_path / "data" / "transforms.json").read_text())
-    assert content["clipped"] == pytest.approx(((250 / 255 + 0.055) / 1.055) ** 2.4, abs=1e-6)
+    limit = pytest.approx(((250 / 255 + 0.055) / 1.055) ** 2.4, abs=1e-6)
+    assert [frame["clipped"] for frame in frames_of(tmp_path / "data")] == [limit] * 3
+
+
+def test_radiance_is_not_clipped_where_other_photographs_have_codes(
+    captured, nerfstudio, meshes, tmp_path
+):
+    name = captured.views[1].name
+    shutil.copyfile(captured.views[1].image, nerfstudio / "images" / f"{name}.exr")
+    change(nerfstudio, set_frame("file_path", f"images/{name}.exr"))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    views = Dataset.load(tmp_path / "data").views
+    assert [view.encoding for view in views] == ["srgb", "linear", "srgb"]
+    assert [view.clipped is None for view in views] == [False, True, False]
 
 
 @pytest.mark.parametrize(

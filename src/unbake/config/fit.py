@@ -480,7 +480,8 @@ class FitConfig:
     def learns_materials(self) -> bool:
         """Whether quantities of the materials are unknown.
 
-        They are with `unknown = "auto"`, which a fit that starts replaces by what the data set says.
+        So they are with `unknown = "auto"`, which a fit that starts replaces by what the data set
+        says.
         """
         return self.unknown in ("auto", "materials", "materials+lighting")
 

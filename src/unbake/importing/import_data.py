@@ -113,7 +113,6 @@ def import_data(
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
             | ({"light": "unknown"} if light is None else {})
-            | _clipped(found.shots)
             | {"frames": frames}
         )
     for line in _summary(found, splits, seen, parts, told):
@@ -307,8 +306,9 @@ def _write_view(
     }
     if shot.coded:
         frame["encoding"] = "srgb"
-    if shot.raw:
-        frame["clipped"] = CLIPPED_RAW
+    limit = _clipped(shot)
+    if limit is not None:
+        frame["clipped"] = limit
     if shot.name in exposures:
         frame["exposure"] = exposures[shot.name]
     counted = on_mesh
@@ -347,12 +347,14 @@ def _has_alpha(shot: Shot) -> bool:
     return image_header(shot.image).channels in (2, 4)
 
 
-def _clipped(shots: Sequence[Shot]) -> dict[str, float]:
-    """The decoded value from which code values are taken for clipped; none of radiance."""
-    if not any(shot.coded for shot in shots):
-        return {}
+def _clipped(shot: Shot) -> float | None:
+    """The decoded value from which on a photograph is taken for clipped; None of radiance."""
+    if shot.raw:
+        return CLIPPED_RAW
+    if not shot.coded:
+        return None
     code = np.full((1, 1, 1), round(CLIPPED_CODE * 255), np.uint8)
-    return {"clipped": round(float(decode(code)[0, 0, 0]), 6)}
+    return round(float(decode(code)[0, 0, 0]), 6)
 
 
 # ------------------------------------------------------------------------------------------ telling
