@@ -329,6 +329,29 @@ def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
     straightened_as_seen(view, lens, 0.002 if suffix == ".exr" else 0.006)
 
 
+def test_pixels_between_clipped_and_other_ones_do_not_count(captured, meshes, tmp_path):
+    top = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 80.0, "cx": 48.0, "cy": 32.0, "k1": -0.2}
+    photograph = np.full((64, 96, 3), 60, np.uint8)
+    photograph[20:44, 30:60] = 252
+    save(photograph, tmp_path / "source" / "images" / "a.png")
+    save(np.full((64, 96), 255, np.uint8), tmp_path / "source" / "images" / "b.png")
+    pose = captured.views[0].camera.to_world.tolist()
+    frames = [{"file_path": f"images/{n}.png", "transform_matrix": pose} for n in ("a", "b")]
+    write_json(tmp_path / "source" / "transforms.json", top | {"frames": frames})
+    import_data(tmp_path / "source", tmp_path / "data", meshes, tell=quiet)
+    one, other = Dataset.load(tmp_path / "data").views
+    pixels = read_photograph(one)
+    counted, values = pixels[..., 3] > 0, pixels[..., :3]
+    dark = np.isclose(values, ((60 / 255 + 0.055) / 1.055) ** 2.4, atol=1e-4).all(2)
+    clipped = (values >= one.clipped).all(2)
+    assert np.array_equal(counted, dark | clipped)
+    assert clipped.sum() > 500 and 50 < (~counted).sum() < 300
+    # One that is clipped as a whole stays so, and has a mask as its neighbours have
+    pixels = read_photograph(other)
+    assert other.mask is not None and (pixels[..., 3] > 0).all()
+    assert (pixels[..., :3] >= other.clipped).all()
+
+
 # -------------------------------------------------------------------------------------------- light
 
 

@@ -26,6 +26,7 @@ from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
+from .lens import Lens
 from .meshes import Part, read_parts, write_scene
 from .raw import CLIPPED as CLIPPED_RAW
 from .raw import read_raw
@@ -289,7 +290,7 @@ def _write_view(
     Args:
         on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
     """
-    camera = shot.lens.camera(shot.to_world)
+    camera, limit, exact = shot.lens.camera(shot.to_world), _clipped(shot), None
     if shot.lens.straight and not shot.raw:
         image = data.image(name, shot.image.suffix.lower())
         image.parent.mkdir(exist_ok=True)
@@ -297,7 +298,7 @@ def _write_view(
     else:
         image, pixels = data.image(name, ".png" if shot.coded else ".exr"), _pixels(shot)
         if not shot.lens.straight:
-            pixels = shot.lens.straightened(pixels, camera.fl_x)
+            pixels, exact = _straightened(shot.lens, pixels, camera.fl_x, limit)
         _write_picture(image, pixels)
     frame: dict[str, Any] = {
         "file_path": data.relative(image),
@@ -306,23 +307,39 @@ def _write_view(
     }
     if shot.coded:
         frame["encoding"] = "srgb"
-    limit = _clipped(shot)
     if limit is not None:
         frame["clipped"] = limit
     if shot.name in exposures:
         frame["exposure"] = exposures[shot.name]
-    counted = on_mesh
-    if shot.mask is not None:
-        mask = _mask(shot)
-        if not shot.lens.straight:
-            straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
-            mask = straight[..., 0] >= 1
-        counted = mask if on_mesh is None else mask & on_mesh
-    if counted is not None:
+    mask = None if shot.mask is None else _mask(shot)
+    if mask is not None and not shot.lens.straight:
+        straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
+        mask = straight[..., 0] >= 1
+    masks = [one for one in (on_mesh, mask, exact) if one is not None]
+    if masks:
         file = data.mask(name)
-        _write_codes(file, np.where(counted, 255, 0).astype(np.uint8)[..., None])
+        _write_codes(file, np.where(np.all(masks, 0), 255, 0).astype(np.uint8)[..., None])
         frame["mask_path"] = data.relative(file)
     return frame
+
+
+def _straightened(
+    lens: Lens, pixels: np.ndarray, focal: float, limit: float | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The photograph of the pinhole camera, and which of its pixels say what they say.
+
+    A pixel between a clipped one and another is darker than the limit, and nobody knows how bright
+    it should be: neither its value nor that it is clipped would be true.
+
+    Args:
+        limit: from which on channels are clipped; None: they never are, and all pixels count.
+    """
+    straight = lens.straightened(pixels, focal)
+    if limit is None:
+        return straight, None
+    clipped = (pixels[..., :3] >= np.float32(limit)).astype(np.float32)
+    between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
+    return straight, ~between.any(axis=2)
 
 
 def _write_picture(file: Path, pixels: np.ndarray) -> None:
