@@ -150,6 +150,24 @@ def test_names_in_two_folders_are_kept_apart(captured, meshes, tmp_path):
     assert names == {("train_r_0", "train"), ("test_r_0", "heldout")}
 
 
+def test_lists_tell_images_of_one_name_apart(captured, meshes, tmp_path):
+    source, frames = tmp_path / "source", []
+    for name, view in zip(("a/001", "b/001", "b/002"), captured.views, strict=True):
+        save(codes(view), source / "images" / f"{name}.png")
+        pose = view.camera.to_world.tolist()
+        frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose})
+    # As the frames name them, and from another folder
+    lists = {
+        "train_filenames": ["./images/a/001.png", "b/002.png"],
+        "val_filenames": ["images/b/001.png"],
+    }
+    top = intrinsics(captured.views[0].camera) | lists | {"frames": frames}
+    write_json(source / "transforms.json", top)
+    import_data(source, tmp_path / "data", meshes, tell=quiet)
+    splits = [view.split for view in Dataset.load(tmp_path / "data").views]
+    assert splits == ["train", "heldout", "train"]
+
+
 def test_every_eighth_view_is_held_out(captured, nerfstudio, meshes, tmp_path):
     def without_lists(content):
         del content["train_filenames"], content["test_filenames"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,7 @@ def read_one_file(
     placed = [
         Shot(
             shot.name,
-            splits.get(Path(shot.name).name, shot.split),
+            _listed(shot.name, splits) or shot.split,
             shot.image,
             shot.lens,
             back(shot.to_world),
@@ -217,12 +217,29 @@ def _taken_back(
     return back, (note,) if moved else ()
 
 
-def _listed_splits(top: dict[str, Any]) -> dict[str, str]:
-    """Splits by the file names of images, where the file has lists of them."""
+def _listed_splits(top: dict[str, Any]) -> dict[PurePosixPath, str]:
+    """Splits by the paths of images, where the file has lists of them."""
     return {
-        Path(name).name: split
+        PurePosixPath(name): split
         for key, split in _SPLIT_LISTS.items()
         if isinstance(top.get(key), list)
         for name in top[key]
         if isinstance(name, str)
     }
+
+
+def _listed(name: str, splits: Mapping[PurePosixPath, str]) -> str | None:
+    """The split of an image in such lists; None where they have none, or more than one.
+
+    Lists name images as frames do, or from another folder: one path is then the end of the other.
+    """
+    path = PurePosixPath(name)
+    if path in splits:
+        return splits[path]
+
+    def same(listed: PurePosixPath) -> bool:
+        count = min(len(listed.parts), len(path.parts))
+        return count > 0 and listed.parts[-count:] == path.parts[-count:]
+
+    found = {split for listed, split in splits.items() if same(listed)}
+    return found.pop() if len(found) == 1 else None
