@@ -77,7 +77,7 @@ def main() -> None:
         run = args.runs / f"{poses}-{pixels:g}"
         fit(data, run, ["--seed", args.seed, "--steps", args.steps, "--poses", poses])
         rows.append({"pixels": pixels, "poses": poses} | scores(run, clean))
-        # What was asked for is of each camera's middle; that of all points follows.
+        # What was asked for is of all views; that of training views follows.
         given = rows[-1]["train_pixels"] if poses == "given" else rows[-2]["given_pixels"]
         rows[-1]["given_pixels"] = given
         told = ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items() if isinstance(v, float))

@@ -12,6 +12,7 @@ from unbake.acquisition.degrade import degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings
 from unbake.dataset.views import Dataset, SensorNoise, read_masked
 from unbake.errors import UserError
+from unbake.evaluation.placing import told_of_place
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.imaging.srgb import to_srgb
 from unbake.io import read_json
@@ -113,14 +114,19 @@ def test_noise_has_the_variance_of_its_electrons(cornell, degraded):
 
 
 def test_poses_are_off_by_pixels_and_the_true_ones_are_kept(cornell, degraded):
-    dataset, truth = degraded(pose_jitter=1.0)
     before = {view.name: view.camera for view in Dataset.load(cornell).views}
-    for view in dataset.views:
-        kept = np.array(truth["views"][view.name]["transform_matrix"])
-        assert np.array_equal(kept, before[view.name].to_world)
-        turned = view.camera.to_world[:3, :3].T @ kept[:3, :3]
-        angle = np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)) * view.camera.fl_x
-        assert 0 < angle < 4
+    scene = parse(Dataset.load(cornell).scene).instantiate()
+    for pixels in (0.3, 3.0):
+        dataset, truth = degraded(pose_jitter=pixels)
+        squares = []
+        for view in dataset.views:
+            given = before[view.name]
+            kept = np.array(truth["views"][view.name]["transform_matrix"])
+            assert np.array_equal(kept, given.to_world)
+            place = told_of_place(scene, given, view.camera)
+            assert place["degrees"] > 0 and place["shift"] > 0 and place["pixels"] < 3 * pixels
+            squares.append(place["pixels"] ** 2)
+        assert np.sqrt(np.mean(squares)) == pytest.approx(pixels, rel=0.1)
 
 
 def test_meshes_are_displaced_by_smooth_noise(cornell, degraded):

@@ -247,21 +247,36 @@ def _write_photograph(
 
 
 def _moved(scene: mi.Scene, cameras: list[Camera], settings: DegradeSettings) -> list[Camera]:
-    """Cameras that are turned and moved at random, half of the error each."""
+    """Cameras that are turned and moved at random, about half of the error each.
+
+    What pixels see moves by `pose_jitter` pixels, root mean square over all views.
+    """
     if not settings.pose_jitter:
         return cameras
-    diagonal = free_space.bounds(scene)[2]
-    moved, every = [], seen_by(scene, [small_camera(camera) for camera in cameras])
+    diagonal, draws, points = free_space.bounds(scene)[2], [], []
+    every = seen_by(scene, [small_camera(camera) for camera in cameras])
     for number, (camera, seen) in enumerate(zip(cameras, every, strict=True)):
         rng = _random(settings, _POSE, number)
-        # Two causes, which move a pixel along two axes each.
-        part = settings.pose_jitter / 2
-        known = seen.distance[np.isfinite(seen.distance)]
-        depth = float(np.median(known)) if len(known) else diagonal
-        turn = rng.normal(0, part / camera.fl_x, 3)
-        shift = rng.normal(0, part * depth / camera.fl_x, 3)
-        moved.append(camera.moved(turn, shift))
-    return moved
+        points.append(seen.position[np.isfinite(seen.distance)])
+        away = (camera.origin - points[-1]) @ camera.to_world[:3, 2]
+        # A shift moves pixels by the inverse of their depth.
+        depth = 1 / math.sqrt(np.mean(away**-2.0)) if len(away) else diagonal
+        draws.append((rng.normal(0, 1, 3), rng.normal(0, depth, 3)))
+
+    def moved(size: float) -> list[Camera]:
+        return [
+            camera.moved(size * turn / camera.fl_x, size * shift / camera.fl_x)
+            for camera, (turn, shift) in zip(cameras, draws, strict=True)
+        ]
+
+    # Pixels move nearly in proportion: a second look takes the rest into account.
+    size = settings.pose_jitter / 2
+    for _ in range(2):
+        pairs = zip(moved(size), cameras, points, strict=True)
+        apart = [one.pixels_from(camera, seen) for one, camera, seen in pairs if len(seen)]
+        if any(apart):
+            size *= settings.pose_jitter / math.sqrt(np.mean(np.square(apart)))
+    return moved(size)
 
 
 def _change_meshes(

@@ -99,7 +99,10 @@ class DegradeSettings:
             tell_default=False,
         ),
     ] = None
-    pose_jitter: Annotated[float, Flag("Poses are off by so many pixels, root mean square")] = 0.0
+    pose_jitter: Annotated[
+        float,
+        Flag("Poses are off: what pixels see moves by so many of them, root mean square of all"),
+    ] = 0.0
     displace: Annotated[
         float, Flag("Meshes are off by so much, as a share of the scene's diagonal")
     ] = 0.0

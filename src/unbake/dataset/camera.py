@@ -205,6 +205,19 @@ class Camera:
         depth = np.where(z < 0, -z, np.nan)
         return np.stack([self.cx + self.fl_x * x / depth, self.cy - self.fl_y * y / depth], axis=1)
 
+    def pixels_from(self, other: Camera, points: np.ndarray) -> float:
+        """How far apart this camera and another one see points, root mean square in pixels.
+
+        Points behind a camera are left out; it is 0 where there is no other one.
+
+        Args:
+            other: of the same image.
+            points: (n, 3) in world space.
+        """
+        apart = self.project(points) - other.project(points)
+        apart = apart[np.isfinite(apart).all(1)]
+        return float(np.sqrt((apart**2).sum(1).mean())) if len(apart) else 0.0
+
     def pixel_of(self, points: np.ndarray) -> np.ndarray:
         """Numbers of the pixels that points project into, whether or not something hides them.
 

@@ -69,14 +69,11 @@ def told_of_place(scene: mi.Scene, given: Camera, found: Camera) -> dict[str, fl
         found: as it was refined.
     """
     (seen,) = seen_by(scene, [small_camera(found)])
-    points = seen.position[np.isfinite(seen.distance)]
-    moved = found.project(points) - given.project(points)
-    moved = moved[np.isfinite(moved).all(1)]
     turn = found.to_world[:3, :3].T @ given.to_world[:3, :3]
     # Of a small angle the sine is exact, and the cosine is not.
     sine = 0.5 * np.linalg.norm((turn - turn.T)[[0, 0, 1], [1, 2, 2]])
     return {
-        "pixels": float(np.sqrt((moved**2).sum(1).mean())) if len(moved) else 0.0,
+        "pixels": found.pixels_from(given, seen.position[np.isfinite(seen.distance)]),
         "degrees": math.degrees(math.atan2(float(sine), 0.5 * float(np.trace(turn) - 1))),
         "shift": float(np.linalg.norm(found.origin - given.origin)),
     }
