@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from typing import get_args
 
 import mitsuba as mi
 import numpy as np
@@ -9,12 +10,12 @@ import pytest
 
 from unbake.acquisition.decimate import decimated
 from unbake.acquisition.degrade import degrade, displacement, response
-from unbake.acquisition.settings import DegradeSettings
+from unbake.acquisition.settings import DegradeSettings, Response
 from unbake.dataset.views import Dataset, SensorNoise, read_masked
 from unbake.errors import UserError
 from unbake.evaluation.placing import told_of_place
 from unbake.imaging.pictures import read_exr, write_exr
-from unbake.imaging.srgb import to_srgb
+from unbake.imaging.srgb import from_srgb, to_srgb
 from unbake.io import read_json
 from unbake.scene.parse import parse
 
@@ -93,10 +94,16 @@ def test_a_response_is_kept_as_a_table_and_ends_at_white(cornell, degraded):
     assert {view.exposure for view in dataset.views} == {truth["gain"]}
 
 
-@pytest.mark.parametrize("kind", ["srgb", "gamma", "contrast"])
+@pytest.mark.parametrize("kind", get_args(Response))
 def test_responses_rise_from_black_to_white(kind):
     values = response(np.linspace(0, 1, 101), kind)
     assert values[0] == 0 and abs(values[-1] - 1) < 1e-12 and (np.diff(values) > 0).all()
+
+
+def test_a_lifted_response_has_another_middle_than_the_curve_of_a_fit():
+    middle = from_srgb(np.array([0.5]))
+    assert to_srgb(response(middle, "lifted")) == pytest.approx(0.65)
+    assert to_srgb(response(middle, "contrast")) == pytest.approx(0.5)
 
 
 def test_noise_has_the_variance_of_its_electrons(cornell, degraded):

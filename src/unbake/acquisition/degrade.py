@@ -49,6 +49,8 @@ _WAVES, _LENGTHS = 24, (0.05, 0.5)
 _JPEG_WHITE = 250
 #: How much an S-shaped response differs from the sRGB curve.
 _CONTRAST = 0.5
+#: How much steeper than the sRGB curve a lifted response is at black.
+_LIFT = 0.6
 
 
 @final
@@ -145,6 +147,9 @@ def response(values: np.ndarray, kind: str) -> np.ndarray:
     if kind == "contrast":
         code = to_srgb(values)
         return from_srgb(code + _CONTRAST * (code * code * (3 - 2 * code) - code))
+    if kind == "lifted":
+        code = to_srgb(values)
+        return from_srgb(code + _LIFT * code * (1 - code))
     return values
 
 

@@ -57,7 +57,7 @@ class CaptureSettings:
 
 
 #: Names of responses; see `acquisition/degrade.py`.
-Response = Literal["srgb", "gamma", "contrast"]
+Response = Literal["srgb", "gamma", "contrast", "lifted"]
 #: Formats of degraded photographs.
 Format = Literal["exr", "png", "jpeg"]
 
@@ -81,14 +81,15 @@ class DegradeSettings:
         Response,
         Flag(
             "Response of the camera: srgb, which is decoded without an error; gamma, a power of "
-            "1/2.2; contrast, an S-shaped curve as of telephones"
+            "1/2.2; contrast, an S-shaped curve as of phones; lifted, brighter in the middle than "
+            "srgb"
         ),
     ] = "srgb"
     vignetting: Annotated[float, Flag("Share of the light that is lost in the corners")] = 0.0
     electrons: Annotated[
         float, Flag("Electrons that white counts, which makes shot noise; 0: none")
     ] = 0.0
-    read_noise: Annotated[float, Flag("Read noise in electrons; it needs a number at white")] = 0.0
+    read_noise: Annotated[float, Flag("Read noise in electrons; it needs --electrons")] = 0.0
     clip: Annotated[
         float | None,
         Flag(
