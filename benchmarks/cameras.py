@@ -11,7 +11,15 @@ of the cameras, against the truth that `degrade` keeps:
 - `stops_error_*`: of the exposures of training views but the first, which is the anchor;
 - `balance_error_*`: of red and blue relative to green, of the same views, in stops;
 - `vignetting_error_most`: over the picture, as a share of the light;
-- `response_error_*`: of what the curve makes of code values, as a share of white.
+- `response_error_*`: of what the curve makes of code values, as a share of white; and
+  `response_scaled_error_*` after the scale `response_scale`, common to all channels: a fit fixes
+  its curve in the middle of the code values; where the true one is different there, so is all
+  light;
+- `train_pixels` and `heldout_pixels`: of the poses that the fit ended with, root mean square in the
+  image over pixels and views, as in `poses.py`; where poses were taken as given, of these.
+
+`true_*` are scores of materials as the true cameras see them: where poses are off, the others
+compare maps that are moved against each other. Any rendered data set will do, rooms as well.
 
 Rows that FILE has of the same data and options are kept: a run that was stopped goes on.
 """
@@ -74,6 +82,8 @@ JPEG = Fault({"format": "jpeg", "electrons": 10000.0, "read_noise": 5.0})
 MESH = Fault({"decimate": 0.1})
 NOISE = Fault({"electrons": 200.0, "read_noise": 4.0})
 CONTRAST = Fault({"response": "contrast"}, ("--response", "monotone"))
+LIFTED = Fault({"response": "lifted"}, ("--response", "monotone"))
+POSES = Fault({"pose_jitter": 1.0}, ("--poses", "refined"))
 
 
 def together(*faults: Fault) -> Fault:
@@ -82,6 +92,7 @@ def together(*faults: Fault) -> Fault:
     return Fault(settings, tuple(word for fault in faults for word in fault.words))
 
 
+ALL_BUT_MESH = together(BALANCE, VIGNETTING, CONTRAST, JPEG, POSES)
 #: As EXIF does.
 TOLD = Fault({"exposure": 1.5, "tell_exposures": True})
 
@@ -96,8 +107,12 @@ FAULTS = {
     "noise": NOISE,
     "noise, told": together(NOISE, Fault({"tell_noise": True})),
     "mesh": MESH,
-    "all, exposures told": together(BALANCE, VIGNETTING, CONTRAST, JPEG, MESH, TOLD),
-    "all": together(BALANCE, VIGNETTING, CONTRAST, JPEG, MESH, EXPOSURE),
+    "poses": POSES,
+    "response off centre, exposures told": together(LIFTED, TOLD),
+    "all but mesh, exposures told": together(ALL_BUT_MESH, TOLD),
+    "all but mesh": together(ALL_BUT_MESH, EXPOSURE),
+    "all, exposures told": together(ALL_BUT_MESH, MESH, TOLD),
+    "all": together(ALL_BUT_MESH, MESH, EXPOSURE),
 }
 
 
@@ -165,6 +180,7 @@ def scores(
     data: Path, fault: str, cameras: str, seed: int, options: Sequence[object]
 ) -> dict[str, float]:
     """Scores of a fit, and errors of what it found of the cameras."""
+    clean = Dataset.load(data)
     with tempfile.TemporaryDirectory() as folder:
         run, words = Path(folder) / "run", ["--seed", seed, *options]
         if fault != "none":
@@ -174,10 +190,13 @@ def scores(
             data = worse
         log = Path(folder) / "log.txt"
         unbake("fit", data, "--out", run, *words, log=log)
-        from unbake.evaluation.evaluate import evaluate  # needs the variant
+        from poses import at_true_cameras  # these need the variant
+
+        from unbake.evaluation.evaluate import evaluate
 
         metrics = evaluate(run, EVALUATION, tell=lambda line: None)
         found = {key: metrics["heldout"][key] for key in SCORES}
+        found |= at_true_cameras(run, clean)
         if metrics.get("camera"):
             truth = json.loads(DataFolder(data).degraded_file.read_text(encoding="utf-8"))
             found |= errors(metrics["camera"], truth)
@@ -211,6 +230,9 @@ def errors(camera: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, flo
         photograph = np.linspace(0, 1, curve.shape[1])
         light = np.interp(photograph**GAMMA, read, linear)
         found |= spread("response_error", curve**GAMMA - light)
+        scale = float((curve**GAMMA * light).sum() / (curve ** (2 * GAMMA)).sum())
+        found |= spread("response_scaled_error", scale * curve**GAMMA - light)
+        found["response_scale"] = scale
     return found
 
 

@@ -107,12 +107,24 @@ def fit(data: Path, run: Path, words: Sequence[object]) -> None:
 
 def scores(run: Path, clean: Dataset) -> dict[str, Any]:
     """The scores of a run, and the errors of its poses in pixels."""
-    recovered, metrics = load_run(run), RunFolder(run).metrics()
+    metrics = RunFolder(run).metrics()
     found = {key: metrics["heldout"][key] for key in SCORES} | {"seconds": metrics["seconds"]}
+    return found | at_true_cameras(run, clean)
+
+
+def at_true_cameras(run: Path, clean: Dataset) -> dict[str, float]:
+    """Scores of materials as the true cameras see them, and the errors of poses in pixels.
+
+    Args:
+        run: that was evaluated.
+        clean: the data set before `degrade`.
+    """
+    recovered, metrics, found = load_run(run), RunFolder(run).metrics(), {}
     seen = MaterialBuffers.of(recovered.problem, clean.heldout, SAMPLES, 0)
     truths = [GroundTruth.of(view) for view in clean.heldout]
     each = [s.psnr(t) for s, t in zip(seen, truths, strict=True) if t is not None]
-    found |= {f"true_{key}": mean_psnr(row[key] for row in each) for key in each[0]}
+    means = {key: mean_psnr(row[key] for row in each) for key in (each[0] if each else ())}
+    found |= {f"true_{key}": value for key, value in means.items() if value is not None}
     images = metrics.get("camera", {}).get("images", ())
     poses = {row["name"]: np.array(row["transform_matrix"]) for row in images}
     scene = recovered.problem.scene_view.scene

@@ -308,8 +308,18 @@ def cameras(result: dict) -> str:
     table = []
     for fault in dict.fromkeys(fault for fault, _ in rows):
         known, fitted = (rows.get((fault, cameras), {}) for cameras in ("known", "fitted"))
-        scores = [plus_minus(row, "albedo_psnr") or "" for row in (known, fitted)]
-        found = [form.format(fitted[key]) for key, form in CAMERAS.items() if key in fitted]
+        # At the true cameras, where that was measured: poses may be off.
+        scores = [
+            plus_minus(row, "true_albedo_psnr" if "true_albedo_psnr" in row else "albedo_psnr")
+            or ""
+            for row in (known, fitted)
+        ]
+        scaled = "response_scaled_error_rms" in fitted
+        found = [
+            form.format(fitted[key])
+            for key, form in CAMERAS.items()
+            if fitted.get(key) and not (scaled and key == "response_error_rms")
+        ]
         table.append([fault, *scores, ", ".join(found)])
     return markdown(["fault", "known", "fitted", "error of what was found"], table)
 
@@ -319,6 +329,8 @@ CAMERAS = {
     "balance_error_rms": "white balance {:.2f} stops",
     "vignetting_error_most": "vignetting {:.2f} of the light",
     "response_error_rms": "response {:.3f} of white",
+    "response_scaled_error_rms": "response {:.3f} of white after a common scale",
+    "train_pixels": "poses {:.2f} pixels",
 }
 
 

@@ -211,6 +211,34 @@ def test_both_passes_of_the_slow_method_set_the_length_at_equal_samples(benchmar
         run["steps_of_equal_samples"]({"methods": rows}, equal, settings)
 
 
+def test_a_response_is_compared_after_a_scale_of_all_channels(benchmarks):
+    cameras = benchmarks("cameras")
+    linear = np.linspace(0, 1, 257)
+    truth = {"response": {"linear": linear.tolist(), "read": linear.tolist()}}
+    curve = np.linspace(0, 1, 17) * 0.5 ** (1 / cameras["GAMMA"])
+    found = cameras["errors"](
+        {"response": dict.fromkeys(("red", "green", "blue"), curve.tolist())}, truth
+    )
+    assert found["response_scale"] == pytest.approx(2)
+    assert found["response_scaled_error_most"] < 1e-3 < found["response_error_rms"]
+
+
+def test_all_faults_of_cameras_are_measured_together(benchmarks):
+    """With the poses, exposures told and untold, and with the true mesh as well."""
+    faults = benchmarks("cameras")["FAULTS"]
+    every = {key for fault in ("exposure", "poses", "jpeg", "response", "vignetting", "mesh",
+                               "white balance") for key in faults[fault].settings}  # fmt: skip
+    told = {"tell_exposures"}
+    assert faults["all"].settings.keys() == every
+    assert faults["all, exposures told"].settings.keys() == every | told
+    assert faults["all but mesh"].settings.keys() == every - {"decimate"}
+    assert faults["all but mesh, exposures told"].settings.keys() == every - {"decimate"} | told
+    for name in ("all", "all but mesh, exposures told"):
+        words = " ".join(faults[name].words)
+        assert "--poses refined" in words
+        assert ("--exposures per-image" in words) == (name == "all")
+
+
 def test_tables_have_the_untrained_fields_first_and_tell_of_how_many_seeds(benchmarks, tmp_path):
     folders = [comparison(tmp_path / f"{seed}", seed, 20.0 + seed) for seed in (0, 2)]
     result = benchmarks("summary")["summary"](folders)
