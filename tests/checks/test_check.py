@@ -156,6 +156,42 @@ def test_a_turntable_is_refused(spoilt, unbake):
     assert "the light must stand still" in text
 
 
+def test_a_fit_does_not_start_on_poses_or_light_that_are_surely_wrong(
+    spoilt, tiny, unbake, tmp_path
+):
+    data = spoilt("cornell")
+    data.poses(lambda pose: pose @ FLIP)
+    words = ("fit", data.save(), "--settings", tiny, "--steps", 0, "--out")
+    outcome = unbake(*words, tmp_path / "run")
+    text = " ".join(outcome.err.split())
+    assert outcome.status == 2 and not (tmp_path / "run").exists()
+    assert "poses seem to be in OpenCV's axes" in text
+    assert "Negate columns 2 and 3 of the matrix, or pass --allow-doubtful" in text
+    assert text.count("error:") == 1
+    outcome = unbake(*words, tmp_path / "run", "--allow-doubtful")
+    assert outcome.status == 0
+    assert "warning: poses seem to be in OpenCV's axes" in " ".join(outcome.out.split())
+
+
+def test_a_fit_does_not_start_on_a_turntable(spoilt, tiny, unbake, tmp_path):
+    data = spoilt("still")
+    turned_light(data.folder)
+    words = ("fit", data.folder, "--settings", tiny, "--steps", 0, "--out", tmp_path / "run")
+    outcome = unbake(*words)
+    assert outcome.status == 2 and not (tmp_path / "run").exists()
+    assert "the light must stand still, or pass --allow-doubtful" in " ".join(outcome.err.split())
+    assert unbake(*words, "--allow-doubtful").status == 0
+
+
+def test_a_fit_starts_where_exposures_differ(spoilt, tiny, unbake, tmp_path):
+    data = spoilt("cornell")
+    for frame in data.frames[::2]:
+        data.picture(frame, lambda pixels: pixels * [2, 2, 2, 1])
+    words = ("--settings", tiny, "--steps", 0, "--out", tmp_path / "run")
+    outcome = unbake("fit", data.save(), *words)
+    assert outcome.status == 0 and "warning: surfaces that views share" in outcome.out
+
+
 def test_exposures_that_differ_are_measured(spoilt):
     data = spoilt("cornell")
     stops = np.array([0.0, 1, -1, 0.5, 0, 1.5, -0.5, 0])

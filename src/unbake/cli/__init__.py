@@ -318,6 +318,7 @@ def fit(
     resume: Flag = False,
     clip_negative: Flag = False,
     allow_outside: Flag = False,
+    allow_doubtful: Flag = False,
     tensorboard: Flag = False,
     radiance_from: Folder = None,
     *,
@@ -348,6 +349,8 @@ def fit(
         resume: Go on with the run in --out; a larger --steps or --seconds makes it longer.
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
+        allow_doubtful: Begin also where poses seem to have other axes or units than the scene, or
+            light seems to turn with the cameras.
         tensorboard: Write losses and scores to OUT/tensorboard, too, for tensorboard --logdir OUT.
         radiance_from: Folder that `unbake solve` wrote for this scene: L starts as it was solved
             there, with any materials, instead of untrained, and has its size.
@@ -378,6 +381,7 @@ def fit(
             resume=resume,
             clip_negative=clip_negative,
             allow_outside=allow_outside,
+            allow_doubtful=allow_doubtful,
             tensorboard=tensorboard,
             radiance_from=radiance_from,
             console=console,
@@ -710,6 +714,7 @@ def compare(
     evaluate_truth: Flag = False,
     clip_negative: Flag = False,
     allow_outside: Flag = False,
+    allow_doubtful: Flag = False,
     *,
     compare: OmitArgPrefixes[CompareFlags],
 ) -> int:
@@ -737,6 +742,8 @@ def compare(
         evaluate_truth: Render captured scenes with their true materials too.
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
+        allow_doubtful: Begin also where poses seem to have other axes or units than the scene, or
+            light seems to turn with the cameras.
         compare: Settings of all methods that differ from those of the preset or the file.
     """
     require("evaluate-spp", evaluate_spp, 1)
@@ -762,6 +769,7 @@ def compare(
             evaluation=evaluation,
             clip_negative=clip_negative,
             allow_outside=allow_outside,
+            allow_doubtful=allow_doubtful,
             ranks=ranks,
         )
     if not ranks.leads:

@@ -85,6 +85,7 @@ def compare(
     evaluation: EvaluationSettings,
     clip_negative: bool = False,
     allow_outside: bool = False,
+    allow_doubtful: bool = False,
     ceiling: bool = True,
     console: Console | None = None,
     ranks: Ranks | None = None,
@@ -105,6 +106,7 @@ def compare(
         evaluation: how results are rendered.
         clip_negative: set negative pixels to zero.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
+        allow_doubtful: as in `fit`.
         ceiling: measure ceilings that the data set does not have yet.
         console: shows progress and tables.
         ranks: of MPI, which share the methods among them and all call this; None: this process is
@@ -148,7 +150,15 @@ def compare(
             try:
                 run = RunFolder(out / name)
                 with lack_told():
-                    progress = _fitted(data, run, fits[name], clip_negative, allow_outside, console)
+                    progress = _fitted(
+                        data,
+                        run,
+                        fits[name],
+                        console,
+                        clip_negative=clip_negative,
+                        allow_outside=allow_outside,
+                        allow_doubtful=allow_doubtful,
+                    )
                     metrics = _evaluated(run, progress, evaluation, allow_outside, console)
                 rows[name] = description(fits[name]) | _numbers(run, metrics)
             except UserError as error:
@@ -271,20 +281,11 @@ def _fitted(
     data: Path,
     run: RunFolder,
     settings: FitConfig,
-    clip_negative: bool,
-    allow_outside: bool,
     console: Console,
+    **allowed: bool,
 ) -> Progress:
     resume, path = run.exists, run.path
-    progress = fit(
-        data,
-        path,
-        settings,
-        resume=resume,
-        clip_negative=clip_negative,
-        allow_outside=allow_outside,
-        console=console,
-    )
+    progress = fit(data, path, settings, resume=resume, console=console, **allowed)
     done, total = progress.step, settings.steps
     if settings.seconds:
         done, total = progress.seconds, settings.seconds

@@ -1,6 +1,7 @@
 """What is wrong with a data set, in words: what, where and the remedy.
 
-A fit tells these before its first step, and `unbake data check` with more beside them.
+A fit refuses what is an error and tells the others before its first step, and `unbake data check`
+tells all of them and more.
 """
 
 from __future__ import annotations

@@ -67,6 +67,7 @@ def fit(
     resume: bool = False,
     clip_negative: bool = False,
     allow_outside: bool = False,
+    allow_doubtful: bool = False,
     tensorboard: bool = False,
     radiance_from: Path | str | None = None,
     console: Console | None = None,
@@ -82,6 +83,8 @@ def fit(
         resume: go on with the run's newest checkpoint.
         clip_negative: take negative pixels as zero.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
+        allow_doubtful: begin also where poses seem to have other axes or units, or light seems to
+            turn with the cameras, which is otherwise an error; told as a warning.
         tensorboard: write the numbers of the log for TensorBoard, too.
         radiance_from: a folder that `solve` or `fine_tune` wrote: L_θ starts as that field instead
             of untrained, with its settings; not when resuming. The materials that it was solved
@@ -94,9 +97,9 @@ def fit(
         early, with a checkpoint.
 
     Raises:
-        UserError: the data set or the run's folder cannot be used, what was learned cannot be
-            saved, the loss does not stay finite, the fit diverges twice, or the solved field is of
-            another scene or other settings.
+        UserError: the data set or the run's folder cannot be used, the data are doubtful, what was
+            learned cannot be saved, the loss does not stay finite, the fit diverges twice, or the
+            solved field is of another scene or other settings.
 
     Paper: Sec. 4, 5.4.
     """
@@ -134,6 +137,7 @@ def fit(
                 allow_outside,
                 solved,
                 ranks,
+                allow_doubtful or resume,
             )
             return begun, lock
 
@@ -181,6 +185,7 @@ def _begin(
     allow_outside: bool = False,
     solved: Solved | None = None,
     ranks: Ranks | None = None,
+    allow_doubtful: bool = False,
 ) -> _Begun:
     """Read all input, and check it; nothing is written but the cache of the data set.
 
@@ -218,7 +223,8 @@ def _begin(
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
     odd = [] if solved is None else start_radiance(problem, solved)
-    for warning in [*odd, *data_warnings(dataset, pixels, problem)]:
+    doubts = data_warnings(dataset, pixels, problem, allow_doubtful=allow_doubtful)
+    for warning in [*odd, *doubts]:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     if recovered is not None:
         console.print(recovered, highlight=False, soft_wrap=True)

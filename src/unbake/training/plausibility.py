@@ -13,6 +13,7 @@ from ..dataset.pixels import PixelSource
 from ..dataset.poses import pose_warnings
 from ..dataset.quick_check import quick_findings
 from ..dataset.views import Dataset, View, check_cameras
+from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..fields.camera import CameraModel
 from ..transport.render import RayGenerator, render_radiance
@@ -28,23 +29,33 @@ _SPREAD = 0.5
 _GREY = 0.5
 
 
-def data_warnings(dataset: Dataset, pixels: PixelSource, problem: Problem) -> list[str]:
+def data_warnings(
+    dataset: Dataset, pixels: PixelSource, problem: Problem, *, allow_doubtful: bool = True
+) -> list[str]:
     """One line for each sign that something is wrong with the data of a fit.
 
     Args:
         dataset: of the fit.
         pixels: to train on.
         problem: with untrained fields.
+        allow_doubtful: tell only where poses have other axes or units, or light turns with the
+            cameras, instead of refusing it.
 
     Raises:
-        UserError: no training view sees a surface of the scene.
+        UserError: no training view sees a surface of the scene, or what is not allowed.
     """
     scene = problem.scene_view.scene
     with dr.suspend_grad():
         inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
         found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
         found += pose_warnings(scene, dataset.train, pixels.photographs, dataset.folder)
-        quick = [] if found else quick_findings(scene, dataset.train, pixels.photographs)
+        quick = quick_findings(scene, dataset.train, pixels.photographs)
+        # Of poses that see little of the scene, nothing else is told but what is surely wrong.
+        quick = [finding for finding in quick if finding.level == "error" or not found]
+        for finding in quick:
+            if finding.level == "error" and not allow_doubtful:
+                remedy = f"{finding.remedy}, or pass --allow-doubtful"
+                raise UserError(finding.what, finding.where or dataset.folder, remedy)
         # Exposures that are fitted may differ.
         fitted = problem.camera is not None and problem.camera.has_exposures
         found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
