@@ -37,6 +37,7 @@ from unbake.training.held_aside import HeldAside, HeldOutPhotographs
 from unbake.training.loop import fit
 from unbake.training.problem import make_problem, training_pixels
 from unbake.training.run_folder import RunFolder
+from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
 from unbake.transport.loss import RelativeL2, pixel_means, squared_error
@@ -396,6 +397,45 @@ def test_nothing_is_compiled_after_the_first_steps_and_all_is_trained(built_in, 
     assert_only_replayed(step, state, rates)
     for key, value in state.phi.items():
         assert (np.array(value) != before[key]).any() and np.isfinite(np.array(value)).all(), key
+
+
+@pytest.mark.parametrize("method", ["prb", "ad-pt"])
+def test_methods_that_follow_paths_train_all_of_a_camera(unknown, method):
+    everything = replace(EVERYTHING, poses="refined", intrinsics="refined")
+    paths = replace(TINY_FIT.path, max_depth=3)
+    config = replace(TINY_FIT, method=method, camera=everything, path=paths, steps=3)
+    begun = begin_fit(Dataset.load(unknown), config)
+    before = {key: np.array(value) for key, value in begun.state.phi.items()}
+    names = {key.partition(".")[0] for key in before}
+    assert names == {"albedo", "roughness", *everything.unknowns}
+    for i in range(3):
+        terms = begun.step(begun.state, i, learning_rates(begun.config, i, i / 3))
+        assert float(terms["skipped"][0]) == 0
+    for key, value in begun.state.phi.items():
+        assert (np.array(value) != before[key]).any() and np.isfinite(np.array(value)).all(), key
+
+
+def test_a_bracket_is_fitted_as_it_is(cornell, tiny, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    (frame,) = (f for f in content["frames"] if f["file_path"].endswith("train_000.exr"))
+    pixels = read_exr(data / frame["file_path"])
+    for name, exposure in (("dark", 0.25), ("bright", 4.0)):
+        more = {"file_path": f"images/{name}.exr", "exposure": exposure, "clipped": 0.5}
+        content["frames"].append(frame | more)
+        exposed = np.minimum(pixels * [*[exposure] * 3, 1], [0.5, 0.5, 0.5, 1])
+        write_exr(data / "images" / f"{name}.exr", exposed)
+    (data / "transforms.json").write_text(json.dumps(content))
+    dataset = Dataset.load(data)
+    photographs = Photographs.load(dataset, False)
+    places = {view.name: 256 * i for i, view in enumerate(dataset.train)}
+    bright = photographs.radiance(np.arange(256) + places["bright"])
+    true = photographs.radiance(np.arange(256) + places["train_000"])
+    assert 0.02 < (true > 0.125).mean() < 0.98
+    np.testing.assert_allclose(bright, np.minimum(true, 0.125), rtol=1e-5)
+    settings = replace(read_toml(tiny), method="direct", steps=4)
+    assert fit(data, tmp_path / "run", settings).step == 4
+    assert np.isfinite(RunFolder(tmp_path / "run").log()[-1]["photo"])
 
 
 def test_what_is_off_costs_nothing(built_in, one_thread, monkeypatch):
