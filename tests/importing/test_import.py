@@ -388,6 +388,21 @@ def test_light_that_nobody_gave_is_unknown_and_every_command_says_so(
     assert f"next: unbake fit {data} --out RUN" in unbake("data", "check", data).out
 
 
+def test_a_room_without_lights_is_told(nerfstudio, meshes, tmp_path):
+    walls, told, line = tmp_path / "walls.ply", [], "all cameras stand inside the mesh"
+    trimesh.creation.box(extents=(1000, 1000, 1000)).export(walls)
+    import_data(nerfstudio, tmp_path / "open", meshes, tell=told.append)
+    assert not any(line in text for text in told)
+    import_data(nerfstudio, tmp_path / "closed", [*meshes, walls], tell=told.append)
+    assert line in told[-1] and "--lights FILE" in told[-1]
+    lamp = tmp_path / "lamp.xml"
+    lamp.write_text("<scene version='3.0.0'><emitter type='point'/></scene>")
+    told.clear()
+    light = LightConfig(lights=lamp)
+    import_data(nerfstudio, tmp_path / "lit", [*meshes, walls], light=light, tell=told.append)
+    assert told and not any(line in text for text in told)
+
+
 def test_known_lights_take_the_place_of_the_unknown_environment(
     nerfstudio, meshes, tmp_path, monkeypatch
 ):

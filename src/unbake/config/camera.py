@@ -45,8 +45,8 @@ class CameraConfig:
     response: Annotated[
         Response,
         Flag(
-            "Response of the camera: known (photographs are linear), or monotone, a curve for each "
-            "channel between the values 0 and 1"
+            "Response of the camera: known (photographs are linear once decoded, JPEG and PNG by "
+            "the sRGB curve), or monotone, a curve for each channel between the values 0 and 1"
         ),
     ] = "known"
     poses: Annotated[

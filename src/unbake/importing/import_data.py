@@ -38,6 +38,8 @@ from .source import Shot, Source, image_header
 CLIPPED_CODE = 250 / 255
 #: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
 _RAYS = 64
+#: A camera from which this share of all directions hits the mesh stands in a room.
+_ENCLOSED = 0.95
 _KNOWN = (
     f"It has a {TRANSFORMS} (nerfstudio), transforms_train.json (Blender), cam.txt and K_list.txt "
     "(FIPT), or cameras.bin or cameras.txt (COLMAP), maybe in sparse/0"
@@ -101,6 +103,7 @@ def import_data(
         data = DataFolder(folder)
         file, scene = _write_scene(data, parts, light, allow_outside, tell)
         seen = _shares_seen(scene, found.shots)
+        dark = light is None and _enclosed(scene, found.shots)
         background = settings.background
         if background == "auto":
             background = "hidden" if all(map(_has_alpha, found.shots)) else "visible"
@@ -118,6 +121,11 @@ def import_data(
         )
     for line in _summary(found, splits, seen, parts, told):
         tell(line)
+    if dark:
+        tell(
+            "warning: all cameras stand inside the mesh, which keeps an environment out, and lamps "
+            "are not found by a fit. Give the lights of the room with --lights FILE"
+        )
     return DataFolder(out)
 
 
@@ -263,6 +271,12 @@ def _shares_seen(scene: mi.Scene, shots: Sequence[Shot]) -> np.ndarray:
             "nerfstudio's cameras in the frame of their file",
         )
     return seen
+
+
+def _enclosed(scene: mi.Scene, shots: Sequence[Shot]) -> bool:
+    """Whether all cameras stand where the mesh is in nearly all directions."""
+    origins = np.array([shot.to_world[:3, 3] for shot in shots])
+    return bool((free_space.enclosure(scene, origins) >= _ENCLOSED).all())
 
 
 def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:
