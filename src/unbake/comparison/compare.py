@@ -282,10 +282,22 @@ def _fitted(
     run: RunFolder,
     settings: FitConfig,
     console: Console,
-    **allowed: bool,
+    *,
+    clip_negative: bool,
+    allow_outside: bool,
+    allow_doubtful: bool,
 ) -> Progress:
     resume, path = run.exists, run.path
-    progress = fit(data, path, settings, resume=resume, console=console, **allowed)
+    progress = fit(
+        data,
+        path,
+        settings,
+        resume=resume,
+        clip_negative=clip_negative,
+        allow_outside=allow_outside,
+        allow_doubtful=allow_doubtful,
+        console=console,
+    )
     done, total = progress.step, settings.steps
     if settings.seconds:
         done, total = progress.seconds, settings.seconds

@@ -353,7 +353,7 @@ def _straightened(
         return straight, None
     clipped = (pixels[..., :3] >= np.float32(limit)).astype(np.float32)
     between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
-    return straight, ~between.any(axis=2)
+    return straight, np.logical_not(np.any(between, axis=2))
 
 
 def _write_picture(file: Path, pixels: np.ndarray) -> None:
