@@ -25,6 +25,7 @@ from unbake.training.problem import make_problem
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
 from unbake.transport.operator import attach_albedo, attach_material
+from unbake.transport.path_sample import Requirements, rhs, trace
 from unbake.transport.vertex import SceneView, find_vertex
 
 REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
@@ -276,3 +277,71 @@ def test_a_frozen_step_trains_every_representation(built_in, representation, rad
     ray = pixel_rays(built_in_cameras("cornell", 8), 1, seed=1)
     v = find_vertex(problem.scene_view, ray, mi.Bool(True), seeded(0, dr.width(ray)))
     assert np.ptp(np.array(attach_albedo(problem.scene_view, v).albedo)) > 1e-3
+
+
+# ------------------------------------------------------- integrators of Mitsuba, after training
+
+
+def picture_of(problem, plugin="path"):
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(built_in_cameras("cornell", 8)[0].to_world),
+            "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+        }
+    )
+    integrator = mi.load_dict({"type": plugin, "max_depth": 3})
+    scene = problem.scene_view.scene
+    return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=8, seed=1))
+
+
+def image_loss(problem, ray):
+    """The sum of a picture of one bounce, made as a training loop of one's own makes it."""
+    pieces = Requirements(1)
+    sampler = seeded(0, dr.width(ray))
+    sample = trace(problem.scene_view, None, ray, sampler, pieces)
+    return dr.sum(dr.sum(rhs(sample, mi.Color3f(0.1))))
+
+
+@pytest.mark.parametrize("plugin", ["path", "volpath"])
+def test_mitsuba_renders_no_black_picture_after_a_loop_of_ones_own(built_in, plugin):
+    """Textures evaluate the fields where nothing was put on the surface for them."""
+    _, problem = cornell_problem(built_in, "neural")
+    ray = pixel_rays(built_in_cameras("cornell", 8), 4, seed=1)
+    optimizer = mi.ad.Adam(1e-2, problem.parameters())
+    for _ in range(2):
+        problem.assign(dict(optimizer.items()))
+        dr.backward(image_loss(problem, ray))
+        optimizer.step()
+    problem.assign(dict(optimizer.items()))
+    found = picture_of(problem, plugin)
+    problem.materials.stand_alone()
+    assert found.mean() > 0.01
+    np.testing.assert_array_equal(found, picture_of(problem, plugin))
+
+
+@pytest.mark.parametrize("representation", ["neural", "bitmap"])
+def test_a_loop_has_the_same_gradients_where_materials_stand_alone(built_in, representation):
+    _, problem = cornell_problem(built_in, representation)
+    ray = pixel_rays(built_in_cameras("cornell", 8), 4, seed=1)
+    gradients = []
+    for alone in (False, True):
+        parameters = randomised(problem.materials)
+        problem.materials.carried = not alone
+        dr.backward(image_loss(problem, ray))
+        gradients.append({k: np.array(dr.grad(p)) for k, p in parameters.items()})
+    assert max(np.abs(g).max() for g in gradients[0].values()) > 0
+    for name, gradient in gradients[0].items():
+        np.testing.assert_array_equal(gradient, gradients[1][name], err_msg=name)
+
+
+def test_mitsuba_renders_what_was_assigned_last(built_in):
+    _, problem = cornell_problem(built_in, "neural")
+    problem.materials.stand_alone()
+    before = picture_of(problem)
+    parameters = {k: 3 * p for k, p in randomised(problem.materials, 1).items()}
+    problem.assign({**problem.parameters(), **parameters})
+    found = picture_of(problem)
+    problem.materials.stand_alone()
+    assert np.abs(found - before).max() > 0.01
+    np.testing.assert_array_equal(found, picture_of(problem))

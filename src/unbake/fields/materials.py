@@ -43,9 +43,8 @@ class Materials(Mapping[str, Field]):
         self.numbers: dict[int, int] = {}
         #: Of the scene; set together with the domain, where fields have values of pieces.
         self.pieces: Pieces | None = None
-        #: Whether textures always read the values put on the surface interaction by `carry`, and
-        #: not within `carrying` alone. It must not change between an evaluation and its
-        #: differentiation, which calls the textures again.
+        #: Whether textures have nothing but what `carry` puts on surface interactions, also outside
+        #: of `carrying`: the fields are not prepared for integrators of Mitsuba; see `stand_alone`.
         self.carried = True
         self._fields = {name: fields[name] for name in in_order(fields)}
 
@@ -67,9 +66,12 @@ class Materials(Mapping[str, Field]):
         }
 
     def assign(self, parameters: Mapping[str, mi.Float | mi.TensorXf]) -> None:
-        """Use these arrays from now on."""
+        """Use these arrays from now on; but for recorded steps, textures stand alone with them."""
         for name, field in self.items():
             field.assign({k: parameters[f"{name}.{k}"] for k in field.parameters()})
+        recorded = is_carrying() or dr.flag(dr.JitFlag.FreezingScope)
+        if self.can_stand_alone and not recorded:
+            self.stand_alone()
 
     @property
     def can_stand_alone(self) -> bool:
@@ -79,7 +81,8 @@ class Materials(Mapping[str, Field]):
     def stand_alone(self) -> None:
         """From now on, textures evaluate the fields themselves, as stock integrators need it.
 
-        They do so with the present parameters: call it again after `assign`.
+        They do so with the present parameters. `assign` of these materials calls it; call it again
+        after `assign` of a single field, or in a frozen function.
 
         Raises:
             UserError: a field cannot be evaluated inside of loops.
@@ -256,7 +259,7 @@ def carrying() -> Iterator[None]:
     """A context in which all textures of fields read what `carry` put on surface interactions.
 
     For our own integrators, whose vertices carry it: a field is then asked once a vertex. What is
-    evaluated in it must not be differentiated after it, unless the textures are `carried` anyway.
+    evaluated in it may be differentiated after it, where the materials themselves pass gradients.
     """
     token = _CARRYING.set(True)
     try:

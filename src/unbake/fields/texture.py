@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import drjit as dr
 import mitsuba as mi
 
 from ..quantities import QUANTITIES
@@ -17,9 +18,9 @@ _NUMBER = "material_number"
 def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Texture]:
     """A texture for each unknown quantity, by the slot of a `principled` BSDF that it is for.
 
-    They read what `carry` put on the surface interaction. After `materials.stand_alone()` they
-    evaluate the field at the interaction instead, with cooperative vectors, so that any integrator
-    of Mitsuba can render the recovered scene.
+    Within `carrying` they read what `carry` put on the surface interaction. Elsewhere they evaluate
+    the field at the interaction, with cooperative vectors, so that any integrator of Mitsuba can
+    render the scene; see `Materials.stand_alone`.
 
     Args:
         number: of the material, where materials have fields of their own; see `material_numbers`.
@@ -34,7 +35,10 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
             self.quantity = props["quantity"]
 
         def lookup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f | mi.Float:
-            if materials.carried or is_carrying():
+            # A path that carried materials with gradients calls the textures again when it is
+            # differentiated, which may be after `carrying`.
+            carried = materials.carried or is_carrying() or dr.grad_enabled(si.dn_du, si.dn_dv)
+            if carried:
                 material = read_carried(si, materials)
             else:
                 material = materials.evaluate(si, mi.Bool(active), engine="coopvec")

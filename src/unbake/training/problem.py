@@ -180,6 +180,7 @@ def make_problem(
         if representation(config.representation).unwrapped:
             edit.require_unwrapped(loaded, scene)
             materials.numbers = material_numbers(loaded)
+        materials.assign(materials.parameters())  # so that Mitsuba can render them untrained, too
 
     radiance = None
     if has_radiance(config.chosen_method):

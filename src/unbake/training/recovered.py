@@ -26,6 +26,11 @@ class Recovered:
     progress: Progress
     clip_negative: bool
 
+    def __repr__(self) -> str:
+        config = self.config
+        told = f"{config.unknown!r} by {config.method!r}, {self.progress.step} steps"
+        return f"Recovered({told}, {str(self.dataset.folder)!r})"
+
 
 @dataclass
 class OpenedRun:
@@ -96,7 +101,4 @@ def load_run(
     if progress is None:
         raise UserError("no readable checkpoint", where=run, remedy="Fit again, or wait for one")
     opened.state.publish(opened.problem)
-    materials = opened.problem.materials
-    if materials is not None and materials.can_stand_alone:
-        materials.stand_alone()
     return Recovered(opened.problem, opened.dataset, opened.config, progress, opened.clip_negative)

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.guide import LightGuide
-from ..fields.materials import Material, carry
+from ..fields.materials import Material, carry, carrying
 from ..fields.radiance import RadianceField
 from .operator import attach_albedo, mixture_at
 from .path_sample import reflected_radiance
@@ -134,6 +134,7 @@ def _carrying(
     return si
 
 
+@carrying()
 def _lights(
     scene_view: SceneView,
     radiance: RadianceField,
@@ -194,6 +195,7 @@ def _lights(
     return found
 
 
+@carrying()
 def _reflected(
     x: Vertex, lights: Sequence[_Light], material: Material, roughness: mi.Float, factor: mi.Float
 ) -> mi.Color3f:

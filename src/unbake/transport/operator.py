@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..fields.guide import Choice, LightGuide, Mixture
-from ..fields.materials import carry, with_joint_gradients
+from ..fields.materials import carry, carrying, with_joint_gradients
 from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
 
 
@@ -42,6 +42,7 @@ def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
     return replace(vertex, si=si, albedo=dr.detach(material["albedo"]))
 
 
+@carrying()
 def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
     """Look up the albedo alone, for a vertex where L_θ is evaluated and no BSDF is."""
     if scene_view.materials is None or "albedo" not in scene_view.materials:
@@ -51,6 +52,7 @@ def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
     return replace(vertex, albedo=dr.detach(albedo))
 
 
+@carrying()
 def bounce(
     scene_view: SceneView,
     vertex: Vertex,

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import drjit as dr
 import mitsuba as mi
 
-from ..fields.materials import Materials, carry
+from ..fields.materials import Materials, carry, carrying
 from .vertex import evaluate
 
 
@@ -52,7 +52,6 @@ def materials_along_paths(materials: Materials | None) -> Iterator[None]:
         return
     before = materials.carried
     materials.stand_alone()
-    materials.carried = True
     interaction = mi.PreliminaryIntersection3f.compute_surface_interaction
 
     def with_material(pi, ray, ray_flags=mi.RayFlags.All, active=True):
@@ -64,7 +63,8 @@ def materials_along_paths(materials: Materials | None) -> Iterator[None]:
     # The one call that is made in Python at each vertex, and before its BSDF is asked.
     mi.PreliminaryIntersection3f.compute_surface_interaction = with_material
     try:
-        yield
+        with carrying():
+            yield
     finally:
         mi.PreliminaryIntersection3f.compute_surface_interaction = interaction
         materials.carried = before

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..fields.materials import Materials
+from ..fields.materials import Materials, carrying
 from ..fields.shapes import met_shapes, registry_number
 from .optimized import optimized_shapes
 
@@ -99,6 +99,7 @@ class Scattering:
     delta: mi.Bool
 
 
+@carrying()
 def find_vertex(
     scene_view: SceneView,
     ray: mi.Ray3f,
