@@ -49,6 +49,13 @@ def test_nothing_is_loaded_before_it_is_needed(folder):
         run.cameras("test")
 
 
+def test_what_was_recovered_prints_as_one_line(run):
+    found = run.recovered
+    assert isinstance(found, unbake.Recovered)
+    told = f"'materials' by 'direct', 2 steps, {str(run.dataset.folder)!r}"
+    assert repr(found) == f"Recovered({told})"
+
+
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(unbake.UserError, match="no run in this folder"):
         unbake.Run(str(tmp_path))

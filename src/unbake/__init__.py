@@ -90,6 +90,7 @@ if TYPE_CHECKING:
     from .training.problem import Problem as Problem
     from .training.problem import make_problem as make_problem
     from .training.problem import training_pixels as training_pixels
+    from .training.recovered import Recovered as Recovered
     from .training.recovered import load_run as load_run
     from .training.run_folder import Origin as Origin
     from .training.run_folder import RunFolder as RunFolder
@@ -142,7 +143,7 @@ _GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "acquisition.degrade": ("degrade",),
         "checks.check": ("check_data",),
         "training.loop": ("fit",),
-        "training.recovered": ("load_run",),
+        "training.recovered": ("Recovered", "load_run"),
         "run": ("Run",),
         "evaluation.settings": ("EvaluationSettings", "RenderSettings"),
         "evaluation.evaluate": ("evaluate",),
