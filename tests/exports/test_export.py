@@ -596,6 +596,22 @@ def test_xatlas_takes_over_where_uvunwrap_fails(mixed, monkeypatch):
     assert unique_share(atlas.placed, seed=7) >= 0.999
 
 
+def test_many_charts_get_a_page_that_holds_them(mixed):
+    found = read_parts(mixed, mixed.parent)
+    block = next(part for part in found.parts if part.name == "block")
+    rng = np.random.default_rng(0)
+    boxes = [
+        replace(block, name=f"box-{i}", triangles=replace(
+            block.triangles, uv=None,
+            positions=block.triangles.positions + rng.uniform(-3, 3, 3).astype(np.float32),
+        ))
+        for i in range(300)
+    ]  # fmt: skip
+    (atlas,) = make_atlases(found.scene, boxes, 0.5)
+    assert atlas.wanted <= 64 < atlas.resolution <= 512
+    assert atlas.method == "uvunwrap" and atlas.unique >= 0.999
+
+
 def test_resolutions_are_powers_of_two_within_limits(mixed):
     found = read_parts(mixed, mixed.parent)
     ground = [part for part in found.parts if part.name == "ground"]

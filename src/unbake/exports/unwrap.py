@@ -19,6 +19,8 @@ from .tessellate import Triangles
 SMALLEST, LARGEST = 64, 8192
 #: Points by which texture coordinates are tried, and the share that must find back.
 POINTS, UNIQUE = 20_000, 0.999
+#: By how much the page of uvunwrap may grow until charts fit into it.
+_LARGER = 8
 #: Empty texels around charts.
 _PADDING = 2
 #: Of the extent of a material's parts: how near a point must come back.
@@ -129,13 +131,13 @@ def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
     failures = []
     for method, unwrap in (("uvunwrap", _by_uvunwrap), ("xatlas", _by_xatlas)):
         try:
-            corners = unwrap([part.triangles for part in parts], resolution)
+            corners, size = unwrap([part.triangles for part in parts], resolution)
         except (RuntimeError, ValueError, ImportError) as error:
             failures.append(f"{method}: {error}")
             continue
         placed = [_split(part, uv) for part, uv in zip(parts, corners, strict=True)]
         share = unique_share(placed)
-        found.append(Atlas(name, materials, placed, method, share, resolution, wanted))
+        found.append(Atlas(name, materials, placed, method, share, size, wanted))
         if share >= UNIQUE:
             break
     if not found:
@@ -236,24 +238,33 @@ def _uv_areas(triangles: Triangles) -> np.ndarray:
 # --------------------------------------------------------------------------------------- unwrapping
 
 
-def _by_uvunwrap(meshes: list[Triangles], resolution: int) -> list[np.ndarray]:
-    """Texture coordinates of each corner, (m, 3, 2) a mesh."""
+def _by_uvunwrap(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndarray], int]:
+    """Texture coordinates of each corner, (m, 3, 2) a mesh, and the edge of a page that holds all.
+
+    The page is doubled where charts do not fit: each has `_PADDING` around it, however small it is.
+    """
     import uvunwrap  # needs Python 3.11
 
     given = [uvunwrap.Mesh(*_welded(mesh)) for mesh in meshes]
-    try:
-        atlas = uvunwrap.generate(given, page_size=resolution, padding=_PADDING)
-    except uvunwrap.UnwrapError as error:
-        raise RuntimeError(str(error)) from None
-    if atlas.page_count != 1:
-        raise RuntimeError(f"it needs {atlas.page_count} pages")
+    size, largest = resolution, min(_LARGER * resolution, LARGEST)
+    while True:
+        try:
+            atlas = uvunwrap.generate(given, page_size=size, padding=_PADDING)
+            lacks = None if atlas.page_count == 1 else f"it needs {atlas.page_count} pages"
+        except uvunwrap.UnwrapError as error:
+            atlas, lacks = None, str(error)
+        if lacks is None or 2 * size > largest:
+            break
+        size *= 2
+    if atlas is None or lacks is not None:
+        raise RuntimeError(lacks)
     corners = [np.array(mesh.corner_uvs, np.float32).reshape(-1, 3, 2) for mesh in atlas.meshes]
     # A page that is less high than wide becomes a square: its texels are only denser.
-    return _checked(corners, meshes)
+    return _checked(corners, meshes), size
 
 
-def _by_xatlas(meshes: list[Triangles], resolution: int) -> list[np.ndarray]:
-    """Texture coordinates of each corner, (m, 3, 2) a mesh."""
+def _by_xatlas(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndarray], int]:
+    """Texture coordinates of each corner, (m, 3, 2) a mesh, and the edge of the page."""
     import xatlas
 
     atlas = xatlas.Atlas()
@@ -268,7 +279,7 @@ def _by_xatlas(meshes: list[Triangles], resolution: int) -> list[np.ndarray]:
     for number in range(len(meshes)):
         _, indices, uv = atlas.get_mesh(number)
         corners.append(uv[indices].astype(np.float32))
-    return _checked(corners, meshes)
+    return _checked(corners, meshes), resolution
 
 
 def _welded(mesh: Triangles) -> tuple[np.ndarray, np.ndarray]:
