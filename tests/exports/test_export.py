@@ -677,8 +677,18 @@ def test_the_command_tells_what_it_wrote(exported, tmp_path, unbake, monkeypatch
     assert "floor/paint: 64 x 64 texels, its own coordinates" in outcome.out
     assert lines[-1] == f"wrote {out}: scene.glb, export.json" and max(map(len, lines[:-1])) < 80
     assert sorted(p.name for p in out.iterdir()) == sorted(
-        ["environment" + ".exr", "export.json", "scene.glb"]
+        ["environment" + ".exr", "export.json", "scene.glb", "unobserved"]
     )
+    # A file of glTF has no place for the masks of what no view saw.
+    told = json.loads((out / "export.json").read_text())
+    masks = {row["name"]: row["unobserved"] for row in told["materials"]}
+    assert set(masks) == {"floor/paint", "stone", "cloth"} and set(masks.values()) < {
+        *told["files"]
+    }
+    for row in told["materials"]:
+        mask = np.array(mi.Bitmap(str(out / row["unobserved"])))
+        assert mask.shape[:2] == (row["resolution"],) * 2
+        assert (mask.max() == 255) == (row["unobserved_share"] > 0)
 
 
 def test_textures_are_as_dense_as_the_fields_ask(exported, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ DIR/
   export.json             what is there, how it was made, and its conventions
   textures/               of each material: OpenEXR, PNG, and a mask of what no view saw
   scene.glb               the scene as binary glTF
+  unobserved/             masks of what no view saw, beside scene.glb where no textures are written
   mitsuba/scene.xml       the scene for Mitsuba, with its own meshes and textures
   usd/scene.usdc          the scene as OpenUSD, with its own textures
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,7 @@ from .lights import Light, environment_picture, read_lights
 from .mitsuba import write_scene
 from .observed import Views
 from .parts import Part, Parts, parsed_principled, read_parts
-from .textures import COLOUR_SPACES, file_names, write_textures
+from .textures import COLOUR_SPACES, file_names, write_mask, write_textures
 from .unwrap import LARGEST, UNIQUE, make_atlases
 from .usd import require_usd, write_usd
 
@@ -69,7 +71,8 @@ _CONVENTIONS = {
     "nobody chose it, textures have more that need it",
     "near": "by quantity, the share of the surface seen by training views where the texture "
     "differs from the recovered field by 2/255 at most, albedo as sRGB",
-    "unobserved": "white where no training view saw the surface: filled from those around it "
+    "unobserved": "a picture for each material, in its texture coordinates: white where no "
+    "training view saw the surface; values there are filled from those around it "
     "that were seen, or the quantity's default where a material has none; what is seen in mirrors "
     "or through glass alone counts as not seen",
 }
@@ -179,7 +182,7 @@ def _export(
             baked.append(baker.bake(atlas, bar.advance, refine=refine))
         bar.says("writing …")
         environment = environment_picture(problem)
-        files, notes = _write(recovered, out, formats, found, baked, lights, environment, learned)
+        written = _write(recovered, out, formats, found, baked, lights, environment, learned)
     names = {id(placed.part): atlas.name for atlas in atlases for placed in atlas.placed}
     manifest = {
         "format": EXPORT_FORMAT,
@@ -195,9 +198,7 @@ def _export(
         "unobserved_share": _unobserved(baked),
         "near": _near(baked),
         "files": sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()),
-        "materials": [
-            _material(one, files.get(one.atlas.name, [])) for one in baked if one.atlas.is_optimized
-        ],
+        "materials": [_material(one, written) for one in baked if one.atlas.is_optimized],
         "parts": [_part(part, names.get(id(part))) for part in found.parts],
         "left_out": found.left_out,
         "lights": [
@@ -212,10 +213,19 @@ def _export(
         "environment": None if environment is None else _ENVIRONMENT,
         "colour_spaces": COLOUR_SPACES,
         "conventions": _CONVENTIONS,
-        "notes": [*_notes(found, baked, lights, _COARSE[texels is None]), *notes],
+        "notes": [*_notes(found, baked, lights, _COARSE[texels is None]), *written.notes],
     }
     _report(manifest, tell)
     return manifest
+
+
+@dataclass(frozen=True)
+class _Written:
+    """What was written."""
+
+    textures: dict[str, list[str]]  #: names of files, by material
+    masks: dict[str, str]  #: of what no training view saw, by material
+    notes: list[str]  #: what is not as it was
 
 
 def _write(
@@ -227,16 +237,20 @@ def _write(
     lights: Sequence[Light],
     environment: Any,
     learned: Sequence[str],
-) -> tuple[dict[str, list[str]], list[str]]:
-    """Write all formats: the textures' files by material, and what is not as it was."""
+) -> _Written:
+    """Write all formats."""
     dataset = recovered.dataset
     shown = [one for one in baked if one.atlas.is_optimized]
     files: dict[str, list[str]] = {}
     notes: list[str] = []
-    if "textures" in formats:
-        stems = file_names([one.atlas.name for one in shown])
-        for stem, one in zip(stems, shown, strict=True):
+    stems = file_names([one.atlas.name for one in shown])
+    masks = {}
+    for stem, one in zip(stems, shown, strict=True):
+        if "textures" in formats:
             files[one.atlas.name] = write_textures(out / "textures", stem, one)
+            masks[one.atlas.name] = f"textures/{stem}_unobserved.png"
+        elif "gltf" in formats:
+            masks[one.atlas.name] = f"unobserved/{write_mask(out / 'unobserved', stem, one)}"
     if environment is not None:
         write_exr(out / _ENVIRONMENT, environment)
     if "gltf" in formats:
@@ -247,7 +261,7 @@ def _write(
         write_usd(out / "usd", found.scene, found.parts, shown, lights, beside, _up(dataset))
     if "mitsuba" in formats:
         (out / "mitsuba").mkdir()
-        written = write_scene(
+        scene = write_scene(
             out / "mitsuba",
             parsed_principled(dataset.scene, dataset.root),
             parsed_principled(dataset.scene, dataset.root),
@@ -257,8 +271,8 @@ def _write(
             environment,
             dataset.train[0].camera,
         )
-        notes += written.notes
-    return files, notes
+        notes += scene.notes
+    return _Written(files, masks, notes)
 
 
 def _up(dataset: Dataset) -> str:
@@ -270,11 +284,12 @@ def _up(dataset: Dataset) -> str:
 # ------------------------------------------------------------------------------------- the manifest
 
 
-def _material(baked: Baked, files: list[str]) -> dict[str, Any]:
+def _material(baked: Baked, written: _Written) -> dict[str, Any]:
     atlas = baked.atlas
     return {
         "name": atlas.name,
-        "textures": files,
+        "textures": written.textures.get(atlas.name, []),
+        "unobserved": written.masks.get(atlas.name),
         "resolution": atlas.resolution,
         "wanted_resolution": atlas.wanted,
         "coordinates": atlas.method,

@@ -41,9 +41,14 @@ def write_textures(folder: Path, stem: str, baked: Baked) -> list[str]:
         write_exr(folder / f"{stem}_{name}.exr", as_image(values))
         write_png(folder / f"{stem}_{name}.png", picture(name, values))
         names += [f"{stem}_{name}.exr", f"{stem}_{name}.png"]
+    return [*names, write_mask(folder, stem, baked)]
+
+
+def write_mask(folder: Path, stem: str, baked: Baked) -> str:
+    """Write what no training view saw of a material, in white; returns the name of the file."""
     mask = np.where(baked.covered & ~baked.observed, 255, 0).astype(np.uint8)
     write_png(folder / f"{stem}_unobserved.png", mask)
-    return [*names, f"{stem}_unobserved.png"]
+    return f"{stem}_unobserved.png"
 
 
 def as_image(values: np.ndarray) -> np.ndarray:
