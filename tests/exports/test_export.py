@@ -612,6 +612,38 @@ def test_many_charts_get_a_page_that_holds_them(mixed):
     assert atlas.method == "uvunwrap" and atlas.unique >= 0.999
 
 
+def test_a_scene_of_many_parts_is_exported_whole(tmp_path):
+    """Sixty meshes, half of them of one material, the others with one each."""
+    rng = np.random.default_rng(0)
+    shapes = []
+    for i in range(60):
+        place = " ".join(
+            f'{axis}="{x:.3f}"' for axis, x in zip("xyz", rng.uniform(-1, 1, 3), strict=True)
+        )
+        inside = '<ref id="shared"/>' if i % 2 else '<bsdf type="diffuse"/>'
+        shapes.append(
+            f'<shape type="cube" id="part-{i}">{inside}<transform name="to_world">'
+            f'<scale value="0.05"/><translate {place}/></transform></shape>'
+        )
+    text = '<scene version="3.0.0"><bsdf type="diffuse" id="shared"/>'
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "scene.xml").write_text(
+        text + "".join(shapes) + '<emitter type="constant"/></scene>'
+    )
+    data = grey_data(tmp_path / "scene" / "scene.xml", tmp_path / "data")
+    fit(data, tmp_path / "run", replace(tiny_fields("grid"), method="direct", steps=0))
+    options = {"texels": 20.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["gltf"], **options)
+    names = {f"part-{i}" for i in range(60)}
+    assert {part["name"] for part in manifest["parts"]} == names
+    assert len(manifest["materials"]) == 31 and not manifest["left_out"]
+    assert max(len(row["parts"]) for row in manifest["materials"]) == 30
+    assert all(row["unique_share"] >= 0.999 for row in manifest["materials"])
+    loaded = trimesh.load(tmp_path / "out" / "scene.glb")
+    assert set(loaded.geometry) == names
+    assert {len(geometry.faces) for geometry in loaded.geometry.values()} == {12}
+
+
 def test_resolutions_are_powers_of_two_within_limits(mixed):
     found = read_parts(mixed, mixed.parent)
     ground = [part for part in found.parts if part.name == "ground"]
