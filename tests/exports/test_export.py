@@ -17,6 +17,7 @@ import pytest
 import trimesh
 from support import tiny_fields
 
+import unbake
 from unbake.dataset.camera import LookAt
 from unbake.dataset.pixels import CameraRays
 from unbake.dataset.views import Dataset, View
@@ -283,6 +284,64 @@ def test_gltf_has_the_recovered_materials(exported):
         own = np.ptp(metallic) > 100 if told[name] == "floor/paint" else metallic.max() == 0
         assert own, "metallic is that of the scene"
         assert material.doubleSided == (name == "ground")
+
+
+@pytest.fixture(scope="module")
+def with_metallic(data, tmp_path_factory) -> Exported:
+    """An export of a run that learned metallic, too."""
+    folder = tmp_path_factory.mktemp("metallic")
+    config = replace(tiny_fields("grid"), method="direct", steps=0)
+    config = replace(config, quantities=("albedo", "roughness", "metallic"))
+    fit(data, folder / "run", config)
+    recovered = load_run(folder / "run")
+    randomise(recovered.problem.materials)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exporting, "load_run", lambda *_, **__: recovered)
+        as_if_seen(patch)
+        words = {"texels": 60.0, "tell": lambda line: None}
+        formats = ("gltf", "textures")
+        manifest = exporting.export(folder / "run", folder / "out", formats, **words)
+    return Exported(folder / "run", recovered, folder / "out", manifest)
+
+
+def test_learned_metallic_is_in_gltf_and_in_textures(with_metallic):
+    """Within 2/255 of the field, at points of each part, and not that of the scene."""
+    made = with_metallic
+    assert made.manifest["learned"] == ["albedo", "roughness", "metallic"]
+    materials = {row["name"]: row for row in made.manifest["materials"]}
+    loaded = trimesh.load(made.folder / "scene.glb")
+    tried = 0
+    for name, geometry in loaded.geometry.items():
+        material = geometry.visual.material
+        if not material.baseColorTexture:
+            continue
+        points, faces = trimesh.sample.sample_surface(geometry, 500, seed=2)
+        weights = trimesh.triangles.points_to_barycentric(geometry.triangles[faces], points)
+        uv = np.einsum("nk,nkd->nd", weights, geometry.visual.uv[geometry.faces[faces]])
+        uv[:, 1] = 1 - uv[:, 1]
+        truth = 255 * material_at(made.recovered, points)["metallic"]
+        blue = looked_up(material.metallicRoughnessTexture.convert("RGB"), uv)[:, 2]
+        files = materials[material.name]["textures"]
+        stems = [made.folder / "textures" / file for file in files if "_metallic." in file]
+        exr, png = sorted(stems, key=lambda file: file.suffix)
+        linear = 255 * looked_up(read_exr(exr)[..., :1], uv)[:, 0]
+        stored = np.array(mi.Bitmap(str(png)))
+        stored = looked_up(stored.reshape(*stored.shape[:2], -1), uv)[:, 0]
+        for found in (blue, linear, stored):
+            assert (np.abs(found - truth) <= 2).mean() > 0.98, name
+        tried += np.ptp(truth) > 20
+    assert tried > 3
+
+
+def test_a_benchmark_compares_learned_metallic(with_metallic, repository, monkeypatch):
+    monkeypatch.syspath_prepend(str(repository / "benchmarks"))
+    points = runpy.run_path(str(repository / "benchmarks" / "round_trip.py"))["Points"]
+    run = unbake.Run(with_metallic.run)
+    run.recovered = with_metallic.recovered
+    made = points(run, with_metallic.folder / "scene.glb", 2000)
+    assert made.shares(made.in_file)["metallic"] > 0.95
+    wrong = made.in_file | {"metallic": 0 * made.in_file["metallic"]}
+    assert made.shares(wrong)["metallic"] < 0.5
 
 
 @pytest.fixture(scope="module")
