@@ -173,6 +173,23 @@ def test_skipped_steps_and_what_was_noted_of_a_fit_are_told(made, tmp_path: Path
     assert EVIL not in text
 
 
+@pytest.mark.parametrize("why", ["nothing learned", "worse than untrained"])
+def test_a_run_that_learned_nothing_is_marked(made, tmp_path: Path, why):
+    """In the table, and at each of its pictures, which may be plain white."""
+    before = write_report(made[1], tmp_path / "before.html").read_text()
+    marked = f'<span class="failed">{why}</span>'
+    assert marked not in before
+    if why == "nothing learned":
+        note = {"step": 190, "seconds": 1.0, "note": "nothing was learned: no gradient"}
+        (made[1][0] / "log.jsonl").write_text(json.dumps(note) + "\n")
+    else:
+        first = {"albedo_psnr": 60.0, "roughness_psnr": 60.0}
+        _edit(made[1][0], lambda m: m.update(yardsticks={"untrained": first}))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    shown = text.count('data-name="Rendering"') + 2 * text.count('data-name="Albedo"')
+    assert text.count(marked) == 1 + shown
+
+
 def test_whether_a_fit_was_still_improving_is_told(made, tmp_path: Path):
     metrics = made[1][0] / "evaluation" / "metrics.json"
     found = {"trend": "improving", "change": -0.031, "noise": 0.004, "share": 0.25}

@@ -243,6 +243,7 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
         path = _recovered(run, view, quantity)
         empty = "not evaluated" if run.optimizes(quantity) else "known, not optimized"
         cell: dict[str, Any] = {"picture": None, "error": None, "empty": empty}
+        cell["trouble"] = _nothing_learned(run) if run.optimizes(quantity) else None
         if path is not None:
             image = display.rgb(path)[0]
             cell["picture"] = paint(image)
@@ -256,6 +257,25 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
 
 
 # ------------------------------------------------------------------------------------------ numbers
+
+
+def _nothing_learned(run: Run) -> str | None:
+    """Why a run is no result, in a few words; None if it is one.
+
+    Its fit noted that nothing was learned, or each material of held-out views scores below that of
+    the untrained fields.
+    """
+    if run.untrained:
+        return None
+    if any(str(line.get("note", "")).startswith("nothing was learned") for line in run.log):
+        return "nothing learned"
+    before = (run.metrics.get("yardsticks") or {}).get("untrained") or {}
+    found = run.metrics.get("heldout") or {}
+    keys = [f"{name}_psnr" for name in QUANTITIES]
+    pairs = [(display.number(found.get(key)), display.number(before.get(key))) for key in keys]
+    known = [(score, first) for score, first in pairs if score is not None and first is not None]
+    below = known and all(score < first for score, first in known)
+    return "worse than untrained" if below else None
 
 
 def _psnrs(runs: list[Run]) -> dict[str, str]:
@@ -291,6 +311,7 @@ def _table(runs: list[Run]) -> list[dict[str, Any]]:
     return [
         {
             "run": run,
+            "trouble": _nothing_learned(run),
             "method": "untrained" if run.untrained else run.metrics["method"],
             "details": _details(run),
             "steps": _count(run.metrics.get("steps")),
