@@ -6,6 +6,7 @@ Import it from test modules alone, which are read once the Mitsuba variant is se
 from __future__ import annotations
 
 import os
+import runpy
 import shutil
 import signal
 import sys
@@ -40,11 +41,21 @@ from unbake.transport.path_tracer import path_traced
 from unbake.transport.samplers import PathSampler, SamplerContext, make_sampler
 from unbake.transport.vertex import SceneView, find_vertex
 
+#: Names of browsers in which tests open pages, as the judges of glTF files know them.
+BROWSERS: tuple[str, ...] = runpy.run_path(
+    str(Path(__file__).parents[1] / "benchmarks" / "gltf_judges.py")
+)["BROWSERS"]
 #: Starts several processes of one command, where MPI is installed.
 MPIEXEC = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
 needs_mpi = pytest.mark.skipif(
     MPIEXEC is None or find_spec("mpi4py") is None, reason="mpiexec and mpi4py are not installed"
 )
+
+
+def found_browser() -> str | None:
+    """The first of the browsers that is installed; None: there is none."""
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
+
 
 #: The smallest network that still has a hash table and a hidden layer.
 TINY = NetworkConfig(

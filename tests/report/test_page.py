@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from support import BROWSERS, found_browser
 
 from unbake.errors import UserError
 from unbake.imaging import pictures
@@ -689,11 +689,12 @@ document.body.dataset.told = JSON.stringify(told);
 </script>"""
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@pytest.mark.skipif(found_browser() is None, reason=f"needs one of {BROWSERS}")
 def test_a_browser_compares_pictures_and_enlarges_them(made, tmp_path: Path):
     page = write_report(made[1], tmp_path / "report.html")
     page.write_text(page.read_text().replace("</body>", f"{_READER}</body>"))
-    words = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1000,800"]
+    words = [found_browser(), "--headless", "--no-sandbox", "--disable-gpu"]
+    words += ["--window-size=1000,800"]
     words += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     (body,) = [a for name, a in _Page(done.stdout).tags if name == "body"]

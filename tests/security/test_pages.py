@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from support import BROWSERS, found_browser
 
 from unbake.imaging import pictures
 from unbake.report.page import write_report
@@ -130,13 +131,10 @@ def test_a_name_is_text_on_a_page(page, name):
     assert text.count("&lt;") > 10
 
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-
-
 @pytest.fixture(scope="session")
 def title_in_browser(tmp_path_factory):
     """Open a page in a headless browser, and return its title after all of its scripts."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    browser = found_browser()
     if browser is None:
         pytest.skip(f"none of the browsers {', '.join(BROWSERS)} is installed")
 

@@ -11,15 +11,19 @@ import sys
 import threading
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
+from support import BROWSERS, found_browser, tiny_fields
 
 from unbake import cli
+from unbake.config import to_toml
 from unbake.errors import UserError
 from unbake.exports.parts import read_parts
+from unbake.io import write_text
 from unbake.training.checkpoint import Progress, save_checkpoint
 from unbake.training.recovered import open_run
 from unbake.training.run_folder import RunFolder
@@ -207,6 +211,89 @@ def test_the_page_follows_a_run_and_changes_nothing_in_it(viewer, run):
     assert digest(run) == before
 
 
+def test_what_is_wrong_with_a_checkpoint_stays_on_the_page(viewer, run, monkeypatch):
+    def fails(self):
+        raise UserError("the checkpoint is of a newer version")
+
+    page = viewer._page
+    with monkeypatch.context() as patch:
+        patch.setattr(ViewedRun, "follow", fails)
+        viewer._looked = -100.0
+        viewer.step(0)
+        assert "newer version" in page._note.content
+        page._tell("choice", "Roughness")
+        viewer.step(0)
+        viewer.step(0)
+        assert "newer version" in page._note.content, "pictures are no answer to it"
+    viewer._looked = -100.0
+    viewer.step(0)
+    assert "newer version" not in page._note.content
+
+
+#: A fit of one thread, so that sums have one order, which takes long enough to be watched.
+ONE_THREAD = """
+import time
+from unbake import backend, cli
+backend.activate()
+import drjit as dr
+from unbake.training.step import TrainingStep
+plain = TrainingStep.__call__
+def step(self, state, number, rates):
+    dr.set_thread_count(1)
+    try:
+        time.sleep(0.2)
+        return plain(self, state, number, rates)
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(2)
+TrainingStep.__call__ = step
+cli.main()
+"""
+
+
+@pytest.mark.slow
+def test_a_fit_that_is_watched_ends_as_one_that_is_not(cornell, tmp_path):
+    """Two checkpoints are followed while it runs; the last state is the same bit by bit."""
+    fields = replace(tiny_fields("grid"), method="direct", steps=60, checkpoint_seconds=0.5)
+    write_text(tmp_path / "settings.toml", to_toml(fields))
+    words = ["fit", cornell, "--settings", tmp_path / "settings.toml"]
+
+    def begun(out):
+        command = [sys.executable, "-c", ONE_THREAD, *words, "--out", out]
+        source = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
+        return subprocess.Popen(
+            list(map(str, command)), env=source, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+
+    watched, alone = tmp_path / "watched", tmp_path / "alone"
+    fit, seen, until = begun(watched), set(), time.monotonic() + 240
+    try:
+        while time.monotonic() < until and not list((watched / "checkpoints").glob("step-*")):
+            assert fit.poll() is None, fit.communicate()[0]
+            time.sleep(0.05)
+        with Viewer(opened(watched), 0) as viewer:
+            while fit.poll() is None and time.monotonic() < until:
+                viewer._looked = -100.0
+                viewer.step(0.01)
+                seen.add(viewer._viewed.shown)
+            viewer._looked = -100.0
+            viewer.step(0)
+            seen.add(viewer._viewed.shown)
+        told = fit.communicate(timeout=60)[0]
+        assert fit.returncode in (0, 1), told
+    finally:
+        fit.kill()
+    assert len(seen - {None}) >= 2, told
+    other = begun(alone)
+    told = other.communicate(timeout=120)[0]
+    assert other.returncode == fit.returncode, told
+    last = [max(run.glob("checkpoints/step-*")) for run in (watched, alone)]
+    assert last[0].name == last[1].name
+    last = [folder / "state.safetensors" for folder in last]
+    assert last[0].read_bytes() == last[1].read_bytes()
+
+
 def test_names_are_text_on_the_page(viewer):
     name = "<img src=x onerror=alert(1)>{alert(1)}"
     viewer._page.show_facts({name: name})
@@ -241,8 +328,6 @@ def test_a_signal_ends_the_command(cornell):
 
 
 # ------------------------------------------------------------------------------------ in a browser
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
 def complaints(browser, url, profile, loaded):
@@ -292,7 +377,7 @@ def complaints(browser, url, profile, loaded):
 
 
 def test_a_browser_shows_the_page_without_an_error(viewer, tmp_path):
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    browser = found_browser()
     if browser is None:
         pytest.skip(f"none of the browsers {', '.join(BROWSERS)} is installed")
     found, loaded, server = [], threading.Event(), viewer._page._server

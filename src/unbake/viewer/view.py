@@ -43,7 +43,6 @@ def view(
             read, or the port is taken.
     """
     require_viser()
-    require_viser()
     with signals.deferred() as stop, Viewer(opened(Path(folder), allow_outside), port) as viewer:
         tell(f"{viewer.url} shows {folder}; Ctrl-C ends it")
         while not stop:
@@ -94,6 +93,7 @@ class Viewer:
         self._wanted: Path | None = None  # a checkpoint; None: the newest
         self._surface_is_old = self._pictures_are_old = True
         self._looked = -POLL
+        self._trouble = ""  # why the checkpoint that is wanted is not shown
         self._page = Page(
             "unbake view",
             port,
@@ -165,11 +165,14 @@ class Viewer:
         written = viewed.checkpoints()
         if self._wanted is not None and self._wanted not in written:
             self._wanted = None  # deleted by the fit
+        before, self._trouble = self._trouble, ""
         try:
             if viewed.follow() if self._wanted is None else viewed.turn_to(self._wanted):
                 self._surface_is_old = self._pictures_are_old = True
         except UserError as error:
-            self._page.say(str(error))
+            self._trouble = str(error)
+        if self._trouble != before:
+            self._page.say(self._trouble)
         number = written.index(viewed.shown) + 1 if viewed.shown in written else len(written)
         which = f"{number} of {len(written)}" if written else "none yet: waiting for the first"
         follows = "; newer ones are shown as they come" if self._wanted is None else ""
@@ -191,5 +194,6 @@ class Viewer:
             try:
                 view = self._views[self._number]
                 self._page.show_pictures(self._viewed.pictures(view, self._choice, self._exposure))
+                self._page.say(self._trouble)  # pictures are of the checkpoint before
             except UserError as error:
                 self._page.say(str(error))

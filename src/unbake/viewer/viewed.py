@@ -251,7 +251,7 @@ class ViewedRun(ViewedData):
         """Show the newest checkpoint that can be read; whether it is another one than before.
 
         Raises:
-            UserError: as of `show`.
+            UserError: as of `turn_to`.
         """
         for checkpoint in reversed(self.checkpoints()):
             if checkpoint == self.shown:
