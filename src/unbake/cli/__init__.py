@@ -481,8 +481,8 @@ def export(
 
     The scene keeps its parts and their names. Each material gets textures of albedo, roughness and
     metallic, in the texture coordinates of its parts if these are unique, else unwrapped. What no
-    training view saw is filled in from what was seen, and marked in a mask. DIR/export.json has all
-    of it.
+    training view saw is filled in from what was seen, and marked in a mask. PATH/export.json has
+    all of it.
 
     Args:
         run: Folder that `unbake fit` wrote.
@@ -559,6 +559,8 @@ def relight(
     render: OmitArgPrefixes[RenderFlags],
 ) -> None:
     """Render the recovered scene under another light, which takes the place of its own.
+
+    Give --envmap, --lights or both. --cameras, --turntable and --truth exclude each other.
 
     Writes NAME.exr (linear radiance) and NAME.png of each camera, and render.json.
 

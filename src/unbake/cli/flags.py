@@ -115,8 +115,8 @@ def _help(option: Option, presets: bool) -> str:
         for name in typing.get_args(config.PresetName):
             value = _text(_value(config.preset(name), option.path))
             names.setdefault(value, []).append(name)
-        told = [f"{' and '.join(who)}: {value}" for value, who in names.items()]
-        default = told[0].partition(": ")[2] if len(told) == 1 else ", ".join(told)
+        told = [f"{', '.join(who)}: {value}" for value, who in names.items()]
+        default = told[0].partition(": ")[2] if len(told) == 1 else "; ".join(told)
         default = f"default: {default}" if len(told) == 1 else default
     else:
         default = f"default: {_text(option.default)}"

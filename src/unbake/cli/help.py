@@ -50,8 +50,24 @@ def wrapped_help(words: Collection[str]) -> Iterator[None]:
         with redirect_stdout(kept):
             yield
     finally:
-        for line in kept.text().splitlines():
-            print(wrapped(line, columns()))
+        told = kept.text()
+        for line in told.splitlines():
+            print(wrapped(_with_out(line, told), columns()))
+
+
+def _with_out(line: str, told: str) -> str:
+    """A line of usage with `-o PATH` where that is required: Tyro 1.0 hides it in `[... OPTIONS]`.
+
+    Args:
+        line: of the help.
+        told: all of the help.
+    """
+    plain = _CODES.sub("", line)
+    if not plain.startswith("usage: ") or " OPTIONS]" not in plain:
+        return line
+    option = re.search(r"-o PATH, --out PATH(.*?)(?=│ -|╰)", _CODES.sub("", told), re.DOTALL)
+    required = option is not None and "(required)" in option[1]
+    return line.replace(" OPTIONS]", " OPTIONS] -o PATH") if required else line
 
 
 def wrapped(line: str, width: int) -> str:

@@ -30,7 +30,7 @@ class LightConfig:
 
     envmap: Path | str | None = None  #: kept as a `Path`
     lights: Path | str | None = None  #: kept as a `Path`
-    envmap_scale: Annotated[float, Flag("What the values of the environment map are times")] = 1.0
+    envmap_scale: Annotated[float, Flag("Factor on the map's values")] = 1.0
     #: Degrees.
     envmap_rotate: Annotated[
         float,

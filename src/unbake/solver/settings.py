@@ -32,9 +32,7 @@ class SolveSettings:
     #: Not counted where `seconds` is given.
     steps: Annotated[int, Flag("Length in steps, unless --seconds is given")] = 2400
     #: Time for measurements is not counted. 0: `steps` counts.
-    seconds: Annotated[
-        float, Flag("Length in seconds of training; it takes the place of steps, where it is not 0")
-    ] = 0.0
+    seconds: Annotated[float, Flag("Length in seconds of training, instead of --steps")] = 0.0
     #: N of Eq. 4.
     batch: Annotated[int, Flag("Points on surfaces a step")] = 8192
     #: M. Their mean is the right-hand side.
@@ -46,7 +44,13 @@ class SolveSettings:
     ] = False
     seed: Annotated[int, Flag("Seed of all random numbers")] = 0
     #: Without a camera file.
-    views: Annotated[int, Flag("Pictures. Cameras are placed automatically")] = 4
+    views: Annotated[
+        int,
+        Flag(
+            "Pictures: cameras are placed automatically, or are those of the built-in scene; "
+            "--from takes the held-out views instead"
+        ),
+    ] = 4
     #: Unless the camera file has its own.
     resolution: Annotated[int, Flag("Width and height of the pictures in pixels")] = 64
     spp: Annotated[
