@@ -88,6 +88,7 @@ def told(found: dict[str, Any]) -> None:
     """Print the last measurement."""
     last = found["measurements"][-1]
     print(f"{last['step']} steps, {last['seconds']:.0f} s, {last['cpu_seconds']:.0f} s of CPU")
+    print(f"its pictures {last['pictures_seconds']:.0f} s")
     print(f"with the reference and measurements {found['wall_seconds']:.0f} s")
     print(f"other programs kept {found['others_cores']:.2f} cores busy")
     print(f"reference: {found['reference_spp']} samples, noise {found['reference_noise']:.5f}")

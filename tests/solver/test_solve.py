@@ -65,6 +65,7 @@ def test_the_untrained_field_did_not_know_it(solved):
     assert (first["step"], last["step"]) == (0, SETTINGS.steps)
     assert first["relmse"]["lhs"] > 10 * last["relmse"]["lhs"]
     assert first["cpu_seconds"] == 0 < last["cpu_seconds"]
+    assert last["pictures_seconds"] > 0 < last["pictures_cpu_seconds"]
     assert (first["spp"], last["spp"]) == (SETTINGS.spp, SETTINGS.final_spp)
 
 

@@ -51,6 +51,7 @@ _DEFINITIONS = {
     "seconds": "of training, without measurements and without the reference",
     "cpu_seconds": "the same of all cores that were at work for it; on a machine that does nothing "
     "else, at most the seconds times its cores",
+    "pictures_seconds": "of the pictures of both sides, all views, on the clock",
     "pictures_cpu_seconds": "of the pictures of both sides, all views, with spp samples a pixel",
 }
 
@@ -241,7 +242,7 @@ class _Learning:
         if self.known.problem is not None:  # a step that was replayed leaves other arrays there
             self.known.problem.assign(self.recovered)
         cameras = list(self.known.cameras.values())
-        begun = time.process_time()
+        begun, begun_wall = time.process_time(), time.perf_counter()
         sides = both_sides(
             self.known.scene_view,
             self.start.radiance,
@@ -251,6 +252,7 @@ class _Learning:
             hide_emitters=not self.known.room,
         )
         entry["pictures_cpu_seconds"] = round(time.process_time() - begun, 3)
+        entry["pictures_seconds"] = round(time.perf_counter() - begun_wall, 3)
         reference = self.pictures.get("reference")
         if reference is not None:
             found = {side: relative_mse(images, reference) for side, images in sides.items()}
