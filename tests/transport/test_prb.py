@@ -19,6 +19,7 @@ from support import (
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.dataset.camera import Camera
+from unbake.fields.materials import is_carrying
 from unbake.fields.texture import material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
@@ -83,11 +84,11 @@ def test_prb_asks_the_fields_once_a_vertex_with_the_result_of_textures(neural, r
 def test_paths_leave_nothing_behind(neural):
     problem, _ = neural
     interaction = mi.PreliminaryIntersection3f.compute_surface_interaction
-    assert problem.materials.carried
+    problem.materials.carried = True
     with pytest.raises(ZeroDivisionError), materials_along_paths(problem.materials):  # noqa: PT012
-        assert problem.materials.carried
+        assert is_carrying()
         raise ZeroDivisionError
-    assert problem.materials.carried
+    assert problem.materials.carried and not is_carrying()
     assert mi.PreliminaryIntersection3f.compute_surface_interaction is interaction
     with materials_along_paths(None):
         assert mi.PreliminaryIntersection3f.compute_surface_interaction is interaction
