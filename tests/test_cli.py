@@ -327,11 +327,11 @@ def test_the_help_of_fit_tells_what_the_presets_say(unbake):
     lighting = preset("release-lighting")
     for key in ("steps", "pixels"):
         assert getattr(paper, key) == getattr(release, key)
-        told = f"cpu: {getattr(cpu, key)}, paper and release: {getattr(paper, key)}, "
+        told = f"cpu: {getattr(cpu, key)}; paper, release: {getattr(paper, key)}; "
         assert f"{told}release-lighting: {getattr(lighting, key)}" in text
-    assert "cpu and release-lighting: 8, paper and release: 16" in text
-    crops = "paper and release and release-lighting: one-view-crop"
-    assert f"cpu: all-views, {crops}" in text
+    assert "cpu, release-lighting: 8; paper, release: 16" in text
+    crops = "paper, release, release-lighting: one-view-crop"
+    assert f"cpu: all-views; {crops}" in text
 
 
 @pytest.mark.parametrize(
@@ -518,3 +518,10 @@ def test_a_registered_representation_is_an_option_like_any_other(monkeypatch):
     assert "wide (wide net)" in str(told.type)
     chosen = with_options(FitConfig(), {"representation": "wide"})
     assert chosen.material_settings["albedo"].width == 64
+
+
+def test_usage_shows_where_a_command_writes_to(unbake):
+    """Tyro lists many options as one, also those that are required."""
+    for command in ("capture", "fit", "solve", "render", "relight", "export"):
+        usage = " ".join(unbake(command, "--help").out.split("\n\n")[0].split())
+        assert "-o PATH" in usage, command

@@ -65,7 +65,7 @@ def _with_out(line: str, told: str) -> str:
     plain = _CODES.sub("", line)
     if not plain.startswith("usage: ") or " OPTIONS]" not in plain:
         return line
-    option = re.search(r"-o PATH, --out PATH(.*?)(?=│ -|╰)", _CODES.sub("", told), re.DOTALL)
+    option = re.search(r"-o PATH, --out PATH(.*?)(?=[│|] -|[╰+])", _CODES.sub("", told), re.DOTALL)
     required = option is not None and "(required)" in option[1]
     return line.replace(" OPTIONS]", " OPTIONS] -o PATH") if required else line
 
