@@ -184,7 +184,8 @@ def test_a_run_that_learned_nothing_is_marked(made, tmp_path: Path, why):
         (made[1][0] / "log.jsonl").write_text(json.dumps(note) + "\n")
     else:
         first = {"albedo_psnr": 60.0, "roughness_psnr": 60.0}
-        _edit(made[1][0], lambda m: m.update(yardsticks={"untrained": first}))
+        found = {"ceiling": None, "constant": first, "untrained": first}
+        _edit(made[1][0], lambda m: m.update(yardsticks=found))
     text = write_report(made[1], tmp_path / "report.html").read_text()
     shown = text.count('data-name="Rendering"') + 2 * text.count('data-name="Albedo"')
     assert text.count(marked) == 1 + shown
