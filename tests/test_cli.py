@@ -258,7 +258,7 @@ def test_o_is_short_for_out(command, unbake):
 @pytest.mark.parametrize(
     ("option", "choices"),
     [
-        ("--unknown", "'materials', 'lighting', 'materials+lighting', 'emission'"),
+        ("--unknown", "'auto', 'materials', 'lighting', 'materials+lighting', 'emission'"),
         ("--preset", "'cpu', 'paper', 'release', 'release-lighting'"),
         ("--quality", "'draft', 'normal', 'high'"),
         ("--pixel-sampling", "'all-views', 'one-view-crop'"),

@@ -89,7 +89,7 @@ class DegradeSettings:
     electrons: Annotated[
         float, Flag("Electrons that white counts, which makes shot noise; 0: none")
     ] = 0.0
-    read_noise: Annotated[float, Flag("Read noise in electrons; it needs --electrons")] = 0.0
+    read_noise: Annotated[float, Flag("Read noise in electrons; only with --electrons given")] = 0.0
     clip: Annotated[
         float | None,
         Flag(

@@ -32,7 +32,9 @@ class SolveSettings:
     #: Not counted where `seconds` is given.
     steps: Annotated[int, Flag("Length in steps, unless --seconds is given")] = 2400
     #: Time for measurements is not counted. 0: `steps` counts.
-    seconds: Annotated[float, Flag("Length in seconds of training, instead of --steps")] = 0.0
+    seconds: Annotated[
+        float, Flag("Length in seconds of training; with it, --steps does not count")
+    ] = 0.0
     #: N of Eq. 4.
     batch: Annotated[int, Flag("Points on surfaces a step")] = 8192
     #: M. Their mean is the right-hand side.
