@@ -169,13 +169,14 @@ class Facts:
     def in_time(self) -> list[Row]:
         """Ours beside PRB after the same training time, a row a scene, by `benchmarks/variants.py`.
 
-        Rows have `data`, `seconds`, `seeds` and `views`, the row of each method by its name, and
-        the `note` of their result: what has changed since, or None.
+        Rows have `data`, `seconds` and `seeds`, the row of each method by its name, and `how` they
+        were made: the processor, and what has changed since.
         """
         rows = []
         for name in ("demo-in-time", "rooms", "objects"):
             found = self.result(name) if self.has(name) else {"rows": []}
             by_scene: dict[str, Row] = {}
+            on = f"on an {found['machine']['processor']}" if found["rows"] else ""
             for row in found["rows"]:
                 by_scene.setdefault(row["data"], {})[row["method"]] = row
             rows += [
@@ -183,8 +184,7 @@ class Facts:
                     "data": data,
                     "seconds": found["length"]["seconds"],
                     "seeds": len(found["seeds"]),
-                    "views": found["data"][data]["train"],
-                    "note": found.get("note"),
+                    "how": ", ".join(filter(None, (on, found.get("note")))),
                 }
                 | methods
                 for data, methods in by_scene.items()

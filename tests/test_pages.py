@@ -186,7 +186,7 @@ def test_what_has_changed_since_a_result_is_told_with_its_scenes(writer, tmp_pat
         " ".join(writer["page"](name, results=results).split())
         for name in ("README.md", "docs/comparison.md")
     )
-    assert "`staircase`, `veach-ajar`: with something else." in readme
+    assert re.search("`staircase`, `veach-ajar`: on an [^.:]*, with something else.", readme)
     assert "`demo`, `kitchen`" not in readme
     assert page.count("Default settings, with something else; about") == 1
 
