@@ -154,8 +154,8 @@ OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
 
 #: Bounces that can be differentiated before the radiance field takes over.
 MOST_BOUNCES = 16
-#: Those that a fit chooses for an object, whose light comes from outside: an error of L_θ is then
-#: seen over two bounces, and a second one costs little. In rooms there is one, as in the paper.
+#: Those that a fit chooses for an object. Most of its light comes from outside, so that a second
+#: bounce costs little, and L_θ matters less. In rooms there is one, as in the paper.
 BOUNCES_OF_OBJECTS = 2
 
 
