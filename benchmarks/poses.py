@@ -44,7 +44,7 @@ from unbake.experiments.commands import unbake  # noqa: E402
 from unbake.imaging.metrics import mean_psnr  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
-from unbake.training.recovered import load_run  # noqa: E402
+from unbake.training.recovered import Recovered, load_run  # noqa: E402
 from unbake.training.run_folder import RunFolder  # noqa: E402
 from unbake.training.validation import GroundTruth, MaterialBuffers  # noqa: E402
 
@@ -119,12 +119,8 @@ def at_true_cameras(run: Path, clean: Dataset) -> dict[str, float]:
         run: that was evaluated.
         clean: the data set before `degrade`.
     """
-    recovered, metrics, found = load_run(run), RunFolder(run).metrics(), {}
-    seen = MaterialBuffers.of(recovered.problem, clean.heldout, SAMPLES, 0)
-    truths = [GroundTruth.of(view) for view in clean.heldout]
-    each = [s.psnr(t) for s, t in zip(seen, truths, strict=True) if t is not None]
-    means = {key: mean_psnr(row[key] for row in each) for key in (each[0] if each else ())}
-    found |= {f"true_{key}": value for key, value in means.items() if value is not None}
+    recovered, metrics = load_run(run), RunFolder(run).metrics()
+    found = {f"true_{key}": value for key, value in as_seen(recovered, clean).items()}
     images = metrics.get("camera", {}).get("images", ())
     poses = {row["name"]: np.array(row["transform_matrix"]) for row in images}
     scene = recovered.problem.scene_view.scene
@@ -138,6 +134,20 @@ def at_true_cameras(run: Path, clean: Dataset) -> dict[str, float]:
             squares.append(told_of_place(scene, camera, view.camera)["pixels"] ** 2)
         found[f"{split}_pixels"] = float(np.sqrt(np.mean(squares)))
     return found
+
+
+def as_seen(recovered: Recovered, captured: Dataset) -> dict[str, float]:
+    """Scores of recovered materials as the held-out views of another data set see them.
+
+    Args:
+        recovered: of the same geometry.
+        captured: with true materials.
+    """
+    seen = MaterialBuffers.of(recovered.problem, captured.heldout, SAMPLES, 0)
+    truths = [GroundTruth.of(view) for view in captured.heldout]
+    each = [s.psnr(t) for s, t in zip(seen, truths, strict=True) if t is not None]
+    means = {key: mean_psnr(row[key] for row in each) for key in (each[0] if each else ())}
+    return {key: value for key, value in means.items() if value is not None}
 
 
 if __name__ == "__main__":

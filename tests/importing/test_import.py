@@ -1,7 +1,6 @@
 """Imports: a captured data set written in the layout of another program comes back as it was."""
 
 import json
-import math
 import re
 import shlex
 import shutil
@@ -12,7 +11,6 @@ import pytest
 import trimesh
 from layouts import (
     APERTURE,
-    APPLIED,
     ISO,
     SECONDS,
     codes,
@@ -22,7 +20,10 @@ from layouts import (
     same_as_captured,
     save,
     straightened_as_seen,
+    write_blender,
+    write_colmap,
     write_json,
+    write_nerfstudio,
 )
 
 from unbake.config.light import LightConfig
@@ -41,20 +42,8 @@ from unbake.scene.parse import parse
 @pytest.fixture
 def nerfstudio(captured, tmp_path):
     """A folder with one `transforms.json`, whose cameras have been moved."""
-    folder = tmp_path / "nerfstudio"
-    frames = []
-    for view in captured.views:
-        save(codes(view), folder / "images" / f"{view.name}.png")
-        pose = (APPLIED @ view.camera.to_world).tolist()
-        frames.append({"file_path": f"./images/{view.name}.png", "transform_matrix": pose})
-    top = intrinsics(captured.views[0].camera) | {"camera_model": "OPENCV", "k1": 0.0, "p2": 0}
-    lists = {"train_filenames": [], "test_filenames": []}
-    for view in captured.views:
-        key = "train_filenames" if view.split == "train" else "test_filenames"
-        lists[key].append(f"./images/{view.name}.png")
-    applied = {"applied_transform": APPLIED[:3].tolist(), "ply_file_path": "sparse_pc.ply"}
-    write_json(folder / "transforms.json", top | applied | lists | {"frames": frames})
-    return folder
+    write_nerfstudio(captured, tmp_path / "nerfstudio")
+    return tmp_path / "nerfstudio"
 
 
 def change(folder, edit, name="transforms.json"):
@@ -110,21 +99,6 @@ def test_a_scale_that_was_applied_is_taken_back(captured, nerfstudio, meshes, tm
     change(nerfstudio, scale)
     import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
     same_as_captured(captured, tmp_path / "data")
-
-
-def write_blender(captured, source):
-    """A folder with a file for each split, names without suffix, and alpha."""
-    angle = 2 * math.atan(0.5 * captured.views[0].camera.width / captured.views[0].camera.fl_x)
-    for split, short in (("train", "train"), ("heldout", "test"), ("heldout", "val")):
-        frames = []
-        for view in captured.views:
-            if view.split != split:
-                continue
-            alpha = np.full((*codes(view).shape[:2], 1), 255, np.uint8)
-            save(np.concatenate([codes(view), alpha], 2), source / short / f"{view.name}.png")
-            pose = view.camera.to_world.tolist()
-            frames.append({"file_path": f"./{short}/{view.name}", "transform_matrix": pose})
-        write_json(source / f"transforms_{short}.json", {"camera_angle_x": angle, "frames": frames})
 
 
 def test_blender_comes_back(captured, meshes, tmp_path):
@@ -528,32 +502,6 @@ DOCS = Path(__file__).parents[2] / "docs" / "import.md"
 BLOCKS = dict(
     re.findall(r"<!-- run by the tests: (\w+) -->\n```\w+\n(.*?)```", DOCS.read_text("utf-8"), re.S)
 )
-
-
-def write_colmap(captured, project):
-    """A project with a text model, written without pycolmap."""
-    (project / "sparse" / "0").mkdir(parents=True)
-    lens = captured.views[0].camera
-    size, focal = f"{lens.width} {lens.height}", f"{lens.fl_x!r} {lens.cx!r} {lens.cy!r}"
-    model = {"cameras": f"1 SIMPLE_PINHOLE {size} {focal}\n", "points3D": "", "images": ""}
-    for number, view in enumerate(captured.views, 1):
-        save(codes(view), project / "images" / f"{view.name}.png")
-        matrix = np.linalg.inv(view.camera.to_world @ np.diag([1.0, -1, -1, 1]))
-        x, y, z, w = quaternion(matrix[:3, :3])
-        numbers = " ".join(repr(float(v)) for v in (w, x, y, z, *matrix[:3, 3]))
-        model["images"] += f"{number} {numbers} 1 {view.name}.png\n\n"
-    for name, content in model.items():
-        (project / "sparse" / "0" / f"{name}.txt").write_text(content)
-
-
-def quaternion(rotation):
-    """(x, y, z, w) of a rotation, by its axis and angle."""
-    values, vectors = np.linalg.eig(rotation)
-    axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
-    cos = np.clip((np.trace(rotation) - 1) / 2, -1, 1)
-    skew = rotation - rotation.T
-    angle = np.arccos(cos) * (1 if axis @ (skew[2, 1], skew[0, 2], skew[1, 0]) >= 0 else -1)
-    return (*(axis * np.sin(angle / 2)), np.cos(angle / 2))
 
 
 def as_one(meshes, file):

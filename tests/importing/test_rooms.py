@@ -1,16 +1,13 @@
 """Rooms in the layout of FIPT: a captured data set that is written in it comes back as it was."""
 
-import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from layouts import codes, quiet, save, write_json
+from layouts import codes, quiet, write_photographed_room, write_rendered_room
 
 from unbake.dataset.views import Dataset, read_photograph
-from unbake.imaging.pictures import write_exr
 from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.settings import ImportSettings
@@ -18,50 +15,18 @@ from unbake.importing.settings import ImportSettings
 DOCS = Path(__file__).parents[2] / "docs" / "import.md"
 
 
-def write_mesh(meshes, folder):
-    folder.mkdir()
-    parts = [trimesh.load_mesh(mesh) for mesh in meshes]
-    trimesh.util.concatenate(parts).export(folder / "scene.obj")
-
-
 @pytest.fixture
 def photographed(captured, meshes, tmp_path):
     """A room with `cam.txt` and `K_list.txt`."""
-    room = tmp_path / "ClassRoom"
-    write_mesh(meshes, room)
-    poses, lenses = [str(len(captured.views))], [str(len(captured.views))]
-    for number, view in enumerate(captured.views):
-        camera = view.camera
-        _, up, back, origin = camera.to_world[:3].T
-        poses += [" ".join(map(repr, row.tolist())) for row in (origin, origin - 2 * back, up)]
-        lenses += [f"{camera.fl_x!r} 0 {camera.cx!r}", f"0 {camera.fl_y!r} {camera.cy!r}", "0 0 1"]
-        (room / "Image").mkdir(exist_ok=True)
-        write_exr(room / "Image" / f"{number:03d}_0001.exr", read_photograph(view))
-        save(codes(view), room / "ldr" / f"{number:03d}_0001.png")
-    (room / "cam.txt").write_text("\n".join(poses) + "\n")
-    (room / "K_list.txt").write_text("\n".join(lenses))
-    return room
+    write_photographed_room(captured, meshes, tmp_path / "ClassRoom")
+    return tmp_path / "ClassRoom"
 
 
 @pytest.fixture
 def rendered(captured, meshes, tmp_path):
     """A room with `train` and `val`."""
-    room = tmp_path / "kitchen"
-    write_mesh(meshes, room)
-    for name, views in (("train", captured.train), ("val", captured.heldout)):
-        frames = []
-        (room / name / "Image").mkdir(parents=True)
-        for number, view in enumerate(views):
-            # x to the left, y up, z forwards
-            left, up, forwards = -view.camera.to_world[:, 0], *(view.camera.to_world[:, [1, 2]].T)
-            pose = np.stack([left, up, -forwards, view.camera.to_world[:, 3]], 1)
-            frames.append({"transform_matrix": pose.tolist()})
-            image = room / name / "Image" / f"{number:03d}_0001.exr"
-            write_exr(image, read_photograph(view)[..., :3])
-        camera = views[0].camera
-        angle = 2 * math.atan(0.5 * camera.width / camera.fl_x)
-        write_json(room / name / "transforms.json", {"camera_angle_x": angle, "frames": frames})
-    return room
+    write_rendered_room(captured, meshes, tmp_path / "kitchen")
+    return tmp_path / "kitchen"
 
 
 def require_same(found, views):
