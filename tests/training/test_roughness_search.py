@@ -1,9 +1,11 @@
 """Searches of roughness: what they sample, the curves they descend on, and their place in a fit."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -314,6 +316,41 @@ def test_ranks_search_together(cornell, tmp_path):
     assert done.returncode == 0, done.stderr  # which also tells that their states are equal
     told = RunFolder(out).log()[-1]["samples"]
     assert told == pytest.approx(20 * 16 * SETTINGS.spp * (1 + SEARCH.times * SHARE), rel=0.01)
+
+
+SHARED = """
+import numpy as np
+from unbake import backend
+backend.activate()
+from test_roughness_search import SEARCH, SMALL, Curves, descend, made_up
+from unbake.fields.field import FieldSpec
+from unbake.fields.network import Network
+from unbake.ranks import Ranks
+rows, found = made_up(noise=0.02)[:10_001], []
+rows["weight"] /= 0.02**2
+every = Curves.of(rows, 2, 6, True)
+for ranks in (Ranks(), Ranks.of_environment()):
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    before = dict(field.parameters())
+    curves = Curves.of(rows, 2, 6, True, ranks)
+    assert curves.total == len(rows)
+    assert abs(len(np.array(curves.losses)) - 8 * len(rows) / ranks.size) <= 8
+    field.assign(before | descend(field, curves, SEARCH, 0.02, ranks))
+    found.append(np.array(field.evaluate(every.point)[0]))
+assert ranks.size == 2 and found[0].std() > 0.1
+assert np.abs(found[0] - found[1]).max() < 1e-3, np.abs(found[0] - found[1]).max()
+"""
+
+
+@needs_mpi
+def test_ranks_descend_together_to_where_one_would():
+    command = [MPIEXEC, "-n", "2", sys.executable, "-c", SHARED]
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_older_runs_and_the_papers_settings_do_not_search(tmp_path):

@@ -88,6 +88,25 @@ class Field(Protocol):
         """
         return {}
 
+    def beside_shared(self, point: SurfacePoint) -> list[mi.Float]:
+        """What does not change at some points while only numbers that points share do.
+
+        Args:
+            point: as of `evaluate`.
+
+        Returns:
+            For `with_shared`; here the values themselves.
+        """
+        return self.evaluate(point)
+
+    def with_shared(self, beside: list[mi.Float], point: SurfacePoint) -> list[mi.Float]:
+        """The same as `evaluate`, of which all but the shared numbers is known already.
+
+        Args:
+            beside: from `beside_shared` of the same points.
+        """
+        return beside
+
     def prepare(self) -> None:
         """Prepare evaluations inside virtual calls and loops; needed after each `assign`."""
 

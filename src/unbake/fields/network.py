@@ -82,12 +82,20 @@ class Network(Field):
         engine: Engine | None = None,
     ) -> list[mi.Float]:
         """Evaluate the network; the caller masks points outside of [0,1]³ or not finite."""
-        outputs = self.perceptron.evaluate([*self.grid(list(point.position)), *extra], engine)
+        features = [*self.grid(list(point.position)), *extra]
+        return self.with_shared(self.perceptron.evaluate(features, engine), point)
+
+    def beside_shared(self, point: SurfacePoint) -> list[mi.Float]:
+        """The network's part."""
+        return self.perceptron.evaluate(self.grid(list(point.position)))
+
+    def with_shared(self, beside: list[mi.Float], point: SurfacePoint) -> list[mi.Float]:
+        """The network's part and the numbers of pieces and colours."""
         if self.pieces is None:
-            return outputs
+            return beside
         shared = self.pieces.evaluate(point)
         outputs = [
-            dr.fma(self._pace, x, y + self._first) for x, y in zip(outputs, shared, strict=True)
+            dr.fma(self._pace, x, y + self._first) for x, y in zip(beside, shared, strict=True)
         ]
         return [sigmoid(x) for x in outputs] if self._bounded else outputs
 

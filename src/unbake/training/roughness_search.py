@@ -167,9 +167,10 @@ class RoughnessSearch:
             albedo = "albedo" in materials
             present = _roughness(field, points(rows, albedo)).numpy()
             rows["weight"] *= precision(rows, present)
-            curves = Curves.of(rows, search.cells, search.colours, albedo)
+            ranks = self._ranks if len(rows) >= self._ranks.size else Ranks()
+            curves = Curves.of(rows, search.cells, search.colours, albedo, ranks)
             own = self._config.material_settings["roughness"].learning_rate
-            found = descend(field, curves, search, search.rate * own)
+            found = descend(field, curves, search, search.rate * own, ranks)
             named = {f"roughness.{key}": self._of_first(x) for key, x in found.items()}
             state.replace({k: dr.lerp(dr.detach(state.phi[k]), x, part) for k, x in named.items()})
         state.publish(self._problem)
@@ -192,15 +193,19 @@ class Curves:
         losses: at the nodes, pixel by pixel, each with the albedo that is the best one there.
         slopes: by the logarithm of roughness, the same.
         nodes: their logarithms.
+        total: how many pixels all ranks have.
     """
 
     point: SurfacePoint
     losses: mi.Float
     slopes: mi.Float
     nodes: mi.Float
+    total: int
 
     @staticmethod
-    def of(rows: np.ndarray, cells: int, colours: int, albedo: bool) -> Curves:
+    def of(
+        rows: np.ndarray, cells: int, colours: int, albedo: bool, ranks: Ranks | None = None
+    ) -> Curves:
         """The curves of sampled pixels.
 
         Args:
@@ -208,15 +213,18 @@ class Curves:
             cells: along an edge of the unit cube, in each of which albedo has its own factor.
             colours: along each channel of albedo, the same.
             albedo: whether it is unknown.
+            ranks: that have an equal part of the curves each; None: this one has them all.
         """
+        ranks, total = ranks or Ranks(), len(rows)
         losses = losses_by_roughness(rows, groups(rows, cells, colours))
+        rows, losses = rows[ranks.rank :: ranks.size], losses[ranks.rank :: ranks.size]
         nodes = np.log(NODES)
         places = np.arange(len(nodes))
         left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
         slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
 
         flat = (from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes))
-        return Curves(points(rows, albedo), *flat)
+        return Curves(points(rows, albedo), *flat, total)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
@@ -254,8 +262,13 @@ def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
 
 def _roughness(field: Field, point: SurfacePoint) -> mi.Float:
     """What a field says of points."""
+    return _in_range(field.evaluate(point))
+
+
+def _in_range(values: list[mi.Float]) -> mi.Float:
+    """Roughness of the values of its field."""
     quantity = QUANTITIES["roughness"]
-    return dr.fma(field.evaluate(point)[0], quantity.upper - quantity.lower, quantity.lower)
+    return dr.fma(values[0], quantity.upper - quantity.lower, quantity.lower)
 
 
 def precision(rows: np.ndarray, roughness: np.ndarray) -> np.ndarray:
@@ -350,37 +363,63 @@ def squared_errors(rows: np.ndarray, factor: np.ndarray) -> np.ndarray:
 
 
 def descend(
-    field: Field, curves: Curves, settings: RoughnessSearchConfig, rate: float
+    field: Field,
+    curves: Curves,
+    settings: RoughnessSearchConfig,
+    rate: float,
+    ranks: Ranks | None = None,
 ) -> dict[str, Any]:
     """Let a field descend on curves by Adam, towards the most probable numbers.
 
     Args:
-        field: of roughness.
+        field: of roughness; the same on all ranks.
         curves: of errors in units of their variance.
         settings: how many steps there are, and how like each other numbers are expected to be.
         rate: of the first step.
+        ranks: that have a part of the curves each; None: there is one.
 
     Returns:
         The parameters that moved, which are those that points share.
     """
+    ranks = ranks or Ranks()
+    first = {key: type(value)(dr.detach(value)) for key, value in field.parameters().items()}
+    optimizer = mi.ad.Adam(rate, {key: first[key] for key in field.shared()})
+    beside = dr.detach(field.beside_shared(curves.point))
+    dr.eval(beside)
+    # Both are logarithms of probabilities, times -2. Errors of a pixel are a mean over channels,
+    # because most of their noise is the same. The mean over ranks is that over all pixels.
     spreads = {
         "pieces": settings.piece_spread,
         "brightnesses": settings.brightness_spread,
         "colours": settings.colour_spread,
     }
-    first = {key: type(value)(dr.detach(value)) for key, value in field.parameters().items()}
-    optimizer = mi.ad.Adam(rate, {key: first[key] for key in field.shared()})
-    # Both are logarithms of probabilities, times -2. Errors of a pixel are a mean over channels,
-    # because most of their noise is the same.
-    pixels = dr.width(curves.losses) // len(NODES)
-    weights = {key: dr.opaque(mi.Float, spread**-2 / pixels) for key, spread in spreads.items()}
+    weights = {key: dr.opaque(mi.Float, x**-2 / curves.total) for key, x in spreads.items()}
+    own = dr.width(curves.losses) // len(NODES) * ranks.size / curves.total
+    weights["pixels"] = dr.opaque(mi.Float, own)
+
     for number in range(settings.steps):
         now = rate * _FINAL_RATE ** (number / settings.steps)
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, now) for key in optimizer})
         field.assign(first | dict(optimizer.items()))
-        loss = dr.mean(curves.at(_roughness(field, curves.point)))
+        roughness = _in_range(field.with_shared(beside, curves.point))
+        loss = weights["pixels"] * dr.mean(curves.at(roughness))
         for key, values in field.deviations(curves.point).items():
             loss += weights[key] * dr.sum(dr.square(values))
         dr.backward(loss)
+        if ranks.size > 1:
+            _share_gradients(optimizer, ranks)
         optimizer.step()
     return {key: dr.detach(value) for key, value in optimizer.items()}
+
+
+def _share_gradients(optimizer: mi.ad.Optimizer, ranks: Ranks) -> None:
+    """Replace the gradients by their mean over all ranks."""
+    gradients = {key: dr.grad(value) for key, value in optimizer.items()}
+    flat = dr.concat([mi.Float(gradient.array) for gradient in gradients.values()])
+    mean, begin = ranks.mean(flat.numpy()), 0
+    for key, gradient in gradients.items():
+        end = begin + dr.width(gradient.array)
+        found = from_numpy(mi.Float, mean[begin:end])
+        is_tensor = dr.is_tensor_v(gradient)
+        dr.set_grad(optimizer[key], mi.TensorXf(found, gradient.shape) if is_tensor else found)
+        begin = end
