@@ -17,9 +17,10 @@ The roughness of pixels that searches see is compared with their true one:
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ from unbake import backend  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 
-#: Pixels that are sampled at once.
-EACH = 2048
+#: Camera samples that are traced at once, for the largest number of them a pixel.
+AT_ONCE = 1 << 18
 #: Samples of made-up photographs, as a multiple of those that a search compares with them.
 CLEANER = 4
 #: Searches whose mean is compared with one of all their samples.
@@ -78,7 +79,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     run = open_run(folder)
     progress = load_checkpoint(run.folder, run.state)
     run.state.publish(run.problem)
-    rows, many, true = sampled(run, pixels, spp)
+    (rows, many), true = sampled(run, pixels, (spp, CLEANER * spp))
     roughness, albedo = true[:, 0], true[:, 1:]
     shared = Shared(run, rows, roughness)
     told = {
@@ -106,11 +107,20 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     return about | {"roughness_psnr": told}
 
 
-def sampled(run: Any, pixels: int, spp: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the same pixels from `spp` and from more samples, and their true materials.
+def sampled(
+    run: Any, pixels: int, spps: Sequence[int], first: int = 0
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Rows of the same pixels from several numbers of samples, and their true materials.
+
+    Args:
+        run: whose fields are those of its checkpoint.
+        pixels: how many are sampled; those that searches cannot use are left out.
+        spps: camera samples of each pixel.
+        first: number of the first batch; batches of other numbers have other random numbers.
 
     Returns:
-        Two arrays of `row_type`, shape (n,), and roughness and albedo, shape (n, 4).
+        An array of `row_type` for each of `spps`, shape (n,), and roughness and albedo, shape
+        (n, 4).
     """
     from unbake.training.problem import pixels_of
     from unbake.training.roughness_search import NODES
@@ -124,20 +134,24 @@ def sampled(run: Any, pixels: int, spp: int) -> tuple[np.ndarray, np.ndarray, np
     truth = np.full((len(table), 4), np.nan, np.float32)
     truth[maps.numbers] = maps.values
 
-    def sample(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        with without_garbage_collection():
-            few, many = (
-                step.by_roughness(run.state, (number, 2 * number + i), EACH, count, NODES)
-                for i, count in enumerate((spp, CLEANER * spp))
-            )
-        kinds = [numbers_of(rows["target"], table) for rows in (few, many)]
-        same, chosen, its = np.intersect1d(*kinds, return_indices=True)
-        return few[chosen], many[its], truth[same]
+    each = min(pixels, AT_ONCE // max(spps))
 
-    batches = [sample(number) for number in range(-(-pixels // EACH))]
-    few, many, true = (np.concatenate(part) for part in zip(*batches, strict=True))
+    def sample(number: int) -> list[np.ndarray]:
+        with without_garbage_collection():
+            found = [
+                step.by_roughness(run.state, (number, 2 * number + i), each, count, NODES)
+                for i, count in enumerate(spps)
+            ]
+        kinds = [numbers_of(rows["target"], table) for rows in found]
+        same = functools.reduce(np.intersect1d, kinds, kinds[0])
+        chosen = [np.unique(kind, return_index=True) for kind in kinds]
+        rows = [r[i[np.isin(k, same)]] for r, (k, i) in zip(found, chosen, strict=True)]
+        return [*rows, truth[same]]
+
+    batches = [sample(first + number) for number in range(-(-pixels // each))]
+    *rows, true = (np.concatenate(part) for part in zip(*batches, strict=True))
     known = np.isfinite(true).all(1)
-    return few[known], many[known], true[known]
+    return [part[known] for part in rows], true[known]
 
 
 class Shared:

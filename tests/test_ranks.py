@@ -371,6 +371,29 @@ def test_ranks_apart_wait_for_those_that_live(repository, monkeypatch):
     assert done.stdout.splitlines() == ["[0, 1]"] * 2 and not done.stderr
 
 
+#: Rank 1 does not come to the end at which MPI waits for it.
+_STAYS = """
+import sys, time
+from unbake import ranks as module
+module._LEAVE = int(sys.argv[1])
+ranks = module.Ranks.of_environment()
+ranks.any(True)
+ranks.leave()
+if not ranks.leads:
+    time.sleep(float(sys.argv[2]))
+"""
+
+
+@needs_mpi
+@pytest.mark.parametrize("stays", [0, 40])
+def test_mpi_that_does_not_end_is_ended(stays, repository, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(repository / "src"))
+    words, start = [MPIEXEC, "-n", "2", sys.executable, "-c", _STAYS, "1", str(stays)], time.time()
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert time.time() - start < 20
+    assert (done.returncode != 0) == (stays > 0)
+
+
 def test_ranks_apart_end_where_one_is_silent_or_the_library_fails(monkeypatch, alarms, capsys):
     class Ended(Exception):
         pass

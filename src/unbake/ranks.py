@@ -64,6 +64,8 @@ _BEAT, _ALIVE, _APART = 1.0, 77, 78
 _PAUSE = 1.0
 #: Seconds in which MPI must end a process; after that the system does.
 _LAST_RESORT = 10
+#: Seconds in which MPI must let rank 0 go when its work is done, and that of all others.
+_LEAVE = 60
 #: Seconds that a rank other than the first waits before it ends all for what happened to it, so
 #: that what happened to all is told once, by rank 0.
 _AFTER_YOU = 0.5
@@ -492,6 +494,14 @@ class Ranks:
 
     # --------------------------------------------------------------------------- how all are ended
 
+    def leave(self) -> None:
+        """Let the system end rank 0 after a minute; for a program whose work is done on all ranks.
+
+        MPI waits for the others then. It does so for ever where the launcher of a host is gone.
+        """
+        if self.size > 1 and self.leads:
+            _end_after(_LEAVE)
+
     @contextmanager
     def guarded(self, say: Callable[[str], object]) -> Iterator[None]:
         """A block in which all ranks end where one fails.
@@ -527,10 +537,15 @@ def _end_by(communicator: Communicator) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     time.sleep(_PASSED_ON)
-    if hasattr(signal, "SIGALRM"):
-        signal.alarm(_LAST_RESORT)
+    _end_after(_LAST_RESORT)
     communicator.Abort(2)
     os._exit(2)
+
+
+def _end_after(seconds: int) -> None:
+    """Let the system end this process after so many seconds, where it can."""
+    if hasattr(signal, "SIGALRM"):
+        signal.alarm(seconds)
 
 
 def _told(error: BaseException) -> str:

@@ -1088,6 +1088,7 @@ def _ranks() -> Iterator[Ranks]:
     ranks = Ranks.of_environment()
     with ranks.guarded(lambda line: print(printable(line, _LONGEST), file=sys.stderr)):
         yield ranks
+        ranks.leave()
 
 
 def _fail(message: str) -> NoReturn:

@@ -19,7 +19,7 @@ class RoughnessSearchConfig:
     last: float = 0.75  #: and the last one; the rest is left for albedo to follow
     share: float = 0.25  #: camera samples of each one, of those that all steps of the fit take
     pixels: int = 1 << 19  #: that are sampled, at most
-    spp: int = 16  #: camera samples of each pixel
+    spp: int = 64  #: camera samples of each pixel
     cells: int = 4  #: along an edge of the scene's cube, in each of which albedo has its own factor
     colours: int = 6  #: along each channel of albedo, the same
     steps: int = 300  #: of Adam, on what was sampled

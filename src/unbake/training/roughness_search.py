@@ -49,7 +49,7 @@ NODES = (0.1, 0.16, 0.24, 0.33, 0.43, 0.55, 0.7, 0.9)
 #: Camera samples that are traced at once.
 _AT_ONCE = 1 << 18
 #: Fewer pixels tell nothing: a fit of some dozen steps does not search.
-_FEWEST = 1 << 14
+_FEWEST = 1 << 12
 #: Tells the random numbers of searches from those of steps, which start at the same seed.
 _SEED = 0x524F5547
 #: The rate that is left at the end of a descent.
