@@ -45,6 +45,31 @@ def test_two_hosts_share_a_cable_and_nothing_else(two_hosts, repository, monkeyp
         assert not hosts.running(0) and not hosts.running(1)
 
 
+#: Rank 0 tells that it lives, for some time; apart from the others, and while they wait for it.
+_SIGNS = """
+import time
+from unbake import ranks as module
+module._BEAT = 0.1
+ranks = module.Ranks.of_environment()
+with ranks.apart():
+    time.sleep(0.5)
+ranks.any(True)
+ranks.announce()
+if ranks.leads:
+    time.sleep(0.5)
+ranks.any(True)
+"""
+
+
+@needs_mpi
+def test_mpi_ends_after_signs_of_life(two_hosts, repository, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(repository / "src"))
+    with two_hosts["TwoHosts"]() as hosts:
+        process = hosts.start(sys.executable, "-c", _SIGNS)
+        _, errors = process.communicate(timeout=20)
+        assert process.returncode == 0, errors
+
+
 #: Two processes with work of their own, one of which waits for the other.
 _APART = """
 import time

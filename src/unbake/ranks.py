@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn, Protocol, TypeVar
@@ -118,7 +118,11 @@ class Communicator(Protocol):
         """Send an array to one rank."""
         ...
 
-    def Irecv(self, buf: Any, source: int = ..., tag: int = ...) -> Any:
+    def Iprobe(self, source: int = ..., tag: int = ...) -> bool:
+        """Whether an array of one rank can be received."""
+        ...
+
+    def Recv(self, buf: Any, source: int = ..., tag: int = ...) -> Any:
         """Receive an array of one rank."""
         ...
 
@@ -157,7 +161,9 @@ class Ranks:
         self._communicator, self.here, self._patience = communicator, here, patience
         self._beats = beats
         self._beating: tuple[threading.Thread, threading.Event] | None = None
-        self._life: Any = None  # the request for the next sign of life of rank 0
+        # Signs of life, by tag and rank: how many were sent, and how many have arrived
+        self._sent: Counter[tuple[int, int]] = Counter()
+        self._arrived: Counter[tuple[int, int]] = Counter()
         self._steps: deque[float] = deque(maxlen=_LAST)  # seconds of the last steps
         self._first_steps, self._step_began = _FIRST, math.nan
         self._announced: float | None = None  # when it was told that some rank may take long
@@ -356,6 +362,7 @@ class Ranks:
                 sent = [request for request in sent if not request.Test()]
                 for rank in () if sent else range(1, self.size):
                     sent.append(self._communicator.Isend(sign, dest=rank, tag=_ALIVE))
+                    self._sent[_ALIVE, rank] += 1
             for request in sent:
                 request.Test()
 
@@ -377,6 +384,7 @@ class Ranks:
         finally:
             stop.set()
             thread.join(_LAST_RESORT)
+        self._receive_rest(_APART)
 
     def _watch(self, stop: threading.Event) -> None:
         """End all where one rank is not heard of any more."""
@@ -391,8 +399,7 @@ class Ranks:
         """Send signs of life, and receive them, until one does not come for too long."""
         assert self._communicator is not None
         sign, others = np.zeros(1, np.uint8), range(1, self.size) if self.leads else [0]
-        signs = {rank: np.empty(1, np.uint8) for rank in others}
-        sent, coming = {}, {}
+        sent: dict[int, Any] = {}
         silent, before = dict.fromkeys(others, 0.0), time.monotonic()
         while not stop.wait(_BEAT):
             now = time.monotonic()
@@ -400,17 +407,14 @@ class Ranks:
             for rank in others:
                 if rank not in sent or sent[rank].Test():
                     sent[rank] = self._communicator.Isend(sign, dest=rank, tag=_APART)
+                    self._sent[_APART, rank] += 1
                 silent[rank] += passed
-                while rank not in coming or coming[rank].Test():
+                if self._has_arrived(_APART, rank):
                     silent[rank] = 0.0
-                    coming[rank] = self._communicator.Irecv(signs[rank], source=rank, tag=_APART)
                 if silent[rank] > self._patience:
                     what = f"process {rank} has not been heard of for {self._patience:.0f} s"
                     remedy = "See whether its network is cut; the same command goes on"
                     raise UserError(what, remedy=remedy)
-        for request in coming.values():
-            request.Cancel()
-            request.Wait()
 
     def _alone_with(self) -> Communicator:
         """The communicator, which no thread uses any more."""
@@ -436,7 +440,10 @@ class Ranks:
         except RuntimeError as error:  # the library knows that a rank is gone
             what = f"the connection to the other processes is lost ({error})"
             raise UserError(" ".join(what.split()), remedy=_GO_ON) from None
-        self._announced = None
+        if self._announced is not None:
+            self._announced = None
+            if self._beats:
+                self._receive_rest(_ALIVE)
 
     def _limit(self) -> float:
         """Seconds to wait for the others at this moment."""
@@ -454,11 +461,21 @@ class Ranks:
         """Whether rank 0 has told so since this was asked the last time."""
         if self._communicator is None or self.leads or not self._beats:
             return False
-        told = False
-        while self._life is None or self._life.Test():
-            told, sign = told or self._life is not None, np.empty(1, np.uint8)
-            self._life = self._communicator.Irecv(sign, source=0, tag=_ALIVE)
-        return told
+        return self._has_arrived(_ALIVE, 0)
+
+    def _has_arrived(self, tag: int, rank: int) -> bool:
+        """Whether a rank has sent signs of life since this was asked the last time."""
+        assert self._communicator is not None
+        before = self._arrived[tag, rank]
+        while self._communicator.Iprobe(source=rank, tag=tag):
+            self._receive(tag, rank)
+        return self._arrived[tag, rank] > before
+
+    def _receive(self, tag: int, rank: int) -> None:
+        """Receive a sign of life, or wait for it."""
+        assert self._communicator is not None
+        self._communicator.Recv(np.empty(1, np.uint8), source=rank, tag=tag)
+        self._arrived[tag, rank] += 1
 
     def _note_step(self) -> None:
         """A step has ended on all ranks."""
@@ -487,10 +504,17 @@ class Ranks:
                 raise UserError(what, remedy=_GO_ON)
             if waited > _AWAKE:
                 time.sleep(_NAP if waited < _LONG else _LONG_NAP)
-        if self._life is not None:  # what comes late counts for the next wait
-            self._life.Cancel()
-            self._life.Wait()
-            self._life = None
+
+    def _receive_rest(self, tag: int) -> None:
+        """Receive all signs of life that were sent; all ranks call this.
+
+        None counts for a later wait then. With MPICH 5 between hosts, one that nobody receives lets
+        `MPI_Finalize` wait for ever on the rank that sent it.
+        """
+        own = np.array([self._sent[tag, rank] for rank in range(self.size)], np.int64)
+        for rank, sent in enumerate(self._gathered(own)[:, self.rank].tolist()):
+            while self._arrived[tag, rank] < sent:
+                self._receive(tag, rank)
 
     # --------------------------------------------------------------------------- how all are ended
 
