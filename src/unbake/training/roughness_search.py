@@ -223,8 +223,8 @@ class Curves:
         left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
         slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
 
-        flat = (from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes))
-        return Curves(points(rows, albedo), *flat, total)
+        flat = [from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes)]
+        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
