@@ -137,9 +137,9 @@ def imported(source: Path, captured: Dataset, meshes: list[Path], out: Path) -> 
     # Not hidden, by Blender's alpha: that would be another problem.
     settings = ImportSettings(background="visible")
     light = LightConfig(lights=str(captured.scene))
-    import_data(source, out, meshes, settings, light=light, allow_outside=True)
-    put_back_splits(out / "transforms.json", captured.views)
-    put_back_materials(out / "scene" / "scene.xml", captured.scene)
+    made = import_data(source, out, meshes, settings, light=light, allow_outside=True)
+    put_back_splits(made.transforms_file, captured.views)
+    put_back_materials(Dataset.load(out).scene, captured.scene)
 
 
 def put_back_splits(file: Path, views: tuple[View, ...]) -> None:
