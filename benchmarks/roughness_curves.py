@@ -13,6 +13,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +42,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
     backend.activate()
-    from unbake.training.checkpoint import load_checkpoint
     from unbake.training.problem import pixels_of
-    from unbake.training.recovered import open_run
     from unbake.training.roughness_search import (
         NODES,
         groups,
@@ -53,8 +52,7 @@ def main() -> None:
     from unbake.training.step import TrainingStep
     from unbake.training.truth_fit import TrueMaps
 
-    run = open_run(args.run)
-    progress = load_checkpoint(run.folder, run.state)
+    run, steps = opened(args.run)
     pixels = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
     step = TrainingStep(run.problem, pixels, run.config)
     each = 2048
@@ -95,8 +93,19 @@ def main() -> None:
         told = ", ".join(f"{name} {row[name]:.3f} ± {row[f'{name}_sd']:.3f}" for name in losses)
         print(f"piece {row['piece']}, {row['pixels']} pixels, {row['true']:.3f}: {told}")
     result = {"machine": machine(), "data": run.dataset.folder.name, "method": run.config.method}
-    result |= {"steps": progress.step if progress else 0, "pixels": len(rows), "spp": args.spp}
+    result |= {"steps": steps, "pixels": len(rows), "spp": args.spp}
     write_json(args.out, result | {"searches": search.times, "rows": found})
+
+
+def opened(folder: Path) -> tuple[Any, int]:
+    """A run with the fields of its checkpoint, and how many steps it has taken."""
+    from unbake.training.checkpoint import load_checkpoint
+    from unbake.training.recovered import open_run
+
+    run = open_run(folder)
+    progress = load_checkpoint(run.folder, run.state)
+    run.state.publish(run.problem)
+    return run, progress.step if progress else 0
 
 
 def numbers_of(targets: np.ndarray, table: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "src"))
 os.environ["PYTHONPATH"] = str(ROOT / "src")
 
-from roughness_curves import numbers_of  # noqa: E402
+from roughness_curves import numbers_of, opened  # noqa: E402
 
 from unbake import backend  # noqa: E402
 from unbake.io import write_json  # noqa: E402
@@ -72,13 +72,9 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         pixels: how many are sampled; those that searches cannot use are left out.
         spp: camera samples of each.
     """
-    from unbake.training.checkpoint import load_checkpoint
-    from unbake.training.recovered import open_run
     from unbake.training.roughness_search import NODES, precision
 
-    run = open_run(folder)
-    progress = load_checkpoint(run.folder, run.state)
-    run.state.publish(run.problem)
+    run, steps = opened(folder)
     (rows, many), true = sampled(run, pixels, (spp, CLEANER * spp))
     roughness, albedo = true[:, 0], true[:, 1:]
     shared = Shared(run, rows, roughness)
@@ -103,7 +99,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     name = run.dataset.folder.name
     for key, value in told.items():
         print(f"{name}: {key}: {value:.2f} dB", flush=True)
-    about = {"data": name, "steps": progress.step if progress else 0, "pixels": len(rows)}
+    about = {"data": name, "steps": steps, "pixels": len(rows)}
     return about | {"roughness_psnr": told}
 
 

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "src"))
 os.environ["PYTHONPATH"] = str(ROOT / "src")
 
+from roughness_curves import opened  # noqa: E402
 from roughness_limits import Shared, sampled  # noqa: E402
 
 from unbake import backend  # noqa: E402
@@ -57,16 +58,12 @@ def main() -> None:
 
 def searches_of(folder: Path, samples: int, spps: list[int], times: int) -> dict[str, Any]:
     """The scores of a run's searches, by their samples a pixel."""
-    from unbake.training.checkpoint import load_checkpoint
-    from unbake.training.recovered import open_run
     from unbake.training.roughness_search import precision
 
-    run = open_run(folder)
-    progress = load_checkpoint(run.folder, run.state)
-    run.state.publish(run.problem)
+    run, steps = opened(folder)
     (rows,), true = sampled(run, samples // min(spps), (min(spps),))
     seen = Shared(run, rows, true[:, 0])
-    found = {"data": run.dataset.folder.name, "steps": progress.step if progress else 0}
+    found = {"data": run.dataset.folder.name, "steps": steps}
     found |= {"as_fitted": seen.score({}), "searches": []}
     for spp in spps:
         scores, noise = [], []

@@ -39,6 +39,7 @@ class Two:
         self.rank, self.others, self.looks, self.status = rank, list(others), looks, None
         self.signs = []  # of life that were sent
         self.coming = None  # signs that have not been received yet; None: one at each look
+        self.looked = False
 
     def Iallreduce(self, send, total):
         total[:] = send + self.others.pop(0)
@@ -62,7 +63,7 @@ class Two:
     def Iprobe(self, source, tag):
         assert source == 1 - self.rank
         if self.coming is None:
-            self.looked = not getattr(self, "looked", False)
+            self.looked = not self.looked
             return self.looked
         return self.coming > 0
 
@@ -71,6 +72,10 @@ class Two:
         if self.coming is not None:
             assert self.coming, "nothing will come"
             self.coming -= 1
+
+    def Irecv(self, sign, source, tag):
+        self.Recv(sign, source, tag)
+        return Request(self.looks)
 
     def Abort(self, status):
         self.status = status
@@ -308,6 +313,16 @@ def test_all_signs_of_life_are_received(early, clock):
     world.others = [np.int32([1]), np.array([0, 7])]  # an answer, and how many were sent
     assert ranks.any(True) == (True,)
     assert not world.coming and not world.others
+
+
+def test_a_sign_of_life_that_does_not_come_is_not_waited_for_without_an_end(clock):
+    ranks = after_steps(1, 0.1, clock, beats=True)
+    ranks.announce()
+    ranks._communicator.others = [np.int32([1]), np.array([0, 7])]
+    ranks._communicator.Irecv = lambda sign, source, tag: Request(None)
+    ranks._communicator.coming, clock.look = 0, 0.5
+    with pytest.raises(UserError, match="have not answered"):
+        ranks.any(True)
 
 
 def test_signs_of_life_end_when_all_meet_again(monkeypatch):

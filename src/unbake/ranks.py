@@ -123,6 +123,10 @@ class Communicator(Protocol):
         ...
 
     def Recv(self, buf: Any, source: int = ..., tag: int = ...) -> Any:
+        """Wait for an array of one rank."""
+        ...
+
+    def Irecv(self, buf: Any, source: int = ..., tag: int = ...) -> Any:
         """Receive an array of one rank."""
         ...
 
@@ -468,14 +472,9 @@ class Ranks:
         assert self._communicator is not None
         before = self._arrived[tag, rank]
         while self._communicator.Iprobe(source=rank, tag=tag):
-            self._receive(tag, rank)
+            self._communicator.Recv(np.empty(1, np.uint8), source=rank, tag=tag)
+            self._arrived[tag, rank] += 1
         return self._arrived[tag, rank] > before
-
-    def _receive(self, tag: int, rank: int) -> None:
-        """Receive a sign of life, or wait for it."""
-        assert self._communicator is not None
-        self._communicator.Recv(np.empty(1, np.uint8), source=rank, tag=tag)
-        self._arrived[tag, rank] += 1
 
     def _note_step(self) -> None:
         """A step has ended on all ranks."""
@@ -512,16 +511,18 @@ class Ranks:
         `MPI_Finalize` wait for ever on the rank that sent it.
         """
         own = np.array([self._sent[tag, rank] for rank in range(self.size)], np.int64)
+        sign = np.empty(1, np.uint8)
         for rank, sent in enumerate(self._gathered(own)[:, self.rank].tolist()):
             while self._arrived[tag, rank] < sent:
-                self._receive(tag, rank)
+                self._exchange(lambda all_, rank=rank: all_.Irecv(sign, source=rank, tag=tag))
+                self._arrived[tag, rank] += 1
 
     # --------------------------------------------------------------------------- how all are ended
 
     def leave(self) -> None:
         """Let the system end rank 0 after a minute; for a program whose work is done on all ranks.
 
-        MPI waits for the others then. It does so for ever where the launcher of a host is gone.
+        MPI waits for the others then: the last resort, should that not end.
         """
         if self.size > 1 and self.leads:
             _end_after(_LEAVE)

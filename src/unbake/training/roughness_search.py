@@ -40,6 +40,7 @@ from ..memory import lacks_memory
 from ..quantities import QUANTITIES
 from ..ranks import Ranks
 from ..transport.by_roughness import row_type
+from .gradients import flat_gradients, set_gradients
 from .problem import Problem
 from .state import State
 from .step import TrainingStep, without_garbage_collection
@@ -394,9 +395,8 @@ def descend(
         "colours": settings.colour_spread,
     }
     weights = {key: dr.opaque(mi.Float, x**-2 / curves.total) for key, x in spreads.items()}
-    own = dr.width(curves.losses) // len(NODES) * ranks.size / curves.total
-    weights["pixels"] = dr.opaque(mi.Float, own)
-
+    share = dr.width(curves.losses) // len(NODES) * ranks.size / curves.total
+    weights["pixels"] = dr.opaque(mi.Float, share)
     for number in range(settings.steps):
         now = rate * _FINAL_RATE ** (number / settings.steps)
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, now) for key in optimizer})
@@ -407,19 +407,7 @@ def descend(
             loss += weights[key] * dr.sum(dr.square(values))
         dr.backward(loss)
         if ranks.size > 1:
-            _share_gradients(optimizer, ranks)
+            own = dr.concat(flat_gradients(optimizer)).numpy()
+            set_gradients(optimizer, from_numpy(mi.Float, ranks.mean(own)))
         optimizer.step()
     return {key: dr.detach(value) for key, value in optimizer.items()}
-
-
-def _share_gradients(optimizer: mi.ad.Optimizer, ranks: Ranks) -> None:
-    """Replace the gradients by their mean over all ranks."""
-    gradients = {key: dr.grad(value) for key, value in optimizer.items()}
-    flat = dr.concat([mi.Float(gradient.array) for gradient in gradients.values()])
-    mean, begin = ranks.mean(flat.numpy()), 0
-    for key, gradient in gradients.items():
-        end = begin + dr.width(gradient.array)
-        found = from_numpy(mi.Float, mean[begin:end])
-        is_tensor = dr.is_tensor_v(gradient)
-        dr.set_grad(optimizer[key], mi.TensorXf(found, gradient.shape) if is_tensor else found)
-        begin = end

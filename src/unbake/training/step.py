@@ -30,6 +30,7 @@ from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
 from ..transport.samplers import SamplerContext, make_sampler
+from .gradients import flat_gradients, set_gradients
 from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
 from .outliers import Blocks
@@ -473,7 +474,7 @@ class TrainingStep:
         self._terms = list(terms)
         parts = [mi.Float(value) for value in terms.values()]
         for _, optimizer in state.optimizers():
-            parts += [mi.Float(dr.grad(value).array) for value in optimizer.values()]
+            parts += flat_gradients(optimizer)
             dr.clear_grad(dict(optimizer.items()))
         found = dr.concat(parts)
         dr.eval(found)
@@ -485,13 +486,7 @@ class TrainingStep:
         for number, name in enumerate(self._terms):
             terms[name] = dr.gather(mi.Float, mean, mi.UInt32(number))
         for _, optimizer in state.optimizers():
-            for value in optimizer.values():
-                count = dr.width(value.array)
-                gradient = dr.gather(mi.Float, mean, first + dr.arange(mi.UInt32, count))
-                if dr.is_tensor_v(value):
-                    gradient = mi.TensorXf(gradient, value.shape)
-                dr.set_grad(value, gradient)
-                first += count
+            first = set_gradients(optimizer, mean, first)
         return self._move(terms, state)
 
     def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
