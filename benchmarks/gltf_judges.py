@@ -5,13 +5,17 @@ They are packages of npm: `npm ci --prefix benchmarks/gltf`. The browser is Chro
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import json
 import math
+import os
+import queue
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
+import time
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -27,8 +31,11 @@ _FLAGS = (
     "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--use-gl=angle",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars",
-    "--force-device-scale-factor=1", "--virtual-time-budget=60000",
+    "--force-device-scale-factor=1",
 )  # fmt: skip
+
+#: A browser takes no longer to load and draw a scene.
+_SECONDS = 300.0
 
 
 def validator_lacks() -> str | None:
@@ -78,22 +85,21 @@ def shown(file: Path, camera: Camera) -> np.ndarray:
         shutil.copy(file, site / "scene.glb")
         (site / "node_modules").symlink_to((FOLDER / "node_modules").resolve())
         (site / "camera.json").write_text(json.dumps(_described(camera)))
-        handler = functools.partial(_Quiet, directory=folder)
-        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-            thread = threading.Thread(target=server.serve_forever)
-            thread.start()
-            picture = site / "picture.png"
-            words = [
-                str(_browser()), *_FLAGS, f"--user-data-dir={folder}/profile",
-                f"--window-size={camera.width},{camera.height}", f"--screenshot={picture}",
-                f"http://127.0.0.1:{server.server_port}/index.html",
-            ]  # fmt: skip
-            try:
-                subprocess.run(words, capture_output=True, timeout=300, check=True)
-            finally:
-                server.shutdown()
-                thread.join()
-        return read_png(picture)[..., :3]
+        page = _Page(folder)
+        words = [
+            str(_browser()), *_FLAGS, f"--user-data-dir={folder}/profile",
+            f"--window-size={camera.width},{camera.height}", page.url,
+        ]  # fmt: skip
+        try:
+            kept = subprocess.DEVNULL
+            with subprocess.Popen(words, stdout=kept, stderr=kept, start_new_session=True) as done:
+                try:
+                    (site / "picture.png").write_bytes(page.picture(done, _SECONDS))
+                finally:
+                    os.killpg(done.pid, signal.SIGKILL)
+        finally:
+            page.close()
+        return read_png(site / "picture.png")[..., :3]
 
 
 def _described(camera: Camera) -> dict[str, Any]:
@@ -107,8 +113,57 @@ def _described(camera: Camera) -> dict[str, Any]:
     }
 
 
-class _Quiet(SimpleHTTPRequestHandler):
-    """Serves files, and prints nothing."""
+class _Page:
+    """A folder served to a browser of this machine, which answers with a picture.
 
-    def log_message(self, format: str, *args: object) -> None:
-        """Tell nothing."""
+    A screenshot by the browser itself is of an unknown moment: of an empty page where textures are
+    large and the machine is busy.
+
+    Args:
+        folder: with index.html.
+    """
+
+    def __init__(self, folder: str) -> None:
+        answers: queue.Queue[tuple[str, bytes]] = queue.Queue()
+
+        class Handler(SimpleHTTPRequestHandler):
+            def __init__(self, *args: Any) -> None:
+                super().__init__(*args, directory=folder)
+
+            def do_POST(self) -> None:
+                body = self.rfile.read(int(self.headers["Content-Length"]))
+                self.send_response(204)
+                self.end_headers()
+                answers.put((self.path.strip("/"), body))
+
+            def log_message(self, format: str, *args: object) -> None:
+                """Tell nothing."""
+
+        self._answers = answers
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_port}/index.html"
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def picture(self, browser: subprocess.Popen[bytes], seconds: float) -> bytes:
+        """What the page sends, as PNG.
+
+        Raises:
+            RuntimeError: it tells of an error, or the browser ends or takes too long.
+        """
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            with contextlib.suppress(queue.Empty):
+                kind, body = self._answers.get(timeout=0.2)
+                if kind != "picture":
+                    raise RuntimeError(f"the page says: {body.decode(errors='replace')}")
+                return body
+            if browser.poll() is not None:
+                raise RuntimeError(f"the browser ended by itself, with {browser.returncode}")
+        raise RuntimeError(f"the page showed nothing in {seconds:g} s")
+
+    def close(self) -> None:
+        """Serve no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

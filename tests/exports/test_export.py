@@ -377,6 +377,16 @@ def test_a_browser_shows_the_recovered_colours(exported, judges):
     assert np.percentile(np.abs(there[known] - 1.0 * here[known]), 90) <= 3
 
 
+def test_a_browser_says_what_it_cannot_show(judges, tmp_path):
+    lacks = judges["browser_lacks"]()
+    if lacks is not None:
+        pytest.skip(lacks)
+    (tmp_path / "broken.glb").write_bytes(b"no glTF")
+    camera = LookAt((0, 0, 4), (0, 0, 0), (0, 1, 0), 60).camera(16, 16)
+    with pytest.raises(RuntimeError, match="the page says: .*not valid JSON"):
+        judges["shown"](tmp_path / "broken.glb", camera)
+
+
 def test_gltf_has_the_lights(exported):
     data = (exported.folder / "scene.glb").read_bytes()
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
