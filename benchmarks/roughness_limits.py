@@ -11,7 +11,9 @@ The roughness of pixels that searches see is compared with their true one:
 - after one more search of all these samples with the default settings, and as the mean of four
   searches of a quarter each;
 - after a search of made-up photographs of the true materials under the run's own radiance field,
-  so that L_theta and albedo can be exact; without noise, and with that of the photographs.
+  so that L_theta is exact; without noise, and with that of the photographs;
+- after such a search whose samples are those of the made-up photographs, so that they have no
+  noise, either: with the fitted albedo, and with the true one.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from unbake.machine import machine  # noqa: E402
 #: Camera samples that are traced at once, for the largest number of them a pixel.
 AT_ONCE = 1 << 18
 #: Samples of made-up photographs, as a multiple of those that a search compares with them.
-CLEANER = 4
+CLEANER = 2
 #: Searches whose mean is compared with one of all their samples.
 PARTS = 4
 #: Steps towards the truth, their rate, and the part of it that is left at the end.
@@ -96,6 +98,10 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         rows["target"] = target
         rows["weight"] = weight * precision(rows, roughness)
         told[name] = shared.score(shared.searched(rows))
+    for name, known in (("no noise at all", rows), ("and true albedo", recoloured(rows, albedo))):
+        exact = without_noise(known)
+        exact["target"] = made_up(exact, roughness, albedo, NODES)
+        told[name] = shared.score(shared.searched(exact))
     name = run.dataset.folder.name
     for key, value in told.items():
         print(f"{name}: {key}: {value:.2f} dB", flush=True)
@@ -252,11 +258,33 @@ def made_up(
     x = np.clip(np.log(np.maximum(roughness, 1e-3)), places[0], places[-1])
     left = np.clip(np.searchsorted(places, x) - 1, 0, len(places) - 2)
     part = ((x - places[left]) / (places[left + 1] - places[left]))[:, None]
-    factor = np.clip(albedo / np.maximum(rows["albedo"], 1e-3), 0, LARGEST_FACTOR)
+    factor = towards(rows, albedo)
     images = [
         rows["plain"][every, i] + factor * rows["coloured"][every, i] for i in (left, left + 1)
     ]
     return rows["gain"] * (images[0] * (1 - part) + images[1] * part)
+
+
+def towards(rows: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """Factors of the fitted albedo that lead to another one, linear RGB, shape (n, 3)."""
+    return np.clip(albedo / np.maximum(rows["albedo"], 1e-3), 0, LARGEST_FACTOR)
+
+
+def recoloured(rows: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """The rows as they would be with another albedo, linear RGB, shape (n, 3)."""
+    found, factor = rows.copy(), towards(rows, albedo)
+    for name, power in (("coloured", 1), ("mixed", 1), ("coloured2", 2)):
+        found[name] *= factor[:, None] ** power
+    found["albedo"] *= factor
+    return found
+
+
+def without_noise(rows: np.ndarray) -> np.ndarray:
+    """The rows as if their means over samples were exact: products are those of the means."""
+    found = rows.copy()
+    found["plain2"], found["coloured2"] = rows["plain"] ** 2, rows["coloured"] ** 2
+    found["mixed"] = rows["plain"] * rows["coloured"]
+    return found
 
 
 if __name__ == "__main__":
