@@ -383,7 +383,7 @@ def test_a_browser_says_what_it_cannot_show(judges, tmp_path):
         pytest.skip(lacks)
     (tmp_path / "broken.glb").write_bytes(b"no glTF")
     camera = LookAt((0, 0, 4), (0, 0, 0), (0, 1, 0), 60).camera(16, 16)
-    with pytest.raises(RuntimeError, match="the page says: .*not valid JSON"):
+    with pytest.raises(RuntimeError, match="not valid JSON"):
         judges["shown"](tmp_path / "broken.glb", camera)
 
 
