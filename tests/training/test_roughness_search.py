@@ -33,7 +33,7 @@ from unbake.training.roughness_search import (
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
-from unbake.transport.by_roughness import row_type
+from unbake.transport.by_roughness import moments, row_type, stratified
 
 SEARCH = RoughnessSearchConfig()
 #: With which a fit of few samples has enough of them for a search.
@@ -93,6 +93,40 @@ def _rendered(step, state, pixels):
     batch = PixelBatch.of(np.arange(len(table)), table)
     both = [step.probe(state, pixels.rays, batch, seed).mean(1) for seed in range(100)]
     return np.mean(both, 0)
+
+
+def test_samples_of_a_set_are_stratified_and_sets_are_not_alike():
+    sampler = stratified(64)
+    sampler.seed(3, 2 * 64)
+    number = np.array(sampler.next_1d()).reshape(8, 16) * 16
+    np.testing.assert_array_equal(np.sort(number.astype(int), 1), [range(16)] * 8)
+    assert len(np.unique(number.astype(int), axis=0)) == 8
+    x, y = (np.array(column).reshape(8, 16) * 4 for column in sampler.next_2d())
+    cell = 4 * x.astype(int) + y.astype(int)
+    np.testing.assert_array_equal(np.sort(cell, 1), [range(16)] * 8)
+
+
+def test_products_of_stratified_samples_are_without_bias():
+    sampler = stratified(64)
+    sampler.seed(3, 20_000 * 64)
+    x = mi.Color3f(sampler.next_1d())
+    found = moments(x, x * x, 64)
+    # As if all samples were independent, they would be too small by 1e-3.
+    for name, value in (("plain2", 1 / 4), ("mixed", 1 / 6), ("coloured2", 1 / 9)):
+        assert found[name].mean() == pytest.approx(value, abs=1e-4)
+
+
+def test_nothing_is_compiled_for_another_draw_of_pixels(built_in):
+    _, _, step, state = started(built_in)
+    step.by_roughness(state, (3, 0), 64, 64, (0.4, 0.6))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        step.by_roughness(state, (4, 1), 64, 64, (0.4, 0.6))
+        dr.sync_thread()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        dr.kernel_history_clear()
+    assert kernels and all(k["cache_hit"] and not k["cache_disk"] for k in kernels)
 
 
 def test_products_of_pairs_have_no_noise_of_their_own(built_in):

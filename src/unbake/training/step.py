@@ -25,7 +25,7 @@ from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..ranks import Ranks
-from ..transport.by_roughness import by_roughness
+from ..transport.by_roughness import by_roughness, stratified
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
@@ -365,7 +365,7 @@ class TrainingStep:
             Those of the pixels that can be told so, and whose numbers are finite, as rows of
             `by_roughness.row_type`.
         """
-        problem, sampler = self._problem, self._probed
+        problem, sampler = self._problem, stratified(spp)
         assert problem.radiance is not None
         of_pixels, of_samples = map(int, seeds)
         with dr.suspend_grad():

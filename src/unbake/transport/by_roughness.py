@@ -11,6 +11,7 @@ samples are the same for all r, so that what differs between two values of r has
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,8 +33,9 @@ _SHARP = 0.2
 def row_type(nodes: int) -> np.dtype:
     """A pixel as a function of roughness r and of a factor g of the albedo, S(r) + g · D(r).
 
-    Products are means over all pairs of different samples of a pixel: their expectation is the
-    product of the expected values. Where the pixel is seen is told by its first sample.
+    Products are means over all pairs of different sets of a pixel's samples (`stratified`): their
+    expectation is the product of the expected values. Where the pixel is seen is told by its first
+    sample.
 
     Args:
         nodes: how many values of r there are.
@@ -55,6 +57,27 @@ def row_type(nodes: int) -> np.dtype:
             ("coloured2", *of_nodes),  # D · D
         ]
     )
+
+
+def stratified(spp: int) -> mi.Sampler:
+    """A sampler for `by_roughness`.
+
+    Samples of a pixel fall into sets, of `_together` each. Those of a set are stratified in every
+    dimension, and sets are independent of each other.
+
+    Args:
+        spp: samples of a pixel, consecutive lanes.
+    """
+    together = _together(spp)
+    sampler = mi.load_dict({"type": "stratified", "sample_count": together})
+    sampler.set_samples_per_wavefront(together)
+    return sampler
+
+
+def _together(spp: int) -> int:
+    """How many samples are a set: the largest square that leaves four sets or more, or 1."""
+    sides = range(1, math.isqrt(spp // 4) + 1)
+    return max((side**2 for side in sides if spp % side**2 == 0), default=1)
 
 
 @dataclass
@@ -83,7 +106,7 @@ def by_roughness(
         scene_view: with a field of roughness, and pieces of surface. Where that of albedo is none,
             D is zero.
         ray: camera rays, world space, `spp` consecutive lanes a pixel.
-        sampler: seeded for as many lanes.
+        sampler: of `stratified`, seeded for as many lanes.
         nodes: values of roughness.
 
     Returns:
@@ -118,7 +141,7 @@ def by_roughness(
             if "albedo" in material:
                 plain = _reflected(x, lights, material, r, dr.opaque(mi.Float, 0))
             dr.eval(plain, whole)
-            for name, values in _moments(plain, whole - plain, spp).items():
+            for name, values in moments(plain, whole - plain, spp).items():
                 rows[name][:, number] = values[chosen]
     return chosen, rows
 
@@ -208,19 +231,32 @@ def _reflected(
     return x.throughput * total
 
 
-def _moments(plain: mi.Color3f, coloured: mi.Color3f, spp: int) -> dict[str, np.ndarray]:
-    """Means over a pixel's samples, and over products of pairs of these, each of shape (n, 3)."""
-    colours = {"plain": plain, "coloured": coloured}
-    sums = {name: [dr.block_sum(c, spp) for c in colour] for name, colour in colours.items()}
+def moments(plain: mi.Color3f, coloured: mi.Color3f, spp: int) -> dict[str, np.ndarray]:
+    """Means over a pixel's samples, and over products of pairs of sets.
+
+    Args:
+        plain, coloured: of the samples, `spp` consecutive lanes a pixel, of `stratified`.
+        spp: samples of a pixel.
+
+    Returns:
+        By their names in `row_type`, each of shape (n, 3).
+    """
+    together = _together(spp)
+    sets = spp // together
+    colours = {
+        name: [dr.block_sum(channel, together) / together for channel in colour]
+        for name, colour in (("plain", plain), ("coloured", coloured))
+    }
+    sums = {name: [dr.block_sum(c, sets) for c in colour] for name, colour in colours.items()}
     dr.eval(sums)
 
     def mean(name: str) -> np.ndarray:
-        return np.stack([np.array(total) for total in sums[name]], 1) / spp
+        return np.stack([np.array(total) for total in sums[name]], 1) / sets
 
     def pairs(a: str, b: str) -> np.ndarray:
-        of_samples = zip(colours[a], colours[b], sums[a], sums[b], strict=True)
-        found = [np.array(u * v - dr.block_sum(x * y, spp)) for x, y, u, v in of_samples]
-        return np.stack(found, 1) / (spp * (spp - 1))
+        of_sets = zip(colours[a], colours[b], sums[a], sums[b], strict=True)
+        found = [np.array(u * v - dr.block_sum(x * y, sets)) for x, y, u, v in of_sets]
+        return np.stack(found, 1) / (sets * (sets - 1))
 
     return {
         "plain": mean("plain"),
