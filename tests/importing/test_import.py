@@ -25,7 +25,9 @@ from layouts import (
     write_json,
     write_nerfstudio,
 )
+from support import TINY_FIT
 
+from unbake.config import to_toml
 from unbake.config.light import LightConfig
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.views import Dataset, read_photograph
@@ -527,6 +529,33 @@ def test_the_commands_of_the_guide_run(
     assert (program, outcome.status, outcome.err) == ("unbake", 0, "")
     assert "one part" in outcome.out and "100 % of the pixels see it" in outcome.out
     assert len(Dataset.load("data").views) == len(captured.views)
+
+
+PHONE = DOCS.parent / "guides" / "phone.md"
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_guide_for_phones_run(captured, meshes, tmp_path, unbake, monkeypatch):
+    pytest.importorskip("pycolmap", reason="COLMAP models need pycolmap")
+    monkeypatch.chdir(tmp_path)
+    write_colmap(captured, Path("project"))
+    Path("project/dense").mkdir()
+    as_one(meshes, Path("project/dense/mesh.ply"))
+    Path("short.toml").write_text(to_toml(TINY_FIT))
+    commands = [
+        shlex.split(command)
+        for command in re.findall(r"^ +(unbake .+)$|`(unbake .+?)`", PHONE.read_text("utf-8"), re.M)
+        for command in command
+        if command
+    ]
+    ran = [words[1] for words in commands]
+    assert ran == ["import", "data", "fit", "evaluate", "report", "export"]
+    for _, *words in commands:
+        short = ["--settings", "short.toml", "--steps", "5"] if words[0] == "fit" else []
+        outcome = unbake(*words, *short)
+        assert outcome.status == 0, (words, outcome.err)
+    assert Path("check.html").is_file() and Path("report.html").is_file()
+    assert list(Path("textures").glob("*.glb"))
 
 
 def test_the_smallest_scene_of_the_guide_is_one(meshes, tmp_path):

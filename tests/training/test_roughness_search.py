@@ -47,7 +47,7 @@ SMALL = NetworkConfig(
 SETTINGS = replace(
     TINY_FIT,
     materials={name: {"neural": SMALL} for name in QUANTITIES},
-    roughness_search=replace(SEARCH, share=SHARE, spp=2),
+    roughness_search=replace(SEARCH, share=SHARE, spp=2, steps=30),
 )
 
 
