@@ -208,7 +208,7 @@ SHARED = {
     "view": False,
     "solve": False,
     "compare": True,
-    "bench": False,
+    "bench": True,  # its rates
     "degrade": False,
     "reproduce": True,
     "doctor": False,
@@ -236,6 +236,16 @@ def test_several_processes_are_refused_by_commands_that_do_not_share_work(
     refused = f"error: 3 processes were started, and unbake {command} takes one. Run it without "
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith("error: called" if SHARED[command] else refused)
+
+
+@pytest.mark.parametrize("what", ["step", "methods", "gradients", "ceiling"])
+def test_measurements_are_of_one_process(what, unbake, monkeypatch):
+    monkeypatch.setenv("PMI_SIZE", "3")
+    monkeypatch.setitem(sys.modules, "mpi4py", None)
+    outcome = unbake("bench", what)
+    assert outcome.status == 2
+    assert outcome.err.startswith(f"error: 3 processes were started, and unbake bench {what} takes")
+    assert "processes share bench rates, compare, fit, reproduce" in outcome.err
 
 
 @needs_mpi

@@ -3,8 +3,11 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 
 import pytest
+from support import MPIEXEC, needs_mpi
 
 from unbake.comparison import bench_rates as module
 from unbake.comparison.bench_rates import found_defaults, settled
@@ -240,6 +243,65 @@ def test_a_method_that_fails_is_recorded(rates, tmp_path, monkeypatch):
     assert "no memory for a step" in outcome.err
     (search,) = searches(tmp_path)
     assert search["best"] is None and "no memory" in search["trials"][0]["error"]
+
+
+def test_a_search_that_fails_does_not_end_the_others(rates, tmp_path, monkeypatch):
+    from unbake.errors import UserError
+
+    def learn(fit):
+        if fit.config.method == "direct":
+            raise UserError("no memory for a step of 256 paths")
+        return 1, 0.1
+
+    monkeypatch.setattr(module, "_learn", learn)
+    monkeypatch.setattr(module, "_scores", lambda fit, dataset: {"score": 20.0})
+    outcome = rates("direct", "no-prior")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "cornell, direct: no memory for a step" in outcome.err
+    failed, done = searches(tmp_path)
+    assert failed["best"] is None and done["best"] is not None
+    table = outcome.out[outcome.out.index("Mean PSNR in dB") :]
+    assert "no-prior" in table and "direct" not in table
+
+
+@needs_mpi
+def test_processes_share_the_searches(rates, cornell, tiny, tmp_path):
+    words = ("bench", "rates", "--data", cornell, "--methods", "direct", "no-prior", "--steps", 2)
+    words += ("--settings", tiny, "--out", tmp_path / "rates.json")
+    start = [MPIEXEC, "-n", "2", sys.executable, "-m", "unbake"]
+    done = subprocess.run([*start, *map(str, words)], capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("wrote ") == 1 and not done.stderr
+    assert [file.name for file in tmp_path.glob("rates.json*")] == ["rates.json"]
+    found = searches(tmp_path)
+    assert [search["method"] for search in found] == ["direct", "no-prior"]
+    assert all(search["best"] and len(search["trials"]) >= 5 for search in found)
+    # One process has nothing left to do.
+    before = (tmp_path / "rates.json").read_bytes()
+    assert rates("direct", "no-prior").status == 0
+    assert (tmp_path / "rates.json").read_bytes() == before
+
+
+def test_a_search_of_another_process_goes_on(rates, tmp_path, monkeypatch):
+    """Its part of the record is beside the file if all were stopped."""
+    assert rates("direct", "no-prior").status == 0
+    file, part = tmp_path / "rates.json", tmp_path / "rates.json.process-1"
+    whole = json.loads(file.read_text())
+    part.write_text(json.dumps({**whole, "searches": whole["searches"][1:]}))
+    second = {**whole["searches"][1], "trials": whole["searches"][1]["trials"][:2], "best": None}
+    file.write_text(json.dumps({**whole, "searches": [whole["searches"][0], second]}))
+    monkeypatch.setattr(module, "begin_fit", None)  # nothing is left to do
+    assert rates("direct", "no-prior").status == 0
+    assert json.loads(file.read_text()) == whole and not part.exists()
+    # A part that is older than the file, and one of a search that the file lacks.
+    part.write_text(json.dumps({**whole, "searches": [second]}))
+    assert rates("direct").status == 0 and searches(tmp_path) == whole["searches"]
+    part.write_text(json.dumps({**whole, "searches": whole["searches"][1:]}))
+    file.write_text(json.dumps({**whole, "searches": whole["searches"][:1]}))
+    assert rates("direct").status == 0 and searches(tmp_path) == whole["searches"]
+    part.write_text(json.dumps({**whole, "searches": [{}]}))
+    outcome = rates("direct")
+    assert outcome.status == 2 and "process-1: no record of searches" in outcome.err
 
 
 def test_other_settings_are_not_mixed_in(rates, cornell, tmp_path):

@@ -120,7 +120,8 @@ def main() -> None:
         # Tyro 1.0 keeps the line breaks of some arguments' texts.
         command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
     try:
-        _require_one_process(words)
+        if words[0] in COMMANDS.keys() - SHARED and not {"-h", "--help"} & {*words}:
+            _require_one_process(words[0])
         with wrapped_help(words):
             status = tyro.extras.subcommand_cli_from_dict(
                 dict(COMMANDS), prog="unbake", description=_DESCRIPTION
@@ -808,7 +809,7 @@ def bench(
 
     rates searches the learning rates of each method on each data set, and the estimator of those
     that follow paths, by fits that are scored on held-out views. The same command goes on after the
-    fits that --out has.
+    fits that --out has. Processes that mpiexec starts share the searches.
 
     gradients takes a run on a data set with true materials. It measures the slope of the loss as a
     quantity goes from the fitted to the true values, and the signal to noise of one batch: of that
@@ -844,6 +845,8 @@ def bench(
     of_gradients = {"batches": batches, "batch": batch, "spp": spp}
     others = {"data": data, "scene": scene, "methods": methods != ("ours",)}
     others |= {"seconds": seconds, "seeds": seeds, "schedule": schedule}
+    if what != "rates":
+        _require_one_process(f"bench {what}")
     if what == "gradients":
         others |= {"steps": steps, "preset": preset, "settings": settings}
         _refuse("gradients has no such option", others)
@@ -864,7 +867,8 @@ def bench(
     if what == "rates":
         length = {"steps": steps, "seconds": seconds}
         chosen = with_length(chosen, {k: v for k, v in length.items() if v is not None})
-        _bench_rates(data, methods, chosen, out, seeds or (0,), schedule)
+        with _ranks() as ranks:
+            _bench_rates(data, methods, chosen, out, seeds or (0,), schedule, ranks)
         return
     only = {"seconds": seconds, "seeds": seeds, "schedule": schedule}
     _refuse("is an option of rates", only, "Or: unbake bench rates")
@@ -933,6 +937,7 @@ def _bench_rates(
     out: Path | None,
     seeds: tuple[int, ...],
     schedule: bool,
+    ranks: Ranks,
 ) -> None:
     for option, value in {"data": data, "out": out}.items():
         if not value:
@@ -948,8 +953,10 @@ def _bench_rates(
     for seed in seeds:
         require("seeds", seed, 0)
     variants = [MethodVariant.of(method) for method in methods]
-    bench_rates(data, variants, chosen, out, Console(highlight=False), seeds, schedule=schedule)
-    _say(f"wrote {out}")
+    console = Console(highlight=False)
+    bench_rates(data, variants, chosen, out, console, seeds, schedule=schedule, ranks=ranks)
+    if ranks.leads:
+        _say(f"wrote {out}")
 
 
 def reproduce(
@@ -1027,13 +1034,14 @@ COMMANDS = {name: command for group in GROUPS.values() for name, command in grou
 
 #: Those whose work several processes share. All others are refused to several: each process would
 #: do all of the work, and write the same files.
-SHARED = frozenset({"fit", "compare", "reproduce"})
+#: Of `bench`, it is `rates` whose work they share.
+SHARED = frozenset({"bench", "compare", "fit", "reproduce"})
 
 
-def _require_one_process(words: list[str]) -> None:
+def _require_one_process(command: str) -> None:
     """Raise a `UserError` where several processes were started for a command that is of one."""
-    command, several = words[0], started()
-    if command not in COMMANDS.keys() - SHARED or several < 2 or {"-h", "--help"} & {*words}:
+    several = started()
+    if several < 2:
         return
     try:
         ranks = Ranks.of_environment()
@@ -1041,7 +1049,8 @@ def _require_one_process(words: list[str]) -> None:
         ranks = Ranks()
     with ranks.guarded(_say):
         what = f"{several} processes were started, and unbake {command} takes one"
-        remedy = f"Run it without mpiexec; processes share {', '.join(sorted(SHARED))}"
+        names = sorted(SHARED - {"bench"} | {"bench rates"})
+        remedy = f"Run it without mpiexec; processes share {', '.join(names)}"
         raise Agreed(what, remedy=remedy)
 
 

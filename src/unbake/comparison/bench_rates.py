@@ -1,12 +1,15 @@
 """Learning rates and estimators of methods, found by fits with several of each.
 
 The file of results is the record: it is written after each trial, and the trials that it holds are
-not repeated.
+not repeated. Several ranks share the searches; those of other ranks than the first stand in files
+beside it until all have ended.
 """
 
 from __future__ import annotations
 
 import gc
+import glob
+import json
 import math
 import sys
 import time
@@ -19,9 +22,11 @@ import drjit as dr
 import numpy as np
 from rich.console import Console
 
+from .. import backend
 from ..config import ChosenEstimator, FitConfig, to_toml
 from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults
+from ..dataset.fingerprint import fingerprint
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
@@ -30,9 +35,12 @@ from ..evaluation.lighting import recovered_emitters, relight_psnr
 from ..formats import check_format
 from ..io import read_object, write_json
 from ..machine import machine
+from ..memory import lack_told
 from ..quantities import QUANTITIES
+from ..ranks import Agreed, Ranks
 from ..training.defaults import own_warm_up, with_defaults
 from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
+from ..training.loop import what_ranks_share
 from ..training.schedule import learning_rates
 from ..training.validation import Score
 from .method_variant import MethodVariant
@@ -72,6 +80,8 @@ DEFINITIONS = {
 SCHEDULE = ("final_learning_rate", "warm_up")
 #: What tells the trials of a search apart.
 TRIED = ("factors", "estimator", *SCHEDULE)
+#: What tells the searches of a record apart.
+SEARCHED = ("method", "data", "unknown")
 
 Row = dict[str, Any]
 
@@ -85,12 +95,13 @@ def bench_rates(
     seeds: Sequence[int] = (0,),
     *,
     schedule: bool = False,
+    ranks: Ranks | None = None,
 ) -> Row:
     """Search the learning rates of methods, and the estimator of those that follow paths.
 
     A search begins with the fields' own rates; see `best_trial`. Its trials are fits of the length
     that the settings say, one for each seed, scored at their end. The same call goes on after the
-    fits that `out` has.
+    fits that `out` has. A search that fails does not end the others.
 
     Args:
         data: folders of data sets, each with true materials or light.
@@ -101,15 +112,71 @@ def bench_rates(
         console: shows progress and a table.
         seeds: of the fits of a trial, whose scores are averaged. More of them may be given later.
         schedule: also search the decay of all rates and the warm-up of the unknowns.
+        ranks: of MPI, which share the searches among them and all call this; None: this process is
+            alone.
 
     Returns:
-        The content of the file.
+        The content of the file. Other ranks than the first return nothing.
 
     Raises:
         UserError: a data set cannot be used or has no truth to judge by, or the file has the same
-            search with other settings.
+            search with other settings; of searches that failed, the first one's error.
     """
-    out = Path(out)
+    out, ranks = Path(out), ranks or Ranks()
+    if not ranks.leads:
+        console = Console(quiet=True)
+    result, planned = ranks.together(lambda: _planned(data, variants, shared, out, seeds, schedule))
+    if ranks.size > 1:
+        told = json.dumps(
+            [{k: s.record[k] for k in ("method", "settings", "seeds")} for s in planned]
+        )
+        datasets = {search.dataset.folder.name: search.dataset for search in planned}
+        files = {name: fingerprint(dataset) for name, dataset in datasets.items()}
+        ranks.require_same(what_ranks_share(told, files))
+        backend.share_cores(ranks.here)
+    # Before any rank writes its own part of the record, that of the last call is in the file.
+    ranks.together(lambda: _take_parts(result, out) if ranks.leads else None)
+
+    part = result if ranks.leads else {**result, "searches": []}
+    errors: list[list[Any]] = []
+    with ranks.apart():
+        mine = ranks.mine(range(len(planned)))
+        for number in mine:
+            search = planned[number]
+            if not ranks.leads:
+                part["searches"].append(search.record)
+            try:
+                with lack_told():
+                    search.run(part, _part_of(out, ranks.rank), console)
+            except UserError as error:
+                errors.append([number, *_told(error)])
+                console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+        own = [[number, planned[number].record] for number in mine]
+        every = ranks.told({"records": own, "errors": errors})
+    for number, record in (row for one in every for row in one["records"]):
+        planned[number].record.update(record)
+    if ranks.leads:
+        _take_parts(result, out)
+        if done := [search.record for search in planned if search.record["best"]]:
+            print_rates(done, console)
+    if failed := sorted(row for one in every for row in one["errors"]):
+        raise Agreed(*failed[0][1:])
+    return result if ranks.leads else {}
+
+
+def _planned(
+    data: Sequence[Path | str],
+    variants: Sequence[MethodVariant],
+    shared: FitConfig,
+    out: Path,
+    seeds: Sequence[int],
+    schedule: bool,
+) -> tuple[Row, list[_Search]]:
+    """The record so far, and the searches that are asked for.
+
+    Raises:
+        UserError: see `bench_rates`.
+    """
     result = _read(out)
     datasets = [Dataset.load(Path(folder)) for folder in data]
     if not datasets:
@@ -120,18 +187,20 @@ def bench_rates(
         raise UserError("two data sets have the same name", "--data", "Rename the folder of one")
     if not shared.seconds:
         _require_one_estimator(variants, shared)
-    planned = [(d, variant) for d in datasets for variant in variants]
-    # Whatever is the default of a method by now: a search begins with what all methods have.
-    configs = [_with_own_schedule(variant.settings(shared)) for _, variant in planned]
-    searches = [
-        _search(result, dataset, variant.name, config, seeds, out, schedule)
-        for (dataset, variant), config in zip(planned, configs, strict=True)
-    ]
-    for (dataset, variant), config, search in zip(planned, configs, searches, strict=True):
-        name = f"{dataset.folder.name}, {variant.name}"
-        _Search(dataset, name, config, search, result, out, console, schedule).run()
-    print_rates(searches, console)
-    return result
+    planned = []
+    for dataset in datasets:
+        for variant in variants:
+            # Whatever is the default of a method by now: a search begins with what all have.
+            config = _with_own_schedule(variant.settings(shared))
+            record = _search(result, dataset, variant.name, config, seeds, out, schedule)
+            name = f"{dataset.folder.name}, {variant.name}"
+            planned.append(_Search(dataset, name, config, record, schedule))
+    return result, planned
+
+
+def _told(error: UserError) -> list[str | None]:
+    """An error's parts, as other ranks are told it."""
+    return [error.what, None if error.where is None else str(error.where), error.remedy]
 
 
 def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
@@ -184,41 +253,40 @@ class _Search:
     """One method on one data set."""
 
     def __init__(
-        self,
-        dataset: Dataset,
-        name: str,
-        config: FitConfig,
-        record: Row,
-        result: Row,
-        out: Path,
-        console: Console,
-        schedule: bool,
+        self, dataset: Dataset, name: str, config: FitConfig, record: Row, schedule: bool
     ) -> None:
-        self._dataset = dataset
-        self._name = name
+        self.dataset = dataset
+        self.name = name
+        self.record = record
         self._config = config
-        self._record = record
-        self._result = result
-        self._out = out
-        self._console = console
         self._schedule = SCHEDULE if schedule else ()
+        self._result: Row = {}
+        self._out = Path()
+        self._console = Console(quiet=True)
 
-    def run(self) -> None:
-        """Make the trials that are missing, and note the best one."""
-        config, record = self._config, self._record
+    def run(self, result: Row, out: Path, console: Console) -> None:
+        """Make the trials that are missing, and note the best one.
+
+        Args:
+            result: with this search's record; written after each trial.
+            out: file to write it to.
+            console: shows progress.
+        """
+        self._result, self._out, self._console = result, out, console
+        config, record = self._config, self.record
         self._complete(record["untrained"], lambda fit: {}, "untrained")
         # What photographs tell least of comes first.
         materials = [name for name in config.unknowns if name in QUANTITIES]
         lights = [name for name in config.unknowns if name not in QUANTITIES]
         if config.seconds and record["best"] is None:
             variants = [replace(config, estimator=name) for name in _estimators(config)]
-            compile_kernels(self._dataset.folder, variants)
+            compile_kernels(self.dataset.folder, variants)
         searched = [*reversed(materials), *lights, *self._schedule]
         estimators = _estimators(config)
         best = best_trial(searched, estimators, self._score)
         found = self._row(best)
         if "error" in found:
-            raise UserError(found["error"], self._name)
+            raise UserError(found["error"], self.name)
         # A file of an earlier version may have trials with another estimator.
         taken = settled([t for t in record["trials"] if t["estimator"] in estimators], found)
         record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
@@ -234,17 +302,17 @@ class _Search:
     def _row(self, trial: Trial) -> Row:
         """The trial's line of the record."""
         same = _tried(trial, self._config)
-        for row in self._record["trials"]:
+        for row in self.record["trials"]:
             if same.items() <= row.items():
                 return row
-        self._record["trials"].append(same | {"score": None, "per_seed": []})
-        return self._record["trials"][-1]
+        self.record["trials"].append(same | {"score": None, "per_seed": []})
+        return self.record["trials"][-1]
 
     def _complete(
         self, row: Row, learn: Callable[[FreshFit], Row], what: str, trial: Trial | None = None
     ) -> None:
         """Make the fits of a line for the seeds that it lacks, and average them."""
-        seeds = self._record["seeds"]
+        seeds = self.record["seeds"]
         missing = [seed for seed in seeds if seed not in {f["seed"] for f in row["per_seed"]}]
         for seed in missing:
             if "error" in row:
@@ -262,9 +330,9 @@ class _Search:
             tried = _tried(trial, config)
             config = replace(config, rate_factors=tried.pop("factors"), **tried)
         try:
-            fit = begin_fit(self._dataset, config)
+            fit = begin_fit(self.dataset, config)
             effort = learn(fit)
-            return _scores(fit, self._dataset) | effort
+            return _scores(fit, self.dataset) | effort
         except UserError as error:
             if trial is None:
                 raise
@@ -279,7 +347,7 @@ class _Search:
     def _say(self, what: str, row: Row) -> None:
         values = [f"{k} {'—' if v is None else f'{v:.2f}'}" for k, v in row.items() if _is_score(k)]
         text = row.get("error") or ", ".join(values)
-        line = f"{self._name}: {what}: {text}"
+        line = f"{self.name}: {what}: {text}"
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -330,14 +398,60 @@ def _is_score(key: str) -> bool:
 
 
 def _read(out: Path) -> Row:
-    """The record so far."""
-    if not out.exists():
-        return {"format": FORMAT, "definitions": DEFINITIONS, "searches": []}
-    result = read_object(out)
-    check_format(result, FORMAT, out)
-    if not isinstance(result.get("searches"), list):
-        raise UserError("no record of searches", out, "Give another --out")
+    """The record so far, with what other ranks than the first found before they were stopped."""
+    result: Row = {"format": FORMAT, "definitions": DEFINITIONS, "searches": []}
+    if out.exists():
+        result = _read_record(out)
+    for part in _parts(out):
+        for search in _read_record(part)["searches"]:
+            same = [old for old in result["searches"] if _key(old) == _key(search)]
+            if not same:
+                result["searches"].append(search)
+            elif _fits(search) > _fits(same[0]):
+                same[0].clear()
+                same[0].update(search)
     return result
+
+
+def _read_record(file: Path) -> Row:
+    result = read_object(file)
+    check_format(result, FORMAT, file)
+    searches = result.get("searches")
+    if not isinstance(searches, list) or not all(_is_search(search) for search in searches):
+        raise UserError("no record of searches", file, "Give another --out")
+    return result
+
+
+def _is_search(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(value.get(key), str) for key in SEARCHED)
+
+
+def _key(search: Row) -> tuple[Any, ...]:
+    """What tells a search from the others of a record."""
+    return tuple(search[key] for key in SEARCHED)
+
+
+def _fits(search: Row) -> int:
+    """How many fits a search has made."""
+    return sum(len(row["per_seed"]) for row in (search["untrained"], *search["trials"]))
+
+
+def _part_of(out: Path, rank: int) -> Path:
+    """The file that a rank writes its searches to until all have ended."""
+    return out if rank == 0 else out.with_name(f"{out.name}.process-{rank}")
+
+
+def _parts(out: Path) -> list[Path]:
+    """The files that other ranks than the first left."""
+    return sorted(out.parent.glob(f"{glob.escape(out.name)}.process-*"))
+
+
+def _take_parts(result: Row, out: Path) -> None:
+    """Write the record in the place of the files of parts, if there are any."""
+    if parts := _parts(out):
+        write_json(out, result, allow_nan=False)
+    for part in parts:
+        part.unlink(missing_ok=True)
 
 
 def _search(
@@ -366,9 +480,8 @@ def _search(
         "follows_paths": config.follows_paths,
         "settings": settings,
     }
-    same = ("method", "data", "unknown")
     for search in result["searches"]:
-        if all(search[key] == described[key] for key in same):
+        if _key(search) == _key(described):
             other = [key for key, value in described.items() if search[key] != value]
             if "settings" in other:
                 both = settings.keys() | search["settings"].keys()
