@@ -207,7 +207,7 @@ def errors(camera: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, flo
     """Errors of what was found of the cameras."""
     found: dict[str, float] = {}
     images = [row for row in camera.get("images", ()) if row["split"] == "train"]
-    images = [row for row in images if row["name"] != camera["anchor"]]
+    images = [row for row in images if row["name"] != camera.get("anchor")]
     true = [truth["views"][row["name"]] for row in images]
     if images and truth["settings"]["exposure"] and not truth["settings"]["tell_exposures"]:
         ratios = [

@@ -223,6 +223,12 @@ def test_a_response_is_compared_after_a_scale_of_all_channels(benchmarks):
     assert found["response_scaled_error_most"] < 1e-3 < found["response_error_rms"]
 
 
+def test_of_refined_poses_alone_a_camera_has_no_errors(benchmarks):
+    camera = {"images": [{"name": "a", "split": "train", "transform_matrix": np.eye(4).tolist()}]}
+    truth = {"views": {"a": {}}, "settings": {"exposure": 0.0}}
+    assert benchmarks("cameras")["errors"](camera, truth) == {}
+
+
 def test_all_faults_of_cameras_are_measured_together(benchmarks):
     """With the poses, exposures told and untold, and with the true mesh as well."""
     faults = benchmarks("cameras")["FAULTS"]
