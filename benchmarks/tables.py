@@ -303,17 +303,12 @@ PRIOR = {
 
 
 def cameras(result: dict) -> str:
-    """Albedo with each fault of cameras taken for known and fitted, and what was found of it."""
+    """Scores with each fault of cameras taken for known and fitted, and what was found of it."""
     rows = {(row["fault"], row["cameras"]): row for row in result["rows"]}
     table = []
     for fault in dict.fromkeys(fault for fault, _ in rows):
         known, fitted = (rows.get((fault, cameras), {}) for cameras in ("known", "fitted"))
-        # At the true cameras, where that was measured: poses may be off.
-        scores = [
-            plus_minus(row, "true_albedo_psnr" if "true_albedo_psnr" in row else "albedo_psnr")
-            or ""
-            for row in (known, fitted)
-        ]
+        scores = [at_true_cameras(row) if row else "" for row in (known, fitted)]
         scaled = "response_scaled_error_rms" in fitted
         found = [
             form.format(fitted[key])
@@ -322,6 +317,13 @@ def cameras(result: dict) -> str:
         ]
         table.append([fault, *scores, ", ".join(found)])
     return markdown(["fault", "known", "fitted", "error of what was found"], table)
+
+
+def at_true_cameras(row: dict) -> str:
+    """Albedo and roughness; where poses may be off, as the true cameras see the materials."""
+    true = "true_albedo_psnr" in row
+    keys = [f"{'true_' if true else ''}{name}_psnr" for name in ("albedo", "roughness")]
+    return " / ".join(plus_minus(row, key) or "" for key in keys)
 
 
 CAMERAS = {
