@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -30,7 +31,14 @@ from unbake.fields.camera import CameraModel
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.report.page import write_report
 from unbake.scene.parse import parse
-from unbake.training.first_gains import _solved, first_gains, shared_points
+from unbake.training import first_gains as first_gains_module
+from unbake.training.first_gains import (
+    SharedPoints,
+    _solved,
+    begin_cameras,
+    first_gains,
+    shared_points,
+)
 from unbake.training.first_response import first_response
 from unbake.training.fresh_fit import begin_fit
 from unbake.training.held_aside import HeldAside, HeldOutPhotographs
@@ -516,6 +524,53 @@ def test_a_response_begins_at_what_exposures_that_differ_say():
     model = CameraModel(3, response=True)
     model.start_response(curves)
     np.testing.assert_allclose(model.curves(), curves, atol=1e-5)
+
+
+def test_green_tells_the_response_where_each_photograph_has_a_white_balance(monkeypatch):
+    """Red and blue alone would be explained by no response at all, with other balances."""
+    rng, views = np.random.default_rng(0), 12
+    stops, balance = rng.uniform(-1.5, 1.5, views), rng.uniform(-0.5, 0.5, (views, 3))
+    balance -= balance[:, [1]]
+    first, second = np.nonzero(~np.eye(views, dtype=bool))
+    first, second = (np.repeat(x, 200) for x in (first, second))
+    light = np.exp(rng.normal(-2, 1, (len(first), 3)))
+    photographs = [
+        light * 2.0 ** (stops[v, None] + balance[v]) * np.exp(rng.normal(0, 0.02, light.shape))
+        for v in (first, second)
+    ]
+    read = [np.where(p < 1, response(np.minimum(p, 1), "contrast"), np.nan) for p in photographs]
+    told = np.log(2) * stops
+    logs = np.log(np.maximum(read, 1e-4)) - told[np.stack([first, second])][..., None]
+    shared = SharedPoints(first, second, logs, np.zeros((views, 3)))
+    monkeypatch.setattr(first_gains_module, "shared_points", lambda *_: shared)
+    camera = CameraModel(views, white_balance="per-image", response=True)
+    train = [SimpleNamespace(name=str(i), exposure=float(2.0**x)) for i, x in enumerate(stops)]
+    scene = SimpleNamespace(scene=None)
+    problem = SimpleNamespace(camera=camera, scene_view=scene)
+    begin_cameras(problem, SimpleNamespace(train=train), None)
+    curves, values = camera.curves(), np.linspace(0, 1, 2000)
+    truth = np.interp(_places(curves) ** 2.2, response(values, "contrast"), values)
+    assert np.sqrt(((curves**2.2 - truth) ** 2).mean()) < 0.02
+    found = np.log2(camera.gains())
+    assert np.abs(found - (balance - balance[0])).max() < 0.1
+    # Taken as linear, photographs tell other balances.
+    taken = np.log2(first_gains(shared))
+    assert np.abs(taken - taken[:, [1]] - (balance - balance[0])).max() > 0.2
+
+
+def _places(curves):
+    return np.linspace(0, 1, curves.shape[1])
+
+
+def test_channels_of_a_response_are_alike_where_nothing_tells_them_apart():
+    model, places = CameraModel(3, response=True), np.linspace(0, 1, 17)
+    bent = places + 0.2 * places * (1 - places)
+    bent *= 0.5 / bent[8]
+    costs = []
+    for curves in ([places] * 3, [bent] * 3, [bent, places, bent]):
+        model.start_response(np.stack(curves))
+        costs.append(float(model.roughness_of_response()[0]))
+    assert costs[0] < 1e-9 < costs[1] < costs[2]
 
 
 def test_gains_of_views_are_the_least_squares_ones():

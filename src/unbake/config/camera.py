@@ -68,7 +68,7 @@ class CameraConfig:
         Flag("Uncertainty of what is refined: standard deviation of its corrections in pixels"),
     ] = 1.0
     learning_rate: float = 0.005  #: Adam; of logs of gains and slopes, and of coefficients
-    smoothness: float = 1e-3  #: weight of differences along the response
+    smoothness: float = 1e-3  #: weight of differences along the response, and between its channels
     pose_learning_rate: float = 0.05  #: Adam; of corrections of poses and intrinsics, in pixels
 
     def __post_init__(self) -> None:

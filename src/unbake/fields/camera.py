@@ -23,6 +23,8 @@ Photographs alone leave some of it open, which conventions decide:
 - A power of f, of all exposures and of all radiance explains the same differences between
   photographs. What lights and geometry say of radiance decides the exponent; where they say
   little, the smoothness of f does, whose optimum is f(P) = P.
+- Where each image has a white balance of its own, that holds for red and blue by themselves, even
+  if exposures are told: what decides then is that f is alike in all channels.
 """
 
 from __future__ import annotations
@@ -167,11 +169,18 @@ class CameraModel:
         return mi.Color3f([self._inverse(photograph[i], heights, i) for i in range(3)])
 
     def roughness_of_response(self) -> mi.Float:
-        """Mean squared difference between neighbouring pieces of f, of the logs of their slopes."""
+        """How uneven f is, and how different in its channels.
+
+        The mean squared difference between neighbouring pieces, of the logs of their slopes, and
+        that between each channel and the next, which may be unlike each other but seldom are.
+        """
         logs = self._arrays["response.log"]
         piece = dr.arange(mi.UInt32, 3 * (PIECES - 1))
         index = piece // (PIECES - 1) * PIECES + piece % (PIECES - 1)
-        return dr.mean(dr.square(read_small(logs, index + 1) - read_small(logs, index)))
+        along = dr.mean(dr.square(read_small(logs, index + 1) - read_small(logs, index)))
+        lane = dr.arange(mi.UInt32, 3 * PIECES)
+        other = (lane + PIECES) % (3 * PIECES)
+        return along + dr.mean(dr.square(read_small(logs, other) - read_small(logs, lane)))
 
     def _relative(self, key: str, view: mi.UInt32, offset: int, stride: int) -> mi.Float:
         """Entries of views less that of the first view, which is the anchor."""

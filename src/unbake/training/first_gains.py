@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import drjit as dr
@@ -124,11 +124,22 @@ def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> No
     gains = first_gains(shared) if solves else np.ones((len(views), 3))
     if solves:
         camera.start(gains)
-    if camera.has_response:
-        told = np.log([view.exposure for view in views])[:, None]
-        exposures, pair = np.log(gains) + told, [shared.first, shared.second]
+    if not camera.has_response:
+        return
+    told, pair = np.log([view.exposure for view in views])[:, None], [shared.first, shared.second]
+    photographs, exposures = shared.logs + told[pair], np.log(gains) + told
+    if camera.white_balance != "per-image":
         ratios = exposures[shared.second] - exposures[shared.first]
-        camera.start_response(first_response(shared.logs + told[pair], ratios))
+        camera.start_response(first_response(photographs, ratios))
+        return
+    # Where each photograph has gains of red and blue of its own, any response of these explains
+    # them. Green tells the response of all channels, and photographs through it tell their gains.
+    green = exposures[:, [1]] if camera.has_exposures else told
+    ratios = green[shared.second] - green[shared.first]
+    curve = first_response(photographs[..., [1]], ratios)
+    camera.start_response(np.repeat(curve, 3, 0))
+    light = np.log(camera.light(np.exp(photographs))) - told[pair]
+    camera.start(first_gains(replace(shared, logs=light)))
 
 
 def _solved(whole: np.ndarray, known: Sequence[tuple[int, int, float, np.ndarray]]) -> np.ndarray:

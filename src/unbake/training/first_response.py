@@ -29,13 +29,15 @@ def first_response(photographs: np.ndarray, exposures: np.ndarray) -> np.ndarray
     and what the mesh lacks are few of the pairs. Where exposures hardly differ, D is 0.
 
     Args:
-        photographs: logs of the values of two photographs, (2, n, 3); NaN where they tell nothing.
-        exposures: logs of the second exposure over the first, (n, 3).
+        photographs: logs of the values of two photographs, (2, n, channels); NaN where they tell
+            nothing.
+        exposures: logs of the second exposure over the first, (n, channels).
 
     Returns:
-        As `CameraModel.curves`.
+        As `CameraModel.curves`, of these channels.
     """
-    return np.stack([_curve(photographs[..., i], exposures[:, i]) for i in range(3)])
+    channels = range(photographs.shape[-1])
+    return np.stack([_curve(photographs[..., i], exposures[:, i]) for i in channels])
 
 
 def _curve(photographs: np.ndarray, exposures: np.ndarray) -> np.ndarray:
