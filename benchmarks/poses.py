@@ -121,9 +121,11 @@ def at_true_cameras(run: Path, clean: Dataset) -> dict[str, float]:
     """
     recovered, metrics = load_run(run), RunFolder(run).metrics()
     found = {f"true_{key}": value for key, value in as_seen(recovered, clean).items()}
-    images = metrics.get("camera", {}).get("images", ())  # without poses, where these were given
-    found_poses = [row for row in images if "transform_matrix" in row]
-    poses = {row["name"]: np.array(row["transform_matrix"]) for row in found_poses}
+    poses = {
+        row["name"]: np.array(row["transform_matrix"])
+        for row in metrics.get("camera", {}).get("images", ())
+        if "transform_matrix" in row  # not where poses were taken as given
+    }
     scene = recovered.problem.scene_view.scene
     given = {view.name: view for view in recovered.dataset.views}
     for split in ("train", "heldout"):

@@ -10,8 +10,9 @@ import runpy
 import shutil
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -193,23 +194,35 @@ def on_ranks(count: int, work: Callable[[Ranks], Any]) -> list[Any]:
 # ----------------------------------------------------------------------------- training steps
 
 
-def assert_only_replayed(step, state, rates, steps: int = 4) -> None:
-    """Take three steps of a fresh fit, then some more: they compile and trace nothing."""
+@contextmanager
+def nothing_compiled() -> Iterator[None]:
+    """A block in which kernels are launched, all of which were compiled before.
+
+    What is recorded and replayed is recorded again if the history of kernels is switched on in
+    between: do that around all of it.
+    """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for i in range(3):
-            step(state, i, rates(i))
-        recorded = step.recordings()
         dr.sync_thread()
         dr.kernel_history_clear()
-        for i in range(3, 3 + steps):
-            terms = step(state, i, rates(i))
-            assert float(terms["skipped"][0]) == 0
+        yield
         dr.sync_thread()
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
         dr.kernel_history_clear()
     assert kernels, "the history was not recorded"
     compiled = [k for k in kernels if not k["cache_hit"] or k["cache_disk"]]
     assert not compiled, [{n: v for n, v in k.items() if n != "ir"} for k in compiled]
+
+
+def assert_only_replayed(step, state, rates, steps: int = 4) -> None:
+    """Take three steps of a fresh fit, then some more: they compile and trace nothing."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for i in range(3):
+            step(state, i, rates(i))
+        recorded = step.recordings()
+        with nothing_compiled():
+            for i in range(3, 3 + steps):
+                terms = step(state, i, rates(i))
+                assert float(terms["skipped"][0]) == 0
     assert step.recordings() == recorded <= 3
 
 

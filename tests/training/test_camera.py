@@ -545,21 +545,17 @@ def test_green_tells_the_response_where_each_photograph_has_a_white_balance(monk
     monkeypatch.setattr(first_gains_module, "shared_points", lambda *_: shared)
     camera = CameraModel(views, white_balance="per-image", response=True)
     train = [SimpleNamespace(name=str(i), exposure=float(2.0**x)) for i, x in enumerate(stops)]
-    scene = SimpleNamespace(scene=None)
-    problem = SimpleNamespace(camera=camera, scene_view=scene)
+    problem = SimpleNamespace(camera=camera, scene_view=SimpleNamespace(scene=None))
     begin_cameras(problem, SimpleNamespace(train=train), None)
     curves, values = camera.curves(), np.linspace(0, 1, 2000)
-    truth = np.interp(_places(curves) ** 2.2, response(values, "contrast"), values)
+    places = np.linspace(0, 1, curves.shape[1])
+    truth = np.interp(places**2.2, response(values, "contrast"), values)
     assert np.sqrt(((curves**2.2 - truth) ** 2).mean()) < 0.02
     found = np.log2(camera.gains())
     assert np.abs(found - (balance - balance[0])).max() < 0.1
     # Taken as linear, photographs tell other balances.
     taken = np.log2(first_gains(shared))
     assert np.abs(taken - taken[:, [1]] - (balance - balance[0])).max() > 0.2
-
-
-def _places(curves):
-    return np.linspace(0, 1, curves.shape[1])
 
 
 def test_channels_of_a_response_are_alike_where_nothing_tells_them_apart():

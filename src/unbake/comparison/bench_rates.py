@@ -127,40 +127,40 @@ def bench_rates(
         console = Console(quiet=True)
     result, planned = ranks.together(lambda: _planned(data, variants, shared, out, seeds, schedule))
     if ranks.size > 1:
-        told = json.dumps(
-            [{k: s.record[k] for k in ("method", "settings", "seeds")} for s in planned]
-        )
-        datasets = {search.dataset.folder.name: search.dataset for search in planned}
+        records = [record for _, _, record in planned]
+        told = [{key: record[key] for key in ("method", "settings", "seeds")} for record in records]
+        datasets = {dataset.folder.name: dataset for dataset, _, _ in planned}
         files = {name: fingerprint(dataset) for name, dataset in datasets.items()}
-        ranks.require_same(what_ranks_share(told, files))
+        ranks.require_same(what_ranks_share(json.dumps(told), files))
         backend.share_cores(ranks.here)
     # Before any rank writes its own part of the record, that of the last call is in the file.
     ranks.together(lambda: _take_parts(result, out) if ranks.leads else None)
 
-    part = result if ranks.leads else {**result, "searches": []}
+    mine = ranks.mine(range(len(planned)))
+    own = [[number, planned[number][2]] for number in mine]
+    part = result if ranks.leads else {**result, "searches": [record for _, record in own]}
     errors: list[list[Any]] = []
     with ranks.apart():
-        mine = ranks.mine(range(len(planned)))
         for number in mine:
-            search = planned[number]
-            if not ranks.leads:
-                part["searches"].append(search.record)
+            dataset, config, record = planned[number]
+            file = _part_of(out, ranks.rank)
             try:
                 with lack_told():
-                    search.run(part, _part_of(out, ranks.rank), console)
+                    _Search(dataset, config, record, part, file, console, schedule).run()
             except UserError as error:
-                errors.append([number, *_told(error)])
-                console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        own = [[number, planned[number].record] for number in mine]
+                errors.append([number, error.what, error.where, error.remedy])
         every = ranks.told({"records": own, "errors": errors})
     for number, record in (row for one in every for row in one["records"]):
-        planned[number].record.update(record)
+        planned[number][2].update(record)
+    failed = [UserError(*parts) for _, *parts in sorted(e for one in every for e in one["errors"])]
+    for error in failed:
+        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
     if ranks.leads:
         _take_parts(result, out)
-        if done := [search.record for search in planned if search.record["best"]]:
+        if done := [record for _, _, record in planned if record["best"]]:
             print_rates(done, console)
-    if failed := sorted(row for one in every for row in one["errors"]):
-        raise Agreed(*failed[0][1:])
+    if failed:
+        raise Agreed.of(failed[0])
     return result if ranks.leads else {}
 
 
@@ -171,8 +171,8 @@ def _planned(
     out: Path,
     seeds: Sequence[int],
     schedule: bool,
-) -> tuple[Row, list[_Search]]:
-    """The record so far, and the searches that are asked for.
+) -> tuple[Row, list[tuple[Dataset, FitConfig, Row]]]:
+    """The record so far, and data, settings and record of each search that is asked for.
 
     Raises:
         UserError: see `bench_rates`.
@@ -193,14 +193,8 @@ def _planned(
             # Whatever is the default of a method by now: a search begins with what all have.
             config = _with_own_schedule(variant.settings(shared))
             record = _search(result, dataset, variant.name, config, seeds, out, schedule)
-            name = f"{dataset.folder.name}, {variant.name}"
-            planned.append(_Search(dataset, name, config, record, schedule))
+            planned.append((dataset, config, record))
     return result, planned
-
-
-def _told(error: UserError) -> list[str | None]:
-    """An error's parts, as other ranks are told it."""
-    return [error.what, None if error.where is None else str(error.where), error.remedy]
 
 
 def found_defaults(result: Row) -> dict[str, dict[SceneKind, MethodDefaults]]:
@@ -253,40 +247,40 @@ class _Search:
     """One method on one data set."""
 
     def __init__(
-        self, dataset: Dataset, name: str, config: FitConfig, record: Row, schedule: bool
+        self,
+        dataset: Dataset,
+        config: FitConfig,
+        record: Row,
+        result: Row,
+        out: Path,
+        console: Console,
+        schedule: bool,
     ) -> None:
-        self.dataset = dataset
-        self.name = name
-        self.record = record
+        self._dataset = dataset
+        self._name = f"{record['data']}, {record['method']}"
         self._config = config
+        self._record = record
+        self._result = result
+        self._out = out
+        self._console = console
         self._schedule = SCHEDULE if schedule else ()
-        self._result: Row = {}
-        self._out = Path()
-        self._console = Console(quiet=True)
 
-    def run(self, result: Row, out: Path, console: Console) -> None:
-        """Make the trials that are missing, and note the best one.
-
-        Args:
-            result: with this search's record; written after each trial.
-            out: file to write it to.
-            console: shows progress.
-        """
-        self._result, self._out, self._console = result, out, console
-        config, record = self._config, self.record
+    def run(self) -> None:
+        """Make the trials that are missing, and note the best one."""
+        config, record = self._config, self._record
         self._complete(record["untrained"], lambda fit: {}, "untrained")
         # What photographs tell least of comes first.
         materials = [name for name in config.unknowns if name in QUANTITIES]
         lights = [name for name in config.unknowns if name not in QUANTITIES]
         if config.seconds and record["best"] is None:
             variants = [replace(config, estimator=name) for name in _estimators(config)]
-            compile_kernels(self.dataset.folder, variants)
+            compile_kernels(self._dataset.folder, variants)
         searched = [*reversed(materials), *lights, *self._schedule]
         estimators = _estimators(config)
         best = best_trial(searched, estimators, self._score)
         found = self._row(best)
         if "error" in found:
-            raise UserError(found["error"], self.name)
+            raise UserError(found["error"], self._name)
         # A file of an earlier version may have trials with another estimator.
         taken = settled([t for t in record["trials"] if t["estimator"] in estimators], found)
         record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
@@ -302,17 +296,17 @@ class _Search:
     def _row(self, trial: Trial) -> Row:
         """The trial's line of the record."""
         same = _tried(trial, self._config)
-        for row in self.record["trials"]:
+        for row in self._record["trials"]:
             if same.items() <= row.items():
                 return row
-        self.record["trials"].append(same | {"score": None, "per_seed": []})
-        return self.record["trials"][-1]
+        self._record["trials"].append(same | {"score": None, "per_seed": []})
+        return self._record["trials"][-1]
 
     def _complete(
         self, row: Row, learn: Callable[[FreshFit], Row], what: str, trial: Trial | None = None
     ) -> None:
         """Make the fits of a line for the seeds that it lacks, and average them."""
-        seeds = self.record["seeds"]
+        seeds = self._record["seeds"]
         missing = [seed for seed in seeds if seed not in {f["seed"] for f in row["per_seed"]}]
         for seed in missing:
             if "error" in row:
@@ -330,9 +324,9 @@ class _Search:
             tried = _tried(trial, config)
             config = replace(config, rate_factors=tried.pop("factors"), **tried)
         try:
-            fit = begin_fit(self.dataset, config)
+            fit = begin_fit(self._dataset, config)
             effort = learn(fit)
-            return _scores(fit, self.dataset) | effort
+            return _scores(fit, self._dataset) | effort
         except UserError as error:
             if trial is None:
                 raise
@@ -347,7 +341,7 @@ class _Search:
     def _say(self, what: str, row: Row) -> None:
         values = [f"{k} {'—' if v is None else f'{v:.2f}'}" for k, v in row.items() if _is_score(k)]
         text = row.get("error") or ", ".join(values)
-        line = f"{self.name}: {what}: {text}"
+        line = f"{self._name}: {what}: {text}"
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 

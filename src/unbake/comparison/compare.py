@@ -232,10 +232,7 @@ def _of_all(
     ranks: Ranks, rows: Mapping[str, Any], errors: Mapping[str, UserError]
 ) -> tuple[dict[str, Any], dict[str, UserError]]:
     """The rows and the errors of all ranks."""
-    parts = {
-        name: [e.what, None if e.where is None else str(e.where), e.remedy]
-        for name, e in errors.items()
-    }
+    parts = {name: [e.what, e.where, e.remedy] for name, e in errors.items()}
     every = ranks.told({"rows": dict(rows), "errors": parts})
     failed = {name: error for one in every for name, error in one["errors"].items()}
     found = {name: row for one in every for name, row in one["rows"].items()}
