@@ -417,7 +417,14 @@ def _read_record(file: Path) -> Row:
 
 
 def _is_search(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(value.get(key), str) for key in SEARCHED)
+    if not isinstance(value, dict) or not all(isinstance(value.get(k), str) for k in SEARCHED):
+        return False
+    trials = value.get("trials")
+    return isinstance(trials, list) and all(map(_has_fits, (value.get("untrained"), *trials)))
+
+
+def _has_fits(row: Any) -> bool:
+    return isinstance(row, dict) and isinstance(row.get("per_seed"), list)
 
 
 def _key(search: Row) -> tuple[Any, ...]:
