@@ -43,7 +43,7 @@ AT_ONCE = 1 << 18
 #: Samples of made-up photographs, as a multiple of those that a search compares with them.
 CLEANER = 2
 #: The rate of a descent that reaches its optimum in as many steps, as a multiple of the usual one.
-TO_OPTIMUM = 4.0
+TO_OPTIMUM = 10.0
 #: Searches whose mean is compared with one of all their samples.
 PARTS = 4
 #: Steps towards the truth, their rate, and the part of it that is left at the end.
