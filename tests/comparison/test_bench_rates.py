@@ -299,8 +299,11 @@ def test_a_search_of_another_process_goes_on(rates, tmp_path, monkeypatch):
     part.write_text(json.dumps({**whole, "searches": whole["searches"][1:]}))
     file.write_text(json.dumps({**whole, "searches": whole["searches"][:1]}))
     assert rates("direct").status == 0 and searches(tmp_path) == whole["searches"]
-    without = {key: value for key, value in second.items() if key != "trials"}
-    for damaged in ({}, without, {**second, "untrained": {}}, {**second, "trials": [None]}):
+    lacking = [
+        {key: value for key, value in second.items() if key != left_out}
+        for left_out in ("trials", "best", "seeds", "settings")
+    ]
+    for damaged in ({}, *lacking, {**second, "untrained": {}}, {**second, "trials": [None]}):
         part.write_text(json.dumps({**whole, "searches": [damaged]}))
         outcome = rates("direct")
         assert outcome.status == 2 and "process-1: no record of searches" in outcome.err

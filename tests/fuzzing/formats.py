@@ -459,9 +459,23 @@ _SEARCHES = json.dumps(
     {
         "format": 1,
         "definitions": {},
-        "searches": [{"method": "ours", "data": "room", "unknown": "materials", "trials": []}],
+        "searches": [
+            {
+                "method": "prb", "data": "room", "kind": "room", "unknown": "materials",
+                "views": 4, "heldout": 1, "resolution": [16, 16], "follows_paths": True,
+                "settings": {"steps": 2}, "seeds": [0],
+                "untrained": {"per_seed": [{"seed": 0, "score": 1.5}], "score": 1.5},
+                "trials": [
+                    {
+                        "factors": {"albedo": 2.0}, "estimator": "two-pass", "score": 2.5,
+                        "per_seed": [{"seed": 0, "score": 2.5, "steps": 2, "seconds": 0.5}],
+                    }
+                ],
+                "best": {"factors": {"albedo": 2.0}, "estimator": "two-pass", "score": 2.5},
+            }
+        ],
     }
-)
+)  # fmt: skip
 
 
 def _read_searches(folder: Path) -> None:

@@ -22,7 +22,7 @@ import drjit as dr
 import numpy as np
 from rich.console import Console
 
-from .. import backend
+from .. import backend, json_checks
 from ..config import ChosenEstimator, FitConfig, to_toml
 from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults
@@ -82,6 +82,17 @@ SCHEDULE = ("final_learning_rate", "warm_up")
 TRIED = ("factors", "estimator", *SCHEDULE)
 #: What tells the searches of a record apart.
 SEARCHED = ("method", "data", "unknown")
+
+_FITS = json_checks.list_of(json_checks.object_with(seed=json_checks.count))
+_SEARCH = json_checks.object_with(
+    **dict.fromkeys(SEARCHED, json_checks.text),
+    seeds=json_checks.list_of(json_checks.count),
+    settings=json_checks.any_object,
+    untrained=json_checks.object_with(per_seed=_FITS),
+    trials=json_checks.list_of(json_checks.object_with(estimator=json_checks.text, per_seed=_FITS)),
+    best=json_checks.or_none(json_checks.any_object),
+)
+_HAS_SEARCHES = json_checks.object_with(searches=json_checks.list_of(_SEARCH))
 
 Row = dict[str, Any]
 
@@ -410,21 +421,9 @@ def _read(out: Path) -> Row:
 def _read_record(file: Path) -> Row:
     result = read_object(file)
     check_format(result, FORMAT, file)
-    searches = result.get("searches")
-    if not isinstance(searches, list) or not all(_is_search(search) for search in searches):
+    if not _HAS_SEARCHES(result):
         raise UserError("no record of searches", file, "Give another --out")
     return result
-
-
-def _is_search(value: Any) -> bool:
-    if not isinstance(value, dict) or not all(isinstance(value.get(k), str) for k in SEARCHED):
-        return False
-    trials = value.get("trials")
-    return isinstance(trials, list) and all(map(_has_fits, (value.get("untrained"), *trials)))
-
-
-def _has_fits(row: Any) -> bool:
-    return isinstance(row, dict) and isinstance(row.get("per_seed"), list)
 
 
 def _key(search: Row) -> tuple[Any, ...]:
@@ -483,7 +482,7 @@ def _search(
     }
     for search in result["searches"]:
         if _key(search) == _key(described):
-            other = [key for key, value in described.items() if search[key] != value]
+            other = [key for key, value in described.items() if search.get(key) != value]
             if "settings" in other:
                 both = settings.keys() | search["settings"].keys()
                 other += sorted(k for k in both if search["settings"].get(k) != settings.get(k))
