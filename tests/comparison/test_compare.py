@@ -435,7 +435,7 @@ def test_samples_of_both_passes_count(compare, tmp_path):
     for name, row in rows.items():
         log = (tmp_path / "out" / name / "log.jsonl").read_text().splitlines()
         assert json.loads(log[-1])["samples"] == row["samples"]
-        rate = 1e3 * row["samples"] / row["steps"] / row["milliseconds_per_step"]
+        rate = 1e3 * row["samples"] / row["steps"] / row["milliseconds_per_step"]  # no searches
         assert row["samples_per_second"] == pytest.approx(rate)
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +21,7 @@ from unbake.fields.network import Network
 from unbake.fields.settings import GridConfig, NetworkConfig, PieceConfig
 from unbake.quantities import QUANTITIES
 from unbake.ranks import Ranks
+from unbake.training import loop
 from unbake.training.problem import make_problem
 from unbake.training.roughness_search import (
     NODES,
@@ -332,6 +334,23 @@ def test_a_fit_tells_the_samples_of_its_searches(cornell, tmp_path, unbake):
     assert unbake("evaluate", out).status == 0
     found = json.loads((out / "evaluation" / "metrics.json").read_text())
     assert found["samples"] == told
+
+
+def test_searches_are_part_of_the_time_of_a_fit(cornell, tmp_path, unbake, monkeypatch):
+    settings, out = tmp_path / "settings.toml", tmp_path / "run"
+    # The first one comes as held-aside pixels are measured, the other before a line of the log.
+    search = replace(SETTINGS.roughness_search, first=0.75, last=1.0)
+    settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20, roughness_search=search)))
+    now, original = [0.0], RoughnessSearch._search
+
+    def searched(*args):
+        now[0] += 1.0
+        return original(*args)
+
+    monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(RoughnessSearch, "_search", searched)
+    assert unbake("fit", cornell, "--settings", settings, "--out", out).status == 0
+    assert RunFolder(out).log()[-1]["seconds"] == 2.0
 
 
 @needs_mpi

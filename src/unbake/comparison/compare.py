@@ -39,14 +39,16 @@ from .method_variant import MethodVariant
 from .tables import print_comparison
 
 DEFINITIONS = {
-    "samples": "camera samples traced in training; of an estimator with two passes, both count",
+    "samples": "camera samples traced in training, those of searches of roughness included; of an "
+    "estimator with two passes, both count",
     "seconds": "training time: without scores, previews and checkpoints, with the compilation of "
-    "the first steps",
+    "the first steps and with searches of roughness",
     "milliseconds_per_step": "median after the first steps",
-    "start_up_seconds": "training time beyond its steps at that median, most of it compilation "
-    "(kernels of earlier runs are cached)",
+    "start_up_seconds": "training time beyond its steps at that median: compilation (kernels of "
+    "earlier runs are cached) and searches of roughness",
     "samples_per_second": "camera samples of a step over that median",
-    "memory_mb": "peak resident memory of the process, which fits all methods one after the other",
+    "memory_mb": "resident memory of the process, which fits all methods one after the other: the "
+    "most that a line of the log tells",
     "skipped": "steps whose loss was not finite",
     "notes": "what was noted of the fit: a state to which it went back, or that it learned nothing",
     "untrained": "the fields that all methods start from, with the shared representation and seed",
@@ -160,7 +162,7 @@ def compare(
                         allow_doubtful=allow_doubtful,
                     )
                     metrics = _evaluated(run, progress, evaluation, allow_outside, console)
-                rows[name] = description(fits[name]) | _numbers(run, metrics)
+                rows[name] = description(fits[name]) | _numbers(run, metrics, fits[name])
             except UserError as error:
                 errors[name] = error
                 rows[name] = description(fits[name]) | {"error": str(error)}
@@ -328,7 +330,7 @@ def _evaluated(
     )
 
 
-def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:
+def _numbers(run: RunFolder, metrics: dict[str, Any], config: FitConfig) -> dict[str, Any]:
     log = run.log()
     each = milliseconds_per_step(log)
     steps, samples, seconds = (metrics[key] for key in ("steps", "samples", "seconds"))
@@ -336,7 +338,7 @@ def _numbers(run: RunFolder, metrics: dict[str, Any]) -> dict[str, Any]:
         "steps": steps,
         "samples": samples,
         "seconds": seconds,
-        "samples_per_second": None if each is None else 1e3 * samples / steps / each,
+        "samples_per_second": None if each is None else 1e3 * config.samples_per_step / each,
         "milliseconds_per_step": each,
         "start_up_seconds": None if each is None else max(0.0, seconds - steps * each / 1e3),
         "memory_mb": max((r["memory_mb"] for r in log if "memory_mb" in r), default=None),

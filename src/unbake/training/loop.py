@@ -372,6 +372,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
         clock = time.perf_counter() - progress.seconds
         # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
         last = _done(config, progress) >= total
+        before = 1.0 if last else _done(config, progress) / total
         if last and begun.restored is None:  # nothing to learn: the untrained fields are the result
             failures = [*saving.save(state, progress), *_show(begun, monitor, progress, lock)]
         while not last:
@@ -395,7 +396,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
             now = _done(config, progress) / total
-            progress.samples += search.search_between(done, now, state, progress.step)
+            _search(search, (before, now), state, progress, clock, ranks)
+            before, last = now, last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
             if not (full or last or due or save or tell):
                 continue
@@ -447,6 +449,27 @@ def _open(
     folder.write_origin(begun.origin)
     folder.write_settings(begun.config)  # from here on there is a run, which can be resumed
     return folder.log_file, folder.events(progress.step + 1) if tensorboard else None
+
+
+def _search(
+    search: RoughnessSearch,
+    between: tuple[float, float],
+    state: State,
+    progress: Progress,
+    clock: float,
+    ranks: Ranks,
+) -> None:
+    """Search for roughness, if that is due: its samples and its time are those of the fit.
+
+    Args:
+        between: fractions of the fit that were done before the present step, and are now.
+        clock: when training began, but for the times at which it stood still.
+    """
+    samples = search.search_between(*between, state, progress.step)
+    if samples:  # on all ranks
+        dr.sync_thread()
+        progress.samples += samples
+        progress.seconds = ranks.of_first(time.perf_counter() - clock)
 
 
 def _watch(
