@@ -19,7 +19,8 @@ MB = 1_000_000
 def limits(tmp_path, monkeypatch):
     """Make this process one of a control group with these files."""
 
-    def make(limit, used):
+    def make(limit, used, statistics=""):
+        (tmp_path / "memory.stat").write_text(statistics)
         files = (tmp_path / "memory.max", tmp_path / "memory.current")
         for file, text in zip(files, (limit, used), strict=True):
             file.write_text(f"{text}\n")
@@ -33,6 +34,20 @@ def test_a_container_has_what_its_limit_leaves(limits):
     assert free_bytes() == 70 * MB
     limits(100 * MB, 130 * MB)
     assert free_bytes() == 0
+
+
+@pytest.mark.parametrize(
+    "statistics",
+    [
+        f"anon {5 * MB}\nactive_file {8 * MB}\ninactive_file {20 * MB}\n",
+        f"inactive_file 0\ntotal_active_file {8 * MB}\ntotal_inactive_file {20 * MB}\n",
+    ],
+)
+def test_files_that_the_kernel_holds_in_memory_can_be_had(limits, statistics):
+    limits(100 * MB, 90 * MB, statistics)
+    assert free_bytes() == 38 * MB
+    limits(100 * MB, 90 * MB, "damaged")
+    assert free_bytes() == 10 * MB
 
 
 def test_without_a_limit_the_memory_of_the_machine_is_free(limits):

@@ -45,7 +45,8 @@ def free_bytes() -> int | None:
         return None
     for limit, used in _LIMITS:
         try:
-            free = min(free, int(Path(limit).read_text()) - int(Path(used).read_text()))
+            taken = int(Path(used).read_text()) - _page_cache(Path(used).with_name("memory.stat"))
+            free = min(free, int(Path(limit).read_text()) - max(0, taken))
         except (OSError, ValueError):  # no such group, or one without a limit
             continue
     for number, key in _RESOURCES:
@@ -59,6 +60,21 @@ def reserved_counts() -> bool:
     """Whether a limit of this process counts memory that is reserved, and not only what is used."""
     limits = (resource.getrlimit(number)[0] for number, _ in _RESOURCES)
     return any(limit != resource.RLIM_INFINITY for limit in limits)
+
+
+def _page_cache(file: Path) -> int:
+    """Bytes of files that a control group holds in memory; the kernel gives them back on demand.
+
+    Args:
+        file: its statistics, of either version of control groups.
+    """
+    try:
+        rows = dict(line.split() for line in file.read_text().splitlines())
+        # Version 1 tells the group alone, and with the groups in it, whose use counts here.
+        prefix = "total_" if "total_inactive_file" in rows else ""
+        return sum(int(rows.get(f"{prefix}{kind}_file", 0)) for kind in ("active", "inactive"))
+    except (OSError, ValueError):
+        return 0
 
 
 def _used(key: str) -> int:
