@@ -19,8 +19,8 @@ def finite(value: Any) -> bool:
 
 
 def number(value: Any) -> bool:
-    """A number, finite or not."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """A number, finite or not; no integer that is larger than any float."""
+    return isinstance(value, float) or (type(value) is int and finite(value))
 
 
 def count(value: Any) -> bool:

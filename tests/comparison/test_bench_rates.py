@@ -243,6 +243,11 @@ def test_a_method_that_fails_is_recorded(rates, tmp_path, monkeypatch):
     assert "no memory for a step" in outcome.err
     (search,) = searches(tmp_path)
     assert search["best"] is None and "no memory" in search["trials"][0]["error"]
+    monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
+    monkeypatch.setattr(module, "_scores", lambda fit, dataset: {"score": 20.0})
+    assert rates("direct").status == 0, "what failed is tried again"
+    (search,) = searches(tmp_path)
+    assert search["best"]["score"] == 20 and not any("error" in t for t in search["trials"])
 
 
 def test_a_search_that_fails_does_not_end_the_others(rates, tmp_path, monkeypatch):

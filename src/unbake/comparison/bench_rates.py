@@ -83,14 +83,24 @@ TRIED = ("factors", "estimator", *SCHEDULE)
 #: What tells the searches of a record apart.
 SEARCHED = ("method", "data", "unknown")
 
-_FITS = json_checks.list_of(json_checks.object_with(seed=json_checks.count))
+_FITS = json_checks.list_of(
+    json_checks.object_with(seed=json_checks.count, score=json_checks.score)
+)
+_TRIAL = json_checks.object_with(
+    estimator=json_checks.text, score=json_checks.score, per_seed=_FITS
+)
+_BEST = json_checks.object_with(
+    factors=json_checks.object_of(json_checks.number),
+    estimator=json_checks.text,
+    score=json_checks.score,
+)
 _SEARCH = json_checks.object_with(
     **dict.fromkeys(SEARCHED, json_checks.text),
     seeds=json_checks.list_of(json_checks.count),
     settings=json_checks.any_object,
     untrained=json_checks.object_with(per_seed=_FITS),
-    trials=json_checks.list_of(json_checks.object_with(estimator=json_checks.text, per_seed=_FITS)),
-    best=json_checks.or_none(json_checks.any_object),
+    trials=json_checks.list_of(_TRIAL),
+    best=json_checks.or_none(_BEST),
 )
 _HAS_SEARCHES = json_checks.object_with(searches=json_checks.list_of(_SEARCH))
 
@@ -277,13 +287,16 @@ class _Search:
         self._schedule = SCHEDULE if schedule else ()
 
     def run(self) -> None:
-        """Make the trials that are missing, and note the best one."""
+        """Make the trials that are missing or failed before, and note the best one."""
         config, record = self._config, self._record
+        for row in record["trials"]:
+            if row.pop("error", None) is not None:
+                row["per_seed"] = [fit for fit in row["per_seed"] if "error" not in fit]
         self._complete(record["untrained"], lambda fit: {}, "untrained")
         # What photographs tell least of comes first.
         materials = [name for name in config.unknowns if name in QUANTITIES]
         lights = [name for name in config.unknowns if name not in QUANTITIES]
-        if config.seconds and record["best"] is None:
+        if config.seconds and (record["best"] is None or self._lacks_seeds()):
             variants = [replace(config, estimator=name) for name in _estimators(config)]
             compile_kernels(self._dataset.folder, variants)
         searched = [*reversed(materials), *lights, *self._schedule]
@@ -296,6 +309,11 @@ class _Search:
         taken = settled([t for t in record["trials"] if t["estimator"] in estimators], found)
         record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
         self._write()
+
+    def _lacks_seeds(self) -> bool:
+        """Whether a trial has not been made for all seeds."""
+        wanted = set(self._record["seeds"])
+        return any(wanted - {fit["seed"] for fit in t["per_seed"]} for t in self._record["trials"])
 
     def _score(self, trial: Trial) -> float:
         found = self._row(trial)

@@ -46,7 +46,7 @@ def print_rates(searches: list[Row], console: Console) -> None:
         schedule = {"final_learning_rate": "final rate", "warm_up": "warm-up"}
         rates += [f"{title} {best[key]:g}" for key, title in schedule.items() if key in best]
         chosen = "\n".join([*rates, best["estimator"]])
-        scores = search["untrained"]["score"], trials[0]["score"], best["score"]
+        scores = search["untrained"].get("score"), trials[0]["score"], best["score"]
         numbers = (_number(score, 2) for score in scores)
         table.add_row(search["data"], search["method"], chosen, str(len(trials)), *numbers)
     console.print(table)
