@@ -29,6 +29,8 @@ from .signals import cleaned_up
 
 #: Longest text file that is read, in bytes: the poses of some 50,000 views.
 LONGEST_TEXT = 64 << 20
+#: The same of a line of a file that is read line by line, in characters.
+_LONGEST_LINE = 1 << 20
 #: How deep objects and lists of a file may be nested.
 DEEPEST = 64
 
@@ -284,6 +286,30 @@ def read_text(path: Path, remedy: str | None = None) -> str:
             said = f"the file has {size / 1e6:.0f} MB, more than the {LONGEST_TEXT / 1e6:.0f} MB"
             raise UserError(f"{said} that are read", path, remedy or "Repair it")
         return Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        said = f"the file cannot be read ({error.strerror})"
+        raise UserError(said, path, remedy or "Check the path") from None
+    except UnicodeDecodeError:
+        raise UserError("the file is not UTF-8 text", path, remedy or "Repair it") from None
+
+
+def read_lines(path: Path, remedy: str | None = None) -> Iterator[str]:
+    """The lines of a UTF-8 text file of any length.
+
+    Args:
+        remedy: what the user can do where the file cannot be read.
+
+    Raises:
+        UserError: the file is missing, unreadable, or not UTF-8, or a line is too long.
+    """
+    require_file(path, remedy=remedy or "Check the path")
+    try:
+        with open(path, encoding="utf-8") as file:
+            while line := file.readline(_LONGEST_LINE + 1):
+                if len(line) > _LONGEST_LINE:
+                    said = f"a line has more than the {_LONGEST_LINE} characters that are read"
+                    raise UserError(said, path, remedy or "Repair it")
+                yield line
     except OSError as error:
         said = f"the file cannot be read ({error.strerror})"
         raise UserError(said, path, remedy or "Check the path") from None

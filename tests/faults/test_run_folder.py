@@ -369,6 +369,9 @@ def test_a_log_with_wrong_types_is_one_line(key, run):
         run.log_file.write_text(f"{text}\n")
         with pytest.raises(UserError, match=r"line 1: is not a JSON object"):
             run.log()
+    run.log_file.write_text('{"step": 1}\n' + " " * (1 << 21))
+    with pytest.raises(UserError, match=r"a line has more than the 1048576 characters"):
+        run.log()
     run.log_file.write_text("[" * 100_000 + '\n{"step": 1}\n')
     with pytest.raises(UserError, match=r"line 1 is not JSON"):
         run.log()

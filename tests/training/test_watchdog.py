@@ -316,11 +316,14 @@ def test_a_fit_that_learns_ends_well(fit):
         ),
     ],
 )
-def test_a_fit_that_learns_nothing_says_so(fit, settings, message):
+def test_a_fit_that_learns_nothing_says_so(fit, settings, message, unbake, cornell):
     outcome, run = fit(more=settings)
     assert outcome.status == 1, outcome
     assert re.search(f"warning: {message}", outcome.out)
     assert re.match(message, notes(run)[-1])
+    told = len(notes(run))
+    again = unbake("fit", cornell, "--out", run.path, "--resume", "--steps", LONG_ENOUGH)
+    assert again.status == 1 and len(notes(run)) == told, "one verdict, however often it ends"
 
 
 def test_lights_that_are_far_too_strong_are_told(fit, cornell, tmp_path):

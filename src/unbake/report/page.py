@@ -30,6 +30,8 @@ from unbake.transport.terms import TERMS
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 SPLITS = ("heldout", "train")
+#: How notes of fits that learned nothing begin.
+_LEARNED_NOTHING = ("nothing was learned", "nothing useful was learned")
 #: Names of the quantities that have pictures.
 NAMES = {"render": "Rendering"} | {name: row.title for name, row in QUANTITIES.items()}
 #: PSNRs: key, quantity and heading.
@@ -267,7 +269,7 @@ def _nothing_learned(run: Run) -> str | None:
     """
     if run.untrained:
         return None
-    if any(str(line.get("note", "")).startswith("nothing was learned") for line in run.log):
+    if any(str(line.get("note", "")).startswith(_LEARNED_NOTHING) for line in run.log):
         return "nothing learned"
     before = (run.metrics.get("yardsticks") or {}).get("untrained") or {}
     found = run.metrics.get("heldout") or {}

@@ -79,9 +79,20 @@ class Monitor:
         """Print a line above the bar."""
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
-    def note(self, step: int, seconds: float, line: str, *, say: bool = True) -> None:
-        """Log, and print, what has to be known of the fit after a step."""
-        self._write({"step": step, "seconds": seconds, "note": line})
+    def note(
+        self, step: int, seconds: float, line: str, *, say: bool = True, verdict: bool = False
+    ) -> None:
+        """Log, and print, what has to be known of the fit after a step.
+
+        Args:
+            step: number of the step.
+            seconds: of training.
+            line: what is noted.
+            say: whether it is printed, too.
+            verdict: whether it is of the whole fit, and so no longer of one that goes on.
+        """
+        entry = {"step": step, "seconds": seconds, "note": line}
+        self._write(entry | {"verdict": True} if verdict else entry)
         if say:
             self.say(f"warning: {line}")
 

@@ -30,7 +30,7 @@ from typing import Any, final
 from ..config import FitConfig, read_toml, to_tables, to_toml
 from ..errors import UserError
 from ..formats import check_format
-from ..io import read_object, read_text, require_utf8, write_json, write_text
+from ..io import read_lines, read_object, read_text, require_utf8, write_json, write_text
 from . import run_numbers
 from .event_log import EventLog
 from .run_lock import RunLock
@@ -292,14 +292,17 @@ class RunFolder:
         file = self.log_file
         if not file.is_file():
             raise UserError("the run has no log", file, _GIVE_RUN)
-        texts = [text for text in read_text(file).splitlines() if text.strip()]
-        lines = []
-        for number, text in enumerate(texts, start=1):
+        lines: list[dict[str, Any]] = []
+        torn: int | None = None
+        for number, text in enumerate(read_lines(file), start=1):
+            if not text.strip():
+                continue
+            if torn is not None:
+                raise UserError(f"line {torn} is not JSON", file, "Remove the line")
             try:
                 line = json.loads(text)
-            except (ValueError, RecursionError) as error:
-                if number < len(texts):
-                    raise UserError(f"line {number} is not JSON", file) from error
+            except (ValueError, RecursionError):
+                torn = number
                 continue
             wrong = run_numbers.wrong_in_log(line)
             if wrong:
@@ -324,14 +327,16 @@ class RunFolder:
     def forget_after(self, step: int) -> None:
         """Drop the lines of the log after a step, and lines that a killed fit left half-written.
 
-        A resumed fit takes those steps again.
+        A resumed fit takes those steps again. Verdicts on the whole fit are dropped, too: it ends
+        once more.
         """
         log, kept = self.log_file, []
         require_no_link(log)
         lines = log.read_bytes().splitlines() if log.is_file() else ()
         for line in (line.decode("utf-8", "replace") for line in lines):
             try:
-                if json.loads(line)["step"] <= step:
+                found = json.loads(line)
+                if found["step"] <= step and not found.get("verdict"):
                     kept.append(line + "\n")
             except (ValueError, KeyError, TypeError, RecursionError):
                 continue
