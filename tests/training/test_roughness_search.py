@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -287,7 +288,7 @@ def test_errors_have_the_variance_1_however_bright_pixels_are():
 def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
     problem, _, step, state = started(built_in)
     search = RoughnessSearch(problem, SETTINGS, step, Ranks())
-    assert not search.due(0.0, 0.39)
+    assert not search.due(0.0, 0.39) and search.rates({}, 0, 0.0) == {}
     assert search.due(0.39, 0.4) and not search.due(0.4, 0.45)
     assert search.due(0.7, 0.8) and not search.due(0.8, 1.0)
     rates = {"albedo": 1.0, "roughness": 1.0}
@@ -351,6 +352,24 @@ def test_searches_are_part_of_the_time_of_a_fit(cornell, tmp_path, unbake, monke
     monkeypatch.setattr(RoughnessSearch, "_search", searched)
     assert unbake("fit", cornell, "--settings", settings, "--out", out).status == 0
     assert RunFolder(out).log()[-1]["seconds"] == 2.0
+
+
+def test_a_fit_without_memory_for_a_search_is_saved(cornell, tmp_path, unbake, monkeypatch):
+    settings, out = tmp_path / "settings.toml", tmp_path / "run"
+    settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20)))
+
+    def none(*args):
+        raise MemoryError
+
+    original = RoughnessSearch._search
+    monkeypatch.setattr(RoughnessSearch, "_search", none)
+    outcome = unbake("fit", cornell, "--settings", settings, "--out", out)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert re.search(r"no memory for a search of roughness with \d+ pixels", outcome.err)
+    assert [path.name for path in RunFolder(out).written_checkpoints()] == ["step-000000008"]
+    monkeypatch.setattr(RoughnessSearch, "_search", original)
+    outcome = unbake("fit", cornell, "--out", out, "--resume", "--steps", 20)
+    assert outcome.status == 0 and "going on after step 8" in outcome.out, outcome
 
 
 @needs_mpi

@@ -396,7 +396,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
             now = _done(config, progress) / total
-            _search(search, (before, now), state, progress, clock, ranks)
+            _search(search, (before, now), saving, state, progress, clock, ranks)
             before, last = now, last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
             if not (full or last or due or save or tell):
@@ -454,6 +454,7 @@ def _open(
 def _search(
     search: RoughnessSearch,
     between: tuple[float, float],
+    saving: Saving,
     state: State,
     progress: Progress,
     clock: float,
@@ -462,10 +463,22 @@ def _search(
     """Search for roughness, if that is due: its samples and its time are those of the fit.
 
     Args:
+        search: what searches.
         between: fractions of the fit that were done before the present step, and are now.
+        saving: saves the state where there is no memory for the search.
+        state: where what is found is left.
+        progress: of the fit.
         clock: when training began, but for the times at which it stood still.
+        ranks: that search together.
+
+    Raises:
+        UserError: there is no memory for it.
     """
-    samples = search.search_between(*between, state, progress.step)
+    try:
+        samples = search.search_between(*between, state, progress.step)
+    except UserError:  # the state is that of before: a search leaves what it finds at its end
+        saving.save(state, progress)
+        raise
     if samples:  # on all ranks
         dr.sync_thread()
         progress.samples += samples
@@ -501,7 +514,7 @@ def _judge(
     """Note what is wrong with a fit that has ended, or tell whether it was still improving."""
     progress.warning = watchdog.verdict(learning_rates(config, progress.step, 0.0))
     if progress.warning is not None:
-        monitor.note(progress.step, progress.seconds, progress.warning)
+        monitor.note(progress.step, progress.seconds, progress.warning, verdict=True)
         return
     for line in errors.told():
         monitor.say(line)

@@ -102,6 +102,8 @@ class RoughnessSearch:
 
     def _pixels(self, step: int, done: float) -> int:
         """How many pixels a search samples after a step and a fraction of the fit; 0: none."""
+        if not done:
+            return 0
         search, of_steps = self._config.roughness_search, self._config.samples_per_step
         pixels = round(search.share * step / done * of_steps / search.spp)
         return min(pixels, search.pixels) if pixels >= _FEWEST else 0
@@ -131,8 +133,9 @@ class RoughnessSearch:
         except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
                 raise
-            what = "no memory for a search of roughness"
-            raise UserError(what, "roughness_search.times", "Set it to 0") from None
+            what = f"no memory for a search of roughness with {pixels} pixels"
+            remedy = "Go on with --resume, without this search, or start another run with fewer"
+            raise UserError(what, "roughness_search.pixels", remedy) from None
 
     def _search(self, state: State, number: int, pixels: int, part: float) -> int:
         """The search after a step.
