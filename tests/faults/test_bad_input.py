@@ -156,6 +156,16 @@ def test_a_spoilt_held_out_view_is_found_when_it_is_used(unbake, refuses, data, 
     assert unbake("evaluate", run, *words, "--clip-negative").status == 0
 
 
+def test_an_evaluation_without_views(unbake, refuses, data, tiny, tmp_path):
+    run = tmp_path / "run"
+    edit_frames(data, lambda d: d.update(frames=[f for f in d["frames"] if f["split"] == "train"]))
+    words = ("--settings", tiny, "--method", "direct", "--steps", 1)
+    assert unbake("fit", data, "--out", run, *words).status == 0
+    line = refuses("evaluate", run, "--spp", 1, "--train-views", 0)
+    assert "--train-views: no view to evaluate" in line
+    assert unbake("evaluate", run, "--spp", 1, "--train-views", 1).status == 0
+
+
 def test_black_photographs(refused_fit, data):
     for name in ("train_000", "train_001"):
         pixels = read_exr(data / "images" / f"{name}.exr")

@@ -104,6 +104,9 @@ def evaluate(
     settings = settings or EvaluationSettings()
     run = Path(run)
     recovered, folder = load_run(run, allow_outside=allow_outside), RunFolder(run)
+    if not (recovered.dataset.heldout or settings.train_views):
+        what = "no view to evaluate: the data set has no held-out views"
+        raise UserError(what, "--train-views", "Give at least 1")
     with folder.lock_evaluation() as lock:
         folder.forget_evaluation()
         return _evaluate(recovered, folder, settings, tell, lock)
