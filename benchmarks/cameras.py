@@ -78,7 +78,8 @@ class Fault:
 EXPOSURE = Fault({"exposure": 1.5}, ("--exposures", "per-image"))
 BALANCE = Fault({"white_balance": 1.0}, ("--white-balance", "per-image"))
 VIGNETTING = Fault({"vignetting": 0.4}, ("--vignetting", "radial"))
-JPEG = Fault({"format": "jpeg", "electrons": 10000.0, "read_noise": 5.0})
+SENSOR = Fault({"electrons": 10000.0, "read_noise": 5.0})
+CODES, COMPRESSED = Fault({"format": "png"}), Fault({"format": "jpeg"})
 MESH = Fault({"decimate": 0.1})
 NOISE = Fault({"electrons": 200.0, "read_noise": 4.0})
 CONTRAST = Fault({"response": "contrast"}, ("--response", "monotone"))
@@ -92,6 +93,7 @@ def together(*faults: Fault) -> Fault:
     return Fault(settings, tuple(word for fault in faults for word in fault.words))
 
 
+JPEG = together(COMPRESSED, SENSOR)
 ALL_BUT_MESH = together(BALANCE, VIGNETTING, CONTRAST, JPEG, POSES)
 #: As EXIF does.
 TOLD = Fault({"exposure": 1.5, "tell_exposures": True})
@@ -104,9 +106,13 @@ FAULTS = {
     "response, exposures told": together(CONTRAST, TOLD),
     "response and exposure": together(CONTRAST, EXPOSURE),
     "jpeg": JPEG,
+    "jpeg, its noise alone": SENSOR,
+    "jpeg, 8 bits alone": CODES,
+    "jpeg, without noise": COMPRESSED,
     "noise": NOISE,
     "noise, told": together(NOISE, Fault({"tell_noise": True})),
     "mesh": MESH,
+    "mesh, outliers found": together(MESH, Fault({}, ("--outliers", "found"))),
     "poses": POSES,
     "response off centre, exposures told": together(LIFTED, TOLD),
     "all but mesh, exposures told": together(ALL_BUT_MESH, TOLD),

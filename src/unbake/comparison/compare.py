@@ -59,7 +59,8 @@ DEFINITIONS = {
     "time_to_quality": "psnr: where the scores of a run end, and 1 and 2 dB below that, for each "
     "unknown of the materials; seconds: training time after which a run first has it, interpolated "
     "linearly between scores; null: never. Scores of all runs are smoothed by a running median of "
-    f"{WINDOW} (shorter at the ends). Targets that a run has before its first step are left out",
+    f"{WINDOW} (shorter at the ends). Targets below the end that a run has "
+    "before its first step are left out",
 }
 #: Of compare.json; 1 had the last albedo alone in `time_to_quality`, and no key `format`.
 COMPARISON_FORMAT = 2

@@ -106,7 +106,7 @@ def seconds_to(
 def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Target]:
     """Targets for every scored quantity: the end of each run's smoothed curve, and below it.
 
-    A run sets no target that it has before its first step.
+    A run sets no target below its end that it has before its first step.
 
     Args:
         curves: score curve of each run by name; a run without scores sets no target.

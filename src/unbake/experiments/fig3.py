@@ -99,7 +99,7 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
     others = [f"{name} / ours" for name in METHODS if name != "ours"]
     caption = (
         "PRB and AD-PT have two passes, as in Mitsuba, or split halves in one pass; the others "
-        "have one pass. The faster one counts. In brackets: the bars of the paper, on its scenes "
+        "have one pass. In brackets: the bars of the paper, on its scenes "
         "and an RTX 3090, with two passes and a depth of 15.\n\n"
     )
     table = markdown(["scene", "path depth", "ours", *others], lines)
