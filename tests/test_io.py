@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,7 @@ from unbake.config import from_toml
 from unbake.errors import UserError
 from unbake.formats import check_format
 from unbake.io import (
+    filled_folder,
     inside,
     number,
     read_json,
@@ -185,3 +187,27 @@ def test_limits_of_the_parser_are_told_in_plain_words(content, why, tmp_path):
     with pytest.raises(UserError, match="not valid TOML") as caught:
         from_toml("a = " + content[:10_000])
     assert f"({why})" in str(caught.value)
+
+
+def test_an_empty_folder_is_filled_and_nothing_is_left_of_a_failure(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    number = out.stat().st_ino
+    monkeypatch.chdir(out)
+    with pytest.raises(ZeroDivisionError), filled_folder(Path()) as folder:
+        (folder / "a.txt").write_text(str(1 / 0))
+    assert not any(out.iterdir())
+    with filled_folder(Path()) as folder:
+        write_text(folder / "b" / "c.txt", "c")
+        write_text(folder / "a.txt", "a")
+        assert not (out / "a.txt").exists()
+    assert sorted(path.name for path in out.iterdir()) == ["a.txt", "b"]
+    assert out.stat().st_ino == number, "the folder is the same, as a mount has to be"
+    other = tmp_path / "other"
+    other.mkdir()
+    with pytest.raises(UserError, match="another program has written"), filled_folder(other):
+        write_text(other / "theirs.txt", "")
+    assert [path.name for path in other.iterdir()] == ["theirs.txt"]
+    with filled_folder(tmp_path / "new" / "folder") as folder:
+        write_text(folder / "a.txt", "a")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["folder"]

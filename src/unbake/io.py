@@ -115,16 +115,29 @@ def filled_folder(out: Path) -> Iterator[Path]:
     Raises:
         UserError: the folder cannot be made or written.
     """
-    partial = out.with_name(f".{out.name[:100]}.{secrets.token_hex(8)}.partial")
+    # Within a folder that there is: it may be the present one, or another file system.
+    beside = out / "x" if out.is_dir() else out
+    partial = beside.with_name(f".{beside.name[:100]}.{secrets.token_hex(8)}.partial")
     with cleaned_up(lambda: shutil.rmtree(partial, ignore_errors=True)):
         try:
             partial.mkdir(parents=True)
             yield partial
-            if out.is_dir():
-                out.rmdir()
-            partial.rename(out)
+            if partial.parent == out:
+                if any(path != partial for path in out.iterdir()):
+                    what = "another program has written to the folder meanwhile"
+                    raise UserError(what, out, "Give another --out")
+                _move_up(partial)
+            else:
+                partial.rename(out)
         except OSError as error:
             raise UserError(f"cannot be written ({error.strerror})", where=out) from None
+
+
+def _move_up(folder: Path) -> None:
+    """Move all that is in a folder to the folder above; folders first, which files tell of."""
+    for path in sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)):
+        path.rename(folder.parent / path.name)
+    folder.rmdir()
 
 
 @contextlib.contextmanager
