@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UserError
+from ..errors import UserError, printable
 from ..io import require_file
 from ..scene.meshes import HEADER, check_mesh
 from ..scene.triangles import write_mesh
@@ -24,6 +24,10 @@ from .faults import Faults
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf")
 #: Albedo and roughness of all parts: a fit does not read them.
 _ALBEDO, _ROUGHNESS = 0.5, 0.5
+#: Steps between positions in single precision, as a share of all geometry, that do not show.
+_COARSEST = 1e-5
+#: Of the constant environment.
+_ENVIRONMENT = "environment"
 _VERSION = "3.0.0"
 
 
@@ -66,12 +70,29 @@ def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
         with faults.collected(file):
             own = _read_ply(file)
             if own is not None:
-                parts.append(replace(own, name=_unique(file.stem, {part.name for part in parts})))
+                parts.append(replace(own, name=_unique(file.stem, parts)))
                 continue
             for name, mesh, to_file in _loaded(file):
-                taken = {part.name for part in parts}
-                parts.append(_part(_unique(name or file.stem, taken), mesh, to_file, file))
+                parts.append(_part(_unique(name or file.stem, parts), mesh, to_file, file))
+    if parts:
+        _check_place(parts, faults)
     return parts
+
+
+def _check_place(parts: Sequence[Part], faults: Faults) -> None:
+    """Meshes far from the origin lose their shape, as Mitsuba has them in single precision."""
+    corners = [
+        corner for part in parts for corner in (part.positions.min(0), part.positions.max(0))
+    ]
+    extent = float(np.ptp(corners, axis=0).max())
+    largest = float(np.abs(corners).max())
+    step = float(np.spacing(np.float32(largest)))
+    if step > _COARSEST * extent:
+        faults.add(
+            f"the mesh is {extent:.3g} units wide and lies up to {largest:.3g} units from the "
+            f"origin, where single precision has steps of {step:.2g} units",
+            remedy="Move mesh and cameras to the origin together",
+        )
 
 
 def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Path:
@@ -86,19 +107,20 @@ def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Pa
     (folder / "meshes").mkdir(parents=True)
     root = ElementTree.Element("scene", version=_VERSION)
     if environment:
-        emitter = _add(root, "emitter", type="constant", id="environment")
+        emitter = _add(root, "emitter", type="constant", id=_ENVIRONMENT)
         _add(emitter, "rgb", name="radiance", value="1")
     for part in parts:
-        sides = _add(root, "bsdf", type="twosided", id=f"{part.name}_sides")
-        bsdf = _add(sides, "bsdf", type="principled", id=part.name)
+        material, sides_of_it, shape_of_it = _ids(part.name)
+        sides = _add(root, "bsdf", type="twosided", id=sides_of_it)
+        bsdf = _add(sides, "bsdf", type="principled", id=material)
         _add(bsdf, "rgb", name="base_color", value=f"{_ALBEDO:g}")
         _add(bsdf, "float", name="roughness", value=f"{_ROUGHNESS:g}")
         part.write(folder / "meshes" / f"{part.name}.ply")
-        shape = _add(root, "shape", type="ply", id=f"{part.name}_shape")
+        shape = _add(root, "shape", type="ply", id=shape_of_it)
         _add(shape, "string", name="filename", value=f"meshes/{part.name}.ply")
         if part.normals is None:
             _add(shape, "boolean", name="face_normals", value="true")
-        _add(shape, "ref", name="bsdf", id=f"{part.name}_sides")
+        _add(shape, "ref", name="bsdf", id=sides_of_it)
     ElementTree.indent(root, space="    ")
     file = folder / "scene.xml"
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
@@ -153,7 +175,9 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     of_nodes = suffix in (".glb", ".gltf")
     options: dict[str, Any] = {"process": False}
     if suffix == ".obj":
-        options |= {"split_objects": True, "split_groups": True, "maintain_order": True}
+        # Not maintain_order: with it, trimesh 5.2 gives vertices the normals and texture
+        # coordinates of others.
+        options |= {"split_objects": True, "split_groups": True}
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of textures that are not there
@@ -176,6 +200,8 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
 
 def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     linear = to_file[:3, :3]
+    if not np.isfinite(to_file).all() or np.linalg.cond(linear) > 1e12:
+        raise UserError(f"the transform of {printable(name)!r} flattens it", file)
     positions = np.array(mesh.vertices, np.float64) @ linear.T + to_file[:3, 3]
     faces = np.array(mesh.faces, np.int64)
     if np.linalg.det(linear) < 0:
@@ -203,11 +229,17 @@ def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     )
 
 
-def _unique(name: str, taken: set[str]) -> str:
-    """A name for files and for Mitsuba that is not taken."""
+def _ids(name: str) -> tuple[str, str, str]:
+    """What a part is called in the scene: its material, both sides of that, and its shape."""
+    return name, f"{name}_sides", f"{name}_shape"
+
+
+def _unique(name: str, parts: Sequence[Part]) -> str:
+    """A name for files and for Mitsuba that no part has, also where case is not told apart."""
+    taken = {_ENVIRONMENT, *(key.lower() for part in parts for key in _ids(part.name))}
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "part"
     found, number = plain, 1
-    while found in taken:
+    while not taken.isdisjoint(key.lower() for key in _ids(found)):
         number += 1
         found = f"{plain}_{number}"
     return found
