@@ -63,8 +63,8 @@ def write_nerfstudio(captured, folder):
     write_json(folder / "transforms.json", top | applied | lists | {"frames": frames})
 
 
-def write_blender(captured, folder):
-    """A file for each split, names without suffix, and alpha."""
+def write_blender(captured, folder, least_alpha=254):
+    """A file for each split, names without suffix, and alpha, which is the least in a corner."""
     angle = horizontal_angle(captured.views[0].camera)
     for split, short in (("train", "train"), ("heldout", "test"), ("heldout", "val")):
         frames = []
@@ -72,6 +72,7 @@ def write_blender(captured, folder):
             if view.split != split:
                 continue
             alpha = np.full((*codes(view).shape[:2], 1), 255, np.uint8)
+            alpha[0, 0] = least_alpha
             save(np.concatenate([codes(view), alpha], 2), folder / short / f"{view.name}.png")
             pose = view.camera.to_world.tolist()
             frames.append({"file_path": f"./{short}/{view.name}", "transform_matrix": pose})

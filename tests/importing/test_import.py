@@ -25,6 +25,7 @@ from layouts import (
     write_json,
     write_nerfstudio,
 )
+from PIL import Image
 from support import TINY_FIT
 
 from unbake.config import to_toml
@@ -33,6 +34,7 @@ from unbake.dataset.photographs import Photographs
 from unbake.dataset.views import Dataset, read_photograph
 from unbake.errors import UserError
 from unbake.imaging.coded import encode
+from unbake.imaging.pictures import write_exr
 from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.settings import ImportSettings
@@ -111,6 +113,66 @@ def test_blender_comes_back(captured, meshes, tmp_path):
     found = same_as_captured(captured, tmp_path / "data")
     assert found.background == "hidden"
     assert any("transforms_val.json is left out" in line for line in told)
+
+
+def test_an_alpha_of_1_everywhere_hides_no_background(captured, meshes, tmp_path):
+    source, boxes = tmp_path / "blender", [m for m in meshes if m.stem in ("short", "tall")]
+    write_blender(captured, source, least_alpha=255)
+    import_data(source, tmp_path / "data", meshes, tell=quiet)
+    assert Dataset.load(tmp_path / "data").background == "visible"
+    import_data(source, tmp_path / "cut", boxes, ImportSettings(background="hidden"), tell=quiet)
+    for view in Dataset.load(tmp_path / "cut").views:
+        assert 0 < (read_photograph(view)[..., 3] > 0).mean() < 1
+
+
+def test_a_transparent_colour_is_an_alpha(captured, nerfstudio, meshes, tmp_path):
+    for view in captured.views:
+        picture = codes(view)
+        picture[0, 0] = (1, 2, 3)
+        file = nerfstudio / "images" / f"{view.name}.png"
+        Image.fromarray(picture).save(file, transparency=(1, 2, 3))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    found = Dataset.load(tmp_path / "data")
+    assert found.background == "hidden"
+    assert all(read_photograph(view)[0, 0, 3] == 0 for view in found.views)
+
+
+def test_negative_pixels_are_told_and_taken_as_zero(captured, nerfstudio, meshes, tmp_path):
+    view = captured.views[1]
+    pixels = read_photograph(view)[..., :3]
+    pixels[2, 3] = -0.01
+    write_exr(nerfstudio / "images" / f"{view.name}.exr", pixels)
+    change(nerfstudio, set_frame("file_path", f"images/{view.name}.exr"))
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    assert f"negative pixels, taken as zero: images/{view.name}.exr" in told[-1]
+    found = read_photograph(Dataset.load(tmp_path / "data").views[1])
+    assert np.allclose(found[..., :3], np.maximum(pixels, 0), rtol=1e-3)
+
+
+def test_images_of_another_folder_are_found_by_the_end_of_their_names(
+    captured, nerfstudio, meshes, tmp_path
+):
+    (nerfstudio / "images").rename(tmp_path / "elsewhere")
+    import_data(nerfstudio, tmp_path / "data", meshes, images=tmp_path / "elsewhere", tell=quiet)
+    same_as_captured(captured, tmp_path / "data")
+
+
+def test_the_present_folder_may_be_filled(captured, nerfstudio, meshes, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    import_data(nerfstudio, ".", meshes, tell=quiet)
+    same_as_captured(captured, tmp_path / "here")
+    assert {path.name for path in Path().iterdir()} == {"images", "scene", "transforms.json"}
+
+
+def test_names_that_no_terminal_shows_become_ones_that_do(captured, nerfstudio, meshes, tmp_path):
+    name = captured.views[1].name
+    image = nerfstudio / "images" / f"{name}.png"
+    image.rename(image.with_name("a\x07b.png"))
+    change(nerfstudio, set_frame("file_path", "images/a\x07b.png"))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    assert {view.name for view in Dataset.load(tmp_path / "data").views} > {"a_b"}
 
 
 def test_names_in_two_folders_are_kept_apart(captured, meshes, tmp_path):
@@ -275,7 +337,8 @@ def test_exif_that_some_lack_is_told_and_not_used(
 def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
     table = tmp_path / "exposures.csv"
     names = [view.name for view in captured.views]
-    table.write_text("name,exposure\n" + "".join(f"{n},{i + 1}\n" for i, n in enumerate(names)))
+    lines = "name,exposure\n" + "".join(f"{n},{i + 1}\n" for i, n in enumerate(names))
+    table.write_text(lines, encoding="utf-8-sig")  # as Excel does
     import_data(nerfstudio, tmp_path / "data", meshes, exposures=table, tell=quiet)
     assert [frame["exposure"] for frame in frames_of(tmp_path / "data")] == [1, 2, 3]
     table.write_text(f"name,exposure\n{names[0]},-1\n{names[1]},2\n")
@@ -293,13 +356,13 @@ def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
     [
         {"camera_model": "OPENCV", "k1": -0.2, "k2": 0.05, "p1": 0.003, "p2": -0.002},
         {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.0, "k4": 0.0},
+        {"is_fisheye": True, "k1": 0.02, "k2": -0.01},
         {"camera_model": "PINHOLE", "fl_y": 90.0},
     ],
-    ids=["opencv", "fisheye", "oblong pixels"],
+    ids=["opencv", "fisheye", "instant-ngp", "oblong pixels"],
 )
 @pytest.mark.parametrize("suffix", [".png", ".exr"])
 def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
-    from unbake.imaging.pictures import write_exr
     from unbake.importing.frames import _lens
 
     top = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 81.0, "cx": 45.0, "cy": 33.0} | keys
@@ -454,6 +517,7 @@ def set_frame(key, value):
         (set_top("frames", 3), "'frames' is not a list of frames"),
         (set_top("camera_model", "EQUIRECTANGULAR"), "unknown camera_model 'EQUIRECTANGULAR'"),
         (set_top("k4", 0.1), "the lens has k4, k5 or k6"),
+        (set_frame("file_path", "/etc/a.png"), "lies outside the source.*--allow-outside"),
         (set_top("w", 32), "the camera is for 32 x 16, the image has 16 x 16 pixels"),
         (set_top("applied_transform", [1]), "'applied_transform' is not an array of 3 x 4"),
         (set_top("applied_transform", (2 * np.eye(4)).tolist()), "'applied_transform' is no rota"),

@@ -11,7 +11,7 @@ from unbake.dataset.views import Dataset, read_photograph
 from unbake.errors import UserError
 from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
-from unbake.importing.raw import CLIPPED, read_raw
+from unbake.importing.raw import CLIPPED, raw_balance, read_raw
 from unbake.importing.settings import ImportSettings
 
 pytest.importorskip("rawpy", reason="camera RAW needs rawpy")
@@ -23,13 +23,16 @@ NEUTRAL = (0.5, 1.0, 0.625)
 PRIVATE, EXIF_DIRECTORY, RATIONAL, SHORT, LONG = 65000, 34665, 5, 3, 4
 
 
-def write_dng(file, light, iso=None):
-    """Light (H, W, 3) in [0, 1] behind a Bayer mosaic, with 1/100 s and f/2 if an ISO is given."""
+def write_dng(file, light, iso=None, chosen=NEUTRAL):
+    """Light (H, W, 3) in [0, 1] behind a Bayer mosaic, with 1/100 s and f/2 if an ISO is given.
+
+    `chosen` is what the camera took for white light.
+    """
     sensor = np.minimum(light * NEUTRAL, 1)
     y, x = np.mgrid[: light.shape[0], : light.shape[1]]
     channel = y % 2 + x % 2
     counts = BLACK + (WHITE - BLACK) * np.take_along_axis(sensor, channel[..., None], 2)[..., 0]
-    parts = [value for share in NEUTRAL for value in (round(1000 * share), 1000)]
+    parts = [value for share in chosen for value in (round(1000 * share), 1000)]
     tags = [
         (50706, "B", 4, (1, 4, 0, 0), True),  # version
         (50708, "s", 0, "unbake", True),
@@ -80,12 +83,14 @@ def test_light_comes_back(tmp_path):
     light = grey(0.4, 0.2, 0.1).copy()
     light[:, 16:] = 0.8
     write_dng(tmp_path / "a.dng", light)
-    found = read_raw(tmp_path / "a.dng")
+    balance = raw_balance(tmp_path / "a.dng")
+    assert np.array(balance[:3]) * NEUTRAL == pytest.approx(balance[1], rel=1e-3)
+    found = read_raw(tmp_path / "a.dng", balance)
     assert found.dtype == np.float32 and found.shape == (SIZE, SIZE, 3)
     assert found[:, :12] == pytest.approx(light[:, :12], abs=1e-3)
     assert found[:, 20:] == pytest.approx(light[:, 20:], abs=1e-3)
     write_dng(tmp_path / "a.dng", 3 * light)
-    assert (read_raw(tmp_path / "a.dng")[:, 20:] >= CLIPPED).all()
+    assert (read_raw(tmp_path / "a.dng", balance)[:, 20:] >= CLIPPED).all()
 
 
 def test_camera_raw_takes_the_place_of_photographs(captured, project, meshes, tmp_path):
@@ -102,6 +107,16 @@ def test_camera_raw_takes_the_place_of_photographs(captured, project, meshes, tm
     exposures = [view.exposure for view in views]
     assert exposures == pytest.approx([0.5, 1, 2], rel=1e-3)
     assert any("(2.0 stops apart), by EXIF" in line for line in told)
+
+
+def test_photographs_have_one_white_balance(project, meshes, tmp_path):
+    write_dng(project / "jpg" / "1.DNG", grey(0.4, 0.2, 0.1), 100, (0.4, 1.0, 0.8))
+    told = []
+    import_data(project, tmp_path / "data", meshes, ImportSettings(holdout=0), tell=told.append)
+    for view in Dataset.load(tmp_path / "data").views:
+        pixels = read_photograph(view)[..., :3]
+        assert pixels == pytest.approx(grey(0.4, 0.2, 0.1), abs=1e-3)
+    assert any("white balance: cameras chose several" in line for line in told)
 
 
 def test_damaged_camera_raw_is_a_fault(project, meshes, tmp_path):

@@ -495,6 +495,8 @@ def _check_lens(keys: dict[str, Any], where: str) -> None:
     model = keys.get("camera_model", "PINHOLE")
     if model not in _PINHOLE_MODELS:
         raise UserError(f"unknown camera_model {model!r}", where, remedy)
+    if keys.get("is_fisheye") is True:
+        raise UserError("the lens is a fisheye ('is_fisheye')", where, remedy)
     distorted = [key for key in _DISTORTION if key in keys and number(keys, key, where) != 0]
     if distorted:
         raise UserError(f"lens distortion in {', '.join(distorted)}", where, remedy)

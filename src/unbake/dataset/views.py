@@ -285,11 +285,24 @@ def read_image(
         UserError: it is missing, unreadable, of another kind or size, or has pixels that are NaN,
             infinite, or (without `clip_negative`) negative.
     """
-    # The header first: a damaged one may ask for more memory than there is
-    _check_header(path, width, height, encoding)
-    require_memory(PIXEL_BYTES * width * height, "the image needs", "Use a smaller image", path)
     if encoding == "srgb":
+        _require_readable(path, width, height, encoding)
         return decode(read_codes(path, _REPLACE)).reshape(-1, 4)
+    pixels = read_radiance(path, width, height)
+    count = int((pixels < 0).any(axis=1).sum())
+    if count and not clip_negative:
+        what = f"{count} of {len(pixels)} pixels are negative"
+        raise UserError(what, path, "Pass --clip-negative to take them as zero")
+    return np.maximum(pixels, 0)
+
+
+def read_radiance(path: Path, width: int, height: int) -> np.ndarray:
+    """One image of radiance as it is, negative pixels too; (width * height, 4) as in `read_image`.
+
+    Raises:
+        UserError: as in `read_image`, but for negative pixels.
+    """
+    _require_readable(path, width, height, "linear")
     try:
         bitmap = mi.Bitmap(str(path))
         size = tuple(bitmap.size())
@@ -301,7 +314,13 @@ def read_image(
     except (RuntimeError, MemoryError, ValueError) as error:
         reason = " ".join(str(error).split())[:160]
         raise UserError(f"the image cannot be read ({reason})", path, _REPLACE) from None
-    return _valid_pixels(np.array(bitmap).reshape(-1, 4), path, clip_negative)
+    pixels = np.array(bitmap).reshape(-1, 4)
+    count = int((~np.isfinite(pixels)).any(axis=1).sum())
+    if count:
+        what = f"{count} of {len(pixels)} pixels are NaN or infinite"
+        remedy = "No measurement is like that: render or convert the image again"
+        raise UserError(what, path, remedy)
+    return pixels
 
 
 def read_photograph(view: View, clip_negative: bool = False) -> np.ndarray:
@@ -479,22 +498,10 @@ def _positive(
     return found
 
 
-def _valid_pixels(pixels: np.ndarray, path: Path, clip_negative: bool) -> np.ndarray:
-    count = int((~np.isfinite(pixels)).any(axis=1).sum())
-    if count:
-        raise UserError(
-            f"{count} of {len(pixels)} pixels are NaN or infinite",
-            path,
-            "No measurement is like that: render or convert the image again",
-        )
-    count = int((pixels < 0).any(axis=1).sum())
-    if count and not clip_negative:
-        raise UserError(
-            f"{count} of {len(pixels)} pixels are negative",
-            path,
-            "Pass --clip-negative to take them as zero",
-        )
-    return np.maximum(pixels, 0)
+def _require_readable(path: Path, width: int, height: int, encoding: str) -> None:
+    # The header first: a damaged one may ask for more memory than there is
+    _check_header(path, width, height, encoding)
+    require_memory(PIXEL_BYTES * width * height, "the image needs", "Use a smaller image", path)
 
 
 def _check_header(path: Path, width: int, height: int, encoding: str = "linear") -> None:

@@ -69,7 +69,12 @@ def read_table(file: Path, shots: Sequence[Shot], faults: Faults) -> tuple[dict[
     Raises:
         UserError: the file cannot be read.
     """
-    rows = list(csv.reader(StringIO(read_text(file))))
+    # Excel's "CSV UTF-8" begins with a byte order mark
+    lines = StringIO(read_text(file).removeprefix("\ufeff"))
+    try:
+        rows = list(csv.reader(lines))
+    except csv.Error as error:
+        raise UserError(f"the table cannot be read ({error})", file) from None
     header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
     if header != _COLUMNS:
         faults.add(f"the first line of the table is not {','.join(_COLUMNS)}", file)

@@ -35,19 +35,21 @@ class Faults:
     """Collects faults; equal ones of several files become one line."""
 
     def __init__(self) -> None:
-        self._places: dict[str, list[str]] = {}
+        self._places: dict[tuple[str, str | None], list[str]] = {}
 
     def __bool__(self) -> bool:
         return bool(self._places)
 
-    def add(self, what: str, place: object = None) -> None:
+    def add(self, what: str, place: object = None, remedy: str | None = None) -> None:
         """Add a fault.
 
         Args:
             what: is wrong, as a sentence without full stop.
             place: a file or an entry that it was found in.
+            remedy: what the user can do about it.
         """
-        self._places.setdefault(what, []).extend([] if place is None else [printable(place)])
+        places = self._places.setdefault((what, remedy), [])
+        places.extend([] if place is None else [printable(place)])
 
     @contextlib.contextmanager
     def collected(self, place: object = None) -> Iterator[None]:
@@ -59,7 +61,7 @@ class Faults:
         try:
             yield
         except UserError as error:
-            self.add(error.what, place if place is not None else error.where)
+            self.add(error.what, place if place is not None else error.where, error.remedy)
 
     def require_none(self, where: Path) -> None:
         """Raise `ImportFaults` where there are any.
@@ -71,9 +73,8 @@ class Faults:
             raise ImportFaults(where, tuple(map(_told, self._places.items())))
 
 
-def _told(fault: tuple[str, list[str]]) -> str:
-    what, places = fault
-    if not places:
-        return what
+def _told(fault: tuple[tuple[str, str | None], list[str]]) -> str:
+    (what, remedy), places = fault
     more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
-    return f"{what}: {', '.join(places[:_NAMED])}{more}"
+    told = f"{what}: {', '.join(places[:_NAMED])}{more}" if places else what
+    return told if remedy is None else f"{told}. {remedy}"

@@ -120,10 +120,9 @@ def _shot(
 ) -> Shot | None:
     """A frame; None where its image, pose or lens is faulty, each of which is told."""
     name = text(frame, "file_path", file.name)
-    root = file.parent if images is None else images
     image = mask = pose = lens = None
     with faults.collected(name):
-        image = with_suffix(_inside(root, name, allow_outside))
+        image = _image(file.parent, name, images, allow_outside)
         header = image_header(image)
         lens = _lens({**top, **frame}, header.width, header.height, name)
     with faults.collected(f"{file.name}: {name}"):
@@ -141,6 +140,23 @@ def _shot(
     return Shot(short.removeprefix("./"), split, image, lens, pose, mask)
 
 
+def _image(folder: Path, name: str, images: Path | None, allow_outside: bool) -> Path:
+    """The file of an image.
+
+    Args:
+        folder: of the JSON file.
+        name: of the image there.
+        images: has it instead, by this name, or by the end of it: `0001.png` of `images/0001.png`.
+        allow_outside: it may lie outside of its folder.
+    """
+    if images is None:
+        return with_suffix(_inside(folder, name, allow_outside))
+    parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
+    ends = [str(PurePosixPath(*parts[first:])) for first in range(len(parts))] or [name]
+    files = [with_suffix(_inside(images, end, allow_outside)) for end in ends]
+    return next((file for file in files if file.is_file()), files[0])
+
+
 def _inside(folder: Path, name: str, allow_outside: bool) -> Path:
     return inside(folder, name, name, "source", allow_outside=allow_outside)
 
@@ -156,10 +172,11 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
 
 def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
     """The lens of a frame; `width` and `height` are those of its image."""
-    model = keys.get("camera_model", "OPENCV")
+    # instant-ngp has no model, but a flag.
+    model = _FISHEYE if keys.get("is_fisheye") is True else keys.get("camera_model", "OPENCV")
     if model not in (*_PINHOLES, *_LENSES, _FISHEYE):
         raise UserError(f"unknown camera_model {model!r}", where)
-    plain = {k: v for k, v in keys.items() if k not in (*_DISTORTION, "camera_model")}
+    plain = {k: v for k, v in keys.items() if k not in (*_DISTORTION, "camera_model", "is_fisheye")}
     plain["transform_matrix"] = np.eye(4).tolist()
     if "w" not in plain or "h" not in plain:
         plain |= {"w": width, "h": height}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,7 +16,7 @@ from ..acquisition.new_light import put_light
 from ..config.light import LightConfig
 from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
-from ..dataset.views import PIXEL_BYTES, counted_by, read_image
+from ..dataset.views import PIXEL_BYTES, counted_by, read_radiance
 from ..errors import UserError
 from ..imaging.coded import decode, encode, read_codes
 from ..imaging.pictures import write_exr
@@ -29,7 +31,7 @@ from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import Lens
 from .meshes import Part, read_parts, write_scene
 from .raw import CLIPPED as CLIPPED_RAW
-from .raw import read_raw
+from .raw import raw_balance, read_raw
 from .rooms import is_room, read_room
 from .settings import ImportSettings
 from .source import Shot, Source, image_header
@@ -89,6 +91,7 @@ def import_data(
     given = [Path(mesh) for mesh in meshes] or ([] if found.mesh is None else [found.mesh])
     if not given:
         faults.add("no mesh was given (--mesh FILE)")
+    found = _balanced(found)
     parts = read_parts(given, faults)
     known, told = exposures_of(found.shots)
     if exposures is not None:
@@ -96,7 +99,7 @@ def import_data(
             known, told = read_table(Path(exposures), found.shots, faults)
     _check_light(light, allow_outside, faults)
     names = _names(found.shots, faults)
-    _check_pictures(found.shots, faults)
+    pictures = _check_pictures(found.shots, faults)
     faults.require_none(source)
     splits = _splits(found.shots, settings.holdout)
     with filled_folder(out) as folder:
@@ -106,14 +109,16 @@ def import_data(
         dark = light is None and _enclosed(scene, found.shots)
         background = settings.background
         if background == "auto":
-            background = "hidden" if all(map(_has_alpha, found.shots)) else "visible"
+            # Screenshots and pictures of some converters have an alpha of 1 everywhere.
+            cut_out = pictures.transparent and pictures.with_alpha == set(names)
+            background = "hidden" if cut_out else "visible"
         frames = []
         for shot in found.shots:
-            cut = background == "hidden" and not _has_alpha(shot)
+            cut = background == "hidden" and shot.name not in pictures.transparent
             on_mesh = _on_mesh(scene, shot.lens.camera(shot.to_world)) if cut else None
-            frames.append(
-                _write_view(data, shot, names[shot.name], splits[shot.name], known, on_mesh)
-            )
+            same = shot.lens.straight and not shot.raw and shot.name not in pictures.negative
+            name, split = names[shot.name], splits[shot.name]
+            frames.append(_write_view(data, shot, name, split, known, on_mesh, same=same))
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
             | ({"light": "unknown"} if light is None else {})
@@ -121,6 +126,9 @@ def import_data(
         )
     for line in _summary(found, splits, seen, parts, told):
         tell(line)
+    if pictures.negative:
+        few = ", ".join(sorted(pictures.negative)[:3])
+        tell(f"{len(pictures.negative)} photographs have negative pixels, taken as zero: {few}")
     if dark:
         tell(
             "warning: all cameras stand inside the mesh, which keeps an environment out, and lamps "
@@ -157,6 +165,21 @@ def _read_source(
     raise UserError("no cameras were found in the source", source, _KNOWN)
 
 
+def _balanced(source: Source) -> Source:
+    """All camera RAW in the white balance of the first one: cameras choose one for each."""
+    balances = {}
+    for shot in source.shots:
+        if shot.raw:
+            with contextlib.suppress(UserError):  # that it cannot be read is told elsewhere
+                balances[shot.name] = raw_balance(shot.image)
+    if not balances:
+        return source
+    first, differ = next(iter(balances.values())), len(set(balances.values())) > 1
+    shots = [replace(shot, balance=first) if shot.raw else shot for shot in source.shots]
+    note = "white balance: cameras chose several, all photographs have that of the first"
+    return replace(source, shots=tuple(shots), notes=(*source.notes, *([note] if differ else ())))
+
+
 def _check_light(light: LightConfig | None, allow_outside: bool, faults: Faults) -> None:
     """Read the files of a light, and add what is wrong with them to the faults."""
     if light is None:
@@ -175,6 +198,8 @@ def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
     names = dict(zip((shot.name for shot in shots), stems, strict=True))
     if len(set(stems)) < len(stems):
         names = {name: "_".join(_plain(PurePosixPath(name).with_suffix(""))) for name in names}
+    # Results are named after views
+    names = {key: _printable(name) for key, name in names.items()}
     taken: dict[str, str] = {}
     for shot in shots:
         other = taken.setdefault(names[shot.name], shot.name)
@@ -185,19 +210,50 @@ def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
     return names
 
 
+def _printable(name: str) -> str:
+    return "".join(letter if letter.isprintable() else "_" for letter in name)
+
+
 def _plain(path: PurePosixPath) -> list[str]:
     return [part for part in path.parts if part not in ("/", ".", "..")]
 
 
-def _check_pictures(shots: Sequence[Shot], faults: Faults) -> None:
+@dataclass(frozen=True)
+class _Pictures:
+    """What the pixels of photographs say: names of those with an alpha channel, and so on.
+
+    Args:
+        with_alpha: have an alpha channel.
+        transparent: have pixels whose alpha is less than 1.
+        negative: have negative radiance.
+    """
+
+    with_alpha: set[str] = field(default_factory=set)
+    transparent: set[str] = field(default_factory=set)
+    negative: set[str] = field(default_factory=set)
+
+    def add(self, shot: Shot, pixels: np.ndarray) -> None:
+        """Take a photograph into account: (H, W, 4)."""
+        if (pixels[..., 3] < 1).any():
+            self.transparent.add(shot.name)
+        if (pixels < 0).any():
+            self.negative.add(shot.name)
+        if shot.name in self.transparent or image_header(shot.image).channels in (2, 4):
+            self.with_alpha.add(shot.name)
+
+
+def _check_pictures(shots: Sequence[Shot], faults: Faults) -> _Pictures:
     """Decode all photographs and masks once, and add those that cannot be read to the faults."""
+    found = _Pictures()
     for shot in shots:
         size = shot.lens.width, shot.lens.height
         if max(size) > LONGEST_SIDE:
             faults.add(f"the image has over {LONGEST_SIDE} pixels along an edge", shot.name)
             continue
         with faults.collected(shot.name):
-            _pixels(shot)
+            found.add(shot, _pixels(shot))
+        with faults.collected(shot.name):
+            shot.lens.camera(shot.to_world)
         if shot.mask is None:
             continue
         with faults.collected(shot.mask):
@@ -205,20 +261,19 @@ def _check_pictures(shots: Sequence[Shot], faults: Faults) -> None:
             if (header.width, header.height) != size:
                 raise UserError("the mask has another size than its image")
             _mask(shot)
-        with faults.collected(shot.name):
-            shot.lens.camera(shot.to_world)
+    return found
 
 
 def _pixels(shot: Shot) -> np.ndarray:
-    """The photograph, (H, W, 4) float32: linear, alpha premultiplied."""
+    """The photograph, (H, W, 4) float32: linear, alpha premultiplied; maybe negative."""
     need = PIXEL_BYTES * shot.lens.width * shot.lens.height
     require_memory(need, "the image needs", "Use a smaller image", shot.name)
     if shot.coded:
         return decode(read_codes(shot.image))
     if shot.raw:
-        linear = read_raw(shot.image)
+        linear = read_raw(shot.image, shot.balance)
         return np.concatenate([linear, np.ones_like(linear[..., :1])], 2)
-    pixels = read_image(shot.image, shot.lens.width, shot.lens.height)
+    pixels = read_radiance(shot.image, shot.lens.width, shot.lens.height)
     return pixels.reshape(shot.lens.height, shot.lens.width, 4)
 
 
@@ -298,19 +353,28 @@ def _write_view(
     split: str,
     exposures: Mapping[str, float],
     on_mesh: np.ndarray | None,
+    *,
+    same: bool,
 ) -> dict[str, Any]:
     """Write the photograph and the mask of a view; returns its frame.
 
     Args:
+        data: to write to.
+        shot: the view.
+        name: its name in the data set.
+        split: its split.
+        exposures: by names of photographs.
         on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
+        same: copy the file as it is.
     """
     camera, limit, exact = shot.lens.camera(shot.to_world), _clipped(shot), None
-    if shot.lens.straight and not shot.raw:
+    if same:
         image = data.image(name, shot.image.suffix.lower())
         image.parent.mkdir(exist_ok=True)
         shutil.copyfile(shot.image, image)
     else:
-        image, pixels = data.image(name, ".png" if shot.coded else ".exr"), _pixels(shot)
+        image = data.image(name, ".png" if shot.coded else ".exr")
+        pixels = np.maximum(_pixels(shot), 0)
         if not shot.lens.straight:
             pixels, exact = _straightened(shot.lens, pixels, camera.fl_x, limit)
         _write_picture(image, pixels)
@@ -372,10 +436,6 @@ def _write_picture(file: Path, pixels: np.ndarray) -> None:
 def _write_codes(file: Path, codes: np.ndarray) -> None:
     bitmap = mi.Bitmap(np.ascontiguousarray(codes))
     write_atomically(file, lambda p: bitmap.write(str(p), mi.Bitmap.FileFormat.PNG))
-
-
-def _has_alpha(shot: Shot) -> bool:
-    return image_header(shot.image).channels in (2, 4)
 
 
 def _clipped(shot: Shot) -> float | None:

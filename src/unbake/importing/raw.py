@@ -1,7 +1,8 @@
-"""Camera RAW, as LibRaw reads it: what the sensor counted, in the white balance of the camera."""
+"""Camera RAW, as LibRaw reads it: what the sensor counted, in one white balance."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 from ..errors import UserError
 from ..imaging.headers import ImageHeader
 
+#: Factors of red, green, blue and the other green.
+Balance = tuple[float, float, float, float]
 #: Of the files of cameras that photographers meet most.
 SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef")
 #: From this share of the largest value on a channel is taken for clipped.
@@ -29,11 +32,15 @@ def raw_header(path: Path) -> ImageHeader:
         return ImageHeader(raw.sizes.width, raw.sizes.height, 3, 16)
 
 
-def read_raw(path: Path) -> np.ndarray:
+def read_raw(path: Path, balance: Balance | None = None) -> np.ndarray:
     """Linear RGB of the sRGB primaries, (H, W, 3) float32, clipped at 1, not turned by its EXIF.
 
-    The black level is taken away and the white balance of the camera applied. There is no curve,
-    and no brightening: the values of photographs of one camera are in one unit.
+    The black level is taken away and a white balance applied. There is no curve, and no
+    brightening: the values of photographs of one camera and balance are in one unit.
+
+    Args:
+        path: the file.
+        balance: as from `raw_balance`; None: that of daylight, as LibRaw knows it of the camera.
 
     Raises:
         UserError: rawpy is missing, or LibRaw cannot read the file.
@@ -43,11 +50,19 @@ def read_raw(path: Path) -> np.ndarray:
             gamma=(1, 1),
             no_auto_bright=True,
             adjust_maximum_thr=0.0,
-            use_camera_wb=True,
+            user_wb=None if balance is None else list(balance),
             output_bps=16,
             user_flip=0,
         )
     return (pixels / 65535).astype(np.float32)
+
+
+def raw_balance(path: Path) -> Balance | None:
+    """The white balance that the camera chose; None where it is not told; errors as there."""
+    with _opened(path) as raw:
+        red, green, blue, green_2 = map(float, raw.camera_whitebalance)
+    known = all(0 < value < math.inf for value in (red, green, blue))
+    return (red, green, blue, green_2 or green) if known else None
 
 
 def raw_exposure(path: Path) -> tuple[float, float, float]:

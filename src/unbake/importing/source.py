@@ -14,7 +14,7 @@ from ..imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, ImageHeader
 from ..io import require_file
 from .lens import Lens
 from .raw import SUFFIXES as RAW_SUFFIXES
-from .raw import is_raw, raw_header
+from .raw import Balance, is_raw, raw_header
 
 #: Suffixes that are tried where the name of an image has none.
 _TRIED = tuple(s for suffix in (*CODED_SUFFIXES, ".exr") for s in (suffix, suffix.upper()))
@@ -33,6 +33,7 @@ class Shot:
         to_world: camera to world, (4, 4) float64, OpenGL axes, in the frame of the mesh.
         mask: a file, zero where pixels do not count; None: all count.
         exposure: the photograph is radiance times this number; None: the source does not say.
+        balance: white balance of camera RAW; None: that of daylight.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Shot:
     to_world: np.ndarray
     mask: Path | None = None
     exposure: float | None = None
+    balance: Balance | None = None
 
     @property
     def coded(self) -> bool:
