@@ -80,6 +80,7 @@ BALANCE = Fault({"white_balance": 1.0}, ("--white-balance", "per-image"))
 VIGNETTING = Fault({"vignetting": 0.4}, ("--vignetting", "radial"))
 SENSOR = Fault({"electrons": 10000.0, "read_noise": 5.0})
 CODES, COMPRESSED = Fault({"format": "png"}), Fault({"format": "jpeg"})
+FULL_CHROMA = Fault({"format": "jpeg", "chroma": "full"})
 MESH = Fault({"decimate": 0.1})
 NOISE = Fault({"electrons": 200.0, "read_noise": 4.0})
 CONTRAST = Fault({"response": "contrast"}, ("--response", "monotone"))
@@ -109,6 +110,7 @@ FAULTS = {
     "jpeg, its noise alone": SENSOR,
     "jpeg, 8 bits alone": CODES,
     "jpeg, without noise": COMPRESSED,
+    "jpeg, without noise, colour at full resolution": FULL_CHROMA,
     "noise": NOISE,
     "noise, told": together(NOISE, Fault({"tell_noise": True})),
     "mesh": MESH,

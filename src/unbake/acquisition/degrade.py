@@ -21,6 +21,7 @@ from typing import Any, final
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from PIL import Image
 
 from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
@@ -47,6 +48,8 @@ _MESHES = ("ply", "obj", "serialized")
 _WAVES, _LENGTHS = 24, (0.05, 0.5)
 #: The code value from which on pixels of a JPEG file count as clipped.
 _JPEG_WHITE = 250
+#: Pillow's names of resolutions of colour.
+_SUBSAMPLING = {"half": "4:2:0", "full": "4:4:4"}
 #: How much an S-shaped response differs from the sRGB curve.
 _CONTRAST = 0.5
 #: How much steeper than the sRGB curve a lifted response is at black.
@@ -244,8 +247,11 @@ def _write_photograph(
         alpha = to_bytes(pixels[..., 3:])
         write_png(file, np.dstack([codes, alpha]) if background == "hidden" else codes)
         return
-    bitmap, jpeg = mi.Bitmap(np.ascontiguousarray(codes)), mi.Bitmap.FileFormat.JPEG
-    write_atomically(file, lambda p: bitmap.write(str(p), jpeg, settings.quality))
+    image, subsampling = Image.fromarray(codes), _SUBSAMPLING[settings.chroma]
+    quality = settings.quality
+    write_atomically(
+        file, lambda p: image.save(p, "JPEG", quality=quality, subsampling=subsampling)
+    )
 
 
 # --------------------------------------------------------------------------------- poses and meshes

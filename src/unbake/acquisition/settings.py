@@ -60,6 +60,8 @@ class CaptureSettings:
 Response = Literal["srgb", "gamma", "contrast", "lifted"]
 #: Formats of degraded photographs.
 Format = Literal["exr", "png", "jpeg"]
+#: How finely JPEG files hold colour.
+Chroma = Literal["half", "full"]
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,13 @@ class DegradeSettings:
         ),
     ] = "exr"
     quality: Annotated[int, Flag("Quality of JPEG files, from 1 to 100")] = 92
+    chroma: Annotated[
+        Chroma,
+        Flag(
+            "Resolution of colour in JPEG files: half of that of brightness along both edges, as "
+            "most cameras write it (4:2:0), or full (4:4:4)"
+        ),
+    ] = "half"
     tell_exposures: Annotated[
         bool, Flag("Write the true exposures to the frames, as EXIF would tell them")
     ] = False
