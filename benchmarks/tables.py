@@ -350,6 +350,7 @@ def photographs(result: dict) -> str:
 
 TABLES = (
     ("Faults of cameras", ("cameras-demo",), cameras),
+    ("Faults of cameras, KITCHEN", ("cameras-kitchen",), cameras),
     ("Real photographs", ("sceaux",), photographs),
     ("Time of a step", ("methods-demo", "methods-staircase"), steps),
     ("Demo", ("demo",), demo),

@@ -230,6 +230,21 @@ def test_photographs_of_8_bits_are_read_as_they_were(kind, error, degraded):
         assert np.abs(codes[0] - codes[1]).mean() < error
 
 
+def test_colour_of_a_jpeg_has_half_the_resolution_or_all_of_it(degraded):
+    plain, _ = degraded(format="png")
+
+    def lost(chroma):
+        """Of differences between channels, root mean square in code values."""
+        found, coded = [], degraded(format="jpeg", chroma=chroma)[0]
+        for one, other in zip(coded.views, plain.views, strict=True):
+            read = [read_masked(view)[0][..., :3].astype(np.float64) for view in (one, other)]
+            codes = [255 * to_srgb(pixels) for pixels in read]
+            found.append(np.diff(codes[0] - codes[1], axis=2))
+        return np.sqrt(np.mean(np.square(found)))
+
+    assert lost("full") < 0.5 * lost("half")
+
+
 def test_a_jpeg_has_a_mask_where_the_background_is_hidden(cornell, tmp_path):
     data = shutil.copytree(cornell, tmp_path / "data")
     content = json.loads((data / "transforms.json").read_text())

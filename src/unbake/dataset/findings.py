@@ -89,7 +89,7 @@ def unequal_exposures(found: Exposures, names: Sequence[str]) -> Finding | None:
         f"another ({printable(names[darkest])} the darkest, {printable(names[brightest])} the "
         "brightest)"
     )
-    remedy = "Give each frame its 'exposure', or fit them: --exposures per-image"
+    remedy = "Give each frame its true 'exposure', or fit them: --exposures per-image"
     return Finding("warning", "exposure", what, None, remedy)
 
 
