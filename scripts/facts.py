@@ -173,7 +173,7 @@ class Facts:
         were made: the processor, and what has changed since.
         """
         rows = []
-        for name in ("demo-in-time", "rooms", "objects"):
+        for name in ("demo-in-time", "rooms", "objects", "lego-plant"):
             found = self.result(name) if self.has(name) else {"rows": []}
             by_scene: dict[str, Row] = {}
             on = f"on an {found['machine']['processor']}" if found["rows"] else ""

@@ -235,7 +235,7 @@ def test_colour_of_a_jpeg_has_half_the_resolution_or_all_of_it(degraded):
 
     def lost(chroma):
         """Of differences between channels, root mean square in code values."""
-        found, coded = [], degraded(format="jpeg", chroma=chroma)[0]
+        found, coded = [], degraded(format="jpeg", chroma=chroma, quality=100)[0]
         for one, other in zip(coded.views, plain.views, strict=True):
             read = [read_masked(view)[0][..., :3].astype(np.float64) for view in (one, other)]
             codes = [255 * to_srgb(pixels) for pixels in read]
