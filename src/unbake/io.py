@@ -116,13 +116,13 @@ def filled_folder(out: Path) -> Iterator[Path]:
         UserError: the folder cannot be made or written.
     """
     # Within a folder that there is: it may be the present one, or another file system.
-    beside = out / "x" if out.is_dir() else out
-    partial = beside.with_name(f".{beside.name[:100]}.{secrets.token_hex(8)}.partial")
+    folder, name = (out, "folder") if out.is_dir() else (out.parent, out.name)
+    partial = folder / f".{name[:100]}.{secrets.token_hex(8)}.partial"
     with cleaned_up(lambda: shutil.rmtree(partial, ignore_errors=True)):
         try:
             partial.mkdir(parents=True)
             yield partial
-            if partial.parent == out:
+            if folder == out:
                 if any(path != partial for path in out.iterdir()):
                     what = "another program has written to the folder meanwhile"
                     raise UserError(what, out, "Give another --out")
@@ -292,18 +292,12 @@ def read_text(path: Path, remedy: str | None = None) -> str:
     Raises:
         UserError: the file is missing, unreadable, or not UTF-8.
     """
-    require_file(path, remedy=remedy or "Check the path")
-    try:
+    with _read_as_text(path, remedy):
         size = Path(path).stat().st_size
         if size > LONGEST_TEXT:
             said = f"the file has {size / 1e6:.0f} MB, more than the {LONGEST_TEXT / 1e6:.0f} MB"
             raise UserError(f"{said} that are read", path, remedy or "Repair it")
         return Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        said = f"the file cannot be read ({error.strerror})"
-        raise UserError(said, path, remedy or "Check the path") from None
-    except UnicodeDecodeError:
-        raise UserError("the file is not UTF-8 text", path, remedy or "Repair it") from None
 
 
 def read_lines(path: Path, remedy: str | None = None) -> Iterator[str]:
@@ -315,14 +309,20 @@ def read_lines(path: Path, remedy: str | None = None) -> Iterator[str]:
     Raises:
         UserError: the file is missing, unreadable, or not UTF-8, or a line is too long.
     """
+    with _read_as_text(path, remedy), open(path, encoding="utf-8") as file:
+        while line := file.readline(_LONGEST_LINE + 1):
+            if len(line) > _LONGEST_LINE:
+                said = f"a line has more than the {_LONGEST_LINE} characters that are read"
+                raise UserError(said, path, remedy or "Repair it")
+            yield line
+
+
+@contextlib.contextmanager
+def _read_as_text(path: Path, remedy: str | None) -> Iterator[None]:
+    """Tell what keeps a file from being read as UTF-8 text; arguments as in `read_text`."""
     require_file(path, remedy=remedy or "Check the path")
     try:
-        with open(path, encoding="utf-8") as file:
-            while line := file.readline(_LONGEST_LINE + 1):
-                if len(line) > _LONGEST_LINE:
-                    said = f"a line has more than the {_LONGEST_LINE} characters that are read"
-                    raise UserError(said, path, remedy or "Repair it")
-                yield line
+        yield
     except OSError as error:
         said = f"the file cannot be read ({error.strerror})"
         raise UserError(said, path, remedy or "Check the path") from None

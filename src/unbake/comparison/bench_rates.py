@@ -296,7 +296,7 @@ class _Search:
         # What photographs tell least of comes first.
         materials = [name for name in config.unknowns if name in QUANTITIES]
         lights = [name for name in config.unknowns if name not in QUANTITIES]
-        if config.seconds and (record["best"] is None or self._lacks_seeds()):
+        if config.seconds and (record["best"] is None or any(map(self._missing, record["trials"]))):
             variants = [replace(config, estimator=name) for name in _estimators(config)]
             compile_kernels(self._dataset.folder, variants)
         searched = [*reversed(materials), *lights, *self._schedule]
@@ -310,10 +310,10 @@ class _Search:
         record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
         self._write()
 
-    def _lacks_seeds(self) -> bool:
-        """Whether a trial has not been made for all seeds."""
-        wanted = set(self._record["seeds"])
-        return any(wanted - {fit["seed"] for fit in t["per_seed"]} for t in self._record["trials"])
+    def _missing(self, row: Row) -> list[int]:
+        """The seeds of which a line of the record has no fit."""
+        made = {fit["seed"] for fit in row["per_seed"]}
+        return [seed for seed in self._record["seeds"] if seed not in made]
 
     def _score(self, trial: Trial) -> float:
         found = self._row(trial)
@@ -335,8 +335,7 @@ class _Search:
         self, row: Row, learn: Callable[[FreshFit], Row], what: str, trial: Trial | None = None
     ) -> None:
         """Make the fits of a line for the seeds that it lacks, and average them."""
-        seeds = self._record["seeds"]
-        missing = [seed for seed in seeds if seed not in {f["seed"] for f in row["per_seed"]}]
+        missing = self._missing(row)
         for seed in missing:
             if "error" in row:
                 break
