@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import TypeAlias, final
 
 import drjit as dr
 import mitsuba as mi
@@ -224,6 +224,10 @@ class RayBatch:
     slopes: tuple[mi.Color3f, mi.Color3f] | None = None  # of `target`, a pixel across and down
 
 
+#: Places of pixels along an axis of their images, how many there are, and the step of numbers.
+_Axis: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | int]
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class PixelSource:
@@ -418,23 +422,44 @@ class PixelSource:
     def _slopes(self, numbers: np.ndarray) -> np.ndarray:
         """How photographs change across and down, linear RGB a pixel, shape (n, 6).
 
-        They are half the differences of both neighbours, which have no noise of the pixel itself;
-        0 beside pixels that do not count and at the edges of the image.
+        They are half the differences of both neighbours, which have no noise of the pixel itself,
+        averaged with those of the pixels on both sides (Sobel's weights) where these are known; 0
+        beside pixels that do not count and at the edges of the image.
         """
         view = self.views_of(numbers)
         first, width, height = np.array(self._layout)[view].T
         row, column = np.divmod(np.asarray(numbers, np.int64) - first, width)
+        axes = (column, width, 1), (row, height, width)
         found = np.empty((len(numbers), 6), np.float32)
-        for axis, (place, size, step) in enumerate([(column, width, 1), (row, height, width)]):
-            inside = (0 < place) & (place < size - 1)
-            before, after = (numbers + np.where(inside, s * step, 0) for s in (-1, 1))
-            if self._counted is not None:
-                first_pixel = self.photographs.pixels.start
-                inside &= self._counted[before - first_pixel] & self._counted[after - first_pixel]
-            pair = (self.photographs.own_rows(side)[:, :3] for side in (after, before))
-            slope = 0.5 * np.subtract(*pair)
-            found[:, 3 * axis : 3 * axis + 3] = np.where(inside[:, None], slope, 0)
+        for axis, (along, beside) in enumerate([axes, axes[::-1]]):
+            slopes, known = zip(
+                *(self._differences(numbers, along, beside, aside) for aside in (0, -1, 1)),
+                strict=True,
+            )
+            sides = (known[1] & known[2])[:, None]
+            mean = np.where(sides, (2 * slopes[0] + slopes[1] + slopes[2]) / 4, slopes[0])
+            found[:, 3 * axis : 3 * axis + 3] = np.where(known[0][:, None], mean, 0)
         return found
+
+    def _differences(
+        self, numbers: np.ndarray, along: _Axis, beside: _Axis, aside: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Half the differences of neighbours, linear RGB, and whether these are there and count.
+
+        Args:
+            numbers: of pixels.
+            along, beside: the axis of the neighbours, and the other one.
+            aside: of the neighbours, in pixels.
+        """
+        (place, size, step), (other, sizes, stride) = along, beside
+        inside = (0 < place) & (place < size - 1)
+        inside &= (0 <= other + aside) & (other + aside < sizes)
+        before, after = (numbers + np.where(inside, aside * stride + s * step, 0) for s in (-1, 1))
+        if self._counted is not None:
+            start = self.photographs.pixels.start
+            inside &= self._counted[before - start] & self._counted[after - start]
+        pair = (self.photographs.own_rows(side)[:, :3] for side in (after, before))
+        return 0.5 * np.subtract(*pair), inside
 
     @cached_property
     def _counted(self) -> np.ndarray | None:
