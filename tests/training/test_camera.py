@@ -39,7 +39,7 @@ from unbake.training.first_gains import (
     first_gains,
     shared_points,
 )
-from unbake.training.first_response import first_response
+from unbake.training.first_response import SeenPoints, first_response, log_falloff
 from unbake.training.fresh_fit import begin_fit
 from unbake.training.held_aside import HeldAside, HeldOutPhotographs
 from unbake.training.loop import fit
@@ -505,25 +505,112 @@ def test_exposures_begin_at_what_photographs_say_of_the_same_points(unknown, exp
         np.testing.assert_allclose(np.log2(gains[1]), np.log2(truth[1] / truth[0]), atol=0.15)
 
 
-def test_a_response_begins_at_what_exposures_that_differ_say():
-    rng, values = np.random.default_rng(0), np.linspace(0, 1, 2000)
-    light = np.exp(rng.normal(-2, 1, (8000, 1)))
-    stops = rng.uniform(-1.5, 1.5, (2, 8000, 1))
-    told = light * 2.0**stops * np.exp(rng.normal(0, 0.05, (2, 8000, 3)))
-    photographs = response(np.minimum(told, 1), "contrast")
-    photographs[:, :400] = rng.uniform(0.01, 0.9, (2, 400, 3))  # of other points
-    logs = np.log(np.where((told < 1) & (photographs > 1e-4), photographs, np.nan))
-    ratio = np.log(2) * (stops[1] - stops[0]) * np.ones(3)
-    curves = first_response(logs, ratio)
-    places = np.linspace(0, 1, curves.shape[1])
+VALUES = np.linspace(0, 1, 2000)
+#: Log noise of photographs, and the gains of their views: stops, and the share lost in corners.
+NOISE, VIEWS, CORNER = 0.25, 24, 0.4
+
+
+def photographed_points(rng, points, stops, corner=0.0, shine=0.0):
+    """Points that up to eight views see, whose response is an S-shaped curve, as `SeenPoints`.
+
+    Every point is as noisy as path traced rooms are. What is clipped or dark is a bound.
+    """
+    view = np.array([rng.permutation(len(stops))[:8] for _ in range(points)]).ravel()
+    point = np.repeat(np.arange(points), 8)
+    light = np.exp(rng.normal(-2.5, 1, points))[point]
+    radius2 = rng.uniform(0, 1, len(point))
+    light *= 2.0 ** stops[view] * (1 - corner * radius2) * np.exp(rng.normal(0, NOISE, len(point)))
+    light *= np.where(rng.uniform(size=len(point)) < shine, rng.uniform(2, 6, len(point)), 1)
+    dark = 0.01 * light.mean()
+    bound = (light >= 1).astype(int) - (light <= dark)
+    logs = np.log(response(np.clip(light, dark, 1), "contrast"))
+    return SeenPoints(point, view, radius2, logs, np.log(2) * stops[view], bound)
+
+
+def error_of_light(curve, values=VALUES):
+    """Of light that a curve reads, as a share of white, at even places of code values."""
+    places = np.linspace(0, 1, len(curve))
     truth = np.interp(places**2.2, response(values, "contrast"), values)
-    assert np.sqrt(((curves**2.2 - truth) ** 2).mean(1)).max() < 0.02
-    assert np.sqrt(((places**2.2 - truth) ** 2).mean()) > 0.03
-    # With one exposure nothing is told, and a model takes the curves as they are.
-    np.testing.assert_array_equal(first_response(logs, 0 * ratio), np.tile(places, (3, 1)))
+    return np.sqrt(((curve**2.2 - truth) ** 2).mean())
+
+
+def ratio_of_light(curve):
+    """What a curve reads over what it is, at code values that most of the photographs have."""
+    places = np.linspace(0, 1, len(curve))
+    truth = np.interp(places**2.2, response(VALUES, "contrast"), VALUES)
+    return (curve[2:14] ** 2.2) / truth[2:14]
+
+
+def test_a_response_begins_at_what_exposures_that_differ_say():
+    """Noise of photographs makes no curve flatter, nor do shine and what is clipped or dark."""
+    rng = np.random.default_rng(0)
+    seen = photographed_points(rng, 6000, rng.uniform(-1.5, 1.5, VIEWS), shine=0.05)
+    told = first_response(seen)
+    assert told.gains is None and told.falloff is None
+    np.testing.assert_allclose(ratio_of_light(told.curve), 1, atol=0.06)
+    assert ratio_of_light(np.linspace(0, 1, len(told.curve))).min() < 0.6
     model = CameraModel(3, response=True)
-    model.start_response(curves)
-    np.testing.assert_allclose(model.curves(), curves, atol=1e-5)
+    model.start_response(np.stack([told.curve] * 3))
+    np.testing.assert_allclose(model.curves(), [told.curve] * 3, atol=1e-5)
+
+
+def test_a_response_stays_where_exposures_hardly_differ_or_nothing_is_shared():
+    rng = np.random.default_rng(1)
+    seen = photographed_points(rng, 500, rng.uniform(-0.05, 0.05, VIEWS))
+    places = np.linspace(0, 1, 17)
+    for some in (seen, seen.some(np.zeros(len(seen.point), bool))):
+        told = first_response(some, VIEWS, vignetting=True)
+        np.testing.assert_array_equal(told.curve, places)
+        assert not told.gains.any() and not told.falloff.any()
+
+
+def test_unknown_gains_and_vignetting_are_told_beside_the_response():
+    rng = np.random.default_rng(2)
+    stops = rng.uniform(-1.5, 1.5, VIEWS)
+    seen = photographed_points(rng, 6000, stops, corner=CORNER)
+    guess = rng.normal(0, 0.2, VIEWS) + np.log(2) * stops
+    told = first_response(replace(seen, gains=guess[seen.view]), VIEWS, vignetting=True)
+    found = guess + told.gains
+    wrong = (found - found[0]) / np.log(2) - (stops - stops[0])
+    assert told.gains[0] == 0 and np.sqrt(np.mean(wrong**2)) < 0.1
+    np.testing.assert_allclose(ratio_of_light(told.curve), 1, atol=0.2)
+    radius2 = np.linspace(0, 1, 9)
+    falloff = np.exp(log_falloff(told.falloff, radius2))
+    np.testing.assert_allclose(falloff, 1 - CORNER * radius2, atol=0.03)
+    model = CameraModel(3, vignetting=True)
+    model.start_vignetting(lambda r: 1 - CORNER * r)
+    np.testing.assert_allclose(model.falloff(radius2), 1 - CORNER * radius2, atol=1e-5)
+
+
+def test_a_response_learns_at_the_smoothed_photograph():
+    """Noise of a pixel is in its photograph: learning there would make curves flat."""
+    rng = np.random.default_rng(3)
+    light = np.exp(rng.normal(-2, 1, 20000)).clip(0, 0.9).astype(np.float32)
+    photograph = light * np.exp(rng.normal(0, 0.4, len(light))).astype(np.float32)
+    model = CameraModel(1, response=True)
+    inputs = SimpleNamespace(
+        pixels=SimpleNamespace(numbers=lambda: dr.arange(mi.UInt32, len(light))),
+        rays=SimpleNamespace(view_of=lambda n: n * 0, radius2=lambda n, view: mi.Float(n) * 0),
+        told=mi.Float(1),
+    )
+
+    def slope(place):
+        """Of the squared error along a power of f; the truth is f(P) = P."""
+        (array,) = model.parameters().values()
+        dr.enable_grad(array)
+        shown, smooth = (
+            None if x is None else mi.Color3f(mi.Float(x)) for x in (photograph, place)
+        )
+        target, reference, _ = TrainingStep._through_camera(None, model, inputs, shown, smooth)
+        np.testing.assert_allclose(np.array(target)[0], photograph, rtol=1e-3)
+        assert reference is None or not dr.grad_enabled(reference)
+        error = dr.square(target - mi.Color3f(mi.Float(light))) / (mi.Float(light) ** 2 + 0.01)
+        dr.backward(dr.mean(dr.mean(error)))
+        gradient = np.array(dr.grad(array)).reshape(3, -1)[0]
+        model.assign({"response.log": dr.detach(array)})
+        return float(gradient @ np.linspace(-1, 1, len(gradient)))
+
+    assert abs(slope(None)) > 5 * abs(slope(light)) > 0
 
 
 def test_green_tells_the_response_where_each_photograph_has_a_white_balance(monkeypatch):
@@ -534,23 +621,24 @@ def test_green_tells_the_response_where_each_photograph_has_a_white_balance(monk
     first, second = np.nonzero(~np.eye(views, dtype=bool))
     first, second = (np.repeat(x, 200) for x in (first, second))
     light = np.exp(rng.normal(-2, 1, (len(first), 3)))
-    photographs = [
-        light * 2.0 ** (stops[v, None] + balance[v]) * np.exp(rng.normal(0, 0.02, light.shape))
-        for v in (first, second)
-    ]
-    read = [np.where(p < 1, response(np.minimum(p, 1), "contrast"), np.nan) for p in photographs]
+    photographs = np.stack(
+        [
+            light * 2.0 ** (stops[v, None] + balance[v]) * np.exp(rng.normal(0, 0.02, light.shape))
+            for v in (first, second)
+        ]
+    )
+    read = np.maximum(response(np.minimum(photographs, 1), "contrast"), 1e-4)
     told = np.log(2) * stops
-    logs = np.log(np.maximum(read, 1e-4)) - told[np.stack([first, second])][..., None]
-    shared = SharedPoints(first, second, logs, np.zeros((views, 3)))
+    logs = np.log(read) - told[np.stack([first, second])][..., None]
+    away, bound = np.zeros(logs.shape[:2]), (photographs >= 1).astype(int)
+    points = np.arange(len(first))
+    shared = SharedPoints(points, first, second, away, logs, bound, np.zeros((views, 3)))
     monkeypatch.setattr(first_gains_module, "shared_points", lambda *_: shared)
     camera = CameraModel(views, white_balance="per-image", response=True)
     train = [SimpleNamespace(name=str(i), exposure=float(2.0**x)) for i, x in enumerate(stops)]
     problem = SimpleNamespace(camera=camera, scene_view=SimpleNamespace(scene=None))
     begin_cameras(problem, SimpleNamespace(train=train), None)
-    curves, values = camera.curves(), np.linspace(0, 1, 2000)
-    places = np.linspace(0, 1, curves.shape[1])
-    truth = np.interp(places**2.2, response(values, "contrast"), values)
-    assert np.sqrt(((curves**2.2 - truth) ** 2).mean()) < 0.02
+    assert max(error_of_light(curve) for curve in camera.curves()) < 0.02
     found = np.log2(camera.gains())
     assert np.abs(found - (balance - balance[0])).max() < 0.1
     # Taken as linear, photographs tell other balances.

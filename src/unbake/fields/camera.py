@@ -22,7 +22,7 @@ Photographs alone leave some of it open, which conventions decide:
   else: with one exposure any f explains the photographs, each with another albedo.
 - A power of f, of all exposures and of all radiance explains the same differences between
   photographs. What lights and geometry say of radiance decides the exponent; where they say
-  little, the smoothness of f does, whose optimum is f(P) = P.
+  little, the smoothness of f does, and that white stays close to white (`first_response.py`).
 - Where each image has a white balance of its own, that holds for red and blue by themselves, even
   if exposures are told: what decides then is that f is alike in all channels.
 """
@@ -30,7 +30,7 @@ Photographs alone leave some of it open, which conventions decide:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, final
 
 import drjit as dr
@@ -121,6 +121,17 @@ class CameraModel:
             found = logs[:, [0, 2]] - logs[:, [1]]
             self._arrays["white_balance.log"] = from_numpy(mi.Float, found.astype(np.float32))
 
+    def start_vignetting(self, falloff: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Begin with another vignetting than none.
+
+        Args:
+            falloff: v of squared radii.
+        """
+        radius2 = np.linspace(0, 1, 65)
+        powers = np.stack([radius2, radius2**2, radius2**3], 1)
+        terms = np.linalg.lstsq(powers, falloff(radius2) - 1, rcond=None)[0] / _ORDERS
+        self._arrays["vignetting.terms"] = from_numpy(mi.Float, terms.astype(np.float32))
+
     def start_response(self, curves: np.ndarray) -> None:
         """Begin with another response than f(P) = P.
 
@@ -161,11 +172,15 @@ class CameraModel:
             gain *= dr.maximum(falloff, _DARKEST)
         return gain
 
-    def exposed(self, photograph: mi.Color3f) -> mi.Color3f:
-        """Photographs through f, linear RGB; the same where the response is known."""
+    def exposed(self, photograph: mi.Color3f, *, learns: bool = True) -> mi.Color3f:
+        """Photographs through f, linear RGB; the same where the response is known.
+
+        Args:
+            learns: whether f gets gradients; photographs do in any case.
+        """
         if not self.has_response:
             return photograph
-        heights = self._heights()
+        heights = self._heights() if learns else dr.detach(self._heights())
         return mi.Color3f([self._inverse(photograph[i], heights, i) for i in range(3)])
 
     def roughness_of_response(self) -> mi.Float:

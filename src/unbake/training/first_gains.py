@@ -13,12 +13,12 @@ import numpy as np
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset, View
 from ..fields.arrays import from_numpy
-from .cameras import Cameras
-from .first_response import first_response
+from .cameras import Cameras, radius2
+from .first_response import SeenPoints, first_response, log_falloff
 from .problem import Problem
 
-#: Pixels of a view that are looked for in other views, and the most of these.
-_PIXELS, _PARTNERS = 256, 24
+#: Pixels of all views that are looked for in other views, and the most of these.
+_PIXELS, _PARTNERS = 65536, 24
 #: Points that two views must share.
 _FEWEST = 8
 #: Weight of what two photographs say as a whole, in points that they share: where they share none.
@@ -33,15 +33,48 @@ class SharedPoints:
     """Light of the same points in two photographs each.
 
     Args:
-        first, second: training views that see a point, shape (n,).
-        logs: of its radiance in the two, linear RGB, shape (2, n, 3); NaN where dark or clipped.
-        whole: of each view as a whole, relative to the first one, shape (views, 3).
+        point: number of a point, shape (n,).
+        first, second: training views that see it, of the same shape. The first one is the same for
+            all pairs of a point.
+        radius2: squared distance from the middle of the photograph, 1 in a corner, shape (2, n).
+        logs: of its radiance in the two, linear RGB, shape (2, n, 3); where it is clipped or dark,
+            of what it is at least or at most.
+        bound: 1 where it is clipped, -1 where it is dark, else 0; of the same shape.
+        whole: logs of each view as a whole, relative to the first one, shape (views, 3).
     """
 
+    point: np.ndarray
     first: np.ndarray
     second: np.ndarray
+    radius2: np.ndarray
     logs: np.ndarray
+    bound: np.ndarray
     whole: np.ndarray
+
+    @property
+    def views(self) -> np.ndarray:
+        """`first` and `second`, shape (2, n)."""
+        return np.stack([self.first, self.second])
+
+    def seen(self, told: np.ndarray, gains: np.ndarray, falloff: np.ndarray) -> list[SeenPoints]:
+        """The same, photograph by photograph, of each channel.
+
+        Args:
+            told: logs of exposures that photographs were divided by, by view.
+            gains: logs of exposures and white balances, shape (views, 3).
+            falloff: as `log_falloff` has it.
+        """
+        alone = np.unique(self.point, return_index=True)[1]
+
+        def flat(pairs: np.ndarray) -> np.ndarray:
+            return np.concatenate([pairs[0, alone], pairs[1]])
+
+        view, radius2 = flat(self.views), flat(self.radius2)
+        point = np.concatenate([self.point[alone], self.point])
+        logs, bound = flat(self.logs) + told[view, None], flat(self.bound)
+        known = gains[view] + log_falloff(falloff, radius2)[:, None]
+        columns = zip(logs.T, known.T, bound.T, strict=True)
+        return [SeenPoints(point, view, radius2, *column) for column in columns]
 
 
 def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> SharedPoints:
@@ -55,7 +88,7 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
         pixels: of these.
     """
     rng = np.random.default_rng(0)
-    places = rng.integers(0, pixels.photographs.count, _PIXELS * len(views))
+    places = rng.integers(0, pixels.photographs.count, _PIXELS)
     numbers = np.unique(pixels.photographs.numbers(places)).astype(np.uint32)
     own = pixels.views_of(numbers)
     points, normals, valid = _points(scene, pixels, numbers)
@@ -84,11 +117,17 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
     source, target, place = source[clear], target[clear], place[clear]
 
     start = own[source]
-    logs = _logs(pixels, views, numbers, own)
+    logs, bound = _logs(pixels, views, numbers, own)
     there = _logs(pixels, views, firsts[target] + place, target)
-    whole = [np.ma.median(np.ma.masked_invalid(logs[own == i]), 0) for i in range(len(views))]
+    known = np.ma.masked_array(logs, bound != 0)
+    whole = [np.ma.median(known[own == i], 0) for i in range(len(views))]
     whole = np.ma.filled(np.ma.array(whole) - whole[0], 0.0)
-    return SharedPoints(start, target, np.stack([logs[source], there]), whole)
+    logs, bound = (
+        np.stack([here[source], x]) for here, x in zip((logs, bound), there, strict=True)
+    )
+    radii = np.concatenate([radius2(view.camera) for view in views])
+    away = np.stack([radii[numbers[source]], radii[firsts[target] + place]])
+    return SharedPoints(source, start, target, away, logs, bound, whole)
 
 
 def first_gains(shared: SharedPoints) -> np.ndarray:
@@ -101,7 +140,8 @@ def first_gains(shared: SharedPoints) -> np.ndarray:
     Returns:
         Linear RGB over what the data set tells of the exposures, shape (views, 3); the first is 1.
     """
-    ratios = shared.logs[1] - shared.logs[0]
+    logs = np.where(shared.bound == 0, shared.logs, np.nan)
+    ratios = logs[1] - logs[0]
     known = []
     for i, j in sorted(set(zip(shared.first.tolist(), shared.second.tolist(), strict=True))):
         ratio = ratios[(shared.first == i) & (shared.second == j)]
@@ -112,34 +152,44 @@ def first_gains(shared: SharedPoints) -> np.ndarray:
 
 
 def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> None:
-    """Let unknown exposures and responses begin where photographs say.
+    """Let unknown exposures, white balances and responses begin where photographs say.
 
-    Exposures that are unknown beside a response are those of f(P) = P at first.
+    Beside an unknown response, vignetting does so, too, if it is unknown.
     """
     camera, views = problem.camera, dataset.train
     solves = Cameras(camera, views).solves
     if camera is None or not (solves or camera.has_response):
         return
     shared = shared_points(problem.scene_view.scene, views, pixels)
-    gains = first_gains(shared) if solves else np.ones((len(views), 3))
-    if solves:
-        camera.start(gains)
+    gains = np.log(first_gains(shared)) if solves else np.zeros((len(views), 3))
     if not camera.has_response:
+        camera.start(np.exp(gains))
         return
-    told, pair = np.log([view.exposure for view in views])[:, None], [shared.first, shared.second]
-    photographs, exposures = shared.logs + told[pair], np.log(gains) + told
-    if camera.white_balance != "per-image":
-        ratios = exposures[shared.second] - exposures[shared.first]
-        camera.start_response(first_response(photographs, ratios))
-        return
-    # Where each photograph has gains of red and blue of its own, any response of these explains
-    # them. Green tells the response of all channels, and photographs through it tell their gains.
-    green = exposures[:, [1]] if camera.has_exposures else told
-    ratios = green[shared.second] - green[shared.first]
-    curve = first_response(photographs[..., [1]], ratios)
-    camera.start_response(np.repeat(curve, 3, 0))
-    light = np.log(camera.light(np.exp(photographs))) - told[pair]
-    camera.start(first_gains(replace(shared, logs=light)))
+    # Green tells what all channels have in common. Where each photograph has gains of red and blue
+    # of its own, these are told by any response of red and blue: all have that of green.
+    told, balanced = np.log([view.exposure for view in views]), camera.white_balance == "per-image"
+    common = told + (gains[:, 1] if camera.has_exposures else 0)
+    falloff, vignetted = np.zeros(3), camera.vignetting() is not None
+    seen = shared.seen(told, np.repeat(common[:, None], 3, 1), falloff)
+    green = first_response(seen[1], len(views) * camera.has_exposures, vignetted)
+    if green.falloff is not None:
+        falloff = green.falloff
+        camera.start_vignetting(lambda radius2: np.exp(log_falloff(falloff, radius2)))
+    if green.gains is not None:
+        common = common + green.gains
+    if balanced:
+        camera.start_response(np.repeat(green.curve[None], 3, 0))
+        exposure = told[shared.views][..., None]
+        light = np.log(camera.light(np.exp(shared.logs + exposure))) - exposure
+        light -= log_falloff(falloff, shared.radius2)[..., None]
+        gains = np.log(first_gains(replace(shared, logs=light)))
+        if camera.has_exposures:
+            gains += (common - told - gains[:, 1])[:, None]
+    else:
+        gains = np.repeat((common - told)[:, None], 3, 1)
+        seen = shared.seen(told, gains + told[:, None], falloff)
+        camera.start_response(np.stack([first_response(channel).curve for channel in seen]))
+    camera.start(np.exp(gains))
 
 
 def _solved(whole: np.ndarray, known: Sequence[tuple[int, int, float, np.ndarray]]) -> np.ndarray:
@@ -165,8 +215,8 @@ def _solved(whole: np.ndarray, known: Sequence[tuple[int, int, float, np.ndarray
 
 def _logs(
     pixels: PixelSource, views: Sequence[View], numbers: np.ndarray, of: np.ndarray
-) -> np.ndarray:
-    """Logs of the radiance of pixels, (n, 3); NaN where they are dark or clipped.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Logs of the radiance of pixels, and where they are bounds; see `SharedPoints`, (n, 3) each.
 
     Args:
         numbers: of the pixels.
@@ -175,9 +225,11 @@ def _logs(
     light = pixels.photographs.radiance(numbers).astype(np.float64)
     sums = np.bincount(of, light.mean(1), len(views))
     least = _DARK * sums / np.maximum(np.bincount(of, minlength=len(views)), 1)
-    limits = np.array([view.limit for view in views])
-    told = (light > least[of, None]) & (light < limits[of, None])
-    return np.log(np.where(told, light, np.nan))
+    # A photograph without light is as dark as can be.
+    least = np.maximum(least, np.finfo(np.float32).tiny)[of, None]
+    limit = np.array([view.limit for view in views])[of, None]
+    bound = (light >= limit).astype(np.int8) - (light <= least)
+    return np.log(np.clip(light, least, limit)), bound
 
 
 def _points(

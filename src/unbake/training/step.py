@@ -608,9 +608,15 @@ class TrainingStep:
             assert inputs.told is not None
             # The response is of the photograph, before it was divided by its exposure.
             told = dr.gather(mi.Float, inputs.told, view)
-            if reference is not None:
-                reference = dr.detach(camera.exposed(reference * told) / told)
-            target = camera.exposed(target * told) / told
+            if reference is None:
+                target = camera.exposed(target * told) / told
+            else:
+                # Where light is too bright by chance, so is its photograph. Curves that learned at
+                # that place would become too flat (regression dilution): they learn at the
+                # smoothed one, which has next to nothing of the pixel's noise.
+                smooth = camera.exposed(reference * told) / told
+                reference = dr.detach(smooth)
+                target = camera.exposed(target * told, learns=False) / told + (smooth - reference)
         return target, reference, gain
 
 
