@@ -21,7 +21,9 @@ of the cameras, against the truth that `degrade` keeps:
 `true_*` are scores of materials as the true cameras see them: where poses are off, the others
 compare maps that are moved against each other. Any rendered data set will do, rooms as well.
 
-Rows that FILE has of the same data and options are kept: a run that was stopped goes on.
+Rows that FILE has of the same data and options are kept: a run that was stopped goes on, on another
+machine, too. Fits have a number of steps, so that scores are the same on all; `machine` of a row is
+the one that took its seconds.
 """
 
 from __future__ import annotations
@@ -147,7 +149,8 @@ def main() -> None:
         if (fault, fit) in known or (fit == "fitted" and not FAULTS[fault].words):
             continue
         found = [scores(args.data, fault, fit, seed, options) for seed in args.seeds]
-        rows.append({"fault": fault, "cameras": fit} | across_seeds(found, found[0]))
+        row = {"fault": fault, "cameras": fit} | across_seeds(found, found[0])
+        rows.append(row | {"machine": result["machine"]})
         told = ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items() if isinstance(v, float))
         print(f"{fault}, {fit}: {told}", flush=True)
         write_json(args.out, result | {"rows": rows})
@@ -155,18 +158,25 @@ def main() -> None:
 
 def about(args: argparse.Namespace) -> dict[str, Any]:
     """What the rows of a result have in common."""
-    dataset = Dataset.load(args.data)
-    camera = dataset.train[0].camera
     return {
         "machine": machine(),
-        "data": args.data.name,
+        **about_data(args.data),
+        **{key: getattr(args, key) for key in OPTIONS},
+        "faults": {name: dict(fault.settings) for name, fault in FAULTS.items()},
+    }
+
+
+def about_data(data: Path) -> dict[str, Any]:
+    """Name and size of a data set."""
+    dataset = Dataset.load(data)
+    camera = dataset.train[0].camera
+    return {
+        "data": data.name,
         "train": len(dataset.train),
         "heldout": len(dataset.heldout),
         "width": camera.width,
         "height": camera.height,
         "spp": dataset.render.get("spp", 0),
-        **{key: getattr(args, key) for key in OPTIONS},
-        "faults": {name: dict(fault.settings) for name, fault in FAULTS.items()},
     }
 
 
@@ -175,10 +185,10 @@ def kept(file: Path, result: Mapping[str, Any]) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     old = json.loads(file.read_text(encoding="utf-8"))
-    same = all(old.get(key) == result[key] for key in ("data", "machine", *OPTIONS))
+    same = all(old.get(key) == result[key] for key in ("data", *OPTIONS))
     faults = old.get("faults", {})
     return [
-        row
+        {"machine": old["machine"]} | row
         for row in old["rows"]
         if same and faults.get(row["fault"]) == result["faults"].get(row["fault"])
     ]
