@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 #: Characters that are shown of a name, and of each part of a message.
 _LONGEST_NAME, _LONGEST_PART = 80, 1000
 
+#: How many of several faults one error tells.
+_TOLD = 3
 #: The least of a range of numbers that must be positive.
 POSITIVE = sys.float_info.min
 
@@ -35,6 +37,21 @@ class UserError(Exception):
         what = _one_line(self.what)
         text = what if self.where is None else f"{_one_line(self.where)}: {what}"
         return text if self.remedy is None else f"{text}. {_one_line(self.remedy)}"
+
+
+def raise_together(faults: Sequence[UserError], others: str = "") -> None:
+    """Raise one error for all that is wrong, or none; of much that is wrong it tells some.
+
+    Args:
+        faults: what is wrong, one after the other.
+        others: how to learn of those that it does not tell, such as ", which the log has".
+    """
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        told = "; ".join(map(str, faults[:_TOLD]))
+        more = len(faults) - _TOLD
+        raise UserError(f"{told}; and {more} more{others}" if more > 0 else told)
 
 
 def of_system(error: OSError) -> str:

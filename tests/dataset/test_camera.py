@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -275,6 +276,17 @@ def test_a_broken_camera_file_is_one_clear_error(tmp_path, content, message):
     with pytest.raises(UserError, match=message) as caught:
         read_cameras(file, 8, 8)
     assert str(file) in str(caught.value) and caught.value.remedy
+
+
+def test_all_broken_cameras_of_a_file_are_told_at_once(tmp_path):
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps([{**ENTRY, "fov": -5}, ENTRY, 3, {**ENTRY, "split": "test"}, 4, 5]))
+    with pytest.raises(UserError) as caught:
+        read_cameras(file, 8, 8)
+    told = str(caught.value)
+    for number, what in ((0, "field of view"), (2, "not an object"), (3, "unknown split")):
+        assert re.search(f"camera {number}: [^;]*{what}", told)
+    assert told.endswith("; and 2 more") and "camera 1:" not in told
 
 
 def test_a_missing_camera_file_is_named(tmp_path):

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from unbake.dataset.data_folder import TRANSFORMS
-from unbake.errors import UserError
+from unbake.errors import UserError, raise_together
 from unbake.io import array, integer, number, read_json, write_text
 
 SPLITS = ("train", "heldout")
@@ -369,7 +369,8 @@ def read_cameras(
         keep_size: leave cameras the size that the file gives them, if it does.
 
     Raises:
-        UserError: the file is missing or not JSON, or an entry lacks a key or is no valid camera.
+        UserError: the file is missing or not JSON, or entries lack a key or are no valid cameras:
+            it tells of several.
     """
     content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
@@ -378,17 +379,23 @@ def read_cameras(
         entries = content.get("cameras") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not entries:
         raise UserError("no cameras in the file", path, _NO_CAMERA_FILE)
-    cameras = []
+    top = content if isinstance(content, dict) else {}
+    cameras, faults = [], []
     for index, entry in enumerate(entries):
         where = f"{path}: camera {index}"
-        if not isinstance(entry, dict):
-            raise UserError("the entry is not an object", where, _NO_CAMERA_FILE)
-        split = read_split(entry, where)
-        if "transform_matrix" in entry:
-            camera = camera_from_frame(entry, content, where, (width, height))
+        try:
+            if not isinstance(entry, dict):
+                raise UserError("the entry is not an object", where, _NO_CAMERA_FILE)
+            split = read_split(entry, where)
+            if "transform_matrix" in entry:
+                camera = camera_from_frame(entry, top, where, (width, height))
+            else:
+                camera = _camera_from_entry(entry, where, width, height)
+        except UserError as error:
+            faults.append(error)
         else:
-            camera = _camera_from_entry(entry, where, width, height)
-        cameras.append((split, camera if keep_size else camera.rescaled(width, height)))
+            cameras.append((split, camera if keep_size else camera.rescaled(width, height)))
+    raise_together(faults)
     return cameras
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from unbake.dataset.camera import Camera, camera_from_frame, frame_of, read_split, spread_rays
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
-from unbake.errors import UserError
+from unbake.errors import UserError, raise_together
 from unbake.imaging.coded import decode, read_codes
 from unbake.imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, read_header
 from unbake.io import number, require_file, text
@@ -45,8 +45,6 @@ _MEANT = {
 }
 #: Bytes of the name of a view, which files of results are named after.
 _LONGEST_NAME = 200
-#: Faults of frames that an error tells.
-_TOLD = 3
 _NEED_HDR = (
     "Give linear HDR images (OpenEXR); PNG, JPEG and TIFF files of a camera are read where "
     f'{TRANSFORMS} has "encoding": "srgb", as `unbake import` writes it'
@@ -237,7 +235,7 @@ class Dataset:
         if faults is not None:
             faults += found
         else:
-            _raise_together(found)
+            raise_together(found, ", all of which `unbake data check` tells")
         if not any(view.split == "train" for view in views):
             raise UserError("no view has the split 'train'", file, "There is nothing to learn from")
         render, seen = _provenance(top, file)
@@ -373,17 +371,6 @@ def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
     touching = free_space.trace(scene, *spread_rays([*cameras.values()], 16)).distance < near
     nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
     return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]
-
-
-def _raise_together(faults: list[UserError]) -> None:
-    """Raise one error for what is wrong with frames; it tells some of it where that is much."""
-    if len(faults) == 1:
-        raise faults[0]
-    if faults:
-        told = "; ".join(map(str, faults[:_TOLD]))
-        more = len(faults) - _TOLD
-        rest = f"; and {more} more, all of which `unbake data check` tells" if more > 0 else ""
-        raise UserError(f"{told}{rest}")
 
 
 def _read_views(
