@@ -7,11 +7,11 @@ import pytest
 import tifffile
 from layouts import APERTURE, ISO, SECONDS, quiet, write_json
 
-from unbake.dataset.views import Dataset, read_photograph
+from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
 from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
-from unbake.importing.raw import CLIPPED, raw_balance, read_raw
+from unbake.importing.raw import CLIPPED, raw_balance, raw_told, read_raw
 from unbake.importing.settings import ImportSettings
 
 pytest.importorskip("rawpy", reason="camera RAW needs rawpy")
@@ -21,12 +21,14 @@ BLACK, WHITE, SIZE = 256, 16383, 32
 NEUTRAL = (0.5, 1.0, 0.625)
 #: tifffile writes no EXIF: a private tag becomes the one of its directory.
 PRIVATE, EXIF_DIRECTORY, RATIONAL, SHORT, LONG = 65000, 34665, 5, 3, 4
+#: Of XYZ to the colours of a sensor that sees some green in all that is blue, and white as grey.
+SEES = ((0.9, -0.3, -0.1), (-0.5, 1.3, 0.2), (-0.1, 0.4, 0.6))
 
 
-def write_dng(file, light, iso=None, chosen=NEUTRAL):
+def write_dng(file, light, iso=None, chosen=NEUTRAL, sees=None):
     """Light (H, W, 3) in [0, 1] behind a Bayer mosaic, with 1/100 s and f/2 if an ISO is given.
 
-    `chosen` is what the camera took for white light.
+    `chosen` is what the camera took for white light, and `sees` how it sees XYZ.
     """
     sensor = np.minimum(light * NEUTRAL, 1)
     y, x = np.mgrid[: light.shape[0], : light.shape[1]]
@@ -43,6 +45,9 @@ def write_dng(file, light, iso=None, chosen=NEUTRAL):
         (50728, "2I", 3, tuple(parts), True),
         (PRIVATE, "I", 1, 0, True),
     ]
+    if sees:
+        entries = [part for row in sees for x in row for part in (round(1000 * x), 1000)]
+        tags += [(50721, "2i", 9, tuple(entries), True), (50778, "H", 1, 21, True)]
     options = {"photometric": 32803, "metadata": None, "software": False}
     file.parent.mkdir(parents=True, exist_ok=True)
     tifffile.imwrite(file, np.round(counts).astype(np.uint16), extratags=tags, **options)
@@ -91,6 +96,37 @@ def test_light_comes_back(tmp_path):
     assert found[:, 20:] == pytest.approx(light[:, 20:], abs=1e-3)
     write_dng(tmp_path / "a.dng", 3 * light)
     assert (read_raw(tmp_path / "a.dng", balance)[:, 20:] >= CLIPPED).all()
+
+
+def test_mixtures_of_clipped_and_other_colours_are_told(tmp_path):
+    """Of a sensor whose green is clipped, neither red nor blue of sRGB is known."""
+    light = grey(0.2, 0.2, 0.2).copy()
+    light[:, 8:16] = (0.6, 1.5, 0.6)
+    light[:, 16:24] = 1.5  # beyond white in all
+    write_dng(tmp_path / "a.dng", light, sees=SEES)
+    balance = raw_balance(tmp_path / "a.dng")
+    told, found = raw_told(tmp_path / "a.dng", balance), read_raw(tmp_path / "a.dng", balance)
+    write_dng(tmp_path / "b.dng", light / 3, sees=SEES)
+    true = 3 * read_raw(tmp_path / "b.dng", balance)
+    assert raw_told(tmp_path / "b.dng", balance).all()
+    # Interpolation between colours of the mosaic reaches two pixels far.
+    inner = {"dark": np.s_[:, :6], "green": np.s_[:, 10:14], "white": np.s_[:, 18:22]}
+    assert told[inner["dark"]].all() and told[inner["white"]].all()
+    assert not told[inner["green"]].any()
+    assert found[inner["dark"]] == pytest.approx(true[inner["dark"]], abs=2e-3)
+    assert (found[inner["white"]] >= CLIPPED).all()
+    assert (np.abs(found - np.minimum(true, 1))[inner["green"]].max(2) > 0.05).all()
+
+
+def test_pixels_of_camera_raw_that_say_nothing_are_masked(project, meshes, tmp_path):
+    light = grey(0.4, 0.2, 0.1).copy()
+    light[:, 8:16] = (0.2, 1.5, 0.2)
+    write_dng(project / "jpg" / "1.DNG", light, 200)
+    import_data(project, tmp_path / "data", meshes, ImportSettings(holdout=0), tell=quiet)
+    views = Dataset.load(tmp_path / "data").views
+    assert views[0].mask is None and views[1].mask is not None
+    counted = read_masked(views[1])[1]
+    assert not counted[:, 10:14].any() and counted[:, :6].all() and counted[:, 18:].all()
 
 
 def test_camera_raw_takes_the_place_of_photographs(captured, project, meshes, tmp_path):

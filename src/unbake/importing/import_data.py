@@ -31,7 +31,7 @@ from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import Lens
 from .meshes import Part, read_parts, write_scene
 from .raw import CLIPPED as CLIPPED_RAW
-from .raw import raw_balance, read_raw
+from .raw import raw_balance, raw_told, read_raw
 from .rooms import is_room, read_room
 from .settings import ImportSettings
 from .source import Shot, Source, image_header
@@ -277,10 +277,13 @@ def _pixels(shot: Shot) -> np.ndarray:
     return pixels.reshape(shot.lens.height, shot.lens.width, 4)
 
 
-def _mask(shot: Shot) -> np.ndarray:
-    """Which pixels count, (H, W) bool."""
-    assert shot.mask is not None
-    return counted_by(read_codes(shot.mask))
+def _mask(shot: Shot) -> np.ndarray | None:
+    """Which pixels count, (H, W) bool; None: all do."""
+    mask = None if shot.mask is None else counted_by(read_codes(shot.mask))
+    told = raw_told(shot.image, shot.balance) if shot.raw else None
+    if told is None or told.all():
+        return mask
+    return told if mask is None else mask & told
 
 
 def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:
@@ -389,7 +392,7 @@ def _write_view(
         frame["clipped"] = limit
     if shot.name in exposures:
         frame["exposure"] = exposures[shot.name]
-    mask = None if shot.mask is None else _mask(shot)
+    mask = _mask(shot)
     if mask is not None and not shot.lens.straight:
         straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
         mask = straight[..., 0] >= 1

@@ -46,15 +46,38 @@ def read_raw(path: Path, balance: Balance | None = None) -> np.ndarray:
         UserError: rawpy is missing, or LibRaw cannot read the file.
     """
     with _opened(path) as raw:
-        pixels = raw.postprocess(
-            gamma=(1, 1),
-            no_auto_bright=True,
-            adjust_maximum_thr=0.0,
-            user_wb=None if balance is None else list(balance),
-            output_bps=16,
-            user_flip=0,
-        )
+        pixels = raw.postprocess(**_as_it_is(balance))
     return (pixels / 65535).astype(np.float32)
+
+
+def raw_told(path: Path, balance: Balance | None = None) -> np.ndarray:
+    """Which pixels of `read_raw` say what they say, or that they are clipped, (H, W) bool.
+
+    The colours of the sensor are mixed to those of sRGB. Where some of them are clipped and others
+    are not, no mixture is true, nor the least that it can be.
+
+    Args:
+        path, balance: as of `read_raw`; errors as there.
+    """
+    with _opened(path) as raw:
+        import rawpy
+
+        colours = rawpy.ColorSpace.raw  # pyright: ignore[reportAttributeAccessIssue]
+        sensor = raw.postprocess(output_color=colours, **_as_it_is(balance))
+        clipped = sensor >= round(65535 * CLIPPED)
+    return clipped.all(2) | ~clipped.any(2)
+
+
+def _as_it_is(balance: Balance | None) -> dict[str, Any]:
+    """Options of LibRaw for linear values in one unit."""
+    return {
+        "gamma": (1, 1),
+        "no_auto_bright": True,
+        "adjust_maximum_thr": 0.0,
+        "user_wb": None if balance is None else list(balance),
+        "output_bps": 16,
+        "user_flip": 0,
+    }
 
 
 def raw_balance(path: Path) -> Balance | None:
