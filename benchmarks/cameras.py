@@ -151,6 +151,7 @@ def main() -> None:
         found = [scores(args.data, fault, fit, seed, options) for seed in args.seeds]
         row = {"fault": fault, "cameras": fit} | across_seeds(found, found[0])
         rows.append(row | {"machine": result["machine"]})
+        known.add((fault, fit))
         told = ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items() if isinstance(v, float))
         print(f"{fault}, {fit}: {told}", flush=True)
         write_json(args.out, result | {"rows": rows})

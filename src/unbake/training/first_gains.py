@@ -17,8 +17,10 @@ from .cameras import Cameras, radius2
 from .first_response import SeenPoints, first_response, log_falloff
 from .problem import Problem
 
-#: Pixels of all views that are looked for in other views, and the most of these.
-_PIXELS, _PARTNERS = 65536, 24
+#: Pixels that are looked for in other views: of all views, or more, if that is less of each.
+_PIXELS, _OF_EACH = 1 << 16, 256
+#: The most views that a pixel is looked for in.
+_PARTNERS = 24
 #: Points that two views must share.
 _FEWEST = 8
 #: Weight of what two photographs say as a whole, in points that they share: where they share none.
@@ -88,7 +90,8 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
         pixels: of these.
     """
     rng = np.random.default_rng(0)
-    places = rng.integers(0, pixels.photographs.count, _PIXELS)
+    wanted = max(_PIXELS, _OF_EACH * len(views))
+    places = rng.integers(0, pixels.photographs.count, wanted)
     numbers = np.unique(pixels.photographs.numbers(places)).astype(np.uint32)
     own = pixels.views_of(numbers)
     points, normals, valid = _points(scene, pixels, numbers)
@@ -188,7 +191,12 @@ def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> No
     else:
         gains = np.repeat((common - told)[:, None], 3, 1)
         seen = shared.seen(told, gains + told[:, None], falloff)
-        camera.start_response(np.stack([first_response(channel).curve for channel in seen]))
+        same = green.gains is None and green.falloff is None
+        curves = [
+            green.curve if same and channel == 1 else first_response(seen[channel]).curve
+            for channel in range(3)
+        ]
+        camera.start_response(np.stack(curves))
     camera.start(np.exp(gains))
 
 

@@ -13,8 +13,8 @@ from ..fields.camera import GAMMA, PIECES
 _APART = 0.2
 #: Photographs of points that are shown with such exposures, without which it stays as it is.
 _FEWEST = 200
-#: The most points that tell unknown gains, too.
-_POINTS = 1 << 14
+#: The most points that are taken, and where gains are unknown.
+_POINTS, _FEWER_POINTS = 1 << 16, 1 << 14
 #: Weights of curvature and of size of a curve's deviation, of that at white, which few photographs
 #: tell, and of the size of gains, against a photograph of a point.
 _CURVATURE, _SIZE, _WHITE, _GAINS = 1e-3, 1e-6, 3e-3, 1e-6
@@ -101,8 +101,9 @@ def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -
     places = np.linspace(0, 1, PIECES + 1)
     known = Told(places, np.zeros(views) if views else None, np.zeros(3) if vignetting else None)
     seen = seen.some(_comparable(seen))
-    if views:
-        seen = seen.some(seen.point < _POINTS)
+    # Points are in the order of views.
+    order = np.random.default_rng(0).permutation(seen.point.max(initial=-1) + 1)
+    seen = seen.some(order[seen.point] < (_FEWER_POINTS if views else _POINTS))
     if (seen.bound == 0).sum() < _FEWEST:
         return known
     found = _Fit(seen, views, vignetting).solved()
