@@ -1,7 +1,7 @@
 """How much light a coarse mesh leaves in a scene, with its true materials and lights.
 
-    python benchmarks/mesh_light.py --data DATA [DATA ...] --out FILE.json [--keep 0.5 0.1]
-        [--spp 256] [--block 4]
+    python benchmarks/mesh_light.py --data DATA [DATA ...] --out FILE.json [--keep 1 0.1]
+        [--spp 64] [--block 4]
 
 The meshes of a rendered data set keep a share of their triangles (`unbake degrade --decimate`). Its
 held-out views are rendered once more and compared with the photographs, blocks of pixels with their
@@ -36,8 +36,8 @@ def main() -> None:
     """Render, print the ratios, and write the result."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets")
-    parser.add_argument("--keep", type=float, nargs="+", default=[1.0, 0.5, 0.1])
-    parser.add_argument("--spp", type=int, default=256, help="samples a pixel")
+    parser.add_argument("--keep", type=float, nargs="+", default=[1.0, 0.1])
+    parser.add_argument("--spp", type=int, default=64, help="samples a pixel")
     parser.add_argument("--block", type=int, default=4, help="edge of blocks in pixels")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
