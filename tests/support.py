@@ -522,3 +522,18 @@ def whole_and_in_parts(
     train("parts")
     stop_at.clear()
     return whole, train("parts", resume=True), steps[0]
+
+
+@contextmanager
+def one_thread():
+    """Sums come in one order, so that equal work gives equal numbers.
+
+    Scenes are to be loaded before: OpenEXR waits for ever for a second thread.
+    """
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+        dr.sync_thread()
+    finally:
+        dr.set_thread_count(threads)

@@ -1,7 +1,6 @@
 """Fits of unknown light: what they recover, their gradients, their steps, and their errors."""
 
 import dataclasses
-from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +11,7 @@ from support import (
     assert_only_replayed,
     built_in_cameras,
     grey_photographs,
+    one_thread,
     pixel_rays,
     seeded,
 )
@@ -215,20 +215,6 @@ def test_replayed_paths_and_bounces_have_one_gradient(built_in, name):
 
 
 # ------------------------------------------------------------------------------------ the step
-
-
-@contextmanager
-def one_thread():
-    """Sums come in one order, so that equal steps give equal numbers.
-
-    Scenes are to be loaded before: OpenEXR waits for ever for a second thread.
-    """
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(threads)
 
 
 def start(built_in, unknown, method, background="hidden"):

@@ -10,12 +10,11 @@ import sys
 import time
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import psutil
 import pytest
-from support import MPIEXEC, needs_mpi, tiny_fields
+from support import MPIEXEC, needs_mpi, one_thread, tiny_fields
 
 from unbake.config import to_toml
 from unbake.dataset.views import Dataset
@@ -44,14 +43,10 @@ def steps_of(data, config, ranks, take):
     pixels = pixels_of(dataset, config, clip_negative=False)
     problem = problem_of(dataset, config, pixels.photographs.mean)
     step, state = TrainingStep(problem, pixels, config, ranks), initial_state(problem)
-    terms, threads = {}, dr.thread_count()
-    dr.set_thread_count(1)  # sums have one order, so that results agree bit by bit
-    try:
+    terms = {}
+    with one_thread():
         for number in range(take):
             terms = step(state, number, learning_rates(config, number, 0.0))
-        dr.sync_thread()
-    finally:
-        dr.set_thread_count(threads)
     return state_digest(state), {name: float(value[0]) for name, value in terms.items()}, step
 
 
