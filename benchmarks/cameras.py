@@ -245,14 +245,18 @@ def errors(camera: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, flo
         found["vignetting_error_most"] = float(np.abs(wrong).max())
     if curves := camera.get("response"):
         curve = np.array([curves[channel] for channel in ("red", "green", "blue")])
-        read, linear = (np.array(truth["response"][key]) for key in ("read", "linear"))
-        photograph = np.linspace(0, 1, curve.shape[1])
-        light = np.interp(photograph**GAMMA, read, linear)
+        light = true_light(truth, curve.shape[1])
         found |= spread("response_error", curve**GAMMA - light)
         scale = float((curve**GAMMA * light).sum() / (curve ** (2 * GAMMA)).sum())
         found |= spread("response_scaled_error", scale * curve**GAMMA - light)
         found["response_scale"] = scale
     return found
+
+
+def true_light(truth: Mapping[str, Any], places: int) -> np.ndarray:
+    """The light of photographs at even places of code values, by what `degrade` keeps."""
+    read, linear = (np.array(truth["response"][key]) for key in ("read", "linear"))
+    return np.interp(np.linspace(0, 1, places) ** GAMMA, read, linear)
 
 
 def spread(name: str, wrong: np.ndarray) -> dict[str, float]:

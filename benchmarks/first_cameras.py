@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from cameras import FAULTS, GAMMA, about_data, errors  # puts src on the path
+from cameras import FAULTS, GAMMA, about_data, errors, true_light  # puts src on the path
 
 import numpy as np  # isort: skip
 
@@ -85,9 +85,7 @@ def begun(data: Path, fault: str, seed: int) -> dict[str, float]:
         found = errors(told, truth)
         if curves := told.get("response"):
             curve = np.array(curves["green"])
-            read, linear = (np.array(truth["response"][key]) for key in ("read", "linear"))
-            light = np.interp(np.linspace(0, 1, len(curve)) ** GAMMA, read, linear)
-            ratios = curve[1:] ** GAMMA / light[1:]
+            ratios = curve[1:] ** GAMMA / true_light(truth, len(curve))[1:]
             found |= {f"ratio_{i + 1:02d}": float(ratio) for i, ratio in enumerate(ratios)}
     return found
 
