@@ -43,7 +43,7 @@ def main() -> None:
     args = parser.parse_args()
     backend.activate()
     from unbake.training.problem import pixels_of
-    from unbake.training.roughness_search import (
+    from unbake.training.roughness_curves import (
         NODES,
         groups,
         losses_by_roughness,

@@ -76,7 +76,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         pixels: how many are sampled; those that searches cannot use are left out.
         spp: camera samples of each.
     """
-    from unbake.training.roughness_search import NODES, precision
+    from unbake.training.roughness_curves import NODES, precision
 
     run, steps = opened(folder)
     (rows, many), true = sampled(run, pixels, (spp, CLEANER * spp))
@@ -131,7 +131,7 @@ def sampled(
         (n, 4).
     """
     from unbake.training.problem import pixels_of
-    from unbake.training.roughness_search import NODES
+    from unbake.training.roughness_curves import NODES
     from unbake.training.step import TrainingStep, without_garbage_collection
     from unbake.training.truth_fit import TrueMaps
 
@@ -175,7 +175,7 @@ class Shared:
         import drjit as dr
 
         from unbake.config import RoughnessSearchConfig
-        from unbake.training.roughness_search import points
+        from unbake.training.roughness_curves import points
 
         self.field = run.problem.materials["roughness"]
         self._rows, self._truth, self._point = rows, truth, points(rows, albedo=True)
@@ -225,11 +225,12 @@ class Shared:
             rows: of `row_type`.
             faster: the rate of its descent, as a multiple of the usual one.
         """
-        from unbake.training.roughness_search import Curves, descend
+        from unbake.training.roughness_curves import Curves
+        from unbake.training.roughness_search import searched
 
         settings = self._settings
         curves = Curves.of(rows, settings.cells, settings.colours, albedo=True)
-        found = descend(self.field, curves, settings, faster * self._rate)
+        found = searched(self.field, curves, settings, faster * self._rate)
         self.field.assign(self.fitted)
         return found
 

@@ -58,7 +58,7 @@ def main() -> None:
 
 def searches_of(folder: Path, samples: int, spps: list[int], times: int) -> dict[str, Any]:
     """The scores of a run's searches, by their samples a pixel."""
-    from unbake.training.roughness_search import precision
+    from unbake.training.roughness_curves import precision
 
     run, steps = opened(folder)
     (rows,), true = sampled(run, samples // min(spps), (min(spps),))
@@ -86,7 +86,7 @@ def noise_of(rows: np.ndarray) -> float:
         rows: of `row_type`.
     """
     from unbake.config import RoughnessSearchConfig
-    from unbake.training.roughness_search import groups, losses_by_roughness
+    from unbake.training.roughness_curves import groups, losses_by_roughness
 
     settings = RoughnessSearchConfig()
     losses = losses_by_roughness(rows, groups(rows, settings.cells, settings.colours))
@@ -103,7 +103,7 @@ def noise_of(rows: np.ndarray) -> float:
 
 def least(losses: np.ndarray) -> float:
     """Where a loss is least, by a parabola through the three nodes about the smallest value."""
-    from unbake.training.roughness_search import NODES
+    from unbake.training.roughness_curves import NODES
 
     middle = int(np.argmin(losses))
     if middle in (0, len(NODES) - 1):

@@ -89,6 +89,21 @@ def test_weak_pieces_count_less():
     np.testing.assert_allclose(half, full / 2, atol=1e-6)
 
 
+def test_raised_pieces_have_higher_outputs_everywhere_and_others_the_same():
+    table = PieceValues(COLOURED, 1)
+    values = randomised(table)
+    of_all = points(number=dr.arange(mi.UInt32, LANES) % 5, strength=0.25)
+    before = np.array(table.evaluate(of_all)[0])
+    raised = table.raised(Piece(mi.UInt32([1, 3]), mi.Float(0.25)), mi.Float([0.5, -2]))
+    assert set(raised) == {"pieces.0"}
+    table.assign(values | raised)
+    change = np.array(table.evaluate(of_all)[0]) - before
+    wanted = np.array([0, 0.5, 0, -2, 0])[np.arange(LANES) % 5]
+    np.testing.assert_allclose(change, wanted, atol=1e-5)
+    network = Network(replace(NETWORK, pieces=PieceConfig()), FieldSpec(1, bounded=True))
+    assert not network.raised(Piece(mi.UInt32([1]), mi.Float(1)), mi.Float([1]))
+
+
 def test_colours_are_shared_by_all_pieces():
     table = PieceValues(COLOURED, 1)
     values = randomised(table)
@@ -202,4 +217,4 @@ def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
     assert most(before) == 0
     assert most(before.replace("format = 2\n", "")) == 0
     assert pieces("steps = 5").colours > 0
-    assert pieces(re.sub("colours = .+\n", "", now)) == replace(pieces(now), colours=0)
+    assert pieces(re.sub("(?m)^colours = .+\n", "", now)) == replace(pieces(now), colours=0)

@@ -13,40 +13,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from searches import SEARCH, SMALL, made_up
 from support import MPIEXEC, TINY_FIT, built_in_cameras, needs_mpi, nothing_compiled
 
-from unbake.config import FitConfig, RoughnessSearchConfig, preset, read_toml, to_toml
+from unbake.config import FitConfig, preset, read_toml, to_toml
 from unbake.dataset.pixels import PixelBatch, PixelSource
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
-from unbake.fields.settings import GridConfig, NetworkConfig, PieceConfig
 from unbake.quantities import QUANTITIES
 from unbake.ranks import Ranks
 from unbake.training import loop
 from unbake.training.problem import make_problem
-from unbake.training.roughness_search import (
+from unbake.training.roughness_curves import (
     NODES,
     Curves,
-    RoughnessSearch,
-    descend,
     groups,
     losses_by_roughness,
     precision,
 )
+from unbake.training.roughness_search import RoughnessSearch, descend
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
 from unbake.transport.by_roughness import moments, row_type, stratified
 
-SEARCH = RoughnessSearchConfig()
 #: With which a fit of few samples has enough of them for a search.
 SHARE = 200.0
-SMALL = NetworkConfig(
-    GridConfig(levels=2, table_log2=8, base_resolution=2),
-    width=8,
-    hidden=1,
-    pieces=PieceConfig(most=64, colours=2),
-)
 SETTINGS = replace(
     TINY_FIT,
     materials={name: {"neural": SMALL} for name in QUANTITIES},
@@ -119,6 +111,14 @@ def test_products_of_stratified_samples_are_without_bias():
         assert found[name].mean() == pytest.approx(value, abs=1e-4)
 
 
+def test_pixels_are_drawn_that_show_one_piece(built_in, monkeypatch):
+    _, pixels, step, state = started(built_in)
+    chosen = len(step.by_roughness(state, (1, 2), 256, 16, NODES))
+    monkeypatch.setattr(step, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
+    drawn = len(step.by_roughness(state, (1, 2), 256, 16, NODES))
+    assert drawn < 0.8 * chosen and chosen > 0.85 * 256
+
+
 def test_nothing_is_compiled_for_another_draw_of_pixels(built_in):
     _, _, step, state = started(built_in)
     step.by_roughness(state, (3, 0), 64, 64, (0.4, 0.6))
@@ -151,26 +151,6 @@ def test_photographs_of_clipped_channels_do_not_count(built_in):
 
 
 # -------------------------------------------------------------------------------------- curves
-
-
-def made_up(count=400, true=(0.24, 0.55), noise=0.0):
-    """Rows of two pieces of surface, in whose photographs albedo differs from what it is by now."""
-    rng = np.random.default_rng(1)
-    rows = np.zeros(count, row_type(len(NODES)))
-    rows["piece"], rows["strength"] = np.arange(count) % 2, 1
-    rows["position"] = rng.uniform(0, 1, (count, 3))
-    rows["albedo"], rows["weight"], rows["gain"] = 0.5, 1, 1
-    sharp = rng.uniform(0.2, 1, (count, 1, 1))  # how much of a highlight a pixel shows
-    nodes = np.array(NODES)[None, :, None]
-    rows["plain"] = sharp * np.exp(-3 * nodes)
-    rows["coloured"] = rng.uniform(0.5, 1, (count, 1, 3)) * (1 + 0 * nodes)
-    rows["plain2"], rows["coloured2"] = rows["plain"] ** 2, rows["coloured"] ** 2
-    rows["mixed"] = rows["plain"] * rows["coloured"]
-    r = np.array(true)[rows["piece"]][:, None]
-    factor = np.array([0.8, 1.3])[rows["piece"]][:, None]
-    rows["target"] = sharp[:, 0] * np.exp(-3 * r) + factor * rows["coloured"][:, 0]
-    rows["target"] += noise * rng.standard_normal((count, 3))
-    return rows
 
 
 def test_albedo_follows_for_each_roughness():
@@ -388,7 +368,9 @@ SHARED = """
 import numpy as np
 from unbake import backend
 backend.activate()
-from test_roughness_search import SEARCH, SMALL, Curves, descend, made_up
+from searches import SEARCH, SMALL, made_up
+from unbake.training.roughness_curves import Curves
+from unbake.training.roughness_search import searched
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
 from unbake.ranks import Ranks
@@ -401,7 +383,7 @@ for ranks in (Ranks(), Ranks.of_environment()):
     curves = Curves.of(rows, 2, 6, True, ranks)
     assert curves.total == len(rows)
     assert abs(len(np.array(curves.losses)) - 8 * len(rows) / ranks.size) <= 8
-    field.assign(before | descend(field, curves, SEARCH, 0.02, ranks))
+    field.assign(before | searched(field, curves, SEARCH, 0.02, ranks))
     found.append(np.array(field.evaluate(every.point)[0]))
 assert ranks.size == 2 and found[0].std() > 0.1
 assert np.abs(found[0] - found[1]).max() < 1e-3, np.abs(found[0] - found[1]).max()
@@ -409,9 +391,9 @@ assert np.abs(found[0] - found[1]).max() < 1e-3, np.abs(found[0] - found[1]).max
 
 
 @needs_mpi
-def test_ranks_descend_together_to_where_one_would():
+def test_ranks_find_together_what_one_would():
     command = [MPIEXEC, "-n", "2", sys.executable, "-c", SHARED]
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
     environment = os.environ | {"PYTHONPATH": path}
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=120, check=False, env=environment

@@ -41,6 +41,7 @@ _AS_BEFORE = {
     "materials.roughness.neural.pieces.colours": 0,
     "regularization.albedo_smoothness": 0.0,
     "roughness_search.times": 0,
+    "roughness_search.pixels_as_one": 0.0,
 }
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
 _OF_RUN = {"preset", "unknown", "method", "seed", "steps", "seconds", "pixels", "spp"}

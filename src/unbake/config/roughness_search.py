@@ -29,6 +29,11 @@ class RoughnessSearchConfig:
     piece_spread: float = 1.5
     brightness_spread: float = 0.25
     colour_spread: float = 1.0
+    #: Pixels of a piece that tell as much of its level as one would by itself, as their errors have
+    #: a part in common; 0: pieces stay at what is most probable
+    pixels_as_one: float = 3.0
+    #: How near colours are whose pieces have like levels, as square roots of linear RGB
+    like_colours: float = 0.1
     rate_between: float = 0.0  #: of the fit's steps after the first search, the same
 
     def __post_init__(self) -> None:
@@ -36,5 +41,6 @@ class RoughnessSearchConfig:
         ranges |= {"share": (POSITIVE, 1000), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
         ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
         ranges |= {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)}
+        ranges |= {"pixels_as_one": (0, 1e6), "like_colours": (1e-3, 1e3)}
         spreads = ("piece_spread", "brightness_spread", "colour_spread")
         require_ranges(self, ranges | dict.fromkeys(spreads, (POSITIVE, 1e6)))

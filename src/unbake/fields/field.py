@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from .domain import SurfacePoint
+    from .pieces import Piece
 
 #: How networks multiply; see `network.py`. Other representations may do without.
 Engine = Literal["fused", "tensor", "coopvec"]
@@ -85,6 +86,18 @@ class Field(Protocol):
             `pieces`: the numbers of these pieces, beside what others have, too; `brightnesses`:
             differences between those of a piece that follow each other; `colours`: the same of what
             all pieces share. Here none.
+        """
+        return {}
+
+    def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float | mi.TensorXf]:
+        """The shared numbers with which pieces have higher outputs before their bounds.
+
+        Args:
+            piece: different pieces of surface.
+            by: how much higher the outputs of each are, everywhere on it.
+
+        Returns:
+            Those that change; here none.
         """
         return {}
 

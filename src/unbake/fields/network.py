@@ -16,6 +16,7 @@ from .field import Cost, Engine, Field, FieldSpec
 from .grid_sizes import USUAL, sized_grid
 from .perceptron import Perceptron, can_record_layout
 from .piece_values import PieceValues
+from .pieces import Piece
 from .settings import NetworkConfig
 
 
@@ -74,6 +75,10 @@ class Network(Field):
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
         """Those of the numbers of pieces and colours, if there are any."""
         return {} if self.pieces is None else self.pieces.deviations(point)
+
+    def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float | mi.TensorXf]:
+        """The numbers of pieces, if there are any."""
+        return {} if self.pieces is None else dict(self.pieces.raised(piece, by))
 
     def evaluate(
         self,

@@ -9,6 +9,7 @@ from .arrays import differences
 from .domain import SurfacePoint, bounded
 from .field import FieldSpec
 from .grid import DenseGrid
+from .pieces import Piece
 from .settings import DenseGridConfig, PieceConfig
 
 
@@ -99,6 +100,22 @@ class PieceValues:
         if self._colours is not None:
             found["colours"] = [gain * x for x in self._colours.differences()]
         return {name: dr.concat(arrays) for name, arrays in found.items()}
+
+    def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float]:
+        """See `Field.raised`."""
+        bins = self._settings.brightnesses
+        every = dr.arange(mi.UInt32, dr.width(piece.number) * bins)
+        own = every // bins
+        number = dr.minimum(dr.gather(mi.UInt32, piece.number, own), self._settings.most - 1)
+        strength = self._settings.gain * piece.strength
+        each = dr.gather(mi.Float, dr.select(strength > 0, by / strength, 0), own)
+        found = {}
+        for i, values in enumerate(self._values):
+            raised = mi.Float(dr.detach(values))
+            here = number * bins + every % bins
+            dr.scatter(raised, dr.gather(mi.Float, values, here) + each, here)
+            found[f"pieces.{i}"] = raised
+        return found
 
     @property
     def features(self) -> int:

@@ -17,13 +17,13 @@ What the field shares between points descends, its numbers of pieces and of colo
 photographs is the same for all samples, and a network would learn it. Of most numbers photographs
 tell little, too. So the most probable ones are sought: squared errors are in units of their
 variance, which the pixels themselves tell, by how bright they are, and numbers of one piece, or of
-like colours, are expected to differ as little as the settings say. After the first search, steps
-leave roughness alone; from the second one on, the mean of what searches find is kept.
+like colours, are expected to differ as little as the settings say. Each piece then moves to the
+roughness that is to be expected of it (`piece_levels.py`). After the first search, steps leave
+roughness alone; from the second one on, the mean of what searches find is kept.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -33,20 +33,17 @@ import numpy as np
 from ..config import FitConfig, RoughnessSearchConfig
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..fields.domain import SurfacePoint
 from ..fields.field import Field
-from ..fields.pieces import Piece
 from ..memory import lacks_memory
-from ..quantities import QUANTITIES
 from ..ranks import Ranks
 from ..transport.by_roughness import row_type
 from .gradients import flat_gradients, set_gradients
+from .piece_levels import with_expected_levels
 from .problem import Problem
+from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
 from .state import State
 from .step import TrainingStep, without_garbage_collection
 
-#: Values of roughness at which pixels are known; curves are cubic between them, in their logarithm.
-NODES = (0.1, 0.16, 0.24, 0.33, 0.43, 0.55, 0.7, 0.9)
 #: Camera samples that are traced at once.
 _AT_ONCE = 1 << 18
 #: Fewer pixels tell nothing: a fit of some dozen steps does not search.
@@ -55,12 +52,6 @@ _FEWEST = 1 << 12
 _SEED = 0x524F5547
 #: The rate that is left at the end of a descent.
 _FINAL_RATE = 0.05
-#: The part of a mean group's knowledge of its albedo that says: it is as it is.
-_CAUTION = 1e-3
-#: Brightnesses of pixels, in each of which errors have one variance.
-_BRIGHTNESSES = 32
-#: Factors of albedo are no larger.
-_LARGEST_FACTOR = 4.0
 
 
 class RoughnessSearch:
@@ -169,12 +160,12 @@ class RoughnessSearch:
         rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
         if len(rows):
             albedo = "albedo" in materials
-            present = _roughness(field, points(rows, albedo)).numpy()
+            present = roughness_of(field, points(rows, albedo)).numpy()
             rows["weight"] *= precision(rows, present)
             ranks = self._ranks if len(rows) >= self._ranks.size else Ranks()
             curves = Curves.of(rows, search.cells, search.colours, albedo, ranks)
             own = self._config.material_settings["roughness"].learning_rate
-            found = descend(field, curves, search, search.rate * own, ranks)
+            found = searched(field, curves, search, search.rate * own, ranks)
             named = {f"roughness.{key}": self._of_first(x) for key, x in found.items()}
             state.replace({k: dr.lerp(dr.detach(state.phi[k]), x, part) for k, x in named.items()})
         state.publish(self._problem)
@@ -188,182 +179,21 @@ class RoughnessSearch:
         return mi.TensorXf(found, array.shape) if dr.is_tensor_v(array) else found
 
 
-@dataclass(frozen=True)
-class Curves:
-    """Photometric losses of pixels as functions of the roughness at a point of each.
+def searched(
+    field: Field,
+    curves: Curves,
+    settings: RoughnessSearchConfig,
+    rate: float,
+    ranks: Ranks | None = None,
+) -> dict[str, Any]:
+    """What a search finds: where a field descends to, with pieces as they are to be expected.
 
-    Args:
-        point: of each pixel.
-        losses: at the nodes, pixel by pixel, each with the albedo that is the best one there.
-        slopes: by the logarithm of roughness, the same.
-        nodes: their logarithms.
-        total: how many pixels all ranks have.
+    Args and returns as of `descend`.
     """
-
-    point: SurfacePoint
-    losses: mi.Float
-    slopes: mi.Float
-    nodes: mi.Float
-    total: int
-
-    @staticmethod
-    def of(
-        rows: np.ndarray, cells: int, colours: int, albedo: bool, ranks: Ranks | None = None
-    ) -> Curves:
-        """The curves of sampled pixels.
-
-        Args:
-            rows: of `row_type`, of those of all ranks.
-            cells: along an edge of the unit cube, in each of which albedo has its own factor.
-            colours: along each channel of albedo, the same.
-            albedo: whether it is unknown.
-            ranks: that have an equal part of the curves each; None: this one has them all.
-        """
-        ranks, total = ranks or Ranks(), len(rows)
-        losses = losses_by_roughness(rows, groups(rows, cells, colours))
-        rows, losses = rows[ranks.rank :: ranks.size], losses[ranks.rank :: ranks.size]
-        nodes = np.log(NODES)
-        places = np.arange(len(nodes))
-        left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
-        slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
-
-        flat = [from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, nodes)]
-        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total)
-
-    def at(self, roughness: mi.Float) -> mi.Float:
-        """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
-        inside = dr.clip(roughness, NODES[0], NODES[-1])
-        span = mi.UInt32(0)
-        for node in NODES[1:-1]:
-            span += dr.select(dr.detach(roughness) >= node, mi.UInt32(1), mi.UInt32(0))
-        left, right = (dr.gather(mi.Float, self.nodes, span + i) for i in (0, 1))
-        first = dr.arange(mi.UInt32, dr.width(roughness)) * len(NODES) + span
-        a, b = (dr.gather(mi.Float, self.losses, first + i) for i in (0, 1))
-        width = right - left
-        p, q = (width * dr.gather(mi.Float, self.slopes, first + i) for i in (0, 1))
-        t = (dr.log(inside) - left) / width
-        return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
-
-
-def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
-    """Where pixels are seen.
-
-    Args:
-        rows: of `row_type`.
-        albedo: whether it is unknown, and so told.
-    """
-
-    def arrays(name: str) -> list[mi.Float]:
-        return [from_numpy(mi.Float, column) for column in rows[name].T]
-
-    number = from_numpy(mi.UInt32, rows["piece"])
-    return SurfacePoint(
-        mi.Point3f(arrays("position")),
-        piece=Piece(number, from_numpy(mi.Float, rows["strength"])),
-        albedo=mi.Color3f(arrays("albedo")) if albedo else None,
-    )
-
-
-def _roughness(field: Field, point: SurfacePoint) -> mi.Float:
-    """What a field says of points."""
-    return _in_range(field.evaluate(point))
-
-
-def _in_range(values: list[mi.Float]) -> mi.Float:
-    """Roughness of the values of its field."""
-    quantity = QUANTITIES["roughness"]
-    return dr.fma(values[0], quantity.upper - quantity.lower, quantity.lower)
-
-
-def precision(rows: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Factors of weights with which errors of pixels have the variance 1, however bright they are.
-
-    Pixels with about the same weight are of one brightness: weights are those of smoothed
-    photographs, by default, and do not follow their noise. The variance is the mean squared error
-    in each of `_BRIGHTNESSES` such sets of equal size.
-
-    Args:
-        rows: of `row_type`.
-        roughness: of pixels as it is by now, shape (n,).
-
-    Returns:
-        Shape (n, 3). Where a weight is zero it is 1.
-    """
-    every = np.arange(len(rows))
-    nearest = np.abs(np.log(NODES) - np.log(np.maximum(roughness, 1e-6))[:, None]).argmin(1)
-    image = rows["gain"] * (rows["plain"] + rows["coloured"])[every, nearest]
-    errors = rows["weight"] * (image - rows["target"]) ** 2
-    found = np.ones_like(errors)
-    for channel in range(3):
-        counted = np.flatnonzero(rows["weight"][:, channel] > 0)
-        order = counted[np.argsort(rows["weight"][counted, channel], kind="stable")]
-        for chosen in np.array_split(order, _BRIGHTNESSES):
-            if len(chosen):
-                found[chosen, channel] = 1 / max(errors[chosen, channel].mean(), 1e-12)
-    return found
-
-
-def groups(rows: np.ndarray, cells: int, colours: int) -> np.ndarray:
-    """The group of each pixel in which albedo has one factor, from 0, shape (n,)."""
-    bright = np.sqrt(np.clip(rows["albedo"], 0, 1))
-    columns = [
-        np.floor(rows["position"] * cells),
-        rows["piece"][:, None],
-        np.minimum(np.floor(bright * colours), colours - 1),
-    ]
-    every = np.concatenate(columns, 1).astype(np.int64)
-    return np.unique(every, axis=0, return_inverse=True)[1].ravel()
-
-
-def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """The squared errors of pixels at each node, with the best albedo for it.
-
-    In each group and channel the factor of the albedo is the one with the smallest sum of errors.
-
-    Args:
-        rows: of `row_type`.
-        group: of each pixel, from 0, shape (n,).
-
-    Returns:
-        As of `squared_errors`.
-    """
-    count = group.max() + 1
-    target, weight, gain = (
-        rows[name][:, None].astype(np.float64) for name in ("target", "weight", "gain")
-    )
-
-    def sums(values: np.ndarray) -> np.ndarray:
-        flat = values.reshape(len(values), -1)
-        found = np.stack([np.bincount(group, column, count) for column in flat.T], 1)
-        return found.reshape(count, *values.shape[1:])
-
-    square = weight * gain**2
-    wanted = sums(weight * gain * target * rows["coloured"] - square * rows["mixed"])
-    known = sums(square * rows["coloured2"])
-    caution = _CAUTION * np.maximum(known.mean(0, keepdims=True), 0) + 1e-30
-    factor = (wanted + caution) / np.maximum(known + caution, caution)
-    return squared_errors(rows, np.clip(factor, 0, _LARGEST_FACTOR)[group])
-
-
-def squared_errors(rows: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """The squared errors of pixels at each node, with albedo times a factor g.
-
-    The error of a pixel is w (γ (S + g · D) − I)², without bias: squares are products of different
-    samples.
-
-    Args:
-        rows: of `row_type`.
-        factor: float64, of a shape that broadcasts to (n, nodes, 3).
-
-    Returns:
-        Means over channels, shape (n, nodes).
-    """
-    target, weight, gain = (
-        rows[name][:, None].astype(np.float64) for name in ("target", "weight", "gain")
-    )
-    image = gain * (rows["plain"] + factor * rows["coloured"])
-    image2 = gain**2 * (rows["plain2"] + factor * (2 * rows["mixed"] + factor * rows["coloured2"]))
-    return (weight * (image2 - target * (2 * image - target))).mean(2)
+    found = descend(field, curves, settings, rate, ranks)
+    if not settings.pixels_as_one:
+        return found
+    return with_expected_levels(field, curves, found, settings, ranks)
 
 
 def descend(
@@ -404,7 +234,7 @@ def descend(
         now = rate * _FINAL_RATE ** (number / settings.steps)
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, now) for key in optimizer})
         field.assign(first | dict(optimizer.items()))
-        roughness = _in_range(field.with_shared(beside, curves.point))
+        roughness = in_range(field.with_shared(beside, curves.point))
         loss = weights["pixels"] * dr.mean(curves.at(roughness))
         for key, values in field.deviations(curves.point).items():
             loss += weights[key] * dr.sum(dr.square(values))

@@ -1,0 +1,139 @@
+"""The roughness that is to be expected of each piece of surface, by empirical Bayes (ours).
+
+A descent ends at the most probable numbers. Photographs tell next to nothing of a small matt piece:
+its curve is nearly flat, and noise decides where it is least. The mean over all roughnesses, each
+as often as it is probable, has the least squared error there. How probable they are before any
+photograph is seen, the pieces tell: many are of few materials, and those of like colours more
+often of one. So the distribution is found together with them, as the one under which what
+photographs show is most probable (nonparametric maximum likelihood by expectation maximization,
+Laird 1978).
+
+Each piece moves as a whole: how its roughness varies with brightness and place stays as it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..config import RoughnessSearchConfig
+from ..fields.arrays import from_numpy
+from ..fields.field import Field
+from ..ranks import Ranks
+from .roughness_curves import NODES, Curves, in_range, of_roughness
+
+#: By how much pieces are moved on trial, in units of the field's outputs before their bounds.
+SHIFTS = np.linspace(-5, 5, 61)
+#: The levels that a distribution knows, as values of the field: where curves are known.
+LEVELS = np.linspace(of_roughness(NODES[0]), of_roughness(NODES[-1]), 48)
+#: The chance that a curve tells nothing, for what no variance knows.
+_ASTRAY = 1e-4
+#: The part of the distribution of all pieces that is even.
+_EVEN = 0.02
+#: So many pieces of a like colour count as much as what all pieces have in common.
+_AS_MANY = 1.0
+#: Steps of expectation maximization.
+_STEPS = 40
+#: Weights by which neighbouring levels are mixed.
+_MIXED = (0.25, 0.5, 0.25)
+#: A value of the field is no nearer to its bounds.
+_NEAREST = 1e-6
+
+
+def with_expected_levels(
+    field: Field,
+    curves: Curves,
+    found: dict[str, Any],
+    settings: RoughnessSearchConfig,
+    ranks: Ranks | None = None,
+) -> dict[str, Any]:
+    """Move each piece to the roughness that is to be expected of it.
+
+    Args:
+        field: of roughness, with numbers of pieces.
+        curves: of errors in units of their variance.
+        found: numbers that points share, in the place of the field's.
+        settings: how many pixels tell as much as one, and which colours are alike.
+        ranks: that have a part of the curves each; None: there is one.
+
+    Returns:
+        What was found, with the numbers of pieces moved.
+    """
+    ranks = ranks or Ranks()
+    pieces, point = curves.pieces, curves.point
+    assert point.piece is not None
+    before = dict(field.parameters())
+    field.assign(before | found)
+    value = np.clip(np.array(field.evaluate(point)[0], np.float64), _NEAREST, 1 - _NEAREST)
+    outputs = np.log(value / (1 - value))
+    unit = np.searchsorted(np.array(pieces.number), np.array(point.piece.number))
+    count = len(np.array(pieces.number))
+
+    def sums(column: np.ndarray) -> np.ndarray:
+        return np.bincount(unit, column, count)
+
+    errors, values = [], []
+    for shift in SHIFTS:
+        value = 1 / (1 + np.exp(-(outputs + shift)))
+        roughness = in_range([from_numpy(mi.Float, value.astype(np.float32))])
+        errors.append(sums(curves.at(roughness).numpy()))
+        values.append(sums(value))
+    albedo = np.zeros((3, len(unit))) if point.albedo is None else np.array(point.albedo)
+    colours = [sums(channel) for channel in np.sqrt(np.clip(albedo, 0, 1))]
+    table = np.stack([sums(np.ones(len(unit))), *colours, *errors, *values], 1)
+    table = ranks.size * ranks.mean(table)
+    pixels, colour, rest = table[:, 0], table[:, 1:4], table[:, 4:]
+    error, value = rest[:, : len(SHIFTS)], rest[:, len(SHIFTS) :] / pixels[:, None]
+    levels = np.stack([np.interp(LEVELS, x, y) for x, y in zip(value, error, strict=True)])
+    wanted = expected(levels, pixels, colour / pixels[:, None], settings)
+    by = [np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)]
+    raised = field.raised(pieces, from_numpy(mi.Float, np.array(by, np.float32)))
+    field.assign(before)
+    return found | raised
+
+
+def expected(
+    errors: np.ndarray, pixels: np.ndarray, colours: np.ndarray, settings: RoughnessSearchConfig
+) -> np.ndarray:
+    """The levels that are to be expected of pieces.
+
+    Args:
+        errors: sums of the squared errors of each piece, in units of their variance, at each of
+            `LEVELS`, shape (pieces, levels).
+        pixels: of each piece, shape (pieces,).
+        colours: the mean of the square roots of albedo, linear RGB, shape (pieces, 3).
+        settings: how many pixels tell as much as one, and which colours are alike.
+
+    Returns:
+        Between 0 and 1, shape (pieces,).
+    """
+    above = errors - errors.min(1, keepdims=True)
+    chance = np.exp(-above / (2 * settings.pixels_as_one)) + _ASTRAY
+    # Pieces of one cell of colours are alike, and those of near cells are by their distance.
+    cell = np.floor(colours / (settings.like_colours / 2))
+    kinds, kind = np.unique(cell, axis=0, return_inverse=True)
+    distance = ((kinds[:, None] - kinds[None]) ** 2).sum(2) / 4
+    near = np.exp(-distance / 2)
+    # Large pieces tell more of what there is, but each is one piece of one material.
+    weight = np.sqrt(pixels)
+    weight = (weight / weight.mean())[:, None]
+    probable = chance / chance.sum(1, keepdims=True)
+    for _ in range(_STEPS):
+        total = _mixed((weight * probable).sum(0, keepdims=True))
+        total = total / total.sum() + _EVEN / len(LEVELS)
+        total /= total.sum()
+        of_kinds = np.zeros((len(kinds), len(LEVELS)))
+        np.add.at(of_kinds, kind.ravel(), weight * probable)
+        before = _mixed(near @ of_kinds) + _AS_MANY * total
+        probable = chance * (before / before.sum(1, keepdims=True))[kind.ravel()]
+        probable /= probable.sum(1, keepdims=True)
+    return probable @ LEVELS
+
+
+def _mixed(distributions: np.ndarray) -> np.ndarray:
+    """Distributions, one a row, with neighbouring levels mixed."""
+    padded = np.pad(distributions, ((0, 0), (1, 1)), mode="edge")
+    a, b, c = _MIXED
+    return a * padded[:, :-2] + b * padded[:, 1:-1] + c * padded[:, 2:]

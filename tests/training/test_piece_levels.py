@@ -1,0 +1,132 @@
+"""The roughness that is to be expected of each piece of surface."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from searches import SEARCH, SMALL, made_up
+
+from unbake.config import FitConfig, read_toml, to_toml
+from unbake.fields.field import FieldSpec
+from unbake.fields.network import Network
+from unbake.training.piece_levels import LEVELS, expected, with_expected_levels
+from unbake.training.roughness_curves import NODES, Curves, in_range
+from unbake.training.roughness_search import descend, searched
+
+RED, BLUE = (0.9, 0.3, 0.3), (0.2, 0.3, 0.9)
+
+
+def parabolas(least, known):
+    """Errors of pieces that are least at their level, as much more beside it as is known of it."""
+    least, known = np.array(least)[:, None], np.array(known)[:, None]
+    return known * (LEVELS - least) ** 2
+
+
+def levels_of(errors, colours, settings=SEARCH, pixels=100.0):
+    return expected(errors, np.full(len(errors), pixels), np.array(colours), settings)
+
+
+def test_what_photographs_show_stays():
+    true = [0.2, 0.35, 0.7, 0.8]
+    found = levels_of(parabolas(true, [1e5] * 4), [RED, BLUE, RED, BLUE])
+    np.testing.assert_allclose(found, true, atol=0.01)
+
+
+def test_what_photographs_do_not_show_is_as_of_like_colours():
+    true, known = [0.25] * 6 + [0.75] * 6, [1e4] * 5 + [0.0] + [1e4] * 5 + [0.0]
+    found = levels_of(parabolas(true, known), [RED] * 6 + [BLUE] * 6)
+    assert found[5] == pytest.approx(0.25, abs=0.08)
+    assert found[11] == pytest.approx(0.75, abs=0.08)
+    # Where all colours are alike it is the mean of all pieces.
+    found = levels_of(
+        parabolas(true, known), [RED] * 6 + [BLUE] * 6, replace(SEARCH, like_colours=99)
+    )
+    np.testing.assert_allclose(found[[5, 11]], 0.5, atol=0.03)
+
+
+def test_errors_are_as_small_as_with_the_true_distribution():
+    rng, materials = np.random.default_rng(3), np.array([0.3, 0.85])
+    true = rng.choice(materials, 300)
+    known = 10 ** rng.uniform(-1, 3, 300)
+    least = np.clip(true + rng.standard_normal(300) / np.sqrt(known), LEVELS[0], LEVELS[-1])
+    errors = parabolas(least, known)
+    found = levels_of(errors, [RED] * 300, replace(SEARCH, pixels_as_one=1.0))
+    chance = np.exp(-known[:, None] * (materials - least[:, None]) ** 2 / 2)
+    best = chance @ materials / chance.sum(1)
+    of_minima, of_found, of_best = (
+        np.square(x - true).mean() for x in (LEVELS[errors.argmin(1)], found, best)
+    )
+    assert of_best < of_found < 1.2 * of_best < of_minima
+
+
+def roughness_at(field, parameters, point):
+    before = dict(field.parameters())
+    field.assign(before | parameters)
+    found = np.array(in_range(field.evaluate(point)))
+    field.assign(before)
+    return found
+
+
+def test_pieces_move_as_a_whole_and_nothing_else_does():
+    rows = made_up(noise=0.02)
+    rows["weight"] /= 0.02**2
+    rows["weight"][rows["piece"] == 1] *= 1e-9  # of which photographs show nothing
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    first = descend(field, curves, replace(SEARCH, steps=200), 0.02)
+    before = {key: np.array(x.array) for key, x in field.parameters().items()}
+    found = with_expected_levels(field, curves, first, SEARCH)
+    assert set(found) == set(first)
+    np.testing.assert_array_equal(found["colours"].array, first["colours"].array)
+    for key, x in field.parameters().items():
+        assert np.array_equal(np.array(x.array), before[key]), key
+    known = rows["piece"] == 0
+    value = roughness_at(field, found, curves.point)
+    assert value[known].mean() == pytest.approx(0.24, abs=0.03)
+    # Both pieces are of one colour.
+    assert value[~known].mean() == pytest.approx(0.24, abs=0.06)
+    apart = {}
+    for name, numbers in (("first", first), ("found", found)):
+        value = (roughness_at(field, numbers, curves.point) - 0.02) / 0.98
+        apart[name] = np.log(value / (1 - value))
+    change = apart["found"] - apart["first"]
+    for piece in (known, ~known):
+        np.testing.assert_allclose(change[piece], change[piece].mean(), atol=1e-3)
+
+
+def test_a_piece_leaves_a_hollow_in_which_a_descent_is_caught():
+    rows = made_up(true=(0.24, 0.9))
+    rows["weight"] *= 1e5
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.1, seed=2))
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    caught, free = (
+        roughness_at(field, searched(field, curves, settings, 0.02), curves.point)
+        for settings in (replace(SEARCH, steps=3, pixels_as_one=0), replace(SEARCH, steps=3))
+    )
+    high = rows["piece"] == 1
+    assert caught[high].mean() < 0.2
+    assert free[high].mean() == pytest.approx(0.9, abs=0.03)
+
+
+def test_sums_of_a_piece_do_not_turn_on_their_way_up():
+    rows = made_up(count=40, true=(0.1, 0.1))
+    rows["coloured"] = rows["coloured2"] = rows["mixed"] = rows["target"] = 0
+    cliff = np.array([2, 87, 1289, 1300, 1310, 1320, 1330, 1340])
+    rows["plain"], rows["plain2"] = 0, (cliff / 40)[:, None]
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    between = np.geomspace(NODES[0], NODES[-1], 200)
+    sums = [float(dr.sum(curves.at(dr.full(mi.Float, x, 40)))[0]) for x in between]
+    assert min(sums) >= 2 - 1e-3
+    assert np.diff(sums).min() > -1e-2
+
+
+def test_older_runs_stay_at_what_is_most_probable(tmp_path):
+    file = tmp_path / "config.toml"
+    text = to_toml(FitConfig())
+    file.write_text(text)
+    assert read_toml(file).roughness_search == SEARCH
+    kept = [x for x in text.splitlines() if not x.startswith("pixels_as_one")]
+    file.write_text("\n".join(kept))
+    assert read_toml(file).roughness_search == replace(SEARCH, pixels_as_one=0)
