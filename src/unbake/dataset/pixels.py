@@ -319,11 +319,11 @@ class PixelSource:
         found = self.photographs
         left = len(found.places) - len(self._before_held)
         if not left:  # whatever is drawn has no weight
-            return self._own_batch(np.full(count, found.pixels.start))
+            return self.of_numbers(np.full(count, found.pixels.start))
         places = np.random.default_rng(seed).integers(0, left, count)
         # Places are among those left: each moves on by the number of held ones before it.
         places += np.searchsorted(self._before_held, places, "right")
-        return self._own_batch(found.own_numbers(found.places.start + places))
+        return self.of_numbers(found.own_numbers(found.places.start + places))
 
     def draw_crop(self, seed: int, count: int) -> PixelBatch:
         """Draw a crop of one random view that this process holds, with all its pixels.
@@ -359,7 +359,7 @@ class PixelSource:
             if held.all():
                 return self.draw(seed, count)
             numbers[held] = rng.choice(numbers[~held], int(held.sum()))
-        return self._own_batch(numbers)
+        return self.of_numbers(numbers)
 
     def place(self, number: int) -> tuple[int, int, int]:
         """The view of a pixel, from 0, and its column and row in it."""
@@ -409,7 +409,8 @@ class PixelSource:
         held = self._own_held - self.photographs.places.start
         return held - np.arange(len(held))
 
-    def _own_batch(self, numbers: np.ndarray) -> PixelBatch:
+    def of_numbers(self, numbers: np.ndarray) -> PixelBatch:
+        """The pixels with these numbers, which are of those that this process holds."""
         slopes = self._slopes(numbers) if self.slopes else None
         return self._batch(numbers, self.photographs.own_rows(numbers), slopes)
 

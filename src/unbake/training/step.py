@@ -25,7 +25,7 @@ from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..ranks import Ranks
-from ..transport.by_roughness import by_roughness, stratified
+from ..transport.by_roughness import by_roughness, meet_one_piece, stratified
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
@@ -59,6 +59,12 @@ class Inputs:
     told: mi.Float | None = None  # exposures of the views as the data set tells, if they are read
     units: PoseUnits | None = None  # of corrections of poses, if there are any
     blocks: Blocks | None = None  # of pixels that lose their weight together, if they are to
+
+
+#: Camera samples that look whether a pixel shows one piece of surface.
+_LOOKS = 4
+#: How often pixels are drawn, at most, for those that do.
+_DRAWS = 16
 
 
 @dataclass(frozen=True)
@@ -370,8 +376,9 @@ class TrainingStep:
         of_pixels, of_samples = map(int, seeds)
         with dr.suspend_grad():
             state.publish(problem)
-            pixels = self._pixels.draw(of_pixels, count)
-            inputs = replace(self._inputs(0, 1), pixels=pixels)  # one pixel, which is not used
+            inputs = self._inputs(0, 1)  # one pixel, which is not used
+            pixels = self._of_one_piece(inputs, of_pixels, count)
+            inputs = replace(inputs, pixels=pixels)
             sampler.seed(dr.opaque(mi.UInt32, of_samples), count * spp)
             placed = self._placed(inputs)
             batch = pixels.batch(placed, sampler, spp)
@@ -393,6 +400,28 @@ class TrainingStep:
             rows["weight"] = self._weight * np.array(weight).T[chosen]
             rows["gain"] = 1 if loss.gain is None else np.array(loss.gain).T[chosen]
         return rows[np.isfinite(rows.view(np.float32).reshape(len(rows), -1)).all(1)]
+
+    def _of_one_piece(self, inputs: Inputs, seed: int, count: int) -> PixelBatch:
+        """Some random pixels that `by_roughness` can tell, as far as a few samples show.
+
+        Where there are few of them in many draws, the others are any pixels.
+        """
+        problem, sampler, placed = self._problem, stratified(_LOOKS), self._placed(inputs)
+        seeds = np.random.SeedSequence(seed).generate_state(2 * _DRAWS).tolist()
+        found, last, left = [], np.zeros(0, np.int64), count
+        for of_pixels, of_samples in zip(seeds[::2], seeds[1::2], strict=True):
+            pixels = self._pixels.draw(of_pixels, count)
+            sampler.seed(dr.opaque(mi.UInt32, of_samples), count * _LOOKS)
+            ray = pixels.batch(placed, sampler, _LOOKS).ray
+            good = meet_one_piece(
+                problem.scene_view, ray, sampler, _LOOKS, hide_emitters=problem.hide_emitters
+            )
+            last = pixels.read()[0].astype(np.int64)
+            found.append(last[good][:left])
+            left -= len(found[-1])
+            if not left:
+                break
+        return self._pixels.of_numbers(np.concatenate([*found, last[:left]]))
 
     def place(self, pixel: int) -> tuple[int, int, int]:
         """The training view of a pixel, from 0, and its column and row in it."""

@@ -125,10 +125,7 @@ def by_roughness(
         albedo = mi.Color3f(material["albedo"]) if "albedo" in material else dr.zeros(mi.Color3f)
         piece, strength = point.piece.number, point.piece.strength
         dr.eval(material, albedo, point.position, piece, strength)
-        first = dr.arange(mi.UInt32, dr.width(x.valid)) // spp * spp
-        counted = x.valid & (dr.max(x.emitted) <= 0) & scene_view.is_optimized(x.si.shape)
-        counted &= dr.gather(mi.UInt32, piece, first) == piece
-        chosen = np.flatnonzero(np.array(counted).reshape(-1, spp).all(1))
+        chosen = np.flatnonzero(_of_one_piece(scene_view, x, piece, spp))
         rows = np.zeros(len(chosen), row_type(len(nodes)))
         lanes = chosen * spp
         rows["piece"], rows["strength"] = np.array(piece)[lanes], np.array(strength)[lanes]
@@ -144,6 +141,37 @@ def by_roughness(
             for name, values in moments(plain, whole - plain, spp).items():
                 rows[name][:, number] = values[chosen]
     return chosen, rows
+
+
+def meet_one_piece(
+    scene_view: SceneView, ray: mi.Ray3f, sampler: mi.Sampler, spp: int, *, hide_emitters: bool
+) -> np.ndarray:
+    """Whether all samples of a pixel meet one piece of surface, and no light on the way.
+
+    Only then can `by_roughness` tell the pixel; within `carrying`.
+
+    Args:
+        scene_view, ray, sampler, hide_emitters: as of `by_roughness`.
+        spp: consecutive lanes a pixel.
+
+    Returns:
+        Of each pixel, shape (n,).
+    """
+    materials = scene_view.materials
+    assert materials is not None
+    with dr.suspend_grad():
+        x = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
+        point = materials.locate(x.si, x.valid)
+        assert point.piece is not None
+        return _of_one_piece(scene_view, x, point.piece.number, spp)
+
+
+def _of_one_piece(scene_view: SceneView, x: Vertex, piece: mi.UInt32, spp: int) -> np.ndarray:
+    """The same, where the vertices of the samples and their pieces are known."""
+    first = dr.arange(mi.UInt32, dr.width(x.valid)) // spp * spp
+    counted = x.valid & (dr.max(x.emitted) <= 0) & scene_view.is_optimized(x.si.shape)
+    counted &= dr.gather(mi.UInt32, piece, first) == piece
+    return np.logical_and.reduce(np.array(counted).reshape(-1, spp), axis=1)
 
 
 def _carrying(
