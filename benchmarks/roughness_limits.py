@@ -35,6 +35,7 @@ os.environ["PYTHONPATH"] = str(ROOT / "src")
 from roughness_curves import numbers_of, opened  # noqa: E402
 
 from unbake import backend  # noqa: E402
+from unbake.config import RoughnessSearchConfig  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 
@@ -174,7 +175,6 @@ class Shared:
     def __init__(self, run: Any, rows: np.ndarray, truth: np.ndarray) -> None:
         import drjit as dr
 
-        from unbake.config import RoughnessSearchConfig
         from unbake.training.roughness_curves import points
 
         self.field = run.problem.materials["roughness"]
@@ -192,12 +192,16 @@ class Shared:
         span = quantity.upper - quantity.lower
         return self.field.evaluate(self._point)[0] * span + quantity.lower
 
-    def score(self, changed: dict[str, Any]) -> float:
-        """The PSNR with some numbers changed."""
+    def values_with(self, changed: dict[str, Any]) -> np.ndarray:
+        """Roughness with some numbers changed, shape (n,)."""
         self.field.assign(self.fitted | changed)
-        found = psnr(self._values().numpy(), self._truth)
+        found = self._values().numpy()
         self.field.assign(self.fitted)
         return found
+
+    def score(self, changed: dict[str, Any]) -> float:
+        """The PSNR with some numbers changed."""
+        return psnr(self.values_with(changed), self._truth)
 
     def towards_truth(self, names: Iterable[str]) -> dict[str, Any]:
         """Some of the numbers, fitted to the true roughness."""
@@ -218,17 +222,23 @@ class Shared:
         self.field.assign(self.fitted)
         return {key: dr.detach(x) for key, x in optimizer.items()}
 
-    def searched(self, rows: np.ndarray, faster: float = 1) -> dict[str, Any]:
+    def searched(
+        self,
+        rows: np.ndarray,
+        faster: float = 1,
+        settings: RoughnessSearchConfig | None = None,
+    ) -> dict[str, Any]:
         """What a search finds; the variance of errors, times weight, is 1.
 
         Args:
             rows: of `row_type`.
             faster: the rate of its descent, as a multiple of the usual one.
+            settings: None: the default ones.
         """
         from unbake.training.roughness_curves import Curves
         from unbake.training.roughness_search import searched
 
-        settings = self._settings
+        settings = settings or self._settings
         curves = Curves.of(rows, settings.cells, settings.colours, albedo=True)
         found = searched(self.field, curves, settings, faster * self._rate)
         self.field.assign(self.fitted)

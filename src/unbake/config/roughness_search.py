@@ -17,7 +17,7 @@ class RoughnessSearchConfig:
     times: int = 2  #: searches, evenly from `first` to `last`; 0: none
     first: float = 0.4  #: fraction of the fit after which the first one comes
     last: float = 0.75  #: and the last one; the rest is left for albedo to follow
-    share: float = 0.25  #: camera samples of each one, of those that all steps of the fit take
+    share: float = 0.4  #: camera samples of each one, of those that all steps of the fit take
     pixels: int = 1 << 19  #: that are sampled, at most
     spp: int = 64  #: camera samples of each pixel
     cells: int = 4  #: along an edge of the scene's cube, in each of which albedo has its own factor
