@@ -97,7 +97,8 @@ def at_means(values: np.ndarray, pieces: np.ndarray, truth: np.ndarray) -> np.nd
         unit = np.clip((values[own] - quantity.lower) / span, 1e-6, 1 - 1e-6)
         moved = 1 / (1 + (1 / unit - 1) * np.exp(-SHIFTS[:, None]))
         moved = quantity.lower + span * moved
-        found[own] = moved[np.abs(moved.mean(1) - truth[own].mean()).argmin()]
+        shift = np.interp(truth[own].mean(), moved.mean(1), SHIFTS)
+        found[own] = quantity.lower + span / (1 + (1 / unit - 1) * np.exp(-shift))
     return found
 
 

@@ -179,7 +179,8 @@ class Shared:
 
         self.field = run.problem.materials["roughness"]
         self._rows, self._truth, self._point = rows, truth, points(rows, albedo=True)
-        self._settings = RoughnessSearchConfig()
+        # Pieces stay where they are most probable.
+        self._settings = RoughnessSearchConfig(pixels_as_one=0)
         self._rate = run.config.material_settings["roughness"].learning_rate * self._settings.rate
         parameters = self.field.parameters()
         self.fitted = {key: type(x)(dr.detach(x)) for key, x in parameters.items()}
@@ -233,7 +234,7 @@ class Shared:
         Args:
             rows: of `row_type`.
             faster: the rate of its descent, as a multiple of the usual one.
-            settings: None: the default ones.
+            settings: None: the default ones, but that pieces stay where they are most probable.
         """
         from unbake.training.roughness_curves import Curves
         from unbake.training.roughness_search import searched

@@ -61,6 +61,17 @@ def test_errors_are_as_small_as_with_the_true_distribution():
     assert of_best < of_found < 1.2 * of_best < of_minima
 
 
+def test_a_piece_alone_does_not_confirm_its_own_noise():
+    (found,) = levels_of(parabolas([LEVELS[0]], [1.0]), [RED], pixels=1e4)
+    assert found == pytest.approx(LEVELS.mean(), abs=0.1)
+
+
+def test_a_piece_that_differs_from_a_crowd_stays_what_photographs_show():
+    true = [0.8] * 100 + [0.3]
+    found = levels_of(parabolas(true, [1e4] * 101), [RED] * 101)
+    assert found[-1] == pytest.approx(0.3, abs=0.02)
+
+
 def roughness_at(field, parameters, point):
     before = dict(field.parameters())
     field.assign(before | parameters)
@@ -96,30 +107,72 @@ def test_pieces_move_as_a_whole_and_nothing_else_does():
         np.testing.assert_allclose(change[piece], change[piece].mean(), atol=1e-3)
 
 
-def test_a_piece_leaves_a_hollow_in_which_a_descent_is_caught():
+def test_a_piece_moves_further_than_a_short_descent():
     rows = made_up(true=(0.24, 0.9))
     rows["weight"] *= 1e5
     field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.1, seed=2))
     curves = Curves.of(rows, 2, 6, albedo=True)
-    caught, free = (
+    near, far = (
         roughness_at(field, searched(field, curves, settings, 0.02), curves.point)
         for settings in (replace(SEARCH, steps=3, pixels_as_one=0), replace(SEARCH, steps=3))
     )
     high = rows["piece"] == 1
-    assert caught[high].mean() < 0.2
-    assert free[high].mean() == pytest.approx(0.9, abs=0.03)
+    assert near[high].mean() < 0.2
+    assert far[high].mean() == pytest.approx(0.9, abs=0.03)
 
 
-def test_sums_of_a_piece_do_not_turn_on_their_way_up():
+def test_what_is_smoother_than_curves_know_stays():
+    rows = made_up(true=(0.1, 0.1))
+    rows["weight"] *= 1e5
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.03, seed=2))
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    before = roughness_at(field, numbers, curves.point)
+    after = roughness_at(field, with_expected_levels(field, curves, numbers, SEARCH), curves.point)
+    assert before.max() < 0.06
+    np.testing.assert_allclose(after, before, atol=1e-4)
+
+
+def test_pieces_beyond_the_last_number_move_together():
+    rows = made_up(noise=0.02)
+    rows["weight"] /= 0.02**2
+    rows["piece"] += 70  # the field has 64 numbers
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.8, seed=2))
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    found = with_expected_levels(field, curves, numbers, SEARCH)
+    value = roughness_at(field, found, curves.point)
+    assert value.std() < 0.02
+    assert 0.24 < value.mean() < 0.55
+
+
+def sums_between(nodes):
+    """Sums over a piece whose curves have these sums at nodes, at 200 roughnesses."""
     rows = made_up(count=40, true=(0.1, 0.1))
+    rows["piece"] = 0
     rows["coloured"] = rows["coloured2"] = rows["mixed"] = rows["target"] = 0
-    cliff = np.array([2, 87, 1289, 1300, 1310, 1320, 1330, 1340])
-    rows["plain"], rows["plain2"] = 0, (cliff / 40)[:, None]
+    rows["plain"], rows["plain2"] = 0, (np.array(nodes) / 40)[:, None]
     curves = Curves.of(rows, 2, 6, albedo=True)
     between = np.geomspace(NODES[0], NODES[-1], 200)
-    sums = [float(dr.sum(curves.at(dr.full(mi.Float, x, 40)))[0]) for x in between]
-    assert min(sums) >= 2 - 1e-3
+    return np.array([float(dr.sum(curves.at(dr.full(mi.Float, x, 40)))[0]) for x in between])
+
+
+def test_there_is_no_hollow_beside_a_cliff():
+    sums = sums_between([2, 87, 1289, 1300, 1310, 1320, 1330, 1340])
     assert np.diff(sums).min() > -1e-2
+    assert sums_between([3, 2, 1289, 1300, 1310, 1320, 1330, 1340]).min() > 0
+
+
+def test_sums_are_least_between_nodes_where_they_fall_and_rise():
+    place = np.log(0.48)
+    sums = sums_between(100 * (np.log(NODES) - place) ** 2)
+    least = np.geomspace(NODES[0], NODES[-1], 200)[sums.argmin()]
+    assert least == pytest.approx(0.48, abs=0.01)
+    assert sums.min() == pytest.approx(0, abs=0.5)
+
+
+def test_squared_errors_far_below_zero_do_not_count():
+    assert sums_between([-4000] * 8).min() == pytest.approx(-40)
 
 
 def test_older_runs_stay_at_what_is_most_probable(tmp_path):

@@ -34,7 +34,8 @@ class RoughnessSearchConfig:
     pixels_as_one: float = 3.0
     #: How near colours are whose pieces have like levels, as square roots of linear RGB
     like_colours: float = 0.1
-    rate_between: float = 0.0  #: of the fit's steps after the first search, the same
+    #: Of the fit's steps after the first search, as a multiple of the field's own
+    rate_between: float = 0.0
 
     def __post_init__(self) -> None:
         ranges = {"times": (0, 1000), "first": (0, 1), "last": (0, 1)}

@@ -63,6 +63,8 @@ class Field(Protocol):
     prepare_recordable: bool = True
     #: Whether fields can be evaluated inside of virtual calls and loops.
     symbolic: bool = True
+    #: How many pieces of surface have numbers of their own; all further ones share the last.
+    most_pieces: int = 0
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays by name; `assign` takes them back."""

@@ -45,6 +45,7 @@ class Network(Field):
         # Values of pieces are added to the outputs before these are bounded.
         pieces = settings.pieces
         self.pieces = PieceValues(pieces, spec.outputs) if pieces.most else None
+        self.most_pieces = pieces.most
         self._pace = pieces.network
         self._bounded = spec.bounded and self.pieces is not None
         self._first = first_value(spec) if self._bounded else 0.0

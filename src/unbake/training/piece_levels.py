@@ -4,9 +4,10 @@ A descent ends at the most probable numbers. Photographs tell next to nothing of
 its curve is nearly flat, and noise decides where it is least. The mean over all roughnesses, each
 as often as it is probable, has the least squared error there. How probable they are before any
 photograph is seen, the pieces tell: many are of few materials, and those of like colours more
-often of one. So the distribution is found together with them, as the one under which what
-photographs show is most probable (nonparametric maximum likelihood by expectation maximization,
-Laird 1978).
+often of one. So the distribution is found together with them, about as the one under which what
+photographs show is most probable (nonparametric maximum likelihood, Laird 1978; by expectation
+maximization with smoothing, Silverman et al. 1990). For each piece it is that of the others: a
+piece by itself would confirm its own noise.
 
 Each piece moves as a whole: how its roughness varies with brightness and place stays as it is.
 """
@@ -21,6 +22,7 @@ import numpy as np
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
 from ..fields.field import Field
+from ..fields.pieces import Piece
 from ..ranks import Ranks
 from .roughness_curves import NODES, Curves, in_range, of_roughness
 
@@ -29,9 +31,9 @@ SHIFTS = np.linspace(-5, 5, 61)
 #: The levels that a distribution knows, as values of the field: where curves are known.
 LEVELS = np.linspace(of_roughness(NODES[0]), of_roughness(NODES[-1]), 48)
 #: The chance that a curve tells nothing, for what no variance knows.
-_ASTRAY = 1e-4
-#: The part of the distribution of all pieces that is even.
-_EVEN = 0.02
+_ASTRAY = 1e-6
+#: The part of a distribution that is even.
+_EVEN = 0.005
 #: So many pieces of a like colour count as much as what all pieces have in common.
 _AS_MANY = 1.0
 #: Steps of expectation maximization.
@@ -62,14 +64,18 @@ def with_expected_levels(
         What was found, with the numbers of pieces moved.
     """
     ranks = ranks or Ranks()
-    pieces, point = curves.pieces, curves.point
+    point = curves.point
     assert point.piece is not None
     before = dict(field.parameters())
     field.assign(before | found)
     value = np.clip(np.array(field.evaluate(point)[0], np.float64), _NEAREST, 1 - _NEAREST)
     outputs = np.log(value / (1 - value))
-    unit = np.searchsorted(np.array(pieces.number), np.array(point.piece.number))
-    count = len(np.array(pieces.number))
+    # The smallest pieces may share the last number of the field.
+    most = field.most_pieces - 1
+    numbers, first = np.unique(np.minimum(curves.pieces.number, most), return_index=True)
+    strengths = np.array(curves.pieces.strength)[first]
+    unit = np.searchsorted(numbers, np.minimum(point.piece.number, most))
+    count = len(numbers)
 
     def sums(column: np.ndarray) -> np.ndarray:
         return np.bincount(unit, column, count)
@@ -88,8 +94,12 @@ def with_expected_levels(
     error, value = rest[:, : len(SHIFTS)], rest[:, len(SHIFTS) :] / pixels[:, None]
     levels = np.stack([np.interp(LEVELS, x, y) for x, y in zip(value, error, strict=True)])
     wanted = expected(levels, pixels, colour / pixels[:, None], settings)
-    by = [np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)]
-    raised = field.raised(pieces, from_numpy(mi.Float, np.array(by, np.float32)))
+    by = np.array([np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)])
+    # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
+    now = value[:, len(SHIFTS) // 2]
+    by[(now < LEVELS[0]) & (wanted < LEVELS[2])] = 0
+    pieces = Piece(from_numpy(mi.UInt32, numbers), from_numpy(mi.Float, strengths))
+    raised = field.raised(pieces, from_numpy(mi.Float, by.astype(np.float32)))
     field.assign(before)
     return found | raised
 
@@ -114,22 +124,27 @@ def expected(
     # Pieces of one cell of colours are alike, and those of near cells are by their distance.
     cell = np.floor(colours / (settings.like_colours / 2))
     kinds, kind = np.unique(cell, axis=0, return_inverse=True)
-    distance = ((kinds[:, None] - kinds[None]) ** 2).sum(2) / 4
-    near = np.exp(-distance / 2)
+    square = (kinds**2).sum(1)
+    near = np.exp((2 * kinds @ kinds.T - square[:, None] - square) / 8)
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
     weight = (weight / weight.mean())[:, None]
     probable = chance / chance.sum(1, keepdims=True)
     for _ in range(_STEPS):
-        total = _mixed((weight * probable).sum(0, keepdims=True))
-        total = total / total.sum() + _EVEN / len(LEVELS)
-        total /= total.sum()
+        own = weight * _mixed(probable)
         of_kinds = np.zeros((len(kinds), len(LEVELS)))
-        np.add.at(of_kinds, kind.ravel(), weight * probable)
-        before = _mixed(near @ of_kinds) + _AS_MANY * total
-        probable = chance * (before / before.sum(1, keepdims=True))[kind.ravel()]
-        probable /= probable.sum(1, keepdims=True)
+        np.add.at(of_kinds, kind.ravel(), own)
+        others = own.sum(0) - own
+        prior = (near @ of_kinds)[kind.ravel()] - own + _AS_MANY * _normalized(others)
+        prior = (1 - _EVEN) * _normalized(prior) + _EVEN / len(LEVELS)
+        probable = _normalized(chance * prior)
     return probable @ LEVELS
+
+
+def _normalized(distributions: np.ndarray) -> np.ndarray:
+    """Distributions, one a row, with the sum 1; an even one where all is zero."""
+    positive = np.maximum(distributions, 0) + 1e-30
+    return positive / positive.sum(1, keepdims=True)
 
 
 def _mixed(distributions: np.ndarray) -> np.ndarray:

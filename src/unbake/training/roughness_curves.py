@@ -89,9 +89,9 @@ class Curves:
 def _slopes(losses: np.ndarray, piece: np.ndarray) -> np.ndarray:
     """Slopes of curves at nodes, by the logarithm of roughness.
 
-    Sums over pieces do not turn between two nodes of a fall or a rise (Fritsch and Carlson 1980):
-    beside a cliff there would be a hollow that no photograph shows. Where a sum is least at a node,
-    it may be less beside it.
+    Sums over a piece of one roughness do not turn between two nodes of a fall or a rise (Fritsch
+    and Carlson 1980): beside a cliff there would be a hollow that no photograph shows. Between two
+    nodes of which one is on a fall and the other on a rise, they may turn.
 
     Args:
         losses: at nodes, shape (n, nodes).
@@ -102,11 +102,15 @@ def _slopes(losses: np.ndarray, piece: np.ndarray) -> np.ndarray:
     left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
     sums = np.stack([np.bincount(piece, column) for column in losses.T], 1)
     secants = np.diff(sums) / np.diff(nodes)
+    beyond = np.pad(secants, ((0, 0), (1, 1)))
     a, b = secants[:, :-1], secants[:, 1:]
+    sides = [
+        np.where(outer * opposite < 0, np.maximum(np.abs(near), np.abs(outer)), np.abs(near))
+        for near, outer, opposite in ((a, beyond[:, :-3], b), (b, beyond[:, 3:], a))
+    ]
     within = (sums[:, 2:] - sums[:, :-2]) / (nodes[2:] - nodes[:-2])
-    most = np.where(a * b > 0, 3 * np.minimum(np.abs(a), np.abs(b)), np.inf)
     part = np.ones_like(sums)
-    part[:, 1:-1] = np.minimum(1, most / np.maximum(np.abs(within), 1e-30))
+    part[:, 1:-1] = np.minimum(1, 3 * np.minimum(*sides) / np.maximum(np.abs(within), 1e-30))
     return part[piece] * (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
 
 

@@ -43,6 +43,10 @@ from .state import State
 _PLANNED_PATHS = 1 << 15
 #: The largest gradient whose square is finite in single precision, with some room.
 _LARGEST_GRADIENT = 1e18
+#: Camera samples that look whether a pixel shows one piece of surface.
+_LOOKS = 4
+#: How often pixels are drawn, at most, for those that do.
+_DRAWS = 16
 
 
 @dataclass
@@ -59,12 +63,6 @@ class Inputs:
     told: mi.Float | None = None  # exposures of the views as the data set tells, if they are read
     units: PoseUnits | None = None  # of corrections of poses, if there are any
     blocks: Blocks | None = None  # of pixels that lose their weight together, if they are to
-
-
-#: Camera samples that look whether a pixel shows one piece of surface.
-_LOOKS = 4
-#: How often pixels are drawn, at most, for those that do.
-_DRAWS = 16
 
 
 @dataclass(frozen=True)
