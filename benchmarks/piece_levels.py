@@ -14,7 +14,6 @@ roughness of these pixels against the true one, PSNR in dB:
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from dataclasses import replace
@@ -28,25 +27,14 @@ sys.path.insert(0, str(ROOT / "src"))
 os.environ["PYTHONPATH"] = str(ROOT / "src")
 
 from roughness_curves import opened  # noqa: E402
-from roughness_limits import Shared, psnr, sampled  # noqa: E402
+from roughness_limits import Shared, psnr, sampled, told_of_runs  # noqa: E402
 
-from unbake import backend  # noqa: E402
 from unbake.config import RoughnessSearchConfig  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
 
 
 def main() -> None:
     """Search in every run, and tell the PSNR of each variant."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=Path, nargs="+", required=True, help="folders of fits")
-    parser.add_argument("--pixels", type=int, default=1 << 17)
-    parser.add_argument("--spp", type=int, default=64)
-    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    args = parser.parse_args()
-    backend.activate()
-    found = [levels_of(run, args.pixels, args.spp) for run in args.runs]
-    write_json(args.out, {"machine": machine(), "spp": args.spp, "rows": found})
+    told_of_runs(__doc__.splitlines()[0], levels_of, 1 << 17, 64)
 
 
 def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
@@ -88,17 +76,16 @@ def at_means(values: np.ndarray, pieces: np.ndarray, truth: np.ndarray) -> np.nd
         truth: as `values`.
     """
     from unbake.quantities import QUANTITIES
-    from unbake.training.piece_levels import SHIFTS
+    from unbake.training.piece_levels import SHIFTS, shifted
 
     quantity, found = QUANTITIES["roughness"], values.copy()
     span = quantity.upper - quantity.lower
     for piece in np.unique(pieces):
         own = pieces == piece
-        unit = np.clip((values[own] - quantity.lower) / span, 1e-6, 1 - 1e-6)
-        moved = 1 / (1 + (1 / unit - 1) * np.exp(-SHIFTS[:, None]))
-        moved = quantity.lower + span * moved
-        shift = np.interp(truth[own].mean(), moved.mean(1), SHIFTS)
-        found[own] = quantity.lower + span / (1 + (1 / unit - 1) * np.exp(-shift))
+        value = (values[own] - quantity.lower) / span
+        means = [quantity.lower + span * shifted(value, by).mean() for by in SHIFTS]
+        by = float(np.interp(truth[own].mean(), means, SHIFTS))
+        found[own] = quantity.lower + span * shifted(value, by)
     return found
 
 

@@ -22,7 +22,7 @@ import argparse
 import functools
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,14 +59,27 @@ COLOURS = 6
 
 def main() -> None:
     """Take runs apart, and tell the PSNR of each variant."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    told_of_runs(__doc__.splitlines()[0], limits_of, 1 << 18, 16)
+
+
+def told_of_runs(
+    description: str, tell: Callable[[Path, int, int], dict[str, Any]], pixels: int, spp: int
+) -> None:
+    """Write what is told of each run that the command line names.
+
+    Args:
+        description: of the command.
+        tell: of a run's folder, pixels and samples of each.
+        pixels, spp: where the command line does not say.
+    """
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--runs", type=Path, nargs="+", required=True, help="folders of fits")
-    parser.add_argument("--pixels", type=int, default=1 << 18)
-    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--pixels", type=int, default=pixels)
+    parser.add_argument("--spp", type=int, default=spp)
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
     backend.activate()
-    found = [limits_of(run, args.pixels, args.spp) for run in args.runs]
+    found = [tell(run, args.pixels, args.spp) for run in args.runs]
     write_json(args.out, {"machine": machine(), "spp": args.spp, "rows": found})
 
 
@@ -187,11 +200,9 @@ class Shared:
         self.values = self._values().numpy()
 
     def _values(self) -> Any:
-        from unbake.quantities import QUANTITIES
+        from unbake.training.roughness_curves import roughness_of
 
-        quantity = QUANTITIES["roughness"]
-        span = quantity.upper - quantity.lower
-        return self.field.evaluate(self._point)[0] * span + quantity.lower
+        return roughness_of(self.field, self._point)
 
     def values_with(self, changed: dict[str, Any]) -> np.ndarray:
         """Roughness with some numbers changed, shape (n,)."""

@@ -68,8 +68,7 @@ def with_expected_levels(
     assert point.piece is not None
     before = dict(field.parameters())
     field.assign(before | found)
-    value = np.clip(np.array(field.evaluate(point)[0], np.float64), _NEAREST, 1 - _NEAREST)
-    outputs = np.log(value / (1 - value))
+    present = np.array(field.evaluate(point)[0], np.float64)
     # The smallest pieces may share the last number of the field.
     most = field.most_pieces - 1
     numbers, first = np.unique(np.minimum(curves.pieces.number, most), return_index=True)
@@ -82,7 +81,7 @@ def with_expected_levels(
 
     errors, values = [], []
     for shift in SHIFTS:
-        value = 1 / (1 + np.exp(-(outputs + shift)))
+        value = shifted(present, shift)
         roughness = in_range([from_numpy(mi.Float, value.astype(np.float32))])
         errors.append(sums(curves.at(roughness).numpy()))
         values.append(sums(value))
@@ -102,6 +101,12 @@ def with_expected_levels(
     raised = field.raised(pieces, from_numpy(mi.Float, by.astype(np.float32)))
     field.assign(before)
     return found | raised
+
+
+def shifted(values: np.ndarray, by: float) -> np.ndarray:
+    """Values of a field, in (0, 1), whose outputs before their bounds are higher by so much."""
+    inside = np.clip(values, _NEAREST, 1 - _NEAREST)
+    return 1 / (1 + (1 / inside - 1) * np.exp(-by))
 
 
 def expected(
@@ -129,7 +134,7 @@ def expected(
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
     weight = (weight / weight.mean())[:, None]
-    probable = chance / chance.sum(1, keepdims=True)
+    probable = _normalized(chance)
     for _ in range(_STEPS):
         own = weight * _mixed(probable)
         of_kinds = np.zeros((len(kinds), len(LEVELS)))

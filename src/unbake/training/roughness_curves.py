@@ -98,20 +98,24 @@ def _slopes(losses: np.ndarray, piece: np.ndarray) -> np.ndarray:
         piece: of each pixel, from 0, shape (n,).
     """
     nodes = np.log(NODES)
+
+    def sums(of_pixels: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(piece, column) for column in of_pixels.T], 1)
+
     places = np.arange(len(nodes))
     left, right = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
-    sums = np.stack([np.bincount(piece, column) for column in losses.T], 1)
-    secants = np.diff(sums) / np.diff(nodes)
+    slopes = (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
+    secants = np.diff(sums(losses)) / np.diff(nodes)
     beyond = np.pad(secants, ((0, 0), (1, 1)))
     a, b = secants[:, :-1], secants[:, 1:]
     sides = [
         np.where(outer * opposite < 0, np.maximum(np.abs(near), np.abs(outer)), np.abs(near))
         for near, outer, opposite in ((a, beyond[:, :-3], b), (b, beyond[:, 3:], a))
     ]
-    within = (sums[:, 2:] - sums[:, :-2]) / (nodes[2:] - nodes[:-2])
-    part = np.ones_like(sums)
-    part[:, 1:-1] = np.minimum(1, 3 * np.minimum(*sides) / np.maximum(np.abs(within), 1e-30))
-    return part[piece] * (losses[:, right] - losses[:, left]) / (nodes[right] - nodes[left])
+    part = np.ones((len(secants), len(nodes)))
+    steep = np.maximum(np.abs(sums(slopes[:, 1:-1])), 1e-30)
+    part[:, 1:-1] = np.minimum(1, 3 * np.minimum(*sides) / steep)
+    return part[piece] * slopes
 
 
 def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:

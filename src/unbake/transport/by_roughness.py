@@ -19,8 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..fields.domain import SurfacePoint
 from ..fields.guide import LightGuide
 from ..fields.materials import Material, carry, carrying
+from ..fields.pieces import Piece
 from ..fields.radiance import RadianceField
 from .operator import attach_albedo, mixture_at
 from .path_sample import reflected_radiance
@@ -118,17 +120,15 @@ def by_roughness(
     materials = scene_view.materials
     assert materials is not None
     with dr.suspend_grad():
-        x = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
-        point = materials.locate(x.si, x.valid)
-        assert point.piece is not None
+        x, point, piece = _met(scene_view, ray, sampler, hide_emitters=hide_emitters)
         material = materials.evaluate_at(point)
         albedo = mi.Color3f(material["albedo"]) if "albedo" in material else dr.zeros(mi.Color3f)
-        piece, strength = point.piece.number, point.piece.strength
-        dr.eval(material, albedo, point.position, piece, strength)
+        dr.eval(material, albedo, point.position, piece)
         chosen = np.flatnonzero(_of_one_piece(scene_view, x, piece, spp))
         rows = np.zeros(len(chosen), row_type(len(nodes)))
         lanes = chosen * spp
-        rows["piece"], rows["strength"] = np.array(piece)[lanes], np.array(strength)[lanes]
+        rows["piece"] = np.array(piece.number)[lanes]
+        rows["strength"] = np.array(piece.strength)[lanes]
         rows["position"] = np.array(point.position).T[lanes]
         rows["albedo"] = np.broadcast_to(np.array(albedo).T, (dr.width(x.valid), 3))[lanes]
         lights = _lights(scene_view, radiance, guide, x, material, sampler)
@@ -157,20 +157,27 @@ def meet_one_piece(
     Returns:
         Of each pixel, shape (n,).
     """
-    materials = scene_view.materials
-    assert materials is not None
     with dr.suspend_grad():
-        x = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
-        point = materials.locate(x.si, x.valid)
-        assert point.piece is not None
-        return _of_one_piece(scene_view, x, point.piece.number, spp)
+        x, _, piece = _met(scene_view, ray, sampler, hide_emitters=hide_emitters)
+        return _of_one_piece(scene_view, x, piece, spp)
 
 
-def _of_one_piece(scene_view: SceneView, x: Vertex, piece: mi.UInt32, spp: int) -> np.ndarray:
+def _met(
+    scene_view: SceneView, ray: mi.Ray3f, sampler: mi.Sampler, *, hide_emitters: bool
+) -> tuple[Vertex, SurfacePoint, Piece]:
+    """What camera rays meet first: the vertex, its place in fields, and its piece of surface."""
+    assert scene_view.materials is not None
+    x = find_vertex(scene_view, ray, mi.Bool(True), sampler, hide_emitters=hide_emitters)
+    point = scene_view.materials.locate(x.si, x.valid)
+    assert point.piece is not None
+    return x, point, point.piece
+
+
+def _of_one_piece(scene_view: SceneView, x: Vertex, piece: Piece, spp: int) -> np.ndarray:
     """The same, where the vertices of the samples and their pieces are known."""
     first = dr.arange(mi.UInt32, dr.width(x.valid)) // spp * spp
     counted = x.valid & (dr.max(x.emitted) <= 0) & scene_view.is_optimized(x.si.shape)
-    counted &= dr.gather(mi.UInt32, piece, first) == piece
+    counted &= dr.gather(mi.UInt32, piece.number, first) == piece.number
     return np.logical_and.reduce(np.array(counted).reshape(-1, spp), axis=1)
 
 
