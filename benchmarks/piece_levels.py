@@ -1,4 +1,4 @@
-"""What a search finds of roughness, with pieces where they are most probable and as is expected.
+"""What a search finds of roughness: where it is most probable, and as is expected of pieces.
 
     python benchmarks/piece_levels.py --runs RUN [RUN ...] [--pixels 131072] [--spp 64]
         --out FILE.json
@@ -8,8 +8,10 @@ roughness of these pixels against the true one, PSNR in dB:
 
 - as it was fitted;
 - where the search's descent ends;
-- with each piece of surface moved to what is to be expected of it, which is the default;
-- with each piece moved to its true mean, which no fit knows: the most that moving pieces can give.
+- with each piece of surface moved to what is to be expected of it;
+- with each piece varying as much as is to be expected of it, and then moved so: the default;
+- with each piece moved to its true mean, which no fit knows: the most that moving pieces can give;
+- with one roughness, the true mean, on each piece: what is left is how much it truly varies there.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         pixels: how many are sampled; those that searches cannot use are left out.
         spp: camera samples of each.
     """
-    from unbake.training.roughness_curves import precision
+    from unbake.training.piece_levels import with_expected_levels
+    from unbake.training.roughness_curves import Curves, precision
 
     run, steps = opened(folder)
     (rows,), true = sampled(run, pixels, (spp,))
@@ -53,13 +56,15 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     rows["weight"] *= precision(rows, shared.values)
     search = RoughnessSearchConfig()
     probable = shared.searched(rows, settings=replace(search, pixels_as_one=0))
+    curves = Curves.of(rows, search.cells, search.colours, albedo=True)
+    values = shared.values_with(probable)
     told = {
         "as fitted": shared.score({}),
         "most probable": shared.score(probable),
+        "levels": shared.score(with_expected_levels(shared.field, curves, probable, search)),
         "expected": shared.score(shared.searched(rows, settings=search)),
-        "true means": psnr(
-            at_means(shared.values_with(probable), rows["piece"], roughness), roughness
-        ),
+        "true means": psnr(at_means(values, rows["piece"], roughness), roughness),
+        "one true roughness": psnr(means_of(roughness, rows["piece"]), roughness),
     }
     name = run.dataset.folder.name
     print(", ".join([name, *(f"{key} {value:.2f} dB" for key, value in told.items())]), flush=True)
@@ -76,17 +81,24 @@ def at_means(values: np.ndarray, pieces: np.ndarray, truth: np.ndarray) -> np.nd
         truth: as `values`.
     """
     from unbake.quantities import QUANTITIES
-    from unbake.training.piece_levels import SHIFTS, shifted
+    from unbake.training.piece_levels import SHIFTS
+    from unbake.training.seen_pieces import outputs_of, values_of
 
     quantity, found = QUANTITIES["roughness"], values.copy()
     span = quantity.upper - quantity.lower
     for piece in np.unique(pieces):
         own = pieces == piece
-        value = (values[own] - quantity.lower) / span
-        means = [quantity.lower + span * shifted(value, by).mean() for by in SHIFTS]
+        outputs = outputs_of((values[own] - quantity.lower) / span)
+        means = [quantity.lower + span * values_of(outputs + by).mean() for by in SHIFTS]
         by = float(np.interp(truth[own].mean(), means, SHIFTS))
-        found[own] = quantity.lower + span * shifted(value, by)
+        found[own] = quantity.lower + span * values_of(outputs + by)
     return found
+
+
+def means_of(values: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+    """The mean of values over the piece of each pixel, shape (n,), as the arguments."""
+    _, here = np.unique(pieces, return_inverse=True)
+    return (np.bincount(here, values) / np.bincount(here))[here]
 
 
 if __name__ == "__main__":

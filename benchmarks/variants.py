@@ -3,8 +3,9 @@
     python benchmarks/variants.py --data DATA [DATA ...] --settings A.toml B.toml --out FILE.json
         [--seeds 0 1 2] [--steps 2400 | --seconds 120] [--methods ours] [--go-on]
 
-The fits of a seed follow each other, and the file is written after each seed. With --go-on, seeds
-that it has already are kept. Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
+The fits of a seed follow each other, and the file is written after each fit. With --go-on, fits
+that it has already are kept: those of the first seeds, of each data set, method and settings.
+Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
 held-out views, with those of the untrained fields; seconds are those of training.
 """
 
@@ -59,46 +60,47 @@ def main() -> None:
         "length": dict([stop]),
         "data": {data.name: described(data) for data in args.data},
     }
-    seeds, found = started(args.out, about) if args.go_on else ([], {})
+    found = started(args.out, about, args.seeds) if args.go_on else {}
     kinds = list(product(args.data, args.methods, args.settings))
     names = [(data.name, method, settings.stem) for data, method, settings in kinds]
-    if seeds and found.keys() != set(names):
+    if not found.keys() <= set(names):
         raise SystemExit(f"{args.out} is of other data sets, methods or settings")
-    for seed in args.seeds:
-        if seed in seeds:
-            continue
+    for number, seed in enumerate(args.seeds):
         for name, (data, method, settings) in zip(names, kinds, strict=True):
-            scores = fit(data, settings, method, seed, stop)
-            found.setdefault(name, []).append(scores)
-            told = ", ".join(f"{key} {value:.2f}" for key, value in scores.items())
+            runs = found.setdefault(name, [])
+            if number < len(runs):
+                continue
+            runs.append(fit(data, settings, method, seed, stop))
+            told = ", ".join(f"{key} {value:.2f}" for key, value in runs[-1].items())
             print(f"{data.name}, {method}, {settings.stem}, seed {seed}: {told}", flush=True)
-        seeds.append(seed)
-        rows = [
-            dict(zip(("data", "method", "settings"), name, strict=True))
-            | across_seeds(found[name], found[name][0])
-            | {"runs": found[name]}
-            for name in names
-        ]
-        write_json(args.out, about | {"seeds": seeds, "rows": rows})
+            seeds = args.seeds[: min(len(found.get(name, [])) for name in names)]
+            rows = [
+                dict(zip(("data", "method", "settings"), name, strict=True))
+                | across_seeds(found[name], found[name][0])
+                | {"runs": found[name]}
+                for name in names
+                if found.get(name)
+            ]
+            write_json(args.out, about | {"seeds": seeds, "rows": rows})
 
 
 def started(
-    file: Path, about: dict[str, Any]
-) -> tuple[list[int], dict[tuple[str, str, str], list[dict[str, float]]]]:
-    """The seeds of a file, and the scores of each: by data, method and settings.
+    file: Path, about: dict[str, Any], seeds: list[int]
+) -> dict[tuple[str, str, str], list[dict[str, float]]]:
+    """The scores of a file, seed by seed: by data, method and settings.
 
     Args:
-        file: has no seeds where it is missing.
+        file: has none where it is missing.
         about: what must be the same.
+        seeds: the first ones must be those of the file.
     """
     if not file.is_file():
-        return [], {}
+        return {}
     before = json.loads(file.read_text(encoding="utf-8"))
-    for key, value in about.items():
+    for key, value in (about | {"seeds": seeds[: len(before["seeds"])]}).items():
         if before.get(key) != value:
             raise SystemExit(f"{file}: {key}: {before.get(key)} is not {value}")
-    rows = before["rows"]
-    return before["seeds"], {(r["data"], r["method"], r["settings"]): r["runs"] for r in rows}
+    return {(r["data"], r["method"], r["settings"]): r["runs"] for r in before["rows"]}
 
 
 def described(data: Path) -> dict[str, int]:

@@ -88,7 +88,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                         "width": 16,
                         "hidden": 1,
                         "learning_rate": 0.004,
-                        "pieces": {"most": 4096, "colours": 6},
+                        "pieces": {"most": 4096, "colours": 6, "variation": True},
                     },
                     "grid": {"cells": 16, "learning_rate": 0.025},
                     "triplane": {"base_resolution": 8, "width": 16, "learning_rate": 0.004},

@@ -25,6 +25,7 @@ from unbake.quantities import QUANTITIES
 LANES = 300
 SMALL = PieceConfig(most=5, brightnesses=4, gain=3.0)
 COLOURED = replace(SMALL, colours=3)
+VARIED = replace(COLOURED, variation=True)
 NETWORK = NetworkConfig(GridConfig(2, 2, 8), width=8, hidden=1, pieces=COLOURED)
 ENGINES = ("tensor", "coopvec", *(["fused"] if can_record_layout() else []))
 
@@ -104,6 +105,56 @@ def test_raised_pieces_have_higher_outputs_everywhere_and_others_the_same():
     assert not network.raised(Piece(mi.UInt32([1]), mi.Float(1)), mi.Float([1]))
 
 
+def test_varied_pieces_differ_less_from_a_value_that_stays():
+    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
+    values = randomised(network)
+    values["variation"] = values["variation"] * 0 + 1
+    network.assign(values)
+    of_all = points(number=dr.arange(mi.UInt32, LANES) % 5, strength=0.25)
+
+    def outputs():
+        value = np.array(network.evaluate(of_all)[0], np.float64)
+        return np.log(value / (1 - value))
+
+    before = outputs()
+    own, about, factor = [1, 3], np.array([0.3, -0.2]), np.array([0.25, 0.5])
+
+    def vary(factor):
+        piece = Piece(mi.UInt32(own), mi.Float(0.25))
+        found = network.varied(piece, mi.Float(about), mi.Float(factor))
+        assert set(found) == {"pieces.0", "variation"}
+        network.assign(network.parameters() | found)
+        return outputs()
+
+    after = vary(factor)
+    wanted = before.copy()
+    for number, middle, part in zip(own, about, factor, strict=True):
+        here = np.arange(LANES) % 5 == number
+        wanted[here] = middle + part * (before[here] - middle)
+    np.testing.assert_allclose(after, wanted, atol=1e-4)
+    # A factor is of all that there is, not of what is left.
+    np.testing.assert_allclose(vary(factor), wanted, atol=1e-4)
+    np.testing.assert_allclose(vary(np.ones(2)), before, atol=1e-4)
+
+
+def test_pieces_without_strength_keep_their_factor():
+    table = PieceValues(VARIED, 1)
+    values = randomised(table)
+    values["variation"] = values["variation"] * 0 + 1
+    table.assign(values)
+    found = table.varied(Piece(mi.UInt32([2]), mi.Float(0)), mi.Float([0.1]), mi.Float([0.5]))
+    for key, x in found.items():
+        np.testing.assert_array_equal(np.array(x), np.array(values[key]))
+
+
+def test_no_gradient_reaches_factors():
+    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
+    values = randomised(network)
+    dr.backward(dr.sum(network.evaluate(points())[0]))
+    reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
+    assert reached == values.keys() - {"variation"}
+
+
 def test_colours_are_shared_by_all_pieces():
     table = PieceValues(COLOURED, 1)
     values = randomised(table)
@@ -173,7 +224,7 @@ def test_roughness_alone_has_pieces():
 
 
 def test_sizes_tell_the_memory():
-    for outputs, settings in product((1, 3), (SMALL, COLOURED)):
+    for outputs, settings in product((1, 3), (SMALL, COLOURED, VARIED)):
         counted = sum(dr.width(v) for v in PieceValues(settings, outputs).parameters().values())
         assert counted == settings.numbers(outputs)
 

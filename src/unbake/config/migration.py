@@ -39,9 +39,11 @@ _AS_BEFORE = {
     "guide.cells": 0,
     "materials.roughness.neural.pieces.most": 0,
     "materials.roughness.neural.pieces.colours": 0,
+    "materials.roughness.neural.pieces.variation": False,
     "regularization.albedo_smoothness": 0.0,
     "roughness_search.times": 0,
     "roughness_search.pixels_as_one": 0.0,
+    "roughness_search.pixels_at_most": 0,
 }
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
 _OF_RUN = {"preset", "unknown", "method", "seed", "steps", "seconds", "pixels", "spp"}

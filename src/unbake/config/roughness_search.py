@@ -32,8 +32,13 @@ class RoughnessSearchConfig:
     #: Pixels of a piece that tell as much of its level as one would by itself, as their errors have
     #: a part in common; 0: pieces stay at what is most probable
     pixels_as_one: float = 3.0
+    #: So many pixels of a piece tell as much as all further ones would, too: errors of L_θ do not
+    #: average out; 0: there is no such number
+    pixels_at_most: int = 2000
     #: How near colours are whose pieces have like levels, as square roots of linear RGB
     like_colours: float = 0.1
+    #: How probable it is, before photographs are seen, that a piece has one roughness
+    one_roughness: float = 0.7
     #: Of the fit's steps after the first search, as a multiple of the field's own
     rate_between: float = 0.0
 
@@ -42,6 +47,7 @@ class RoughnessSearchConfig:
         ranges |= {"share": (POSITIVE, 1000), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
         ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
         ranges |= {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)}
-        ranges |= {"pixels_as_one": (0, 1e6), "like_colours": (1e-3, 1e3)}
+        ranges |= {"pixels_as_one": (0, 1e6), "pixels_at_most": (0, 1 << 30)}
+        ranges |= {"like_colours": (1e-3, 1e3), "one_roughness": (0, 1)}
         spreads = ("piece_spread", "brightness_spread", "colour_spread")
         require_ranges(self, ranges | dict.fromkeys(spreads, (POSITIVE, 1e6)))

@@ -103,6 +103,22 @@ class Field(Protocol):
         """
         return {}
 
+    def varied(
+        self, piece: Piece, about: mi.Float, factor: mi.Float
+    ) -> dict[str, mi.Float | mi.TensorXf]:
+        """The shared numbers with which outputs of pieces, before their bounds, vary less or more.
+
+        Args:
+            piece: different pieces of surface.
+            about: outputs of each that stay as they are.
+            factor: how much others differ from it, in units of how much they would if no piece had
+                a factor.
+
+        Returns:
+            Those that change; here none.
+        """
+        return {}
+
     def beside_shared(self, point: SurfacePoint) -> list[mi.Float]:
         """What does not change at some points while only numbers that points share do.
 

@@ -81,6 +81,12 @@ class Network(Field):
         """The numbers of pieces, if there are any."""
         return {} if self.pieces is None else dict(self.pieces.raised(piece, by))
 
+    def varied(
+        self, piece: Piece, about: mi.Float, factor: mi.Float
+    ) -> dict[str, mi.Float | mi.TensorXf]:
+        """The numbers and factors of pieces, if there are any."""
+        return {} if self.pieces is None else dict(self.pieces.varied(piece, about, factor))
+
     def evaluate(
         self,
         point: SurfacePoint,
@@ -99,10 +105,8 @@ class Network(Field):
         """The network's part and the numbers of pieces and colours."""
         if self.pieces is None:
             return beside
-        shared = self.pieces.evaluate(point)
-        outputs = [
-            dr.fma(self._pace, x, y + self._first) for x, y in zip(beside, shared, strict=True)
-        ]
+        beside = [dr.fma(self._pace, x, self._first) for x in beside]
+        outputs = self.pieces.evaluate(point, beside)
         return [sigmoid(x) for x in outputs] if self._bounded else outputs
 
     def cost(self) -> Cost:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -30,6 +32,9 @@ class PieceValues:
     the square roots of linear RGB albedo, linear between its corners. Numbers of pieces are added
     to it, for what differs between pieces of one colour.
 
+    What differs within a piece may be noise. So a piece may have a factor of all that it has beside
+    its own numbers. No gradient reaches it: searches of roughness find it.
+
     Args:
         settings: sizes.
         outputs: of the field.
@@ -42,12 +47,15 @@ class PieceValues:
         self._colours = None
         if settings.colours:
             self._colours = DenseGrid(DenseGridConfig(settings.colours), FieldSpec(outputs))
+        self._factors = dr.opaque(mi.Float, 1, settings.most) if settings.variation else None
 
     def parameters(self) -> dict[str, mi.Float]:
-        """`pieces.0`, …: the numbers of each output; `colours`, if there are any."""
+        """`pieces.0`, …: the numbers of each output; if there are any, `colours`, `variation`."""
         found = {f"pieces.{i}": values for i, values in enumerate(self._values)}
         if self._colours is not None:
             found["colours"] = self._colours.parameters()["corners"]
+        if self._factors is not None:
+            found["variation"] = self._factors
         return found
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
@@ -55,9 +63,17 @@ class PieceValues:
         self._values = [parameters[f"pieces.{i}"] for i in range(len(self._values))]
         if self._colours is not None:
             self._colours.assign({"corners": parameters["colours"]})
+        if self._factors is not None:
+            self._factors = parameters["variation"]
 
-    def evaluate(self, point: SurfacePoint) -> list[mi.Float]:
+    def evaluate(
+        self, point: SurfacePoint, beside: Sequence[mi.Float] | None = None
+    ) -> list[mi.Float]:
         """One number for each output; where the albedo is not told, all are taken as mid-grey.
+
+        Args:
+            point: where.
+            beside: what outputs are without pieces and colours, to which these are added.
 
         Raises:
             ValueError: the piece is not told.
@@ -71,17 +87,23 @@ class PieceValues:
         below = dr.minimum(mi.UInt32(at), bins - 2)
         share = at - mi.Float(below)
         number = dr.minimum(point.piece.number, self._settings.most - 1)
+        others = list(beside or [mi.Float(0)] * len(self._values))
+        if self._colours is not None:
+            colour = mi.Point3f([dr.sqrt(bounded(channel, 0, 1)) for channel in albedo])
+            shared = self._colours.evaluate(SurfacePoint(colour))
+            others = [
+                dr.fma(self._settings.gain, x, y) for x, y in zip(shared, others, strict=True)
+            ]
+        if self._factors is not None:
+            factor = dr.gather(mi.Float, dr.detach(self._factors), number)
+            others = [factor * x for x in others]
         first = number * bins + below
         gain = self._settings.gain * point.piece.strength
         found = []
-        for values in self._values:
+        for values, other in zip(self._values, others, strict=True):
             low, high = (dr.gather(mi.Float, values, first + i) for i in (0, 1))
-            found.append(gain * dr.fma(share, high - low, low))
-        if self._colours is None:
-            return found
-        colour = mi.Point3f([dr.sqrt(bounded(channel, 0, 1)) for channel in albedo])
-        shared = self._colours.evaluate(SurfacePoint(colour))
-        return [dr.fma(self._settings.gain, x, y) for x, y in zip(shared, found, strict=True)]
+            found.append(dr.fma(gain, dr.fma(share, high - low, low), other))
+        return found
 
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
         """See `Field.deviations`."""
@@ -103,22 +125,40 @@ class PieceValues:
 
     def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float]:
         """See `Field.raised`."""
+        return self._changed(piece, dr.full(mi.Float, 1, dr.width(piece.number)), by)
+
+    def varied(self, piece: Piece, about: mi.Float, factor: mi.Float) -> dict[str, mi.Float]:
+        """See `Field.varied`."""
+        if self._factors is None:
+            return {}
+        number = dr.minimum(piece.number, self._settings.most - 1)
+        before = dr.gather(mi.Float, self._factors, number)
+        factor = dr.select(piece.strength > 0, factor, before)
+        times = factor / before
+        factors = mi.Float(dr.detach(self._factors))
+        dr.scatter(factors, factor, number)
+        return self._changed(piece, times, (1 - times) * about) | {"variation": factors}
+
+    def _changed(self, piece: Piece, times: mi.Float, plus: mi.Float) -> dict[str, mi.Float]:
+        """The numbers of pieces with a factor, and then with more in units of outputs."""
         bins = self._settings.brightnesses
         every = dr.arange(mi.UInt32, dr.width(piece.number) * bins)
         own = every // bins
         number = dr.minimum(dr.gather(mi.UInt32, piece.number, own), self._settings.most - 1)
         strength = self._settings.gain * piece.strength
-        each = dr.gather(mi.Float, dr.select(strength > 0, by / strength, 0), own)
+        plus = dr.select(strength > 0, plus / strength, 0)
+        times, plus = (dr.gather(mi.Float, x, own) for x in (times, plus))
         found = {}
         for i, values in enumerate(self._values):
-            raised = mi.Float(dr.detach(values))
+            changed = mi.Float(dr.detach(values))
             here = number * bins + every % bins
-            dr.scatter(raised, dr.gather(mi.Float, values, here) + each, here)
-            found[f"pieces.{i}"] = raised
+            dr.scatter(changed, dr.fma(times, dr.gather(mi.Float, values, here), plus), here)
+            found[f"pieces.{i}"] = changed
         return found
 
     @property
     def features(self) -> int:
         """Numbers that are looked up at a point."""
         outputs = len(self._values)
-        return (2 + (8 if self._colours is not None else 0)) * outputs
+        factors = 0 if self._factors is None else 1
+        return (2 + (8 if self._colours is not None else 0)) * outputs + factors

@@ -90,6 +90,9 @@ class PieceConfig:
     network: float = 0.2  #: how much slower the network learns beside pieces
     #: Cells along each channel of a table by colour of the albedo, which all pieces share; 0: none
     colours: int = 0
+    #: Whether each piece has a factor of what it has from the network and from colours, which
+    #: searches find
+    variation: bool = False
 
     def __post_init__(self) -> None:
         sizes = {"most": (0, 1 << 20), "brightnesses": (2, 64), "colours": (0, 64)}
@@ -100,7 +103,8 @@ class PieceConfig:
         if not self.most:
             return 0
         grid = features_of(outputs) * (self.colours + 1) ** 3 if self.colours else 0
-        return outputs * self.brightnesses * self.most + grid
+        factors = self.most if self.variation else 0
+        return outputs * self.brightnesses * self.most + grid + factors
 
 
 @dataclass(frozen=True)

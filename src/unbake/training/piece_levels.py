@@ -22,16 +22,14 @@ import numpy as np
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
 from ..fields.field import Field
-from ..fields.pieces import Piece
 from ..ranks import Ranks
-from .roughness_curves import NODES, Curves, in_range, of_roughness
+from .roughness_curves import NODES, Curves, of_roughness
+from .seen_pieces import SeenPieces, chances, normalized, values_of
 
 #: By how much pieces are moved on trial, in units of the field's outputs before their bounds.
 SHIFTS = np.linspace(-5, 5, 61)
 #: The levels that a distribution knows, as values of the field: where curves are known.
 LEVELS = np.linspace(of_roughness(NODES[0]), of_roughness(NODES[-1]), 48)
-#: The chance that a curve tells nothing, for what no variance knows.
-_ASTRAY = 1e-6
 #: The part of a distribution that is even.
 _EVEN = 0.005
 #: So many pieces of a like colour count as much as what all pieces have in common.
@@ -40,8 +38,6 @@ _AS_MANY = 1.0
 _STEPS = 40
 #: Weights by which neighbouring levels are mixed.
 _MIXED = (0.25, 0.5, 0.25)
-#: A value of the field is no nearer to its bounds.
-_NEAREST = 1e-6
 
 
 def with_expected_levels(
@@ -63,50 +59,20 @@ def with_expected_levels(
     Returns:
         What was found, with the numbers of pieces moved.
     """
-    ranks = ranks or Ranks()
-    point = curves.point
-    assert point.piece is not None
-    before = dict(field.parameters())
-    field.assign(before | found)
-    present = np.array(field.evaluate(point)[0], np.float64)
-    # The smallest pieces may share the last number of the field.
-    most = field.most_pieces - 1
-    numbers, first = np.unique(np.minimum(curves.pieces.number, most), return_index=True)
-    strengths = np.array(curves.pieces.strength)[first]
-    unit = np.searchsorted(numbers, np.minimum(point.piece.number, most))
-    count = len(numbers)
-
-    def sums(column: np.ndarray) -> np.ndarray:
-        return np.bincount(unit, column, count)
-
-    errors, values = [], []
-    for shift in SHIFTS:
-        value = shifted(present, shift)
-        roughness = in_range([from_numpy(mi.Float, value.astype(np.float32))])
-        errors.append(sums(curves.at(roughness).numpy()))
-        values.append(sums(value))
-    albedo = np.zeros((3, len(unit))) if point.albedo is None else np.array(point.albedo)
-    colours = [sums(channel) for channel in np.sqrt(np.clip(albedo, 0, 1))]
-    table = np.stack([sums(np.ones(len(unit))), *colours, *errors, *values], 1)
-    table = ranks.size * ranks.mean(table)
-    pixels, colour, rest = table[:, 0], table[:, 1:4], table[:, 4:]
-    error, value = rest[:, : len(SHIFTS)], rest[:, len(SHIFTS) :] / pixels[:, None]
+    seen = SeenPieces(field, curves, found, settings, ranks)
+    error = seen.sums(seen.errors(seen.outputs + shift) for shift in SHIFTS)
+    value = seen.means(values_of(seen.outputs + shift) for shift in SHIFTS)
     levels = np.stack([np.interp(LEVELS, x, y) for x, y in zip(value, error, strict=True)])
-    wanted = expected(levels, pixels, colour / pixels[:, None], settings)
+    wanted = expected(levels, seen.pixels, seen.colours, settings)
     by = np.array([np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)])
     # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
     now = value[:, len(SHIFTS) // 2]
     by[(now < LEVELS[0]) & (wanted < LEVELS[2])] = 0
-    pieces = Piece(from_numpy(mi.UInt32, numbers), from_numpy(mi.Float, strengths))
-    raised = field.raised(pieces, from_numpy(mi.Float, by.astype(np.float32)))
+    before = dict(field.parameters())
+    field.assign(before | found)
+    raised = field.raised(seen.pieces, from_numpy(mi.Float, by.astype(np.float32)))
     field.assign(before)
     return found | raised
-
-
-def shifted(values: np.ndarray, by: float) -> np.ndarray:
-    """Values of a field, in (0, 1), whose outputs before their bounds are higher by so much."""
-    inside = np.clip(values, _NEAREST, 1 - _NEAREST)
-    return 1 / (1 + (1 / inside - 1) * np.exp(-by))
 
 
 def expected(
@@ -124,8 +90,7 @@ def expected(
     Returns:
         Between 0 and 1, shape (pieces,).
     """
-    above = errors - errors.min(1, keepdims=True)
-    chance = np.exp(-above / (2 * settings.pixels_as_one)) + _ASTRAY
+    chance = chances(errors, pixels, settings)
     # Pieces of one cell of colours are alike, and those of near cells are by their distance.
     cell = np.floor(colours / (settings.like_colours / 2))
     kinds, kind = np.unique(cell, axis=0, return_inverse=True)
@@ -134,22 +99,16 @@ def expected(
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
     weight = (weight / weight.mean())[:, None]
-    probable = _normalized(chance)
+    probable = normalized(chance)
     for _ in range(_STEPS):
         own = weight * _mixed(probable)
         of_kinds = np.zeros((len(kinds), len(LEVELS)))
         np.add.at(of_kinds, kind.ravel(), own)
         others = own.sum(0) - own
-        prior = (near @ of_kinds)[kind.ravel()] - own + _AS_MANY * _normalized(others)
-        prior = (1 - _EVEN) * _normalized(prior) + _EVEN / len(LEVELS)
-        probable = _normalized(chance * prior)
+        prior = (near @ of_kinds)[kind.ravel()] - own + _AS_MANY * normalized(others)
+        prior = (1 - _EVEN) * normalized(prior) + _EVEN / len(LEVELS)
+        probable = normalized(chance * prior)
     return probable @ LEVELS
-
-
-def _normalized(distributions: np.ndarray) -> np.ndarray:
-    """Distributions, one a row, with the sum 1; an even one where all is zero."""
-    positive = np.maximum(distributions, 0) + 1e-30
-    return positive / positive.sum(1, keepdims=True)
 
 
 def _mixed(distributions: np.ndarray) -> np.ndarray:

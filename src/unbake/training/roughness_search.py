@@ -17,8 +17,9 @@ What the field shares between points descends, its numbers of pieces and of colo
 photographs is the same for all samples, and a network would learn it. Of most numbers photographs
 tell little, too. So the most probable ones are sought: squared errors are in units of their
 variance, which the pixels themselves tell, by how bright they are, and numbers of one piece, or of
-like colours, are expected to differ as little as the settings say. Each piece then moves to the
-roughness that is to be expected of it (`piece_levels.py`). After the first search, steps leave
+like colours, are expected to differ as little as the settings say. Each piece then varies as much
+as is to be expected of it (`piece_variation.py`), and moves to the roughness that is
+(`piece_levels.py`). After the first search, steps leave
 roughness alone; from the second one on, the mean of what searches find is kept.
 """
 
@@ -39,6 +40,7 @@ from ..ranks import Ranks
 from ..transport.by_roughness import row_type
 from .gradients import flat_gradients, set_gradients
 from .piece_levels import with_expected_levels
+from .piece_variation import with_all_variation, with_expected_variation
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
 from .state import State
@@ -188,12 +190,17 @@ def searched(
 ) -> dict[str, Any]:
     """What a search finds: where a field descends to, with pieces as they are to be expected.
 
-    Args and returns as of `descend`.
+    Args and returns as of `descend`; the field stays as it is.
     """
+    before = dict(field.parameters())
+    if settings.pixels_as_one:
+        field.assign(before | with_all_variation(field, curves, settings, ranks))
     found = descend(field, curves, settings, rate, ranks)
-    if not settings.pixels_as_one:
-        return found
-    return with_expected_levels(field, curves, found, settings, ranks)
+    if settings.pixels_as_one:
+        found = with_expected_variation(field, curves, found, settings, ranks)
+        found = with_expected_levels(field, curves, found, settings, ranks)
+    field.assign(before)
+    return found
 
 
 def descend(

@@ -1,0 +1,117 @@
+"""The pieces of surface that a search of roughness has sampled, and what their pixels tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..config import RoughnessSearchConfig
+from ..fields.arrays import from_numpy
+from ..fields.field import Field
+from ..fields.pieces import Piece
+from ..ranks import Ranks
+from .roughness_curves import Curves, in_range
+
+#: A value of the field is no nearer to its bounds.
+_NEAREST = 1e-6
+#: The chance that a curve tells nothing, for what no variance knows.
+_ASTRAY = 1e-6
+
+
+class SeenPieces:
+    """The pieces that curves are of; pixels are those of this rank, pieces those of all.
+
+    Args:
+        field: of roughness, with numbers of pieces.
+        curves: of errors in units of their variance.
+        numbers: that points share, in the place of the field's.
+        settings: how many pixels tell as much as one.
+        ranks: that have a part of the curves each; None: there is one.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        curves: Curves,
+        numbers: dict[str, Any],
+        settings: RoughnessSearchConfig,
+        ranks: Ranks | None = None,
+    ) -> None:
+        self._curves, self._settings, self._ranks = curves, settings, ranks or Ranks()
+        point = curves.point
+        assert point.piece is not None
+        before = dict(field.parameters())
+        field.assign(before | numbers)
+        #: Of the field at pixels, before their bounds, shape (n,).
+        self.outputs = outputs_of(np.array(field.evaluate(point)[0], np.float64))
+        field.assign(before)
+        # The smallest pieces may share the last number of the field.
+        most = field.most_pieces - 1
+        present, first = np.unique(np.minimum(curves.pieces.number, most), return_index=True)
+        strengths = np.array(curves.pieces.strength)[first]
+        self.pieces = Piece(from_numpy(mi.UInt32, present), from_numpy(mi.Float, strengths))
+        #: The piece of each pixel, from 0, shape (n,).
+        self.piece_of = np.searchsorted(present, np.minimum(point.piece.number, most))
+        albedo = np.zeros((3, len(self.outputs))) if point.albedo is None else point.albedo
+        bright = np.sqrt(np.clip(np.array(albedo), 0, 1))
+        sums = self.sums([np.ones(len(self.outputs)), *bright])
+        #: The pixels of each piece, shape (pieces,).
+        self.pixels = sums[:, 0]
+        #: The mean of the square roots of albedo, linear RGB, shape (pieces, 3).
+        self.colours = sums[:, 1:] / self.pixels[:, None]
+
+    def sums(self, columns: Iterable[np.ndarray]) -> np.ndarray:
+        """Sums over the pixels of each piece, shape (pieces, columns); columns have shape (n,)."""
+        count = dr.width(self.pieces.number)
+        own = np.stack([np.bincount(self.piece_of, column, count) for column in columns], 1)
+        return self._ranks.size * self._ranks.mean(own)
+
+    def means(self, columns: Iterable[np.ndarray]) -> np.ndarray:
+        """Means over the pixels of each piece; see `sums`."""
+        return self.sums(columns) / self.pixels[:, None]
+
+    def errors(self, outputs: np.ndarray) -> np.ndarray:
+        """The errors of pixels with other outputs before their bounds, shape (n,)."""
+        values = from_numpy(mi.Float, values_of(outputs).astype(np.float32))
+        return self._curves.at(in_range([values])).numpy()
+
+    def chances(self, errors: np.ndarray) -> np.ndarray:
+        """How probable photographs are where pieces have errors, as a multiple of the highest.
+
+        Errors of neighbouring pixels have a part in common, and those of L_θ all pixels of a piece.
+
+        Args:
+            errors: of all pixels of each piece, in units of their variance, for each of some
+                possibilities, shape (pieces, possibilities).
+        """
+        return chances(errors, self.pixels, self._settings)
+
+
+def chances(errors: np.ndarray, pixels: np.ndarray, settings: RoughnessSearchConfig) -> np.ndarray:
+    """See `SeenPieces.chances`; pixels are those of each piece, shape (pieces,)."""
+    as_one = np.full(len(pixels), settings.pixels_as_one)
+    if settings.pixels_at_most:
+        as_one = np.maximum(as_one, pixels / settings.pixels_at_most)
+    above = errors - errors.min(1, keepdims=True)
+    return np.exp(-above / (2 * as_one[:, None])) + _ASTRAY
+
+
+def normalized(distributions: np.ndarray) -> np.ndarray:
+    """Distributions, one a row, with the sum 1; an even one where all is zero."""
+    positive = np.maximum(distributions, 0) + 1e-30
+    return positive / positive.sum(1, keepdims=True)
+
+
+def outputs_of(values: np.ndarray) -> np.ndarray:
+    """Outputs of a field before their bounds, of values between 0 and 1."""
+    inside = np.clip(values, _NEAREST, 1 - _NEAREST)
+    return np.log(inside / (1 - inside))
+
+
+def values_of(outputs: np.ndarray) -> np.ndarray:
+    """Values between 0 and 1, of outputs of a field before their bounds."""
+    return 1 / (1 + np.exp(-outputs))

@@ -1,0 +1,169 @@
+"""How much roughness varies within each piece of surface, as far as photographs tell."""
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from searches import SEARCH, SMALL, made_up
+from support import randomised
+
+from unbake.config import FitConfig, read_toml, to_toml
+from unbake.fields.field import FieldSpec
+from unbake.fields.network import Network
+from unbake.training.piece_variation import PARTS, with_all_variation, with_expected_variation
+from unbake.training.roughness_curves import NODES, Curves, in_range, of_roughness
+from unbake.training.roughness_search import searched
+from unbake.training.seen_pieces import chances, outputs_of, values_of
+
+VARIED = replace(SMALL, pieces=replace(SMALL.pieces, variation=True))
+
+
+def varied_field():
+    """A field whose roughness differs within pieces."""
+    field = Network(VARIED, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    parameters = randomised(field)
+    parameters["pieces.0"] *= 0.3
+    parameters["variation"] = parameters["variation"] * 0 + 1
+    parameters["grid"] *= 20
+    field.assign(parameters)
+    return field
+
+
+def roughness_at(field, numbers, point):
+    before = dict(field.parameters())
+    field.assign(before | numbers)
+    found = np.array(in_range(field.evaluate(point)), np.float64)
+    field.assign(before)
+    return found
+
+
+def photographed(rows, roughness):
+    """The rows with photographs of this roughness, without noise."""
+    every = np.arange(len(rows))
+    x = np.clip(np.log(roughness), np.log(NODES[0]), np.log(NODES[-1]))
+    left = np.clip(np.searchsorted(np.log(NODES), x) - 1, 0, len(NODES) - 2)
+    part = ((x - np.log(NODES)[left]) / np.diff(np.log(NODES))[left])[:, None]
+    image = rows["plain"] + rows["coloured"]
+    rows["target"] = image[every, left] * (1 - part) + image[every, left + 1] * part
+    return rows
+
+
+def sampled(count=2000):
+    rows = made_up(count=count)
+    rows["albedo"] = np.random.default_rng(4).uniform(0.3, 0.6, (count, 1))
+    rows["weight"] = 1e5
+    return rows
+
+
+def spread(values, pieces):
+    return np.array([values[pieces == number].std() for number in (0, 1)])
+
+
+def test_what_photographs_show_to_be_one_roughness_becomes_one():
+    rows, field = sampled(), varied_field()
+    point = Curves.of(rows, 2, 6, albedo=True).point
+    before = roughness_at(field, {}, point)
+    outputs = outputs_of(of_roughness(before))
+    means = np.array([outputs[rows["piece"] == number].mean() for number in (0, 1)])
+    middle = np.array(in_range([mi.Float(values_of(means))]))
+    curves = Curves.of(photographed(rows, middle[rows["piece"]]), 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    after = roughness_at(
+        field, with_expected_variation(field, curves, numbers, SEARCH), curves.point
+    )
+    assert spread(before, rows["piece"]).min() > 0.02
+    assert (spread(after, rows["piece"]) < 0.2 * spread(before, rows["piece"])).all()
+    for number, wanted in enumerate(middle):
+        assert after[rows["piece"] == number].mean() == pytest.approx(wanted, abs=0.01)
+
+
+def test_what_photographs_show_to_differ_differs():
+    rows, field = sampled(), varied_field()
+    point = Curves.of(rows, 2, 6, albedo=True).point
+    before = roughness_at(field, {}, point)
+    curves = Curves.of(photographed(rows, before), 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    found = with_expected_variation(field, curves, numbers, SEARCH)
+    after = roughness_at(field, found, curves.point)
+    assert spread(before, rows["piece"]).min() > 0.02
+    np.testing.assert_allclose(after, before, atol=0.1 * before.std())
+
+
+def test_what_photographs_do_not_show_is_as_is_to_be_expected():
+    rows, field = sampled(), varied_field()
+    rows["weight"] = 1e-12
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    for probable in (0.0, 0.4, 1.0):
+        settings = replace(SEARCH, one_roughness=probable)
+        found = with_expected_variation(field, curves, numbers, settings)
+        expected = probable * PARTS[0] + (1 - probable) * PARTS[1:].mean()
+        np.testing.assert_allclose(np.array(found["variation"])[:2], expected, rtol=1e-3)
+        assert (np.array(found["variation"])[2:] == 1).all()
+
+
+def test_what_a_search_took_the_next_one_has_again():
+    rows, field = sampled(), varied_field()
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    before = roughness_at(field, numbers, curves.point)
+    rows["weight"] = 1e-12
+    nothing = Curves.of(rows, 2, 6, albedo=True)
+    settings = replace(SEARCH, one_roughness=1.0)
+    flat = with_expected_variation(field, nothing, numbers, settings)
+    small = spread(roughness_at(field, flat, curves.point), rows["piece"])
+    assert (small < 0.03 * spread(before, rows["piece"])).all()
+    field.assign(dict(field.parameters()) | flat)
+    again = with_all_variation(field, curves, SEARCH)
+    np.testing.assert_allclose(roughness_at(field, again, curves.point), before, atol=1e-3)
+
+
+def test_a_search_ends_with_pieces_of_one_roughness():
+    rows = made_up(count=2000, noise=0.02)
+    rows["weight"] /= 0.02**2
+    field = varied_field()
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    before = {key: np.array(x.array) for key, x in field.parameters().items()}
+    apart, one = (
+        roughness_at(field, searched(field, curves, settings, 0.02), curves.point)
+        for settings in (replace(SEARCH, pixels_as_one=0), SEARCH)
+    )
+    for key, x in field.parameters().items():
+        assert np.array_equal(np.array(x.array), before[key]), key
+    assert (spread(one, rows["piece"]) < 0.5 * spread(apart, rows["piece"])).all()
+    for number, true in enumerate((0.24, 0.55)):
+        assert one[rows["piece"] == number].mean() == pytest.approx(true, abs=0.04)
+
+
+def test_pixels_of_a_piece_tell_no_more_than_some_would():
+    errors = np.array([[0.0, 40.0, 90.0]])
+    few = replace(SEARCH, pixels_as_one=2.0, pixels_at_most=1000)
+    every = replace(few, pixels_at_most=0)
+    wanted = chances(errors, np.array([500.0]), every)
+    np.testing.assert_allclose(chances(errors, np.array([2000.0]), few), wanted)
+    np.testing.assert_allclose(chances(20 * errors, np.array([40_000.0]), few), wanted)
+    assert (chances(20 * errors, np.array([40_000.0]), every) < wanted)[0, 1:].all()
+
+
+def test_fields_without_factors_stay():
+    rows = sampled()
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    curves = Curves.of(rows, 2, 6, albedo=True)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    found = with_expected_variation(field, curves, numbers, SEARCH)
+    assert set(found) == {"pieces.0", "colours"}
+    for key, x in numbers.items():
+        np.testing.assert_array_equal(np.array(found[key].array), np.array(x.array))
+
+
+def test_runs_of_before_have_no_factors_and_count_all_pixels(tmp_path):
+    file = tmp_path / "config.toml"
+    text = to_toml(FitConfig())
+    file.write_text(text)
+    assert read_toml(file).materials["roughness"]["neural"].pieces.variation
+    names = ("variation", "pixels_at_most", "one_roughness")
+    file.write_text("\n".join(x for x in text.splitlines() if not x.startswith(names)))
+    before = read_toml(file)
+    assert not before.materials["roughness"]["neural"].pieces.variation
+    assert before.roughness_search == replace(SEARCH, pixels_at_most=0)
