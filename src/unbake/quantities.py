@@ -64,7 +64,18 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 display="colour",
                 gltf="baseColorTexture.rgb",
                 settings={
-                    "neural": {"hidden": 1, "learning_rate": 0.015},
+                    "neural": {
+                        "hidden": 1,
+                        "learning_rate": 0.015,
+                        "pieces": {
+                            "most": 4096,
+                            "brightnesses": 2,
+                            "gain": 1.0,
+                            "network": 1.0,
+                            "variation": True,
+                            "learned": False,
+                        },
+                    },
                     "grid": {"cells": 64, "learning_rate": 0.1},
                     "triplane": {"learning_rate": 0.06},
                     "bitmap": {"resolution": 128, "learning_rate": 0.15},

@@ -106,31 +106,32 @@ def test_raised_pieces_have_higher_outputs_everywhere_and_others_the_same():
 
 
 def test_varied_pieces_differ_less_from_a_value_that_stays():
-    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
+    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(2, bounded=True, seed=2))
     values = randomised(network)
     values["variation"] = values["variation"] * 0 + 1
     network.assign(values)
     of_all = points(number=dr.arange(mi.UInt32, LANES) % 5, strength=0.25)
 
     def outputs():
-        value = np.array(network.evaluate(of_all)[0], np.float64)
+        value = np.array([np.array(x, np.float64) for x in network.evaluate(of_all)])
         return np.log(value / (1 - value))
 
     before = outputs()
-    own, about, factor = [1, 3], np.array([0.3, -0.2]), np.array([0.25, 0.5])
+    own, factor = [1, 3], np.array([0.25, 0.5])
+    about = np.array([[0.3, -0.2], [1.0, 0.1]])  # of each output, on each piece
 
     def vary(factor):
         piece = Piece(mi.UInt32(own), mi.Float(0.25))
-        found = network.varied(piece, mi.Float(about), mi.Float(factor))
-        assert set(found) == {"pieces.0", "variation"}
+        found = network.varied(piece, [mi.Float(x) for x in about], mi.Float(factor))
+        assert set(found) == {"pieces.0", "pieces.1", "variation"}
         network.assign(network.parameters() | found)
         return outputs()
 
     after = vary(factor)
     wanted = before.copy()
-    for number, middle, part in zip(own, about, factor, strict=True):
+    for number, middle, part in zip(own, about.T[:, :, None], factor, strict=True):
         here = np.arange(LANES) % 5 == number
-        wanted[here] = middle + part * (before[here] - middle)
+        wanted[:, here] = middle + part * (before[:, here] - middle)
     np.testing.assert_allclose(after, wanted, atol=1e-4)
     # A factor is of all that there is, not of what is left.
     np.testing.assert_allclose(vary(factor), wanted, atol=1e-4)
@@ -142,7 +143,7 @@ def test_pieces_without_strength_keep_their_factor():
     values = randomised(table)
     values["variation"] = values["variation"] * 0 + 1
     table.assign(values)
-    found = table.varied(Piece(mi.UInt32([2]), mi.Float(0)), mi.Float([0.1]), mi.Float([0.5]))
+    found = table.varied(Piece(mi.UInt32([2]), mi.Float(0)), [mi.Float(0.1)], mi.Float([0.5]))
     for key, x in found.items():
         np.testing.assert_array_equal(np.array(x), np.array(values[key]))
 
@@ -153,6 +154,27 @@ def test_no_gradient_reaches_factors():
     dr.backward(dr.sum(network.evaluate(points())[0]))
     reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
     assert reached == values.keys() - {"variation"}
+
+
+def test_numbers_that_are_not_learned_change_nothing_by_themselves():
+    spec = FieldSpec(3, bounded=True, initial=0.3, seed=2)
+    settings = replace(SMALL, variation=True, learned=False, gain=1.0, network=1.0)
+    found = []
+    for pieces in (settings, PieceConfig()):
+        network = Network(replace(NETWORK, pieces=pieces), spec)
+        values = network.parameters()
+        dr.enable_grad(values)
+        network.assign(values)
+        outputs = network.evaluate(points())
+        dr.backward(dr.sum(outputs[0] + 2 * outputs[1]))
+        gradients = {key: np.array(dr.grad(x).array) for key, x in values.items()}
+        found.append((np.array([np.array(x) for x in outputs]), gradients))
+    (with_pieces, gradients), (without, wanted) = found
+    np.testing.assert_allclose(with_pieces, without, atol=1e-6)
+    for key, gradient in wanted.items():
+        np.testing.assert_allclose(gradients[key], gradient, atol=1e-5, err_msg=key)
+    for key in gradients.keys() - wanted.keys():
+        assert not gradients[key].any(), key
 
 
 def test_colours_are_shared_by_all_pieces():

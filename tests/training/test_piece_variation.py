@@ -11,8 +11,22 @@ from support import randomised
 from unbake.config import FitConfig, read_toml, to_toml
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
-from unbake.training.piece_variation import PARTS, with_all_variation, with_expected_variation
-from unbake.training.roughness_curves import NODES, Curves, in_range, of_roughness
+from unbake.training.piece_variation import (
+    ALBEDO_PARTS,
+    PARTS,
+    expected_albedo,
+    with_all_variation,
+    with_expected_variation,
+)
+from unbake.training.roughness_curves import (
+    NODES,
+    Curves,
+    albedo_errors,
+    in_range,
+    of_roughness,
+    points,
+    squared_errors,
+)
 from unbake.training.roughness_search import searched
 from unbake.training.seen_pieces import chances, outputs_of, values_of
 
@@ -134,6 +148,73 @@ def test_a_search_ends_with_pieces_of_one_roughness():
     assert (spread(one, rows["piece"]) < 0.5 * spread(apart, rows["piece"])).all()
     for number, true in enumerate((0.24, 0.55)):
         assert one[rows["piece"] == number].mean() == pytest.approx(true, abs=0.04)
+
+
+def albedo_field(rows):
+    """A field whose albedo differs within pieces, which the rows then have."""
+    settings = replace(SMALL, pieces=replace(VARIED.pieces, colours=0, gain=1.0, learned=False))
+    field = Network(settings, FieldSpec(3, bounded=True, initial=0.5, seed=2))
+    parameters = randomised(field)
+    parameters["variation"] = parameters["variation"] * 0 + 1
+    parameters["grid"] *= 10
+    field.assign(parameters)
+    rows["albedo"] = albedo_at(field, {}, rows)
+    return field
+
+
+def albedo_at(field, numbers, rows):
+    before = dict(field.parameters())
+    field.assign(before | numbers)
+    found = np.array([np.array(x, float) for x in field.evaluate(points(rows, albedo=False))])
+    field.assign(before)
+    return found.T
+
+
+def of_albedo(rows, albedo, roughness):
+    """The rows with photographs of this albedo and roughness, without noise."""
+    node = NODES.index(roughness)
+    factor = albedo / rows["albedo"]
+    rows["target"] = rows["plain"][:, node] + factor * rows["coloured"][:, node]
+    return rows
+
+
+def test_an_albedo_that_photographs_show_to_be_one_becomes_one():
+    rows = sampled()
+    field = albedo_field(rows)
+    piece = rows["piece"]
+    means = np.array([rows["albedo"][piece == number].mean(0) for number in (0, 1)])
+    of_albedo(rows, means[piece], 0.33)
+    found = expected_albedo(field, rows, np.full(len(rows), 0.33), SEARCH)
+    assert set(found) == {"pieces.0", "pieces.1", "pieces.2", "variation"}
+    np.testing.assert_allclose(np.array(found["variation"])[:2], ALBEDO_PARTS[0], rtol=1e-3)
+    after = albedo_at(field, found, rows)
+    for number in (0, 1):
+        before = rows["albedo"][piece == number].std(0)
+        assert before.min() > 0.02
+        assert (after[piece == number].std(0) < 0.2 * before).all()
+        np.testing.assert_allclose(after[piece == number].mean(0), means[number], atol=5e-3)
+
+
+def test_an_albedo_that_photographs_show_to_differ_differs():
+    rows = sampled()
+    field = albedo_field(rows)
+    of_albedo(rows, rows["albedo"], 0.33)
+    found = expected_albedo(field, rows, np.full(len(rows), 0.33), SEARCH)
+    np.testing.assert_allclose(np.array(found["variation"])[:2], 1, atol=0.02)
+    np.testing.assert_allclose(albedo_at(field, found, rows), rows["albedo"], atol=0.01)
+
+
+def test_errors_by_albedo_are_those_of_curves():
+    rows = sampled()
+    rows["target"] += 0.1
+    rows["weight"] = 1
+    factor = np.random.default_rng(2).uniform(0.5, 1.5, (len(rows), 3))
+    wanted = squared_errors(rows, factor[:, None])
+    for node in (0, 3, 7):
+        found = albedo_errors(rows, np.full(len(rows), NODES[node]), factor * rows["albedo"])
+        np.testing.assert_allclose(found, wanted[:, node], rtol=1e-5, atol=1e-6)
+    beyond = albedo_errors(rows, np.full(len(rows), 0.02), factor * rows["albedo"])
+    np.testing.assert_allclose(beyond, wanted[:, 0], rtol=1e-5, atol=1e-6)
 
 
 def test_pixels_of_a_piece_tell_no_more_than_some_would():

@@ -282,6 +282,24 @@ def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
     assert moved == {"roughness.pieces.0", "roughness.colours"}
 
 
+def test_the_last_search_tells_how_much_albedo_varies(built_in):
+    defaults = FitConfig().materials
+    pieces = {name: defaults[name]["neural"].pieces for name in ("albedo", "roughness")}
+    fields = {name: {"neural": replace(SMALL, pieces=pieces[name])} for name in pieces}
+    config = replace(SETTINGS, materials=SETTINGS.materials | fields)
+    problem, _, step, state = started(built_in, config)
+    search = RoughnessSearch(problem, config, step, Ranks())
+
+    def factors(name):
+        return np.unique(np.array(state.phi[f"{name}.variation"]))
+
+    assert search.search_between(0.3, 0.5, state, 4)
+    assert factors("albedo").tolist() == [1]
+    assert factors("roughness").min() < 1
+    assert search.search_between(0.7, 0.8, state, 8)
+    assert 0.1 < factors("albedo").min() < 1
+
+
 def test_fits_of_few_samples_do_not_search(built_in):
     config = replace(SETTINGS, roughness_search=SEARCH)
     problem, _, step, state = started(built_in, config)

@@ -37,6 +37,8 @@ _GROUPS = ("grid", "bitmap")
 _AS_BEFORE = {
     "held_aside": 0.0,
     "guide.cells": 0,
+    "materials.albedo.neural.pieces.most": 0,
+    "materials.albedo.neural.pieces.variation": False,
     "materials.roughness.neural.pieces.most": 0,
     "materials.roughness.neural.pieces.colours": 0,
     "materials.roughness.neural.pieces.variation": False,

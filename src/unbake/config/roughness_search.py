@@ -39,6 +39,7 @@ class RoughnessSearchConfig:
     like_colours: float = 0.1
     #: How probable it is, before photographs are seen, that a piece has one roughness
     one_roughness: float = 0.7
+    one_albedo: float = 0.7  #: the same of albedo
     #: Of the fit's steps after the first search, as a multiple of the field's own
     rate_between: float = 0.0
 
@@ -48,6 +49,6 @@ class RoughnessSearchConfig:
         ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
         ranges |= {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)}
         ranges |= {"pixels_as_one": (0, 1e6), "pixels_at_most": (0, 1 << 30)}
-        ranges |= {"like_colours": (1e-3, 1e3), "one_roughness": (0, 1)}
+        ranges |= {"like_colours": (1e-3, 1e3), "one_roughness": (0, 1), "one_albedo": (0, 1)}
         spreads = ("piece_spread", "brightness_spread", "colour_spread")
         require_ranges(self, ranges | dict.fromkeys(spreads, (POSITIVE, 1e6)))

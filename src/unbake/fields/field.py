@@ -104,13 +104,13 @@ class Field(Protocol):
         return {}
 
     def varied(
-        self, piece: Piece, about: mi.Float, factor: mi.Float
+        self, piece: Piece, about: Sequence[mi.Float], factor: mi.Float
     ) -> dict[str, mi.Float | mi.TensorXf]:
         """The shared numbers with which outputs of pieces, before their bounds, vary less or more.
 
         Args:
             piece: different pieces of surface.
-            about: outputs of each that stay as they are.
+            about: of each output, the value on each piece that stays as it is.
             factor: how much others differ from it, in units of how much they would if no piece had
                 a factor.
 

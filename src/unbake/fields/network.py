@@ -82,7 +82,7 @@ class Network(Field):
         return {} if self.pieces is None else dict(self.pieces.raised(piece, by))
 
     def varied(
-        self, piece: Piece, about: mi.Float, factor: mi.Float
+        self, piece: Piece, about: Sequence[mi.Float], factor: mi.Float
     ) -> dict[str, mi.Float | mi.TensorXf]:
         """The numbers and factors of pieces, if there are any."""
         return {} if self.pieces is None else dict(self.pieces.varied(piece, about, factor))

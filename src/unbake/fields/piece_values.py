@@ -33,7 +33,8 @@ class PieceValues:
     to it, for what differs between pieces of one colour.
 
     What differs within a piece may be noise. So a piece may have a factor of all that it has beside
-    its own numbers. No gradient reaches it: searches of roughness find it.
+    its own numbers. No gradient reaches it: searches of roughness find it. Where numbers are not
+    learned, either, a piece is as it would be without until a search changes it.
 
     Args:
         settings: sizes.
@@ -101,6 +102,8 @@ class PieceValues:
         gain = self._settings.gain * point.piece.strength
         found = []
         for values, other in zip(self._values, others, strict=True):
+            if not self._settings.learned:
+                values = dr.detach(values)
             low, high = (dr.gather(mi.Float, values, first + i) for i in (0, 1))
             found.append(dr.fma(gain, dr.fma(share, high - low, low), other))
         return found
@@ -125,9 +128,12 @@ class PieceValues:
 
     def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float]:
         """See `Field.raised`."""
-        return self._changed(piece, dr.full(mi.Float, 1, dr.width(piece.number)), by)
+        one = dr.full(mi.Float, 1, dr.width(piece.number))
+        return self._changed(piece, one, [by] * len(self._values))
 
-    def varied(self, piece: Piece, about: mi.Float, factor: mi.Float) -> dict[str, mi.Float]:
+    def varied(
+        self, piece: Piece, about: Sequence[mi.Float], factor: mi.Float
+    ) -> dict[str, mi.Float]:
         """See `Field.varied`."""
         if self._factors is None:
             return {}
@@ -137,22 +143,25 @@ class PieceValues:
         times = factor / before
         factors = mi.Float(dr.detach(self._factors))
         dr.scatter(factors, factor, number)
-        return self._changed(piece, times, (1 - times) * about) | {"variation": factors}
+        plus = [(1 - times) * x for x in about]
+        return self._changed(piece, times, plus) | {"variation": factors}
 
-    def _changed(self, piece: Piece, times: mi.Float, plus: mi.Float) -> dict[str, mi.Float]:
-        """The numbers of pieces with a factor, and then with more in units of outputs."""
+    def _changed(
+        self, piece: Piece, times: mi.Float, plus: Sequence[mi.Float]
+    ) -> dict[str, mi.Float]:
+        """The numbers of pieces with a factor, and then with more in units of each output."""
         bins = self._settings.brightnesses
         every = dr.arange(mi.UInt32, dr.width(piece.number) * bins)
         own = every // bins
         number = dr.minimum(dr.gather(mi.UInt32, piece.number, own), self._settings.most - 1)
         strength = self._settings.gain * piece.strength
-        plus = dr.select(strength > 0, plus / strength, 0)
-        times, plus = (dr.gather(mi.Float, x, own) for x in (times, plus))
+        times = dr.gather(mi.Float, times, own)
+        here = number * bins + every % bins
         found = {}
-        for i, values in enumerate(self._values):
+        for i, (values, more) in enumerate(zip(self._values, plus, strict=True)):
             changed = mi.Float(dr.detach(values))
-            here = number * bins + every % bins
-            dr.scatter(changed, dr.fma(times, dr.gather(mi.Float, values, here), plus), here)
+            more = dr.gather(mi.Float, dr.select(strength > 0, more / strength, 0), own)
+            dr.scatter(changed, dr.fma(times, dr.gather(mi.Float, values, here), more), here)
             found[f"pieces.{i}"] = changed
         return found
 

@@ -93,6 +93,7 @@ class PieceConfig:
     #: Whether each piece has a factor of what it has from the network and from colours, which
     #: searches find
     variation: bool = False
+    learned: bool = True  #: whether steps change numbers of pieces; False: searches alone do
 
     def __post_init__(self) -> None:
         sizes = {"most": (0, 1 << 20), "brightnesses": (2, 64), "colours": (0, 64)}

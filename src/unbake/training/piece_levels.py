@@ -23,7 +23,7 @@ from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
 from ..fields.field import Field
 from ..ranks import Ranks
-from .roughness_curves import NODES, Curves, of_roughness
+from .roughness_curves import NODES, Curves, in_range, of_roughness
 from .seen_pieces import SeenPieces, chances, normalized, values_of
 
 #: By how much pieces are moved on trial, in units of the field's outputs before their bounds.
@@ -59,11 +59,14 @@ def with_expected_levels(
     Returns:
         What was found, with the numbers of pieces moved.
     """
-    seen = SeenPieces(field, curves, found, settings, ranks)
-    error = seen.sums(seen.errors(seen.outputs + shift) for shift in SHIFTS)
-    value = seen.means(values_of(seen.outputs + shift) for shift in SHIFTS)
+    seen = SeenPieces(field, curves.point, curves.pieces, found, settings, ranks)
+    (outputs,) = seen.outputs
+    error = seen.sums(errors_of(curves, outputs + shift) for shift in SHIFTS)
+    value = seen.means(values_of(outputs + shift) for shift in SHIFTS)
     levels = np.stack([np.interp(LEVELS, x, y) for x, y in zip(value, error, strict=True)])
-    wanted = expected(levels, seen.pixels, seen.colours, settings)
+    albedo = curves.point.albedo
+    bright = np.zeros((3, len(outputs))) if albedo is None else np.clip(np.array(albedo), 0, 1)
+    wanted = expected(levels, seen.pixels, seen.means(np.sqrt(bright)), settings)
     by = np.array([np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)])
     # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
     now = value[:, len(SHIFTS) // 2]
@@ -73,6 +76,12 @@ def with_expected_levels(
     raised = field.raised(seen.pieces, from_numpy(mi.Float, by.astype(np.float32)))
     field.assign(before)
     return found | raised
+
+
+def errors_of(curves: Curves, outputs: np.ndarray) -> np.ndarray:
+    """The errors of pixels with other outputs of the field before their bounds, both (n,)."""
+    values = from_numpy(mi.Float, values_of(outputs).astype(np.float32))
+    return curves.at(in_range([values])).numpy()
 
 
 def expected(

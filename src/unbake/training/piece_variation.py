@@ -1,14 +1,18 @@
-"""How much roughness varies within each piece of surface, as far as photographs tell (ours).
+"""How much materials vary within each piece of surface, as far as photographs tell (ours).
 
-What differs within a piece is what its network, its brightnesses and the colours of the albedo say:
-where photographs tell little, that is noise. Most pieces are of one material, and have one
-roughness. So that is taken to be probable beforehand (`one_roughness`), and any part of what was
-found as probable as any other. Errors of pixels tell how probable each part is afterwards, and the
-mean over all parts has the least squared error.
+What differs within a piece is what a network, brightnesses and colours of the albedo say of it:
+where photographs tell little, that is noise. Most pieces are of one material. So it is taken to be
+probable beforehand that one has one roughness, or one albedo (`one_roughness`, `one_albedo`), and
+any larger part of what was found is as probable as any other. Errors of pixels tell how probable
+each part is afterwards, and the mean over all parts has the least squared error.
+
+Of albedo, photographs know what steps have fitted to them, noise included: so they ask for more
+than there is. What is left out is that of which even the same photographs show nothing.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -18,11 +22,14 @@ from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
 from ..fields.field import Field
 from ..ranks import Ranks
-from .roughness_curves import Curves
-from .seen_pieces import SeenPieces, normalized
+from .piece_levels import errors_of
+from .roughness_curves import Curves, albedo_errors, pieces_of, points
+from .seen_pieces import SeenPieces, normalized, outputs_of, values_of
 
 #: Parts of the variation. Of the least one, which stands for none, all can be had back.
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
+#: The same of albedo, which steps go on to learn, its level by what is left of the variation.
+ALBEDO_PARTS = np.arange(1, 9) / 8
 
 
 def with_expected_variation(
@@ -32,7 +39,7 @@ def with_expected_variation(
     settings: RoughnessSearchConfig,
     ranks: Ranks | None = None,
 ) -> dict[str, Any]:
-    """Let each piece vary as much as is to be expected of it.
+    """Let each piece vary in its roughness as much as is to be expected of it.
 
     Args:
         field: of roughness.
@@ -44,14 +51,12 @@ def with_expected_variation(
     Returns:
         What was found, with the numbers and factors of pieces changed, if they have factors.
     """
-    seen = SeenPieces(field, curves, found, settings, ranks)
-    (middle,) = seen.means([seen.outputs]).T
-    here = middle[seen.piece_of]
-    errors = seen.sums(seen.errors(here + x * (seen.outputs - here)) for x in PARTS)
-    prior = np.full(len(PARTS), (1 - settings.one_roughness) / (len(PARTS) - 1))
-    prior[0] = settings.one_roughness
-    parts = normalized(seen.chances(errors) * prior) @ PARTS
-    return found | _varied(field, found, seen, middle, parts)
+    seen = SeenPieces(field, curves.point, curves.pieces, found, settings, ranks)
+    (outputs,), about = seen.outputs, _means(seen)
+    here = about[0, seen.piece_of]
+    errors = (errors_of(curves, here + part * (outputs - here)) for part in PARTS)
+    parts = _expected(seen, errors, PARTS, settings.one_roughness)
+    return found | _varied(field, found, seen, about, parts)
 
 
 def with_all_variation(
@@ -62,18 +67,65 @@ def with_all_variation(
     Args and returns as of `with_expected_variation`; the field's own numbers are those found.
     """
     numbers = {key: field.parameters()[key] for key in field.shared()}
-    seen = SeenPieces(field, curves, numbers, settings, ranks)
-    (middle,) = seen.means([seen.outputs]).T
-    return numbers | _varied(field, numbers, seen, middle, np.ones(len(middle)))
+    seen = SeenPieces(field, curves.point, curves.pieces, numbers, settings, ranks)
+    return numbers | _varied(field, numbers, seen, _means(seen), np.ones(len(seen.pixels)))
+
+
+def expected_albedo(
+    field: Field, rows: np.ndarray, roughness: np.ndarray, settings: RoughnessSearchConfig
+) -> dict[str, Any]:
+    """Let each piece vary in its albedo as much as is to be expected of it, about its mean.
+
+    Args:
+        field: of albedo.
+        rows: of `row_type`, whose weights are inverse variances, from all ranks.
+        roughness: of these pixels, shape (n,).
+        settings: how probable one albedo is, and how many pixels tell as much as one.
+
+    Returns:
+        The numbers and factors of pieces that change; none where pieces have no factors.
+    """
+    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {}, settings)
+    about = outputs_of(seen.means(values_of(seen.outputs)).T)
+    here = about[:, seen.piece_of]
+    errors = (
+        albedo_errors(rows, roughness, values_of(here + part * (seen.outputs - here)).T)
+        for part in ALBEDO_PARTS
+    )
+    parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo)
+    return _varied(field, {}, seen, about, parts)
+
+
+def _means(seen: SeenPieces) -> np.ndarray:
+    """The means of outputs over pieces, shape (outputs, pieces)."""
+    return seen.means(seen.outputs).T
+
+
+def _expected(
+    seen: SeenPieces, errors: Iterable[np.ndarray], parts: np.ndarray, none: float
+) -> np.ndarray:
+    """The part of its variation that is to be expected of each piece, shape (pieces,).
+
+    Args:
+        errors: of pixels with each part, shape (n,) each.
+        none: how probable the first part is beforehand.
+    """
+    prior = np.full(len(parts), (1 - none) / (len(parts) - 1))
+    prior[0] = none
+    return normalized(seen.chances(seen.sums(errors)) * prior) @ parts
 
 
 def _varied(
-    field: Field, numbers: dict[str, Any], seen: SeenPieces, middle: np.ndarray, parts: np.ndarray
+    field: Field,
+    numbers: dict[str, Any],
+    seen: SeenPieces,
+    about: Sequence[np.ndarray] | np.ndarray,
+    parts: np.ndarray,
 ) -> dict[str, Any]:
-    """The numbers with which outputs of pieces differ from a middle by a part of all there is."""
+    """The numbers with which outputs of pieces differ from a value by a part of all there is."""
     before = dict(field.parameters())
     field.assign(before | numbers)
-    about, factor = (from_numpy(mi.Float, x.astype(np.float32)) for x in (middle, parts))
-    found = field.varied(seen.pieces, about, factor)
+    factor, *levels = (from_numpy(mi.Float, x.astype(np.float32)) for x in (parts, *about))
+    found = field.varied(seen.pieces, levels, factor)
     field.assign(before)
     return found

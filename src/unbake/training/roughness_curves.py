@@ -63,8 +63,8 @@ class Curves:
         ranks, total = ranks or Ranks(), len(rows)
         # A squared error is not below zero. What is far below has few samples of a sharp lobe.
         losses = np.maximum(losses_by_roughness(rows, groups(rows, cells, colours)), _LEAST)
-        _, first, piece = np.unique(rows["piece"], return_index=True, return_inverse=True)
-        pieces = _pieces(rows[first])
+        piece = np.unique(rows["piece"], return_inverse=True)[1]
+        pieces = pieces_of(rows)
         slopes = _slopes(losses, piece.ravel())
         here = slice(ranks.rank, None, ranks.size)
         rows, losses, slopes = rows[here], losses[here], slopes[here]
@@ -136,8 +136,13 @@ def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
     )
 
 
+def pieces_of(rows: np.ndarray) -> Piece:
+    """The different pieces of surface that pixels see, in the order of their numbers."""
+    return _pieces(rows[np.unique(rows["piece"], return_index=True)[1]])
+
+
 def _pieces(rows: np.ndarray) -> Piece:
-    """The pieces of surface that pixels see."""
+    """The piece of surface that each pixel sees."""
     return Piece(from_numpy(mi.UInt32, rows["piece"]), from_numpy(mi.Float, rows["strength"]))
 
 
@@ -228,7 +233,7 @@ def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
     return squared_errors(rows, np.clip(factor, 0, _LARGEST_FACTOR)[group])
 
 
-def squared_errors(rows: np.ndarray, factor: np.ndarray) -> np.ndarray:
+def squared_errors(rows: np.ndarray | dict[str, np.ndarray], factor: np.ndarray) -> np.ndarray:
     """The squared errors of pixels at each node, with albedo times a factor g.
 
     The error of a pixel is w (γ (S + g · D) − I)², without bias: squares are products of different
@@ -247,3 +252,27 @@ def squared_errors(rows: np.ndarray, factor: np.ndarray) -> np.ndarray:
     image = gain * (rows["plain"] + factor * rows["coloured"])
     image2 = gain**2 * (rows["plain2"] + factor * (2 * rows["mixed"] + factor * rows["coloured2"]))
     return (weight * (image2 - target * (2 * image - target))).mean(2)
+
+
+def albedo_errors(rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """The squared errors of pixels with another albedo than they have by now.
+
+    Args:
+        rows: of `row_type`; between its nodes they are linear in the logarithm of roughness.
+        roughness: shape (n,).
+        albedo: linear RGB, shape (n, 3).
+
+    Returns:
+        As of `squared_errors`, but no less than curves have it, shape (n,).
+    """
+    places, every = np.log(NODES), np.arange(len(rows))
+    place = np.clip(np.log(np.maximum(roughness, NODES[0])), places[0], places[-1])
+    left = np.clip(np.searchsorted(places, place) - 1, 0, len(places) - 2)
+    part = ((place - places[left]) / np.diff(places)[left])[:, None]
+    single = {name: rows[name] for name in ("target", "weight", "gain")}
+    for name in ("plain", "coloured", "plain2", "mixed", "coloured2"):
+        a, b = rows[name][every, left], rows[name][every, left + 1]
+        single[name] = (a + part * (b - a))[:, None]
+    factor = albedo / np.maximum(rows["albedo"], 1e-3)
+    errors = squared_errors(single, np.clip(factor, 0, _LARGEST_FACTOR)[:, None])
+    return np.maximum(errors[:, 0], _LEAST)

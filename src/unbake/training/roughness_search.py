@@ -40,7 +40,7 @@ from ..ranks import Ranks
 from ..transport.by_roughness import row_type
 from .gradients import flat_gradients, set_gradients
 from .piece_levels import with_expected_levels
-from .piece_variation import with_all_variation, with_expected_variation
+from .piece_variation import expected_albedo, with_all_variation, with_expected_variation
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
 from .state import State
@@ -71,10 +71,12 @@ class RoughnessSearch:
     ) -> None:
         self._problem, self._config, self._step, self._ranks = problem, config, step, ranks
         search, materials = config.roughness_search, problem.materials
-        self._field = None
+        self._field = self._albedo = None
         if materials is not None and problem.radiance is not None:
             field = materials.get("roughness")
             self._field = field if field is not None and field.shared() else None
+            albedo = materials.get("albedo")
+            self._albedo = albedo if albedo is not None and albedo.shared() else None
         # A single search is the last one; there is none where there is nothing to search.
         times = 0 if self._field is None else search.times
         self._places = np.sort(np.linspace(search.last, search.first, times))
@@ -122,7 +124,9 @@ class RoughnessSearch:
             with without_garbage_collection():
                 # The first ones are of an L_θ that is not there yet.
                 part = 1 / max(1, int((self._places <= now).sum()) - 1)
-                return self._search(state, number, -(-pixels // self._ranks.size), part)
+                last = bool((self._places <= now).all())
+                each = -(-pixels // self._ranks.size)
+                return self._search(state, number, each, part, last)
         except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
                 raise
@@ -130,12 +134,14 @@ class RoughnessSearch:
             remedy = "Go on with --resume, without this search, or start another run with fewer"
             raise UserError(what, "roughness_search.pixels", remedy) from None
 
-    def _search(self, state: State, number: int, pixels: int, part: float) -> int:
+    def _search(self, state: State, number: int, pixels: int, part: float, last: bool) -> int:
         """The search after a step.
 
         Args:
             pixels: of this rank.
             part: of the way to what is found that is gone.
+            last: whether albedo is told how much it varies within pieces, too: later steps that
+                learn it do not get back what is taken from it.
         """
         search, materials, field = (
             self._config.roughness_search,
@@ -170,6 +176,11 @@ class RoughnessSearch:
             found = searched(field, curves, search, search.rate * own, ranks)
             named = {f"roughness.{key}": self._of_first(x) for key, x in found.items()}
             state.replace({k: dr.lerp(dr.detach(state.phi[k]), x, part) for k, x in named.items()})
+            if last and search.pixels_as_one and self._albedo is not None:
+                state.publish(self._problem)
+                now = roughness_of(field, points(rows, albedo)).numpy()
+                told = expected_albedo(self._albedo, rows, now, search)
+                state.replace({f"albedo.{key}": self._of_first(x) for key, x in told.items()})
         state.publish(self._problem)
         return batches * each * search.spp * self._ranks.size
 

@@ -1,4 +1,4 @@
-"""The pieces of surface that a search of roughness has sampled, and what their pixels tell."""
+"""The pieces of surface that a search of roughness has sampled, and sums over their pixels."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
+from ..fields.domain import SurfacePoint
 from ..fields.field import Field
 from ..fields.pieces import Piece
 from ..ranks import Ranks
-from .roughness_curves import Curves, in_range
 
 #: A value of the field is no nearer to its bounds.
 _NEAREST = 1e-6
@@ -23,46 +23,42 @@ _ASTRAY = 1e-6
 
 
 class SeenPieces:
-    """The pieces that curves are of; pixels are those of this rank, pieces those of all.
+    """The pieces that pixels see; pixels are those of this rank, pieces those of all.
 
     Args:
-        field: of roughness, with numbers of pieces.
-        curves: of errors in units of their variance.
+        field: with numbers of pieces.
+        point: of each pixel.
+        pieces: that pixels of any rank see, in the order of their numbers.
         numbers: that points share, in the place of the field's.
         settings: how many pixels tell as much as one.
-        ranks: that have a part of the curves each; None: there is one.
+        ranks: that have a part of the pixels each; None: there is one.
     """
 
     def __init__(
         self,
         field: Field,
-        curves: Curves,
+        point: SurfacePoint,
+        pieces: Piece,
         numbers: dict[str, Any],
         settings: RoughnessSearchConfig,
         ranks: Ranks | None = None,
     ) -> None:
-        self._curves, self._settings, self._ranks = curves, settings, ranks or Ranks()
-        point = curves.point
+        self._settings, self._ranks = settings, ranks or Ranks()
         assert point.piece is not None
         before = dict(field.parameters())
         field.assign(before | numbers)
-        #: Of the field at pixels, before their bounds, shape (n,).
-        self.outputs = outputs_of(np.array(field.evaluate(point)[0], np.float64))
+        #: Of the field at pixels, before their bounds, shape (outputs, n).
+        self.outputs = outputs_of(np.stack([np.array(x, float) for x in field.evaluate(point)]))
         field.assign(before)
         # The smallest pieces may share the last number of the field.
         most = field.most_pieces - 1
-        present, first = np.unique(np.minimum(curves.pieces.number, most), return_index=True)
-        strengths = np.array(curves.pieces.strength)[first]
+        present, first = np.unique(np.minimum(pieces.number, most), return_index=True)
+        strengths = np.array(pieces.strength)[first]
         self.pieces = Piece(from_numpy(mi.UInt32, present), from_numpy(mi.Float, strengths))
         #: The piece of each pixel, from 0, shape (n,).
         self.piece_of = np.searchsorted(present, np.minimum(point.piece.number, most))
-        albedo = np.zeros((3, len(self.outputs))) if point.albedo is None else point.albedo
-        bright = np.sqrt(np.clip(np.array(albedo), 0, 1))
-        sums = self.sums([np.ones(len(self.outputs)), *bright])
         #: The pixels of each piece, shape (pieces,).
-        self.pixels = sums[:, 0]
-        #: The mean of the square roots of albedo, linear RGB, shape (pieces, 3).
-        self.colours = sums[:, 1:] / self.pixels[:, None]
+        self.pixels = self.sums([np.ones(len(self.piece_of))])[:, 0]
 
     def sums(self, columns: Iterable[np.ndarray]) -> np.ndarray:
         """Sums over the pixels of each piece, shape (pieces, columns); columns have shape (n,)."""
@@ -73,11 +69,6 @@ class SeenPieces:
     def means(self, columns: Iterable[np.ndarray]) -> np.ndarray:
         """Means over the pixels of each piece; see `sums`."""
         return self.sums(columns) / self.pixels[:, None]
-
-    def errors(self, outputs: np.ndarray) -> np.ndarray:
-        """The errors of pixels with other outputs before their bounds, shape (n,)."""
-        values = from_numpy(mi.Float, values_of(outputs).astype(np.float32))
-        return self._curves.at(in_range([values])).numpy()
 
     def chances(self, errors: np.ndarray) -> np.ndarray:
         """How probable photographs are where pieces have errors, as a multiple of the highest.
