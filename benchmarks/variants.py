@@ -77,7 +77,7 @@ def main() -> None:
             rows = [
                 dict(zip(("data", "method", "settings"), name, strict=True))
                 | across_seeds(found[name], found[name][0])
-                | {"runs": found[name]}
+                | {"seeds": args.seeds[: len(found[name])], "runs": found[name]}
                 for name in names
                 if found.get(name)
             ]
@@ -92,14 +92,18 @@ def started(
     Args:
         file: has none where it is missing.
         about: what must be the same.
-        seeds: the first ones must be those of the file.
+        seeds: the first ones must be those of its rows.
     """
     if not file.is_file():
         return {}
     before = json.loads(file.read_text(encoding="utf-8"))
-    for key, value in (about | {"seeds": seeds[: len(before["seeds"])]}).items():
+    for key, value in about.items():
         if before.get(key) != value:
             raise SystemExit(f"{file}: {key}: {before.get(key)} is not {value}")
+    for row in before["rows"]:
+        of_row = row.get("seeds", before["seeds"])
+        if of_row != seeds[: len(row["runs"])]:
+            raise SystemExit(f"{file}: a row has the seeds {of_row}")
     return {(r["data"], r["method"], r["settings"]): r["runs"] for r in before["rows"]}
 
 

@@ -69,7 +69,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                         "learning_rate": 0.015,
                         "pieces": {
                             "most": 4096,
-                            "brightnesses": 2,
+                            "brightnesses": 1,
                             "gain": 1.0,
                             "network": 1.0,
                             "variation": True,

@@ -148,6 +148,19 @@ def test_pieces_without_strength_keep_their_factor():
         np.testing.assert_array_equal(np.array(x), np.array(values[key]))
 
 
+def test_surfaces_of_which_nothing_is_known_have_no_factor():
+    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
+    values = randomised(network)
+    spreads = {}
+    for strength, factor in ((0.0, 1), (0.0, 1 / 64), (0.5, 1), (0.5, 1 / 64)):
+        values["variation"] = values["variation"] * 0 + factor
+        network.assign(values)
+        value = np.array(network.evaluate(points(number=4, strength=strength))[0])
+        spreads[strength, factor] = value.std()
+    assert spreads[0.0, 1] == spreads[0.0, 1 / 64] > 0.01
+    assert spreads[0.5, 1 / 64] < 0.5 * spreads[0.5, 1]
+
+
 def test_no_gradient_reaches_factors():
     network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
     values = randomised(network)
@@ -158,7 +171,7 @@ def test_no_gradient_reaches_factors():
 
 def test_numbers_that_are_not_learned_change_nothing_by_themselves():
     spec = FieldSpec(3, bounded=True, initial=0.3, seed=2)
-    settings = replace(SMALL, variation=True, learned=False, gain=1.0, network=1.0)
+    settings = replace(SMALL, variation=True, learned=False, brightnesses=1, gain=1.0, network=1.0)
     found = []
     for pieces in (settings, PieceConfig()):
         network = Network(replace(NETWORK, pieces=pieces), spec)
@@ -246,14 +259,16 @@ def test_roughness_alone_has_pieces():
 
 
 def test_sizes_tell_the_memory():
-    for outputs, settings in product((1, 3), (SMALL, COLOURED, VARIED)):
+    for outputs, settings in product(
+        (1, 3), (SMALL, COLOURED, VARIED, replace(VARIED, brightnesses=1))
+    ):
         counted = sum(dr.width(v) for v in PieceValues(settings, outputs).parameters().values())
         assert counted == settings.numbers(outputs)
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"most": -1}, {"brightnesses": 1}, {"gain": 0.0}, {"network": 0.0}, {"colours": -1}],
+    [{"most": -1}, {"brightnesses": 0}, {"gain": 0.0}, {"network": 0.0}, {"colours": -1}],
 )
 def test_sizes_out_of_range_are_refused(wrong):
     with pytest.raises(UserError, match=next(iter(wrong))):

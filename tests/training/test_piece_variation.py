@@ -204,6 +204,21 @@ def test_an_albedo_that_photographs_show_to_differ_differs():
     np.testing.assert_allclose(albedo_at(field, found, rows), rows["albedo"], atol=0.01)
 
 
+def test_another_search_of_albedo_goes_on_from_what_is_left():
+    rows = sampled()
+    field = albedo_field(rows)
+    rows["weight"] = 1e-12  # photographs show nothing
+    settings = replace(SEARCH, one_albedo=1.0)
+    first = spread(rows["albedo"][:, 1], rows["piece"])
+    for factor in (1 / 8, 1 / 64, 1 / 64):
+        found = expected_albedo(field, rows, np.full(len(rows), 0.33), settings)
+        np.testing.assert_allclose(np.array(found["variation"])[:2], factor, rtol=1e-3)
+        field.assign(dict(field.parameters()) | found)
+        rows["albedo"] = albedo_at(field, {}, rows)
+        now = spread(rows["albedo"][:, 1], rows["piece"])
+        np.testing.assert_allclose(now, factor * first, rtol=0.3)
+
+
 def test_errors_by_albedo_are_those_of_curves():
     rows = sampled()
     rows["target"] += 0.1
@@ -213,6 +228,10 @@ def test_errors_by_albedo_are_those_of_curves():
     for node in (0, 3, 7):
         found = albedo_errors(rows, np.full(len(rows), NODES[node]), factor * rows["albedo"])
         np.testing.assert_allclose(found, wanted[:, node], rtol=1e-5, atol=1e-6)
+    middle = albedo_errors(rows, np.full(len(rows), np.sqrt(NODES[3] * NODES[4])), rows["albedo"])
+    ends = [albedo_errors(rows, np.full(len(rows), NODES[i]), rows["albedo"]) for i in (3, 4)]
+    assert (middle < np.maximum(*ends) + 1e-6).mean() > 0.95
+    assert np.abs(middle - ends[0]).min() > 0
     beyond = albedo_errors(rows, np.full(len(rows), 0.02), factor * rows["albedo"])
     np.testing.assert_allclose(beyond, wanted[:, 0], rtol=1e-5, atol=1e-6)
 
@@ -225,6 +244,19 @@ def test_pixels_of_a_piece_tell_no_more_than_some_would():
     np.testing.assert_allclose(chances(errors, np.array([2000.0]), few), wanted)
     np.testing.assert_allclose(chances(20 * errors, np.array([40_000.0]), few), wanted)
     assert (chances(20 * errors, np.array([40_000.0]), every) < wanted)[0, 1:].all()
+
+
+def test_small_pieces_of_different_strength_that_share_a_number_stay():
+    rows = sampled()
+    rows["piece"] += 70  # the field has 64 numbers
+    field = varied_field()
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    for strengths, stays in (((0.5, 0.5), False), ((0.5, 0.1), True)):
+        rows["strength"] = np.array(strengths)[rows["piece"] - 70]
+        curves = Curves.of(rows, 2, 6, albedo=True)
+        found = with_expected_variation(field, curves, numbers, replace(SEARCH, one_roughness=1.0))
+        assert (np.array(found["variation"]) == 1).all() == stays
+        assert (np.array(found["pieces.0"]) == np.array(numbers["pieces.0"])).all() == stays
 
 
 def test_fields_without_factors_stay():
@@ -243,8 +275,13 @@ def test_runs_of_before_have_no_factors_and_count_all_pixels(tmp_path):
     text = to_toml(FitConfig())
     file.write_text(text)
     assert read_toml(file).materials["roughness"]["neural"].pieces.variation
-    names = ("variation", "pixels_at_most", "one_roughness")
-    file.write_text("\n".join(x for x in text.splitlines() if not x.startswith(names)))
+    assert read_toml(file).materials["albedo"]["neural"].pieces.most
+    albedo = "[materials.albedo.neural.pieces]\n"
+    names = ("variation", "pixels_at_most", "one_")
+    kept = text.replace(text[text.index(albedo) :].split("\n\n")[0], albedo + "most = 0")
+    file.write_text("\n".join(x for x in kept.splitlines() if not x.startswith(names)))
     before = read_toml(file)
-    assert not before.materials["roughness"]["neural"].pieces.variation
+    for name in ("albedo", "roughness"):
+        assert not before.materials[name]["neural"].pieces.variation
+    assert not before.materials["albedo"]["neural"].pieces.most
     assert before.roughness_search == replace(SEARCH, pixels_at_most=0)

@@ -39,7 +39,8 @@ class RoughnessSearchConfig:
     like_colours: float = 0.1
     #: How probable it is, before photographs are seen, that a piece has one roughness
     one_roughness: float = 0.7
-    one_albedo: float = 0.7  #: the same of albedo
+    #: The same of albedo, which keeps an eighth of what was found, to be learned on
+    one_albedo: float = 0.7
     #: Of the fit's steps after the first search, as a multiple of the field's own
     rate_between: float = 0.0
 

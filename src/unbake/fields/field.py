@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -162,3 +163,14 @@ class Field(Protocol):
     def cost(self) -> Cost:
         """Work of one evaluation, for the least time that a step could take."""
         ...
+
+
+@contextmanager
+def holding(field: Field, numbers: Mapping[str, mi.Float | mi.TensorXf]) -> Iterator[None]:
+    """A context in which a field has other numbers in the place of some of its parameters."""
+    before = field.parameters()
+    field.assign({**before, **numbers})
+    try:
+        yield
+    finally:
+        field.assign(before)

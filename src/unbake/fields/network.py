@@ -46,7 +46,7 @@ class Network(Field):
         pieces = settings.pieces
         self.pieces = PieceValues(pieces, spec.outputs) if pieces.most else None
         self.most_pieces = pieces.most
-        self._pace = pieces.network
+        self._pace, self._learned = pieces.network, pieces.learned
         self._bounded = spec.bounded and self.pieces is not None
         self._first = first_value(spec) if self._bounded else 0.0
         of_layers = replace(spec, bounded=False) if self._bounded else spec
@@ -70,8 +70,8 @@ class Network(Field):
         self.perceptron.prepare()
 
     def shared(self) -> Set[str]:
-        """The numbers of pieces and colours, if there are any."""
-        return frozenset() if self.pieces is None else self.pieces.parameters().keys()
+        """The numbers and factors of pieces and those of colours, if steps learn them."""
+        return self.pieces.parameters().keys() if self.pieces and self._learned else frozenset()
 
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
         """Those of the numbers of pieces and colours, if there are any."""

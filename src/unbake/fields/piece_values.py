@@ -74,19 +74,15 @@ class PieceValues:
 
         Args:
             point: where.
-            beside: what outputs are without pieces and colours, to which these are added.
+            beside: what outputs are without pieces and colours, to which these are added. The
+                factor of a piece is of that, too.
 
         Raises:
             ValueError: the piece is not told.
         """
         if point.piece is None:
             raise ValueError("a field with values of pieces is asked at a point without its piece")
-        bins = self._settings.brightnesses
         albedo = mi.Color3f(0.25) if point.albedo is None else dr.detach(point.albedo)
-        mean = dr.mean(albedo)
-        at = dr.sqrt(bounded(mean, 0, 1)) * (bins - 1)
-        below = dr.minimum(mi.UInt32(at), bins - 2)
-        share = at - mi.Float(below)
         number = dr.minimum(point.piece.number, self._settings.most - 1)
         others = list(beside or [mi.Float(0)] * len(self._values))
         if self._colours is not None:
@@ -97,15 +93,26 @@ class PieceValues:
             ]
         if self._factors is not None:
             factor = dr.gather(mi.Float, dr.detach(self._factors), number)
+            factor = dr.select(point.piece.strength > 0, factor, 1)  # 0: nothing is known of it
             others = [factor * x for x in others]
-        first = number * bins + below
         gain = self._settings.gain * point.piece.strength
+        own = self._own(number, dr.mean(albedo))
+        return [dr.fma(gain, x, y) for x, y in zip(own, others, strict=True)]
+
+    def _own(self, number: mi.UInt32, mean: mi.Float) -> list[mi.Float]:
+        """The numbers of pieces where the mean of linear RGB albedo is so much, an output each."""
+        bins, tables = self._settings.brightnesses, self._values
+        if not self._settings.learned:
+            tables = [dr.detach(values) for values in tables]
+        if bins == 1:
+            return [dr.gather(mi.Float, values, number) for values in tables]
+        at = dr.sqrt(bounded(mean, 0, 1)) * (bins - 1)
+        below = dr.minimum(mi.UInt32(at), bins - 2)
+        share, first = at - mi.Float(below), number * bins + below
         found = []
-        for values, other in zip(self._values, others, strict=True):
-            if not self._settings.learned:
-                values = dr.detach(values)
+        for values in tables:
             low, high = (dr.gather(mi.Float, values, first + i) for i in (0, 1))
-            found.append(dr.fma(gain, dr.fma(share, high - low, low), other))
+            found.append(dr.fma(share, high - low, low))
         return found
 
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
@@ -119,9 +126,11 @@ class PieceValues:
         of_pieces = [
             values * dr.gather(mi.Float, strength, every // bins) for values in self._values
         ]
-        here = dr.arange(mi.UInt32, self._settings.most * (bins - 1))
-        here += here // (bins - 1)  # all but the last one of a piece
-        found = {"pieces": of_pieces, "brightnesses": [differences(v, here, 1) for v in of_pieces]}
+        found = {"pieces": of_pieces}
+        if bins > 1:
+            here = dr.arange(mi.UInt32, self._settings.most * (bins - 1))
+            here += here // (bins - 1)  # all but the last one of a piece
+            found["brightnesses"] = [differences(v, here, 1) for v in of_pieces]
         if self._colours is not None:
             found["colours"] = [gain * x for x in self._colours.differences()]
         return {name: dr.concat(arrays) for name, arrays in found.items()}
@@ -169,5 +178,5 @@ class PieceValues:
     def features(self) -> int:
         """Numbers that are looked up at a point."""
         outputs = len(self._values)
-        factors = 0 if self._factors is None else 1
-        return (2 + (8 if self._colours is not None else 0)) * outputs + factors
+        own = min(self._settings.brightnesses, 2) + (8 if self._colours is not None else 0)
+        return own * outputs + (0 if self._factors is None else 1)

@@ -85,7 +85,8 @@ class PieceConfig:
     """
 
     most: int = 0  #: pieces with values of their own; smaller ones share them. 0: there are none
-    brightnesses: int = 8  #: of the albedo, from black to white
+    #: Of the albedo, from black to white, in each of which a piece has its own number
+    brightnesses: int = 8
     gain: float = 7.0  #: how much faster a large piece learns than the network would alone
     network: float = 0.2  #: how much slower the network learns beside pieces
     #: Cells along each channel of a table by colour of the albedo, which all pieces share; 0: none
@@ -96,11 +97,11 @@ class PieceConfig:
     learned: bool = True  #: whether steps change numbers of pieces; False: searches alone do
 
     def __post_init__(self) -> None:
-        sizes = {"most": (0, 1 << 20), "brightnesses": (2, 64), "colours": (0, 64)}
+        sizes = {"most": (0, 1 << 20), "brightnesses": (1, 64), "colours": (0, 64)}
         require_ranges(self, sizes | {"gain": (POSITIVE, 1e4), "network": (POSITIVE, 1.0)})
 
     def numbers(self, outputs: int) -> int:
-        """How many numbers are learned."""
+        """How many numbers there are."""
         if not self.most:
             return 0
         grid = features_of(outputs) * (self.colours + 1) ** 3 if self.colours else 0

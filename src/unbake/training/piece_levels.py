@@ -21,7 +21,7 @@ import numpy as np
 
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
-from ..fields.field import Field
+from ..fields.field import Field, holding
 from ..ranks import Ranks
 from .roughness_curves import NODES, Curves, in_range, of_roughness
 from .seen_pieces import SeenPieces, chances, normalized, values_of
@@ -71,10 +71,8 @@ def with_expected_levels(
     # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
     now = value[:, len(SHIFTS) // 2]
     by[(now < LEVELS[0]) & (wanted < LEVELS[2])] = 0
-    before = dict(field.parameters())
-    field.assign(before | found)
-    raised = field.raised(seen.pieces, from_numpy(mi.Float, by.astype(np.float32)))
-    field.assign(before)
+    with holding(field, found):
+        raised = field.raised(seen.pieces, from_numpy(mi.Float, by.astype(np.float32)))
     return found | raised
 
 

@@ -4,10 +4,11 @@ What differs within a piece is what a network, brightnesses and colours of the a
 where photographs tell little, that is noise. Most pieces are of one material. So it is taken to be
 probable beforehand that one has one roughness, or one albedo (`one_roughness`, `one_albedo`), and
 any larger part of what was found is as probable as any other. Errors of pixels tell how probable
-each part is afterwards, and the mean over all parts has the least squared error.
+each part is afterwards. The mean over all parts has the least squared error, of outputs before
+their bounds.
 
-Of albedo, photographs know what steps have fitted to them, noise included: so they ask for more
-than there is. What is left out is that of which even the same photographs show nothing.
+What varies was fitted to the same photographs, noise included, albedo more so than roughness: so
+they ask for more than there is. What is taken away is that of which even they show nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
-from ..fields.field import Field
+from ..fields.field import Field, holding
 from ..ranks import Ranks
 from .piece_levels import errors_of
 from .roughness_curves import Curves, albedo_errors, pieces_of, points
@@ -28,7 +29,7 @@ from .seen_pieces import SeenPieces, normalized, outputs_of, values_of
 
 #: Parts of the variation. Of the least one, which stands for none, all can be had back.
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
-#: The same of albedo, which steps go on to learn, its level by what is left of the variation.
+#: The same of albedo, of what it has by now: steps go on to learn it, its level by what is left.
 ALBEDO_PARTS = np.arange(1, 9) / 8
 
 
@@ -85,6 +86,9 @@ def expected_albedo(
     Returns:
         The numbers and factors of pieces that change; none where pieces have no factors.
     """
+    factors = field.parameters().get("variation")
+    if factors is None:
+        return {}
     seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {}, settings)
     about = outputs_of(seen.means(values_of(seen.outputs)).T)
     here = about[:, seen.piece_of]
@@ -93,7 +97,8 @@ def expected_albedo(
         for part in ALBEDO_PARTS
     )
     parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo)
-    return _varied(field, {}, seen, about, parts)
+    present = np.array(factors)[np.array(seen.pieces.number)]
+    return _varied(field, {}, seen, about, np.maximum(parts * present, PARTS[0]))
 
 
 def _means(seen: SeenPieces) -> np.ndarray:
@@ -123,9 +128,6 @@ def _varied(
     parts: np.ndarray,
 ) -> dict[str, Any]:
     """The numbers with which outputs of pieces differ from a value by a part of all there is."""
-    before = dict(field.parameters())
-    field.assign(before | numbers)
     factor, *levels = (from_numpy(mi.Float, x.astype(np.float32)) for x in (parts, *about))
-    found = field.varied(seen.pieces, levels, factor)
-    field.assign(before)
-    return found
+    with holding(field, numbers):
+        return field.varied(seen.pieces, levels, factor)

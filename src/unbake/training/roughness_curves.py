@@ -25,6 +25,8 @@ _BRIGHTNESSES = 32
 _LEAST = -1.0
 #: Factors of albedo are no larger.
 _LARGEST_FACTOR = 4.0
+#: Less albedo than this is not told from it.
+_BLACK = 1e-3
 
 
 @dataclass(frozen=True)
@@ -263,7 +265,7 @@ def albedo_errors(rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -
         albedo: linear RGB, shape (n, 3).
 
     Returns:
-        As of `squared_errors`, but no less than curves have it, shape (n,).
+        Means over channels, no less than curves have them, shape (n,).
     """
     places, every = np.log(NODES), np.arange(len(rows))
     place = np.clip(np.log(np.maximum(roughness, NODES[0])), places[0], places[-1])
@@ -273,6 +275,5 @@ def albedo_errors(rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -
     for name in ("plain", "coloured", "plain2", "mixed", "coloured2"):
         a, b = rows[name][every, left], rows[name][every, left + 1]
         single[name] = (a + part * (b - a))[:, None]
-    factor = albedo / np.maximum(rows["albedo"], 1e-3)
-    errors = squared_errors(single, np.clip(factor, 0, _LARGEST_FACTOR)[:, None])
-    return np.maximum(errors[:, 0], _LEAST)
+    factor = np.maximum(albedo, _BLACK) / np.maximum(rows["albedo"], _BLACK)
+    return np.maximum(squared_errors(single, factor[:, None])[:, 0], _LEAST)

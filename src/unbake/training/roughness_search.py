@@ -19,7 +19,7 @@ tell little, too. So the most probable ones are sought: squared errors are in un
 variance, which the pixels themselves tell, by how bright they are, and numbers of one piece, or of
 like colours, are expected to differ as little as the settings say. Each piece then varies as much
 as is to be expected of it (`piece_variation.py`), and moves to the roughness that is
-(`piece_levels.py`). After the first search, steps leave
+(`piece_levels.py`); in the last search, albedo varies so, too. After the first search, steps leave
 roughness alone; from the second one on, the mean of what searches find is kept.
 """
 
@@ -34,7 +34,7 @@ import numpy as np
 from ..config import FitConfig, RoughnessSearchConfig
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..fields.field import Field
+from ..fields.field import Field, holding
 from ..memory import lacks_memory
 from ..ranks import Ranks
 from ..transport.by_roughness import row_type
@@ -71,12 +71,10 @@ class RoughnessSearch:
     ) -> None:
         self._problem, self._config, self._step, self._ranks = problem, config, step, ranks
         search, materials = config.roughness_search, problem.materials
-        self._field = self._albedo = None
+        self._field = None
         if materials is not None and problem.radiance is not None:
             field = materials.get("roughness")
             self._field = field if field is not None and field.shared() else None
-            albedo = materials.get("albedo")
-            self._albedo = albedo if albedo is not None and albedo.shared() else None
         # A single search is the last one; there is none where there is nothing to search.
         times = 0 if self._field is None else search.times
         self._places = np.sort(np.linspace(search.last, search.first, times))
@@ -174,13 +172,16 @@ class RoughnessSearch:
             curves = Curves.of(rows, search.cells, search.colours, albedo, ranks)
             own = self._config.material_settings["roughness"].learning_rate
             found = searched(field, curves, search, search.rate * own, ranks)
-            named = {f"roughness.{key}": self._of_first(x) for key, x in found.items()}
-            state.replace({k: dr.lerp(dr.detach(state.phi[k]), x, part) for k, x in named.items()})
-            if last and search.pixels_as_one and self._albedo is not None:
-                state.publish(self._problem)
-                now = roughness_of(field, points(rows, albedo)).numpy()
-                told = expected_albedo(self._albedo, rows, now, search)
-                state.replace({f"albedo.{key}": self._of_first(x) for key, x in told.items()})
+            for key, x in found.items():
+                before = dr.detach(state.phi[f"roughness.{key}"])
+                found[key] = dr.lerp(before, self._of_first(x), part)
+            changed = {f"roughness.{key}": x for key, x in found.items()}
+            if last and search.pixels_as_one and albedo:
+                with holding(field, found):
+                    now = roughness_of(field, points(rows, albedo)).numpy()
+                told = expected_albedo(materials["albedo"], rows, now, search)
+                changed |= {f"albedo.{key}": self._of_first(x) for key, x in told.items()}
+            state.replace(changed)
         state.publish(self._problem)
         return batches * each * search.spp * self._ranks.size
 
@@ -203,14 +204,11 @@ def searched(
 
     Args and returns as of `descend`; the field stays as it is.
     """
-    before = dict(field.parameters())
-    if settings.pixels_as_one:
-        field.assign(before | with_all_variation(field, curves, settings, ranks))
-    found = descend(field, curves, settings, rate, ranks)
-    if settings.pixels_as_one:
-        found = with_expected_variation(field, curves, found, settings, ranks)
-        found = with_expected_levels(field, curves, found, settings, ranks)
-    field.assign(before)
+    with holding(field, with_all_variation(field, curves, settings, ranks)):
+        found = descend(field, curves, settings, rate, ranks)
+        if settings.pixels_as_one:
+            found = with_expected_variation(field, curves, found, settings, ranks)
+            found = with_expected_levels(field, curves, found, settings, ranks)
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
 from ..fields.domain import SurfacePoint
-from ..fields.field import Field
+from ..fields.field import Field, holding
 from ..fields.pieces import Piece
 from ..ranks import Ranks
 
@@ -45,15 +45,17 @@ class SeenPieces:
     ) -> None:
         self._settings, self._ranks = settings, ranks or Ranks()
         assert point.piece is not None
-        before = dict(field.parameters())
-        field.assign(before | numbers)
+        with holding(field, numbers):
+            values = field.evaluate(point)
         #: Of the field at pixels, before their bounds, shape (outputs, n).
-        self.outputs = outputs_of(np.stack([np.array(x, float) for x in field.evaluate(point)]))
-        field.assign(before)
-        # The smallest pieces may share the last number of the field.
+        self.outputs = outputs_of(np.stack([np.array(x, float) for x in values]))
+        # The smallest pieces may share the last number of the field. It cannot stand for a level of
+        # all of them where it counts more for some than for others, and is left as it is.
         most = field.most_pieces - 1
-        present, first = np.unique(np.minimum(pieces.number, most), return_index=True)
-        strengths = np.array(pieces.strength)[first]
+        own, strengths = np.minimum(pieces.number, most), np.array(pieces.strength)
+        present, first, of_own = np.unique(own, return_index=True, return_inverse=True)
+        alike = np.bincount(of_own, strengths != strengths[first[of_own]]) == 0
+        strengths = np.where(alike, strengths[first], 0)
         self.pieces = Piece(from_numpy(mi.UInt32, present), from_numpy(mi.Float, strengths))
         #: The piece of each pixel, from 0, shape (n,).
         self.piece_of = np.searchsorted(present, np.minimum(point.piece.number, most))
