@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeVar
 
@@ -11,7 +10,6 @@ from ..config.fit import BOUNCES_OF_OBJECTS, OWN_FINAL_RATE, OWN_WARM_UP
 from ..config.method_defaults import MethodDefaults, method_defaults
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
-from ..fields.settings import FieldSettings, NetworkConfig, PieceConfig
 from ..quantities import QUANTITIES
 from ..transport.methods import METHODS
 from ..transport.objective import has_radiance
@@ -95,7 +93,6 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
         estimator = config.one_pass if estimator == "all-pairs" else estimator
     return replace(
         config,
-        materials=_without_idle_pieces(config),
         bounces=config.bounces or own_bounces(config, kind),
         rate_factors=factors,
         estimator=estimator,
@@ -104,26 +101,6 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
         ),
         warm_up=_first_known(config.warm_up, found.warm_up, own_warm_up(config)),
     )
-
-
-def _without_idle_pieces(config: FitConfig) -> Mapping[str, Mapping[str, FieldSettings]]:
-    """Settings of materials, without pieces that only searches would change if there are none."""
-    if (
-        config.roughness_search.times
-        and config.learns_materials
-        and "roughness" in config.quantities
-        and has_radiance(config.chosen_method)
-    ):
-        return config.materials
-    return {
-        name: {
-            key: replace(settings, pieces=PieceConfig())
-            if isinstance(settings, NetworkConfig) and not settings.pieces.learned
-            else settings
-            for key, settings in of_name.items()
-        }
-        for name, of_name in config.materials.items()
-    }
 
 
 def own_bounces(config: FitConfig, kind: SceneKind) -> int:
