@@ -31,7 +31,8 @@ def run(tmp_path):
 def often(tiny, tmp_path):
     """Settings with a checkpoint after every step."""
     file = tmp_path / "often.toml"
-    small = "\n[materials.roughness.neural.pieces]\nmost = 0\n"
+    kinds = ("albedo", "roughness")
+    small = "".join(f"\n[materials.{kind}.neural.pieces]\nmost = 0\n" for kind in kinds)
     file.write_text("checkpoint_seconds = 0\n" + tiny.read_text() + small)
     return file
 
