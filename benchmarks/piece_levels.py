@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT / "src"))
 os.environ["PYTHONPATH"] = str(ROOT / "src")
 
 from roughness_curves import opened  # noqa: E402
-from roughness_limits import Shared, psnr, sampled, told_of_runs  # noqa: E402
+from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs  # noqa: E402
 
 from unbake.config import RoughnessSearchConfig  # noqa: E402
 
@@ -93,12 +93,6 @@ def at_means(values: np.ndarray, pieces: np.ndarray, truth: np.ndarray) -> np.nd
         by = float(np.interp(truth[own].mean(), means, SHIFTS))
         found[own] = quantity.lower + span * values_of(outputs + by)
     return found
-
-
-def means_of(values: np.ndarray, pieces: np.ndarray) -> np.ndarray:
-    """The mean of values over the piece of each pixel, shape (n,), as the arguments."""
-    _, here = np.unique(pieces, return_inverse=True)
-    return (np.bincount(here, values) / np.bincount(here))[here]
 
 
 if __name__ == "__main__":

@@ -90,7 +90,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         pixels: how many are sampled; those that searches cannot use are left out.
         spp: camera samples of each.
     """
-    from unbake.training.roughness_curves import NODES, precision
+    from unbake.training.roughness_curves import precision
 
     run, steps = opened(folder)
     (rows, many), true = sampled(run, pixels, (spp, CLEANER * spp))
@@ -111,7 +111,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         "to the optimum": shared.score(shared.searched(rows, TO_OPTIMUM)),
         "searches": shared.score(mean),
     }
-    clean = made_up(many, roughness, albedo, NODES)
+    clean = made_up(many, roughness, albedo)
     deviation = 1 / np.sqrt(np.maximum(rows["weight"], 1e-12))
     noisy = clean + deviation * np.random.default_rng(0).standard_normal(clean.shape)
     for name, target in (("made-up and noisy", noisy), ("made-up photographs", clean)):
@@ -120,7 +120,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         told[name] = shared.score(shared.searched(rows))
     for name, known in (("no noise at all", rows), ("and true albedo", recoloured(rows, albedo))):
         exact = without_noise(known)
-        exact["target"] = made_up(exact, roughness, albedo, NODES)
+        exact["target"] = made_up(exact, roughness, albedo)
         told[name] = shared.score(shared.searched(exact))
     name = run.dataset.folder.name
     for key, value in told.items():
@@ -269,8 +269,13 @@ class Shared:
         columns = [self._rows["piece"][:, None], np.minimum(colour, COLOURS - 1)]
         kind = np.concatenate(columns, 1).astype(np.int64)
         group = np.unique(kind, axis=0, return_inverse=True)[1].ravel()
-        mean = np.bincount(group, network) / np.bincount(group)
-        return quantity.lower + span / (1 + np.exp(-(tables + mean[group])))
+        return quantity.lower + span / (1 + np.exp(-(tables + means_of(network, group))))
+
+
+def means_of(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """The mean of values over the group of each pixel, shape (n,), as the arguments."""
+    _, here = np.unique(groups, return_inverse=True)
+    return (np.bincount(here, values) / np.bincount(here))[here]
 
 
 def psnr(values: np.ndarray, truth: np.ndarray) -> float:
@@ -278,25 +283,18 @@ def psnr(values: np.ndarray, truth: np.ndarray) -> float:
     return float(-10 * np.log10(np.square(values - truth).mean()))
 
 
-def made_up(
-    rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray, nodes: tuple[float, ...]
-) -> np.ndarray:
+def made_up(rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -> np.ndarray:
     """Photographs of pixels with these materials, as light that is compared, shape (n, 3).
 
     Args:
-        rows: of `row_type`; linear in the logarithm of roughness between nodes.
+        rows: of `row_type`.
         roughness: shape (n,).
         albedo: linear RGB, shape (n, 3).
     """
-    places, every = np.log(nodes), np.arange(len(rows))
-    x = np.clip(np.log(np.maximum(roughness, 1e-3)), places[0], places[-1])
-    left = np.clip(np.searchsorted(places, x) - 1, 0, len(places) - 2)
-    part = ((x - places[left]) / (places[left + 1] - places[left]))[:, None]
-    factor = towards(rows, albedo)
-    images = [
-        rows["plain"][every, i] + factor * rows["coloured"][every, i] for i in (left, left + 1)
-    ]
-    return rows["gain"] * (images[0] * (1 - part) + images[1] * part)
+    from unbake.training.roughness_curves import at_roughness
+
+    light = at_roughness(rows, roughness, ("plain", "coloured"))
+    return rows["gain"] * (light["plain"] + towards(rows, albedo) * light["coloured"])
 
 
 def towards(rows: np.ndarray, albedo: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@
 
 The fits of a seed follow each other, and the file is written after each fit. With --go-on, fits
 that it has already are kept: those of the first seeds, of each data set, method and settings.
-Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over
-held-out views, with those of the untrained fields; seconds are those of training.
+Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over held-out views, with those of
+the untrained fields; seconds are those of training.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ def test_what_a_search_took_the_next_one_has_again():
     small = spread(roughness_at(field, flat, curves.point), rows["piece"])
     assert (small < 0.03 * spread(before, rows["piece"])).all()
     field.assign(dict(field.parameters()) | flat)
-    again = with_all_variation(field, curves, SEARCH)
+    again = with_all_variation(field, curves)
     np.testing.assert_allclose(roughness_at(field, again, curves.point), before, atol=1e-3)
 
 

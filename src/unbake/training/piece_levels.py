@@ -21,7 +21,7 @@ import numpy as np
 
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
-from ..fields.field import Field, holding
+from ..fields.field import Field
 from ..ranks import Ranks
 from .roughness_curves import NODES, Curves, in_range, of_roughness
 from .seen_pieces import SeenPieces, chances, normalized, values_of
@@ -59,7 +59,7 @@ def with_expected_levels(
     Returns:
         What was found, with the numbers of pieces moved.
     """
-    seen = SeenPieces(field, curves.point, curves.pieces, found, settings, ranks)
+    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks)
     (outputs,) = seen.outputs
     error = seen.sums(errors_of(curves, outputs + shift) for shift in SHIFTS)
     value = seen.means(values_of(outputs + shift) for shift in SHIFTS)
@@ -71,9 +71,7 @@ def with_expected_levels(
     # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
     now = value[:, len(SHIFTS) // 2]
     by[(now < LEVELS[0]) & (wanted < LEVELS[2])] = 0
-    with holding(field, found):
-        raised = field.raised(seen.pieces, from_numpy(mi.Float, by.astype(np.float32)))
-    return found | raised
+    return found | seen.raised(by)
 
 
 def errors_of(curves: Curves, outputs: np.ndarray) -> np.ndarray:

@@ -13,19 +13,17 @@ they ask for more than there is. What is taken away is that of which even they s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from ..config import RoughnessSearchConfig
-from ..fields.arrays import from_numpy
-from ..fields.field import Field, holding
+from ..fields.field import Field
 from ..ranks import Ranks
 from .piece_levels import errors_of
 from .roughness_curves import Curves, albedo_errors, pieces_of, points
-from .seen_pieces import SeenPieces, normalized, outputs_of, values_of
+from .seen_pieces import SeenPieces, chances, normalized, outputs_of, values_of
 
 #: Parts of the variation. Of the least one, which stands for none, all can be had back.
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
@@ -42,34 +40,32 @@ def with_expected_variation(
 ) -> dict[str, Any]:
     """Let each piece vary in its roughness as much as is to be expected of it.
 
-    Args:
-        field: of roughness.
-        curves: of errors in units of their variance.
-        found: numbers that points share, in the place of the field's; all of the variation.
-        settings: how probable one roughness is, and how many pixels tell as much as one.
-        ranks: that have a part of the curves each; None: there is one.
-
-    Returns:
-        What was found, with the numbers and factors of pieces changed, if they have factors.
+    Args and returns as of `with_expected_levels`. What was found has all of the variation; it stays
+    where pieces have no factors.
     """
-    seen = SeenPieces(field, curves.point, curves.pieces, found, settings, ranks)
+    if "variation" not in found:
+        return found
+    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks)
     (outputs,), about = seen.outputs, _means(seen)
     here = about[0, seen.piece_of]
     errors = (errors_of(curves, here + part * (outputs - here)) for part in PARTS)
-    parts = _expected(seen, errors, PARTS, settings.one_roughness)
-    return found | _varied(field, found, seen, about, parts)
+    parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
+    return found | seen.varied(about, parts)
 
 
-def with_all_variation(
-    field: Field, curves: Curves, settings: RoughnessSearchConfig, ranks: Ranks | None = None
-) -> dict[str, Any]:
-    """What a field has where earlier searches took nothing from what differs within pieces.
+def with_all_variation(field: Field, curves: Curves, ranks: Ranks | None = None) -> dict[str, Any]:
+    """The numbers that points share, as if no search had taken anything from what differs.
 
-    Args and returns as of `with_expected_variation`; the field's own numbers are those found.
+    Args:
+        field: of roughness.
+        curves: of the pieces that are asked for.
+        ranks: that have a part of the curves each; None: there is one.
     """
     numbers = {key: field.parameters()[key] for key in field.shared()}
-    seen = SeenPieces(field, curves.point, curves.pieces, numbers, settings, ranks)
-    return numbers | _varied(field, numbers, seen, _means(seen), np.ones(len(seen.pixels)))
+    if "variation" not in numbers:
+        return numbers
+    seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks)
+    return numbers | seen.varied(_means(seen), np.ones(len(seen.pixels)))
 
 
 def expected_albedo(
@@ -89,16 +85,16 @@ def expected_albedo(
     factors = field.parameters().get("variation")
     if factors is None:
         return {}
-    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {}, settings)
+    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {})
     about = outputs_of(seen.means(values_of(seen.outputs)).T)
     here = about[:, seen.piece_of]
     errors = (
         albedo_errors(rows, roughness, values_of(here + part * (seen.outputs - here)).T)
         for part in ALBEDO_PARTS
     )
-    parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo)
+    parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo, settings)
     present = np.array(factors)[np.array(seen.pieces.number)]
-    return _varied(field, {}, seen, about, np.maximum(parts * present, PARTS[0]))
+    return seen.varied(about, np.maximum(parts * present, PARTS[0]))
 
 
 def _means(seen: SeenPieces) -> np.ndarray:
@@ -107,27 +103,19 @@ def _means(seen: SeenPieces) -> np.ndarray:
 
 
 def _expected(
-    seen: SeenPieces, errors: Iterable[np.ndarray], parts: np.ndarray, none: float
+    seen: SeenPieces,
+    errors: Iterable[np.ndarray],
+    parts: np.ndarray,
+    none: float,
+    settings: RoughnessSearchConfig,
 ) -> np.ndarray:
     """The part of its variation that is to be expected of each piece, shape (pieces,).
 
     Args:
         errors: of pixels with each part, shape (n,) each.
         none: how probable the first part is beforehand.
+        settings: how many pixels tell as much as one.
     """
     prior = np.full(len(parts), (1 - none) / (len(parts) - 1))
     prior[0] = none
-    return normalized(seen.chances(seen.sums(errors)) * prior) @ parts
-
-
-def _varied(
-    field: Field,
-    numbers: dict[str, Any],
-    seen: SeenPieces,
-    about: Sequence[np.ndarray] | np.ndarray,
-    parts: np.ndarray,
-) -> dict[str, Any]:
-    """The numbers with which outputs of pieces differ from a value by a part of all there is."""
-    factor, *levels = (from_numpy(mi.Float, x.astype(np.float32)) for x in (parts, *about))
-    with holding(field, numbers):
-        return field.varied(seen.pieces, levels, factor)
+    return normalized(chances(seen.sums(errors), seen.pixels, settings) * prior) @ parts

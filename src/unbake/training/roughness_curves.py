@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -256,24 +257,38 @@ def squared_errors(rows: np.ndarray | dict[str, np.ndarray], factor: np.ndarray)
     return (weight * (image2 - target * (2 * image - target))).mean(2)
 
 
+def at_roughness(
+    rows: np.ndarray, roughness: np.ndarray, names: Iterable[str]
+) -> dict[str, np.ndarray]:
+    """What rows say of nodes, each at its roughness, shape (n, 3).
+
+    Args:
+        rows: of `row_type`; between nodes they are linear in the logarithm of roughness, and beyond
+            them they stay as they are.
+        roughness: shape (n,).
+        names: of numbers that rows have at nodes.
+    """
+    places, every = np.log(NODES), np.arange(len(rows))
+    place = np.log(np.clip(roughness, NODES[0], NODES[-1]))
+    left = np.clip(np.searchsorted(places, place) - 1, 0, len(places) - 2)
+    part = ((place - places[left]) / np.diff(places)[left])[:, None]
+    ends = {name: (rows[name][every, left], rows[name][every, left + 1]) for name in names}
+    return {name: a + part * (b - a) for name, (a, b) in ends.items()}
+
+
 def albedo_errors(rows: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -> np.ndarray:
     """The squared errors of pixels with another albedo than they have by now.
 
     Args:
-        rows: of `row_type`; between its nodes they are linear in the logarithm of roughness.
+        rows: of `row_type`.
         roughness: shape (n,).
         albedo: linear RGB, shape (n, 3).
 
     Returns:
         Means over channels, no less than curves have them, shape (n,).
     """
-    places, every = np.log(NODES), np.arange(len(rows))
-    place = np.clip(np.log(np.maximum(roughness, NODES[0])), places[0], places[-1])
-    left = np.clip(np.searchsorted(places, place) - 1, 0, len(places) - 2)
-    part = ((place - places[left]) / np.diff(places)[left])[:, None]
+    names = ("plain", "coloured", "plain2", "mixed", "coloured2")
     single = {name: rows[name] for name in ("target", "weight", "gain")}
-    for name in ("plain", "coloured", "plain2", "mixed", "coloured2"):
-        a, b = rows[name][every, left], rows[name][every, left + 1]
-        single[name] = (a + part * (b - a))[:, None]
+    single |= {name: x[:, None] for name, x in at_roughness(rows, roughness, names).items()}
     factor = np.maximum(albedo, _BLACK) / np.maximum(rows["albedo"], _BLACK)
     return np.maximum(squared_errors(single, factor[:, None])[:, 0], _LEAST)

@@ -204,7 +204,7 @@ def searched(
 
     Args and returns as of `descend`; the field stays as it is.
     """
-    with holding(field, with_all_variation(field, curves, settings, ranks)):
+    with holding(field, with_all_variation(field, curves, ranks)):
         found = descend(field, curves, settings, rate, ranks)
         if settings.pixels_as_one:
             found = with_expected_variation(field, curves, found, settings, ranks)

@@ -30,7 +30,6 @@ class SeenPieces:
         point: of each pixel.
         pieces: that pixels of any rank see, in the order of their numbers.
         numbers: that points share, in the place of the field's.
-        settings: how many pixels tell as much as one.
         ranks: that have a part of the pixels each; None: there is one.
     """
 
@@ -40,10 +39,9 @@ class SeenPieces:
         point: SurfacePoint,
         pieces: Piece,
         numbers: dict[str, Any],
-        settings: RoughnessSearchConfig,
         ranks: Ranks | None = None,
     ) -> None:
-        self._settings, self._ranks = settings, ranks or Ranks()
+        self._field, self._numbers, self._ranks = field, numbers, ranks or Ranks()
         assert point.piece is not None
         with holding(field, numbers):
             values = field.evaluate(point)
@@ -72,20 +70,33 @@ class SeenPieces:
         """Means over the pixels of each piece; see `sums`."""
         return self.sums(columns) / self.pixels[:, None]
 
-    def chances(self, errors: np.ndarray) -> np.ndarray:
-        """How probable photographs are where pieces have errors, as a multiple of the highest.
+    def raised(self, by: np.ndarray) -> dict[str, Any]:
+        """See `Field.raised`; shape (pieces,)."""
+        with holding(self._field, self._numbers):
+            return self._field.raised(self.pieces, _of_field(by))
 
-        Errors of neighbouring pixels have a part in common, and those of L_θ all pixels of a piece.
+    def varied(self, about: np.ndarray, factor: np.ndarray) -> dict[str, Any]:
+        """See `Field.varied`; of shapes (outputs, pieces) and (pieces,)."""
+        levels = [_of_field(level) for level in about]
+        with holding(self._field, self._numbers):
+            return self._field.varied(self.pieces, levels, _of_field(factor))
 
-        Args:
-            errors: of all pixels of each piece, in units of their variance, for each of some
-                possibilities, shape (pieces, possibilities).
-        """
-        return chances(errors, self.pixels, self._settings)
+
+def _of_field(values: np.ndarray) -> mi.Float:
+    return from_numpy(mi.Float, values.astype(np.float32))
 
 
 def chances(errors: np.ndarray, pixels: np.ndarray, settings: RoughnessSearchConfig) -> np.ndarray:
-    """See `SeenPieces.chances`; pixels are those of each piece, shape (pieces,)."""
+    """How probable photographs are where pieces have errors, as a multiple of the highest.
+
+    Errors of neighbouring pixels have a part in common, and those of L_θ all pixels of a piece.
+
+    Args:
+        errors: of all pixels of each piece, in units of their variance, for each of some
+            possibilities, shape (pieces, possibilities).
+        pixels: of each piece, shape (pieces,).
+        settings: how many pixels tell as much as one.
+    """
     as_one = np.full(len(pixels), settings.pixels_as_one)
     if settings.pixels_at_most:
         as_one = np.maximum(as_one, pixels / settings.pixels_at_most)
