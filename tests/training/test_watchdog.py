@@ -52,7 +52,8 @@ def spoil(state, word="radiance", value=np.nan):
     optimizer = state.theta if word == "radiance" else state.phi
     of_word = word != "radiance"
     key = [k for k in optimizer if k.startswith(word) == of_word and not k.startswith("guide")][-1]
-    optimizer[key] = type(optimizer[key])(np.full_like(np.array(optimizer[key]), value))
+    # Not by NumPy: where a step is recorded, the memory of its arrays cannot be released.
+    optimizer[key] = dr.full(type(optimizer[key]), value, optimizer[key].shape)
 
 
 # --------------------------------------------------------------------------------- the state
@@ -172,7 +173,7 @@ def test_an_exploding_loss_goes_back_once_and_then_ends_the_fit(begun):
         assert read(0.5) == []
     spoiled = mi.TensorXf if dr.is_tensor_v(next(iter(state.phi.values()))) else mi.Float
     key = next(iter(state.phi))
-    state.phi[key] = spoiled(np.array(state.phi[key]) + 1)
+    state.phi[key] = spoiled(dr.detach(state.phi[key]) + 1)
     assert dog.trusts and read(0.5 * EXPLOSION * 1.1) == []
     assert not dog.trusts, "it is not to be saved"
     (line,) = read(0.5 * EXPLOSION * 2)
