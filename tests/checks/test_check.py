@@ -1,5 +1,7 @@
 """What is wrong with a data set is told at once, with the remedy; good data raise no alarm."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -207,6 +209,28 @@ def test_exposures_that_differ_are_measured(spoilt):
     for frame, stop in zip(data.frames, stops, strict=True):
         frame["exposure"] = 2.0**stop
     assert [f.check for f in found(data.save()) if f.level == "warning"] == []
+
+
+def test_noise_that_was_clipped_at_black_is_told(spoilt, tiny, unbake, tmp_path):
+    """Its size, before a fit and by `data check`, until the data set tells it."""
+    data, rng, read = spoilt("cornell"), np.random.default_rng(0), 0.1
+
+    def noisy(pixels):
+        rgb = pixels[..., :3] + rng.normal(0, read, (*pixels.shape[:2], 3))
+        return np.dstack([np.maximum(rgb, 0), pixels[..., 3]])
+
+    for frame in data.content["frames"]:
+        data.picture(frame, noisy)
+    (finding,) = [f for f in check_data(data.save()).findings if f.check == "noise"]
+    told = float(re.search(r'"read": ([0-9.]+)', finding.remedy)[1])
+    assert finding.level == "warning" and told == pytest.approx(read, rel=0.2)
+    words = ("--settings", tiny, "--steps", 1)
+    outcome = unbake("fit", data.folder, "--out", tmp_path / "run", *words)
+    assert outcome.status == 0 and "noise seems to have been clipped at black" in outcome.out
+    data.content["noise"] = {"read": read}
+    assert not [f for f in check_data(data.save()).findings if f.check == "noise"]
+    outcome = unbake("fit", data.folder, "--out", tmp_path / "other", *words)
+    assert outcome.status == 0 and "clipped at black" not in outcome.out
 
 
 def test_clipped_black_blurred_and_double_photographs_are_told(spoilt):

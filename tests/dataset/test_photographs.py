@@ -213,7 +213,7 @@ def test_noise_that_is_known_is_not_told_from_neighbours(dataset, where, monkeyp
         monkeypatch.setattr(module, "IN_MEMORY", 0)
     made, exposure = dataset("visible"), 4.0
     told = Photographs.load(made, False, smoothed=True).table.copy()
-    known = [replace(view, noise=SensorNoise(0.5, 0.25)) for view in made.views]
+    known = [replace(view, noise=SensorNoise(0.02, 0.05)) for view in made.views]
     found = Photographs.load(replace(made, views=known), False, smoothed=True).table.copy()
     np.testing.assert_array_equal(found[:, :3], told[:, :3])
     # Nothing but the noise differs: what is left of the squares is the mean and the peak.
@@ -223,12 +223,12 @@ def test_noise_that_is_known_is_not_told_from_neighbours(dataset, where, monkeyp
     mean = told[: WIDTH * HEIGHT, :3].reshape(HEIGHT, WIDTH, 3)[y - 2 : y + 3, x - 2 : x + 3]
     mean, at = mean.mean((0, 1)), y * WIDTH + x
     added = found[at, 3:] ** 2 - still[at, 3:] ** 2
-    np.testing.assert_allclose(added, 0.5 * mean + 0.25**2, rtol=1e-3)
+    np.testing.assert_allclose(added, 0.02 * mean + 0.05**2, rtol=1e-3)
     # Of values that are divided by the exposure.
     exposed = [replace(view, exposure=exposure) for view in known]
     divided = Photographs.load(replace(made, views=exposed), False, smoothed=True).table
     added = divided[at, 3:] ** 2 - (still[at, 3:] / exposure) ** 2
-    np.testing.assert_allclose(added, (0.5 * mean + 0.25**2) / exposure**2, rtol=1e-3)
+    np.testing.assert_allclose(added, (0.02 * mean + 0.05**2) / exposure**2, rtol=1e-3)
 
 
 def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_both(

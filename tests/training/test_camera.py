@@ -330,7 +330,7 @@ def test_an_untrained_camera_changes_nothing():
     model = CameraModel(3, exposure=True, white_balance="common", vignetting=True, response=True)
     view, radius2 = mi.UInt32([0, 1, 2]), mi.Float([0, 0.5, 1])
     np.testing.assert_array_equal(np.array(model.gain(view, radius2)), 1)
-    values = np.array([0.0, 1e-4, 0.2, 0.5, 1.0, 3.0], np.float32)
+    values = np.array([-0.05, 0.0, 1e-4, 0.2, 0.5, 1.0, 3.0], np.float32)
     np.testing.assert_allclose(
         np.array(model.exposed(mi.Color3f(mi.Float(values)))), [values] * 3, rtol=1e-4, atol=1e-7
     )
@@ -354,8 +354,9 @@ def test_gains_and_responses_are_the_same_in_steps_and_in_evaluations():
     np.testing.assert_allclose(model.light(middle), middle, rtol=1e-6)
     assert np.abs(model.light(np.ones((1, 3))) - 1).min() > 0.01
     np.testing.assert_allclose(model.photographed(light), values, rtol=1e-3, atol=1e-5)
-    # Gradients reach all of it, but the anchor through exposures of its own
-    loss = dr.sum(dr.sum(gain) + dr.sum(model.exposed(mi.Color3f(mi.Float(values[:12, 0])))))
+    # Gradients reach all of it, but the anchor through exposures of its own; below zero, none does
+    below = mi.Float(values[:12, 0] - 0.1)
+    loss = dr.sum(dr.sum(gain) + dr.sum(model.exposed(mi.Color3f(below))))
     dr.backward(loss)
     for key, array in arrays.items():
         gradient = np.array(dr.grad(array))

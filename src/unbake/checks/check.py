@@ -28,6 +28,7 @@ from ..dataset.findings import (
     unequal_exposures,
 )
 from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
+from ..dataset.noise_at_black import blocks, noise_at_black, told_noise
 from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, seen_by, small_camera, small_view
@@ -64,6 +65,7 @@ class CheckedView:
         facts: what its pixels tell.
         seen: what the pixels of the small view see.
         share: of the pixels that should see a surface, those that do, in [0, 1].
+        dark: what blocks of pixels tell of noise at black; none where it is told.
     """
 
     view: View
@@ -71,6 +73,7 @@ class CheckedView:
     facts: PictureFacts
     seen: Seen
     share: float
+    dark: np.ndarray
 
 
 @final
@@ -207,16 +210,18 @@ def _checked(
     light = cleaned[:, :3] if view.exposure == 1 else cleaned[:, :3] / np.float32(view.exposure)
     small = small_view(view.name, camera, light, alpha)
     shape = (camera.height, camera.width)
+    picture, inside = pixels[:, :3].reshape(*shape, 3), counted.reshape(shape)
     hit = np.isfinite(seen.distance)
     facts = picture_facts(
-        pixels[:, :3].reshape(*shape, 3),
+        picture,
         _enlarged((hit & ~seen.emits).reshape(small.alpha.shape), shape),
-        counted.reshape(shape),
+        inside,
         view.clipped,
     )
     wanted = (small.alpha > 0.5).ravel()
     share = float(hit[wanted].mean()) if wanted.any() else 0.0
-    return CheckedView(view, small, facts, seen, share)
+    dark = blocks(picture, inside & (view.noise is None))
+    return CheckedView(view, small, facts, seen, share, dark)
 
 
 def _check_masks(result: DataCheck) -> None:
@@ -333,6 +338,7 @@ def _check_pictures(result: DataCheck) -> None:
         "of the pixels of surfaces are black",
         "Expose more, or check that the photographs are of these views",
     )
+    result.add(noise_at_black(told_noise(np.concatenate([v.dark for v in views]))))
     soft = blurred([v.facts for v in views])
     if soft:
         remedy = "Leave them out: blur would be fitted as smoother materials"

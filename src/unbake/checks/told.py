@@ -16,7 +16,7 @@ _ROWS = {
     "alignment": ("alignment",),
     "exposure": ("exposure",),
     "light": ("light",),
-    "pixels": ("clipped", "black"),
+    "pixels": ("clipped", "black", "noise"),
     "blur": ("blur",),
     "coverage": ("coverage",),
     "duplicates": ("duplicates",),

@@ -142,7 +142,7 @@ def photograph_edges(view: SmallView) -> np.ndarray:
     luminance = view.rgb.mean(axis=-1)
     positive = luminance[luminance > 0]
     floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
-    logarithm = np.log(luminance + floor)
+    logarithm = np.log(np.maximum(luminance, 0) + floor)
     slope = np.hypot(*np.gradient(logarithm)) + np.hypot(*np.gradient(view.alpha))
     top = float(np.quantile(slope, 0.98))
     return _blurred(np.minimum(slope / top, 1)) if top > 1e-9 else np.zeros_like(slope)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
 from typing import Any, final
 
 import numpy as np
 
 from ..errors import UserError
+from ..imaging.windows import around, mean_of_counted
 from .camera import Camera
+from .clipped_noise import without_clipped_noise
 from .hot_pixels import without_hot_pixels
 from .shares import dealt
 from .views import Dataset, SensorNoise, View, read_masked
@@ -22,7 +23,7 @@ RADIUS = 2
 #: A mask whose response to constant and to linear images is zero, and has the variance of the noise
 #: (Immerkær 1996, Fast Noise Variance Estimation).
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
-#: An image with its camera: linear RGBA, shape (pixels, 4), and whether pixels count, (pixels,);
+#: An image with its camera: linear RGB, shape (pixels, 3), and whether pixels count, (pixels,);
 #: then its noise, if that is known.
 Image = tuple[Camera, np.ndarray, np.ndarray, SensorNoise | None]
 
@@ -122,7 +123,9 @@ class Plan:
                 if found is not None:
                     hot_pixels.append(asdict(found))
                 noise = None if view.noise is None else view.noise.divided(view.exposure)
-                yield camera, _in_radiance(pixels, view), counted, noise
+                radiance = _in_radiance(pixels, view)
+                rgb = without_clipped_noise(radiance[:, :3], counted, camera, noise)
+                yield camera, rgb, counted, noise
 
         made = fill(table, images(), self.chooses, first)
         return replace(made, told=replace(made.told, hot_pixels=hot_pixels))
@@ -158,16 +161,15 @@ def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0)
         first: number of the first pixel of the table.
     """
     start, sums, counts, seen = 0, [], [], []
-    for camera, pixels, counted, noise in images:
-        stop = start + len(pixels)
-        rgb = pixels[:, :3]
+    for camera, rgb, counted, noise in images:
+        stop = start + len(rgb)
         table[start:stop, :3] = rgb
         if table.shape[1] == WITH_BLURRED:
             # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
             with np.errstate(over="ignore", invalid="ignore"):
                 table[start:stop, 3:] = _reference(rgb, counted, camera, noise)
         sums.append(float((rgb[counted] if some else rgb).sum(dtype=np.float64)))
-        counts.append(int(counted.sum()) if some else len(pixels))
+        counts.append(int(counted.sum()) if some else len(rgb))
         if some:
             seen.append(first + start + np.flatnonzero(counted))
         start = stop
@@ -193,50 +195,21 @@ def _reference(
     """
     shape = (camera.height, camera.width, -1)
     image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
-    mean = _mean_of_counted(image, weight)
+    mean = mean_of_counted(image, weight, RADIUS)
     mean = np.where(np.isnan(mean), image, mean)
     # Pixels that do not count are no peaks, and no noise is told from them.
     known = np.where(weight > 0, image, mean)
     response, inside = np.zeros_like(known), np.ones_like(weight)
     first, second = (np.full_like(known, -np.inf) for _ in range(2))
-    neighbours = zip(_NOISE.ravel(), _around(known, 1), _around(weight, 1), strict=True)
+    neighbours = zip(_NOISE.ravel(), around(known, 1), around(weight, 1), strict=True)
     for share, there, counted in neighbours:
         response += share * there
         inside *= counted
         np.maximum(second, np.minimum(first, there), out=second)
         np.maximum(first, there, out=first)
     if sensor is None:
-        noise = np.nan_to_num(_mean_of_counted(response**2, inside))
+        noise = np.nan_to_num(mean_of_counted(response**2, inside, RADIUS))
     else:
         noise = sensor.variance(mean)
     peak = np.maximum(known - second, 0)
     return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)
-
-
-def _mean_of_counted(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The mean of those of 5 x 5 pixels around each one that have weight 1; NaN where none has."""
-    if weight.all():
-        return _window_sums(image) / np.float32((2 * RADIUS + 1) ** 2)
-    share = _window_sums(weight)
-    return _window_sums(image * weight) / np.where(share > 0, share, np.nan)
-
-
-def _window_sums(image: np.ndarray) -> np.ndarray:
-    """The sum of 5 x 5 pixels around each one, edges repeated; (height, width, channels)."""
-    for axis in (0, 1):
-        image = reduce(np.add, _along(image, axis, RADIUS))
-    return image
-
-
-def _around(image: np.ndarray, radius: int) -> Iterator[np.ndarray]:
-    """The image moved to every place of a window, row by row, edges repeated."""
-    for moved in _along(image, 0, radius):
-        yield from _along(moved, 1, radius)
-
-
-def _along(image: np.ndarray, axis: int, radius: int) -> Iterator[np.ndarray]:
-    """The image moved along an axis by -radius to radius pixels, edges repeated."""
-    padded = np.pad(image, [(radius, radius) if i == axis else (0, 0) for i in range(3)], "edge")
-    for start in range(2 * radius + 1):
-        part = slice(start, start + image.shape[axis])
-        yield padded[part] if axis == 0 else padded[:, part]

@@ -140,7 +140,7 @@ class Photographs:
         """
         table = np.empty((len(rgb), WITH_BLURRED if smoothed else COLUMNS), np.float32)
         images = [
-            (camera, pixels, (pixels[:, 3] > 0) | (not foreground_only), None)
+            (camera, pixels[:, :3], (pixels[:, 3] > 0) | (not foreground_only), None)
             for camera, pixels in zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
         ]
         return _made(fill(table, images, foreground_only))

@@ -219,13 +219,16 @@ class CameraModel:
         return heights
 
     def _inverse(self, value: mi.Float, heights: mi.Float, channel: int) -> mi.Float:
-        """One channel through f: pieces of positive slope, equal ones for 8-bit files."""
-        place = dr.power(value, 1 / GAMMA) * PIECES
+        """One channel through f: pieces of positive slope, equal ones for 8-bit files.
+
+        No file has values below zero. Those that noise has, once it is corrected, stay as they are.
+        """
+        place = dr.power(dr.maximum(value, 0), 1 / GAMMA) * PIECES
         piece = dr.minimum(mi.UInt32(place), PIECES - 1)
         index = piece + channel * (PIECES + 1)
         low, high = read_small(heights, index), read_small(heights, index + 1)
         height = dr.fma(high - low, place - mi.Float(piece), low)
-        return dr.power(dr.maximum(height, 1e-6), GAMMA)
+        return dr.power(dr.maximum(height, 1e-6), GAMMA) + dr.minimum(value, 0)
 
     # ----------------------------------------------------------------------------- as numbers
 

@@ -1,0 +1,75 @@
+"""Noise of a sensor that was clipped at black makes dark surfaces brighter than they are (ours).
+
+A sensor's value of little light is now and then below zero. A file holds zero instead. So the mean
+of what it holds is not the light x but, where noise is normal with the standard deviation σ,
+
+    f(x) = E max(0, x + σ n) = x Φ(x / σ) + σ φ(x / σ),
+
+which is 0.4 σ where there is no light (the Tobit model, Tobin 1958). All views of a surface agree
+on that, and a fit would explain it by albedo.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..imaging.windows import mean_of_counted
+from .camera import Camera
+from .views import SensorNoise
+
+#: Half the edge of the window that tells how much light there is, in pixels.
+RADIUS = 2
+#: From so many standard deviations on, nothing is clipped.
+_BRIGHT = 4.0
+#: Entries of the table of f.
+_TABLE = 513
+
+
+def without_clipped_noise(
+    rgb: np.ndarray, counted: np.ndarray, camera: Camera, sensor: SensorNoise | None
+) -> np.ndarray:
+    """A photograph less what its clipped noise adds to it on average.
+
+    How much that is depends on the light alone, which the mean of the 5 x 5 pixels around each one
+    tells by the inverse of f. What is taken away is the same for all values of a window, so that
+    noise stays as it is: values may now be below zero, as they were in the sensor.
+
+    Args:
+        rgb: linear, in the sensor's units, shape (pixels, 3).
+        counted: whether pixels count, shape (pixels,).
+        camera: of the photograph.
+        sensor: what its noise is; None: nobody has told.
+
+    Returns:
+        The same photograph where noise is not known, has no part that is the same for all light, or
+        was not clipped: a value is below zero.
+    """
+    if sensor is None or not sensor.read or not counted.any() or (rgb[counted] < 0).any():
+        return rgb
+    shape = (camera.height, camera.width, -1)
+    weight = counted.astype(np.float32).reshape(shape)
+    mean = mean_of_counted(rgb.reshape(shape), weight, RADIUS).reshape(rgb.shape)
+    light, clipped = _means(sensor)
+    added = mean - np.interp(mean, clipped, light)
+    return rgb - np.where(mean < clipped[-1], added, 0).astype(np.float32)
+
+
+def _means(sensor: SensorNoise) -> tuple[np.ndarray, np.ndarray]:
+    """Light x in rising order, and f(x)."""
+    half = 0.5 * _BRIGHT**2 * sensor.shot
+    brightest = half + math.sqrt(half**2 + (_BRIGHT * sensor.read) ** 2)  # x = _BRIGHT σ(x)
+    light = brightest * np.linspace(0, 1, _TABLE) ** 2
+    deviation = np.sqrt(sensor.shot * light + sensor.read**2)
+    return light, light * below(light / deviation) + deviation * density(light / deviation)
+
+
+def below(z: np.ndarray) -> np.ndarray:
+    """Φ(z), the share of normal numbers below z, shape (n,)."""
+    return np.array([0.5 * math.erfc(-value / math.sqrt(2)) for value in z.tolist()])
+
+
+def density(z: np.ndarray) -> np.ndarray:
+    """φ(z), the density of normal numbers."""
+    return np.exp(-0.5 * np.square(z)) / math.sqrt(2 * math.pi)

@@ -1,0 +1,118 @@
+"""Whether noise of a sensor was clipped at black, and which noise: told by zeros (ours).
+
+Zeros of a dark surface in noise lie beside values above zero, each by chance; those of a shadow lie
+side by side. A block of pixels with little light tells its noise by the share of its zeros p and
+its mean m: light x and deviation σ are those with p = Φ(−x / σ) and m = f(x), as
+`clipped_noise.py` has it. The sensor's shot and read noise are a line through σ² over x.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .clipped_noise import below, density
+from .data_folder import TRANSFORMS
+from .findings import Finding
+from .views import SensorNoise
+
+#: Edge of a block, in pixels.
+_EDGE = 5
+#: Blocks of a view that are looked at, about.
+_MOST = 1 << 14
+#: Zeros of a block in which light is told from noise, at most.
+_MOST_ZEROS = 13
+#: The share of blocks with a few zeros from which on it matters; and their number.
+_SHARE, _FEWEST = 0.05, 200
+#: Zeros are noise if pairs of them side by side are at most so many times as many as by chance.
+_BY_CHANCE = 1.35
+#: Sets of blocks by how much light there is, and shares of zeros that tell it.
+_SETS, _LEAST, _TELLING = 30, 0.05, 0.5
+#: Noise clips half of all values, where there is no light. Sets with more zeros, but not of zeros
+#: alone, tell that light itself is rare, as where paths do not find it; one may be chance.
+_RARE, _NONE = 0.6, 0.98
+#: Columns of `blocks`: light around it, its mean, its zeros, pairs of them side by side.
+COLUMNS = 4
+
+
+def blocks(rgb: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """What blocks of a photograph tell, a row for each of its blocks and channels.
+
+    Args:
+        rgb: in the sensor's units, (height, width, 3).
+        counted: whether pixels count, (height, width).
+
+    Returns:
+        Shape (n, `COLUMNS`), of blocks that count as a whole, as those on both sides do.
+    """
+    height, width = (side // _EDGE for side in counted.shape)
+    if height < 1 or width < 3:
+        return np.zeros((0, COLUMNS), np.float32)
+
+    def cut(image: np.ndarray) -> np.ndarray:
+        whole = image[: height * _EDGE, : width * _EDGE]
+        return whole.reshape(height, _EDGE, width, _EDGE, -1)
+
+    values = cut(rgb)
+    zero = (values <= 0).astype(np.float32)
+    zeros, mean = zero.sum((1, 3)), values.mean((1, 3))
+    pairs = (zero[:, 1:] * zero[:, :-1]).sum((1, 3))
+    pairs += (zero[:, :, :, 1:] * zero[:, :, :, :-1]).sum((1, 3))
+    whole = cut(counted).min((1, 3))[..., 0] > 0
+    whole = whole[:, 1:-1] & whole[:, :-2] & whole[:, 2:]
+    around = 0.5 * (mean[:, :-2] + mean[:, 2:])
+    columns = (around, mean[:, 1:-1], zeros[:, 1:-1], pairs[:, 1:-1])
+    rows = np.stack([column[whole].ravel() for column in columns], 1)
+    return rows[:: max(1, len(rows) // _MOST)].astype(np.float32)
+
+
+def told_noise(rows: np.ndarray) -> SensorNoise | None:
+    """The noise that was clipped at black, about.
+
+    Args:
+        rows: of the blocks of all views.
+
+    Returns:
+        None where there is none, or so little that it does not matter; and where zeros have
+        another cause: shadows, or pictures of a path tracer whose paths found no light.
+    """
+    around, mean, zeros, pairs = rows.astype(np.float64).T
+    some = (zeros >= 1) & (zeros <= _MOST_ZEROS)
+    if some.sum() < max(_FEWEST, _SHARE * len(rows)):
+        return None
+    ways, pixels = 2 * _EDGE * (_EDGE - 1), _EDGE**2
+    chance = ways / (pixels * (pixels - 1)) * (zeros * (zeros - 1))[some].sum()
+    if pairs[some].sum() > _BY_CHANCE * chance:
+        return None
+    # Sets are by what is beside a block: by its own mean, noise would choose them.
+    sets = np.array_split(np.argsort(around, kind="stable"), _SETS)
+    share, light = (np.array([x[one].mean() for one in sets]) for x in (zeros / pixels, mean))
+    telling = (share > _LEAST) & (share < _TELLING)
+    if telling.sum() < 2 or ((share > _RARE) & (share < _NONE)).sum() > 1:
+        return None
+    z = _deviations(1 - share[telling])
+    deviation = light[telling] / (z * below(z) + density(z))
+    line = np.stack([z * deviation, np.ones_like(z)], 1) / deviation[:, None] ** 2
+    shot, square = np.linalg.lstsq(line, np.ones(len(z)), rcond=None)[0].tolist()
+    # Without a part that all light has, zeros are where there was none.
+    if square < 0.25 * float(deviation.min()) ** 2:
+        return None
+    return SensorNoise(max(shot, 0.0), square**0.5)
+
+
+def _deviations(share: np.ndarray) -> np.ndarray:
+    """Places where Φ is a share between `_TELLING` and 1 − `_LEAST`."""
+    places = np.linspace(-0.1, 2, 512)
+    return np.interp(share, below(places), places)
+
+
+def noise_at_black(noise: SensorNoise | None) -> Finding | None:
+    """What is to be said of noise that was found, and that nobody told."""
+    if noise is None:
+        return None
+    what = (
+        "noise seems to have been clipped at black, which makes dark surfaces brighter than they "
+        "are: zeros lie at random between values above zero"
+    )
+    told = f'"noise": {{"shot": {noise.shot:.2g}, "read": {noise.read:.2g}}}'
+    remedy = f"Tell what the sensor's noise is, about {told} in {TRANSFORMS}, and fits correct it"
+    return Finding("warning", "noise", what, None, remedy)

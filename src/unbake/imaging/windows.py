@@ -1,0 +1,45 @@
+"""Sums over windows of pixels around each pixel of a picture, edges repeated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import reduce
+
+import numpy as np
+
+
+def mean_of_counted(image: np.ndarray, weight: np.ndarray, radius: int) -> np.ndarray:
+    """The mean of those pixels of a window around each one that have weight 1.
+
+    Args:
+        image: shape (height, width, channels).
+        weight: 0 or 1, shape (height, width, 1).
+        radius: of the window, whose edge has 2 radius + 1 pixels.
+
+    Returns:
+        Of the shape of the image; NaN where no pixel has weight.
+    """
+    if weight.all():
+        return _sums(image, radius) / np.float32((2 * radius + 1) ** 2)
+    share = _sums(weight, radius)
+    return _sums(image * weight, radius) / np.where(share > 0, share, np.nan)
+
+
+def around(image: np.ndarray, radius: int) -> Iterator[np.ndarray]:
+    """The image moved to every place of a window, row by row."""
+    for moved in along(image, 0, radius):
+        yield from along(moved, 1, radius)
+
+
+def along(image: np.ndarray, axis: int, radius: int) -> Iterator[np.ndarray]:
+    """The image moved along an axis by -radius to radius pixels."""
+    padded = np.pad(image, [(radius, radius) if i == axis else (0, 0) for i in range(3)], "edge")
+    for start in range(2 * radius + 1):
+        part = slice(start, start + image.shape[axis])
+        yield padded[part] if axis == 0 else padded[:, part]
+
+
+def _sums(image: np.ndarray, radius: int) -> np.ndarray:
+    for axis in (0, 1):
+        image = reduce(np.add, along(image, axis, radius))
+    return image

@@ -1,0 +1,77 @@
+"""Noise that was clipped at black is found by its zeros, and nothing else is taken for it."""
+
+import numpy as np
+import pytest
+
+from unbake.dataset.noise_at_black import COLUMNS, blocks, noise_at_black, told_noise
+from unbake.dataset.views import SensorNoise
+
+SIDE = 240
+
+
+def scene(darkest=0.002, brightest=0.5):
+    """Light that rises from left to right, with a little texture; (SIDE, SIDE, 3)."""
+    rise = np.geomspace(darkest, brightest, SIDE)[None, :, None]
+    texture = 1 + 0.1 * np.sin(np.arange(SIDE) / 3)[:, None, None]
+    return np.broadcast_to(rise * texture, (SIDE, SIDE, 3))
+
+
+def photograph(light, noise, seed=0):
+    """By a sensor that counts electrons, clipped at black."""
+    rng = np.random.default_rng(seed)
+    counted = noise.shot * rng.poisson(light / noise.shot) if noise.shot else light
+    return np.maximum(counted + rng.normal(0, noise.read, light.shape), 0).astype(np.float32)
+
+
+def found(*pictures, counted=None):
+    every = np.ones(pictures[0].shape[:2], bool) if counted is None else counted
+    return told_noise(np.concatenate([blocks(picture, every) for picture in pictures]))
+
+
+@pytest.mark.parametrize("noise", [SensorNoise(0.005, 0.02), SensorNoise(0.0005, 0.01)])
+@pytest.mark.parametrize("unit", [1.0, 0.1])
+def test_the_noise_of_a_sensor_is_found(noise, unit):
+    pictures = [unit * photograph(scene(), noise, seed) for seed in range(4)]
+    told = found(*pictures)
+    assert told.read == pytest.approx(unit * noise.read, rel=0.1)
+    assert 0 <= told.shot < unit * 5 * noise.shot
+    finding = noise_at_black(told)
+    assert finding.level == "warning" and f'"read": {told.read:.2g}' in finding.remedy
+
+
+def test_photographs_without_noise_at_black_are_not_doubted():
+    assert noise_at_black(None) is None
+    bright = [photograph(scene(0.2), SensorNoise(0.0, 0.01), seed) for seed in range(4)]
+    assert found(*bright) is None
+    assert found(scene().astype(np.float32)) is None
+    assert found(np.zeros((SIDE, SIDE, 3), np.float32)) is None
+
+
+def test_shadows_and_black_texture_are_no_noise():
+    y, x = np.mgrid[:SIDE, :SIDE]
+    for black in ((x // 7 + y // 11) % 2 == 0, (x - y) % 17 < 4, (x % 12 < 4) & (y % 9 < 4)):
+        assert found(np.where(black[..., None], 0, scene()).astype(np.float32)) is None
+
+
+@pytest.mark.parametrize("hits", [0.3, 1.0, 3.0])
+def test_paths_that_find_no_light_are_no_noise_of_a_sensor(hits):
+    """A pixel's mean over samples of which few find light: there are zeros, and no bias."""
+    rng = np.random.default_rng(1)
+    light = scene(0.02, 1.0)
+    counts = rng.poisson(hits * light / light.mean())
+    pictures = rng.gamma(np.maximum(counts, 1e-9)) * (counts > 0)
+    assert found(pictures.astype(np.float32)) is None
+
+
+def test_pixels_that_do_not_count_and_small_pictures_tell_nothing():
+    noisy = photograph(scene(), SensorNoise(0.005, 0.02))
+    assert found(noisy, counted=np.zeros((SIDE, SIDE), bool)) is None
+    for shape in ((4, 40), (40, 14), (1, 1)):
+        small = noisy[: shape[0], : shape[1]]
+        assert blocks(small, np.ones(shape, bool)).shape == (0, COLUMNS)
+        assert found(small) is None
+    # Only blocks that count as a whole.
+    counted = np.arange(SIDE)[None].repeat(SIDE, 0) < SIDE // 2
+    spoiled = np.where(counted[..., None], noisy, 0)
+    half = blocks(spoiled, counted)
+    np.testing.assert_array_equal(half, blocks(noisy[:, : SIDE // 2], counted[:, : SIDE // 2]))
