@@ -216,19 +216,39 @@ def test_noise_that_is_known_is_not_told_from_neighbours(dataset, where, monkeyp
     known = [replace(view, noise=SensorNoise(0.02, 0.05)) for view in made.views]
     found = Photographs.load(replace(made, views=known), False, smoothed=True).table.copy()
     np.testing.assert_array_equal(found[:, :3], told[:, :3])
-    # Nothing but the noise differs: what is left of the squares is the mean and the peak.
-    quiet = [replace(view, noise=SensorNoise()) for view in made.views]
-    still = Photographs.load(replace(made, views=quiet), False, smoothed=True).table.copy()
-    y, x = 2, 3
-    mean = told[: WIDTH * HEIGHT, :3].reshape(HEIGHT, WIDTH, 3)[y - 2 : y + 3, x - 2 : x + 3]
-    mean, at = mean.mean((0, 1)), y * WIDTH + x
-    added = found[at, 3:] ** 2 - still[at, 3:] ** 2
-    np.testing.assert_allclose(added, 0.02 * mean + 0.05**2, rtol=1e-3)
+    # The mean is that of the 24 others; a peak exceeds the second one by more than noise does.
+    image, (y, x) = told[: WIDTH * HEIGHT, :3].reshape(HEIGHT, WIDTH, 3), (2, 3)
+    mean = (image[:, 1:6].sum((0, 1)) - image[y, x]) / 24
+    noise = 0.02 * mean + 0.05**2
+    second = np.sort(image[y - 1 : y + 2, x - 1 : x + 2].reshape(9, 3), 0)[-2]
+    peak = np.maximum(image[y, x] - second - 3 * np.sqrt(noise), 0)
+    expected, at = np.sqrt(mean**2 + noise + peak**2), y * WIDTH + x
+    np.testing.assert_allclose(found[at, 3:], expected, rtol=1e-5)
     # Of values that are divided by the exposure.
     exposed = [replace(view, exposure=exposure) for view in known]
     divided = Photographs.load(replace(made, views=exposed), False, smoothed=True).table
-    added = divided[at, 3:] ** 2 - (still[at, 3:] / exposure) ** 2
-    np.testing.assert_allclose(added, (0.02 * mean + 0.05**2) / exposure**2, rtol=1e-3)
+    np.testing.assert_allclose(divided[at, 3:], expected / exposure, rtol=1e-5)
+
+
+@pytest.mark.parametrize("light", [0.02, 0.05, 0.2])
+def test_weights_do_not_follow_noise_that_is_known(tmp_path, light):
+    """However dark a surface is, the optimum of a constant is right to a few percent."""
+    noise, side = SensorNoise(0.005, 0.02), 128
+    rng = np.random.default_rng(3)
+    deviation = np.sqrt(noise.shot * light + noise.read**2)
+    rgba = np.ones((side, side, 4), np.float32)
+    rgba[..., :3] = np.maximum(light + rng.normal(0, deviation, (side, side, 3)), 0)
+    mi.Bitmap(rgba).write(str(tmp_path / "0.exr"))
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, side, side)
+    ends = []
+    for told in (noise, None):
+        view = View("0", "train", camera, tmp_path / "0.exr", {}, noise=told)
+        data = Dataset(tmp_path, tmp_path / "s.xml", "visible", [view], {}, None)
+        table = Photographs.load(data, False, smoothed=True).table
+        ends.append(np.average(table[:, :3], weights=1 / (table[:, 3:] ** 2 + 1e-6)))
+    assert abs(ends[0] / light - 1) < 0.04
+    # What is clipped makes it brighter and weights make it darker: by as much near 0.02.
+    assert light < 0.05 or abs(ends[0] - light) < 0.5 * abs(ends[1] - light)
 
 
 def test_a_file_without_the_blurred_copy_is_made_anew_and_one_with_it_serves_both(

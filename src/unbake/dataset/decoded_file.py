@@ -44,6 +44,7 @@ def in_file(plan: Plan) -> Decoded:
     if any(view.noise is not None for view in views):
         key["noise"] = [None if view.noise is None else asdict(view.noise) for view in views]
         key["black"] = {"radius": BLACK_RADIUS, "less": "what clipped noise adds"}
+        key["reference"] = "of others, and of peaks beyond the noise"
     data.require_own_cache()
     found = _find_cache(data, key)
     if found is not None:

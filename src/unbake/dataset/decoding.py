@@ -23,6 +23,8 @@ RADIUS = 2
 #: A mask whose response to constant and to linear images is zero, and has the variance of the noise
 #: (Immerkær 1996, Fast Noise Variance Estimation).
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
+#: So many standard deviations of known noise are no peak.
+_PEAK = 3.0
 #: An image with its camera: linear RGB, shape (pixels, 3), and whether pixels count, (pixels,);
 #: then its noise, if that is known.
 Image = tuple[Camera, np.ndarray, np.ndarray, SensorNoise | None]
@@ -187,6 +189,9 @@ def _reference(
     3 x 3, as fireflies are. The first two have next to nothing of the pixel's own noise in them, so
     that errors are not weighed by their sign. Where photographs are noisy they weigh less.
 
+    Noise that is known may be larger than the light. Then the mean is that of the others alone, and
+    a peak is what exceeds them by more than noise does: one pixel of nine is the brightest.
+
     Args:
         rgb: of one view, linear, shape (pixels, 3).
         counts: whether a pixel counts, shape (pixels,). Background that is hidden is black, and
@@ -195,7 +200,7 @@ def _reference(
     """
     shape = (camera.height, camera.width, -1)
     image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
-    mean = mean_of_counted(image, weight, RADIUS)
+    mean = mean_of_counted(image, weight, RADIUS, others=sensor is not None)
     mean = np.where(np.isnan(mean), image, mean)
     # Pixels that do not count are no peaks, and no noise is told from them.
     known = np.where(weight > 0, image, mean)
@@ -211,5 +216,6 @@ def _reference(
         noise = np.nan_to_num(mean_of_counted(response**2, inside, RADIUS))
     else:
         noise = sensor.variance(mean)
+        second += _PEAK * np.sqrt(noise)
     peak = np.maximum(known - second, 0)
     return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)

@@ -8,21 +8,26 @@ from functools import reduce
 import numpy as np
 
 
-def mean_of_counted(image: np.ndarray, weight: np.ndarray, radius: int) -> np.ndarray:
+def mean_of_counted(
+    image: np.ndarray, weight: np.ndarray, radius: int, *, others: bool = False
+) -> np.ndarray:
     """The mean of those pixels of a window around each one that have weight 1.
 
     Args:
         image: shape (height, width, channels).
         weight: 0 or 1, shape (height, width, 1).
         radius: of the window, whose edge has 2 radius + 1 pixels.
+        others: leave the pixel in the middle out.
 
     Returns:
         Of the shape of the image; NaN where no pixel has weight.
     """
-    if weight.all():
+    if weight.all() and not others:
         return _sums(image, radius) / np.float32((2 * radius + 1) ** 2)
-    share = _sums(weight, radius)
-    return _sums(image * weight, radius) / np.where(share > 0, share, np.nan)
+    share, total = _sums(weight, radius), _sums(image * weight, radius)
+    if others:
+        share, total = share - weight, total - image * weight
+    return total / np.where(share > 0, share, np.nan)
 
 
 def around(image: np.ndarray, radius: int) -> Iterator[np.ndarray]:
