@@ -221,12 +221,14 @@ def test_noise_that_was_clipped_at_black_is_told(spoilt, tiny, unbake, tmp_path)
 
     for frame in data.content["frames"]:
         data.picture(frame, noisy)
+    assert not [f for f in check_data(data.save()).findings if f.check == "noise"], "rendered"
+    del data.content["render"]
     (finding,) = [f for f in check_data(data.save()).findings if f.check == "noise"]
-    told = float(re.search(r'"read": ([0-9.]+)', finding.remedy)[1])
+    told = float(re.search(r'"read": ([0-9.]+)', finding.what)[1])
     assert finding.level == "warning" and told == pytest.approx(read, rel=0.2)
     words = ("--settings", tiny, "--steps", 1)
     outcome = unbake("fit", data.folder, "--out", tmp_path / "run", *words)
-    assert outcome.status == 0 and "noise seems to have been clipped at black" in outcome.out
+    assert outcome.status == 0 and "noise was clipped at black" in outcome.out
     data.content["noise"] = {"read": read}
     assert not [f for f in check_data(data.save()).findings if f.check == "noise"]
     outcome = unbake("fit", data.folder, "--out", tmp_path / "other", *words)

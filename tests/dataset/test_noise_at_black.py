@@ -1,10 +1,18 @@
 """Noise that was clipped at black is found by its zeros, and nothing else is taken for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from unbake.dataset.noise_at_black import COLUMNS, blocks, noise_at_black, told_noise
-from unbake.dataset.views import SensorNoise
+from unbake.dataset.camera import Camera
+from unbake.dataset.clipped_noise import without_clipped_noise
+from unbake.dataset.data_folder import DataFolder
+from unbake.dataset.findings import noise_at_black
+from unbake.dataset.noise_at_black import COLUMNS, blocks, found_noise, told_noise
+from unbake.dataset.photographs import Photographs
+from unbake.dataset.views import Dataset, SensorNoise, View
+from unbake.imaging.pictures import write_exr
 
 SIDE = 240
 
@@ -36,7 +44,7 @@ def test_the_noise_of_a_sensor_is_found(noise, unit):
     assert told.read == pytest.approx(unit * noise.read, rel=0.1)
     assert 0 <= told.shot < unit * 5 * noise.shot
     finding = noise_at_black(told)
-    assert finding.level == "warning" and f'"read": {told.read:.2g}' in finding.remedy
+    assert finding.level == "warning" and f'"read": {told.read:.2g}' in finding.what
 
 
 def test_photographs_without_noise_at_black_are_not_doubted():
@@ -75,3 +83,31 @@ def test_pixels_that_do_not_count_and_small_pictures_tell_nothing():
     spoiled = np.where(counted[..., None], noisy, 0)
     half = blocks(spoiled, counted)
     np.testing.assert_array_equal(half, blocks(noisy[:, : SIDE // 2], counted[:, : SIDE // 2]))
+
+
+def test_a_fit_corrects_what_it_finds_and_leaves_what_is_told_or_rendered(tmp_path):
+    noise, camera = (
+        SensorNoise(0.005, 0.02),
+        Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, SIDE, SIDE),
+    )
+    views = []
+    for i in range(4):
+        picture = photograph(scene(), noise, i)
+        write_exr(tmp_path / f"{i}.exr", np.dstack([picture, np.ones((SIDE, SIDE))]))
+        views.append(View(f"{i}", "train", camera, tmp_path / f"{i}.exr", {}))
+    data = Dataset(tmp_path, tmp_path / "s.xml", "visible", views, {}, None)
+    found = Photographs.load(data, False)
+    assert found.noise == found_noise(data) and found.noise.read == pytest.approx(0.02, rel=0.1)
+    corrected = without_clipped_noise(
+        photograph(scene(), noise, 0).reshape(-1, 3), np.ones(SIDE**2, bool), camera, found.noise
+    )
+    np.testing.assert_array_equal(found.table[: SIDE**2, :3], corrected)
+    dark = found.table[:, 0].reshape(4, SIDE, SIDE)[..., :40]
+    assert dark.mean() == pytest.approx(scene()[:, :40].mean(), rel=0.25)
+    told = replace(data, views=tuple(replace(view, noise=noise) for view in views))
+    assert Photographs.load(told, False).noise is None
+    rendered = replace(data, render={"spp": 16})
+    plain = Photographs.load(rendered, False)
+    assert plain.noise is None and plain.table[:, :3].min() == 0
+    DataFolder(tmp_path).degraded_file.write_text("{}")
+    assert Photographs.load(rendered, False).noise == found.noise

@@ -25,10 +25,11 @@ from ..dataset.findings import (
     light_that_turns,
     misaligned,
     named,
+    noise_at_black,
     unequal_exposures,
 )
 from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
-from ..dataset.noise_at_black import blocks, noise_at_black, told_noise
+from ..dataset.noise_at_black import found_noise
 from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, seen_by, small_camera, small_view
@@ -65,7 +66,6 @@ class CheckedView:
         facts: what its pixels tell.
         seen: what the pixels of the small view see.
         share: of the pixels that should see a surface, those that do, in [0, 1].
-        dark: what blocks of pixels tell of noise at black; none where it is told.
     """
 
     view: View
@@ -73,7 +73,6 @@ class CheckedView:
     facts: PictureFacts
     seen: Seen
     share: float
-    dark: np.ndarray
 
 
 @final
@@ -178,6 +177,7 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         except UserError as error:
             faults.append(error)
     result.findings += _grouped(faults, dataset.folder)
+    result.add(noise_at_black(found_noise(dataset, clip_negative)))
     _check_masks(result)
     train = [v for v in result.views if v.view.split == "train"]
     if not train:
@@ -210,18 +210,16 @@ def _checked(
     light = cleaned[:, :3] if view.exposure == 1 else cleaned[:, :3] / np.float32(view.exposure)
     small = small_view(view.name, camera, light, alpha)
     shape = (camera.height, camera.width)
-    picture, inside = pixels[:, :3].reshape(*shape, 3), counted.reshape(shape)
     hit = np.isfinite(seen.distance)
     facts = picture_facts(
-        picture,
+        pixels[:, :3].reshape(*shape, 3),
         _enlarged((hit & ~seen.emits).reshape(small.alpha.shape), shape),
-        inside,
+        counted.reshape(shape),
         view.clipped,
     )
     wanted = (small.alpha > 0.5).ravel()
     share = float(hit[wanted].mean()) if wanted.any() else 0.0
-    dark = blocks(picture, inside & (view.noise is None))
-    return CheckedView(view, small, facts, seen, share, dark)
+    return CheckedView(view, small, facts, seen, share)
 
 
 def _check_masks(result: DataCheck) -> None:
@@ -338,7 +336,6 @@ def _check_pictures(result: DataCheck) -> None:
         "of the pixels of surfaces are black",
         "Expose more, or check that the photographs are of these views",
     )
-    result.add(noise_at_black(told_noise(np.concatenate([v.dark for v in views]))))
     soft = blurred([v.facts for v in views])
     if soft:
         remedy = "Leave them out: blur would be fitted as smoother materials"

@@ -15,6 +15,8 @@ import numpy as np
 from ..errors import UserError, printable
 from .agreement import Exposures, TurningLight
 from .alignment import Alignment
+from .data_folder import TRANSFORMS
+from .views import SensorNoise
 
 #: An error: a fit makes no sense. A warning: it will be worse than it could be. A hint: something
 #: to know.
@@ -103,3 +105,16 @@ def light_that_turns(found: TurningLight | None) -> Finding | None:
     )
     remedy = "Take the photographs by moving the camera around: the light must stand still"
     return Finding("error", "light", what, None, remedy)
+
+
+def noise_at_black(found: SensorNoise | None) -> Finding | None:
+    """What is to be said of noise that was clipped at black, and that nobody told."""
+    if found is None:
+        return None
+    numbers = f'"noise": {{"shot": {found.shot:.2g}, "read": {found.read:.2g}}}'
+    what = (
+        "noise was clipped at black, which makes dark surfaces brighter than they are: zeros lie "
+        f"at random between values above zero. Fits correct it, as if told {numbers}"
+    )
+    remedy = f"Tell in {TRANSFORMS} what the sensor's noise is, if you know it"
+    return Finding("warning", "noise", what, None, remedy)

@@ -1,4 +1,4 @@
-"""Whether noise of a sensor was clipped at black, and which noise: told by zeros (ours).
+"""Which noise of a sensor was clipped at black, if any: told by zeros (ours).
 
 Zeros of a dark surface in noise lie beside values above zero, each by chance; those of a shadow lie
 side by side. A block of pixels with little light tells its noise by the share of its zeros p and
@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import UserError
 from .clipped_noise import below, density
-from .data_folder import TRANSFORMS
-from .findings import Finding
-from .views import SensorNoise
+from .data_folder import DataFolder
+from .views import Dataset, SensorNoise, read_masked
 
 #: Edge of a block, in pixels.
 _EDGE = 5
@@ -30,6 +30,8 @@ _SETS, _LEAST, _TELLING = 30, 0.05, 0.5
 #: Noise clips half of all values, where there is no light. Sets with more zeros, but not of zeros
 #: alone, tell that light itself is rare, as where paths do not find it; one may be chance.
 _RARE, _NONE = 0.6, 0.98
+#: Views that are looked at: as many as have so many pixels together, within these bounds.
+_PIXELS, _FEWEST_VIEWS, _MOST_VIEWS = 1 << 22, 4, 24
 #: Columns of `blocks`: light around it, its mean, its zeros, pairs of them side by side.
 COLUMNS = 4
 
@@ -105,14 +107,31 @@ def _deviations(share: np.ndarray) -> np.ndarray:
     return np.interp(share, below(places), places)
 
 
-def noise_at_black(noise: SensorNoise | None) -> Finding | None:
-    """What is to be said of noise that was found, and that nobody told."""
-    if noise is None:
+def found_noise(dataset: Dataset, clip_negative: bool = False) -> SensorNoise | None:
+    """The noise that was clipped at black in training views whose noise nobody tells, about.
+
+    Pictures that were rendered have no sensor, unless `unbake degrade` gave them one.
+
+    Args:
+        clip_negative: take negative pixels as zero.
+
+    Returns:
+        None where an image cannot be read, too: whoever reads them all says which.
+    """
+    views = [view for view in dataset.train if view.noise is None]
+    degraded = DataFolder(dataset.folder).degraded_file.exists()
+    if not views or (dataset.render and not degraded):
         return None
-    what = (
-        "noise seems to have been clipped at black, which makes dark surfaces brighter than they "
-        "are: zeros lie at random between values above zero"
-    )
-    told = f'"noise": {{"shot": {noise.shot:.2g}, "read": {noise.read:.2g}}}'
-    remedy = f"Tell what the sensor's noise is, about {told} in {TRANSFORMS}, and fits correct it"
-    return Finding("warning", "noise", what, None, remedy)
+    size = max(1, views[0].camera.width * views[0].camera.height)
+    count = min(max(_PIXELS // size, _FEWEST_VIEWS), _MOST_VIEWS, len(views))
+    rows = []
+    for i in np.linspace(0, len(views) - 1, count).round().astype(int).tolist():
+        try:
+            pixels, mask = read_masked(views[i], clip_negative)
+        except UserError:
+            return None
+        counted = np.ones(pixels.shape[:2], bool) if mask is None else mask
+        if dataset.background == "hidden":
+            counted = counted & (pixels[..., 3] > 0)
+        rows.append(blocks(pixels[..., :3], counted))
+    return told_noise(np.concatenate(rows))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from operator import add
 from typing import final
@@ -22,8 +22,9 @@ from .camera import Camera
 from .decoded_file import in_file
 from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Told, fill
 from .hot_pixels import HotPixels
+from .noise_at_black import found_noise
 from .shares import Share
-from .views import PIXEL_BYTES, Dataset
+from .views import PIXEL_BYTES, Dataset, SensorNoise
 
 #: Photographs of a process that take more than this, in bytes, are not held in memory but in a file
 #: of the data set's folder, of which the system keeps in memory what it has room for.
@@ -50,6 +51,7 @@ class Photographs:
             taken.
         mean: mean radiance of the pixels to train on, of all views.
         hot_pixels: pixels that were too bright and are not as in the images, by view, of all views.
+        noise: that was clipped at black, found and corrected where nobody tells it; None: none was.
         share: what this process holds; None: all.
 
     Paper: Sec. 5.4.
@@ -59,6 +61,7 @@ class Photographs:
     chosen: np.ndarray | None
     mean: float
     hot_pixels: tuple[HotPixels, ...] = ()
+    noise: SensorNoise | None = None
     share: Share | None = None
 
     @property
@@ -153,7 +156,9 @@ class Photographs:
         smoothed: bool = True,
         ranks: Ranks | None = None,
     ) -> Photographs:
-        """The training views of a data set; every image is read once, also over many fits.
+        """The training views of a data set.
+
+        Every image is read once, also over many fits; but for some that are looked at for noise.
 
         Args:
             clip_negative: take negative pixels as zero.
@@ -166,14 +171,18 @@ class Photographs:
                 cannot be written to.
         """
         ranks = ranks or Ranks()
+        noise = ranks.together(lambda: found_noise(dataset, clip_negative), math.inf)
+        if noise is not None:
+            views = [replace(v, noise=v.noise or noise) for v in dataset.views]
+            dataset = replace(dataset, views=tuple(views))
         plan = Plan.of(dataset, clip_negative, WITH_BLURRED if smoothed else COLUMNS, ranks.size)
         found = ranks.together(lambda: _loaded(plan, ranks.rank, ranks.here), math.inf)
         if ranks.size == 1:
-            return _made(found)
+            return _made(found, noise)
         every = [Told(**told) for told in ranks.told(asdict(found.told))]
         counts = np.concatenate([told.counts for told in every])
         share = Share(ranks, plan.first_views, np.array(plan.sizes), counts)
-        return _made(found, every, share)
+        return _made(found, noise, every, share)
 
 
 def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
@@ -203,11 +212,15 @@ def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
 
 
 def _made(
-    decoded: Decoded, every: Sequence[Told] | None = None, share: Share | None = None
+    decoded: Decoded,
+    noise: SensorNoise | None = None,
+    every: Sequence[Told] | None = None,
+    share: Share | None = None,
 ) -> Photographs:
     """Decoded photographs: all of them, or a share.
 
     Args:
+        noise: that was found.
         every: what is known of the views of each process; None: this one holds all.
         share: what it holds.
     """
@@ -216,7 +229,8 @@ def _made(
     total = reduce(add, (value for told in every for value in told.sums), 0.0)
     count = sum(sum(told.counts) for told in every)
     hot_pixels = tuple(HotPixels(**found) for told in every for found in told.hot_pixels)
-    return Photographs(decoded.table, decoded.chosen, total / max(3 * count, 1), hot_pixels, share)
+    mean = total / max(3 * count, 1)
+    return Photographs(decoded.table, decoded.chosen, mean, hot_pixels, noise, share)
 
 
 def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:

@@ -9,8 +9,13 @@ import numpy as np
 
 from .agreement import exposures, shared_points, turning_light
 from .alignment import FEWEST_VIEWS, SHORTEST_SIDE, alignment
-from .findings import Finding, light_that_turns, misaligned, unequal_exposures
-from .noise_at_black import COLUMNS, blocks, noise_at_black, told_noise
+from .findings import (
+    Finding,
+    light_that_turns,
+    misaligned,
+    noise_at_black,
+    unequal_exposures,
+)
 from .photographs import Photographs
 from .small_views import SmallView, seen_by, small_camera, small_view
 from .views import View
@@ -24,7 +29,7 @@ _CHANNELS = 4
 def quick_findings(
     scene: mi.Scene, views: Sequence[View], photographs: Photographs
 ) -> list[Finding]:
-    """Look for poses, exposures and light that do not belong together, and for clipped noise.
+    """Look for poses, exposures and light that do not belong together; and what noise was found.
 
     Args:
         scene: that the photographs show.
@@ -32,12 +37,14 @@ def quick_findings(
         photographs: of these views.
 
     Returns:
-        Nothing where views are too few or too small to tell.
+        Nothing but noise where views are too few or too small to tell.
     """
+    noise = noise_at_black(photographs.noise)
+    told = [] if noise is None else [noise]
     chosen = np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int)
     large = [i for i in chosen.tolist() if _shorter_side(views[i]) >= SHORTEST_SIDE]
     if len(large) < FEWEST_VIEWS:
-        return []
+        return told
     small = _small_views(views, photographs, large)
     better = misaligned(alignment(scene, small))
     if better is not None:
@@ -45,9 +52,8 @@ def quick_findings(
     points = shared_points(small, seen_by(scene, [view.camera for view in small]))
     found = exposures(points, len(small))
     names = [view.name for view in small]
-    noise = noise_at_black(told_noise(_dark_blocks(views, photographs, large)))
-    every = unequal_exposures(found, names), light_that_turns(turning_light(points, found)), noise
-    return [finding for finding in every if finding is not None]
+    both = unequal_exposures(found, names), light_that_turns(turning_light(points, found))
+    return [finding for finding in both if finding is not None] + told
 
 
 def _shorter_side(view: View) -> int:
@@ -79,41 +85,16 @@ def _small_views(
     return small
 
 
-def _dark_blocks(
-    views: Sequence[View], photographs: Photographs, numbers: Sequence[int]
-) -> np.ndarray:
-    """Blocks of views whose noise nobody has told, each looked at by the process that holds it."""
-    first = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)])
-
-    def own() -> np.ndarray:
-        found = [np.zeros((0, COLUMNS), np.float32)]
-        for i in numbers:
-            if first[i] in photographs.pixels and views[i].noise is None:
-                rgb, counted = _pixels(photographs, int(first[i]), int(first[i + 1]))
-                shape = (views[i].camera.height, views[i].camera.width)
-                rgb = rgb.reshape(*shape, 3) * np.float32(views[i].exposure)
-                found.append(blocks(rgb, counted.reshape(shape)))
-        return np.concatenate(found)
-
-    return photographs.joined(own)
-
-
 def _small_view(view: View, photographs: Photographs, start: int, stop: int) -> SmallView:
     """A view that this process holds.
 
     Args:
         start, stop: numbers of its first pixel and of that of the next view.
     """
-    rgb, counted = _pixels(photographs, start, stop)
-    alpha = None if photographs.chosen is None else counted.astype(np.float32)
-    return small_view(view.name, view.camera, rgb, alpha)
-
-
-def _pixels(photographs: Photographs, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance of pixels that this process holds, and whether they are trained on."""
-    first, counted = photographs.pixels.start, np.ones(stop - start, bool)
+    first, alpha = photographs.pixels.start, None
     if photographs.chosen is not None:
         inside = slice(*np.searchsorted(photographs.chosen, (start, stop)))
-        counted[:] = False
-        counted[photographs.chosen[inside].astype(np.int64) - start] = True
-    return np.array(photographs.table[start - first : stop - first, :3]), counted
+        alpha = np.zeros(stop - start, np.float32)
+        alpha[photographs.chosen[inside].astype(np.int64) - start] = 1
+    rgb = np.array(photographs.table[start - first : stop - first, :3])
+    return small_view(view.name, view.camera, rgb, alpha)
