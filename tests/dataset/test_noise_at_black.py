@@ -85,6 +85,13 @@ def test_pixels_that_do_not_count_and_small_pictures_tell_nothing():
     np.testing.assert_array_equal(half, blocks(noisy[:, : SIDE // 2], counted[:, : SIDE // 2]))
 
 
+def test_of_a_large_picture_some_rows_are_looked_at():
+    light = np.tile(scene(), (8, 8, 1))
+    rows = blocks(photograph(light, SensorNoise(0.0, 0.02)), np.ones(light.shape[:2], bool))
+    assert 10_000 < len(rows) / 3 < 17_000
+    assert told_noise(rows).read == pytest.approx(0.02, rel=0.1)
+
+
 def test_a_fit_corrects_what_it_finds_and_leaves_what_is_told_or_rendered(tmp_path):
     noise, camera = (
         SensorNoise(0.005, 0.02),

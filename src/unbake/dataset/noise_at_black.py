@@ -50,9 +50,11 @@ def blocks(rgb: np.ndarray, counted: np.ndarray) -> np.ndarray:
     if height < 1 or width < 3:
         return np.zeros((0, COLUMNS), np.float32)
 
+    step = -(-height * width // _MOST)  # of many rows, some
+
     def cut(image: np.ndarray) -> np.ndarray:
-        whole = image[: height * _EDGE, : width * _EDGE]
-        return whole.reshape(height, _EDGE, width, _EDGE, -1)
+        rows = image[: height * _EDGE].reshape(height, _EDGE, image.shape[1], -1)[::step]
+        return rows[:, :, : width * _EDGE].reshape(len(rows), _EDGE, width, _EDGE, -1)
 
     values = cut(rgb)
     zero = (values <= 0).astype(np.float32)
@@ -63,8 +65,7 @@ def blocks(rgb: np.ndarray, counted: np.ndarray) -> np.ndarray:
     whole = whole[:, 1:-1] & whole[:, :-2] & whole[:, 2:]
     around = 0.5 * (mean[:, :-2] + mean[:, 2:])
     columns = (around, mean[:, 1:-1], zeros[:, 1:-1], pairs[:, 1:-1])
-    rows = np.stack([column[whole].ravel() for column in columns], 1)
-    return rows[:: max(1, len(rows) // _MOST)].astype(np.float32)
+    return np.stack([column[whole].ravel() for column in columns], 1).astype(np.float32)
 
 
 def told_noise(rows: np.ndarray) -> SensorNoise | None:
