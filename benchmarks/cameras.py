@@ -125,6 +125,9 @@ FAULTS = {
     "all": together(ALL_BUT_MESH, MESH, EXPOSURE),
 }
 
+#: In which rows stand.
+ORDER = ["none", *FAULTS]
+
 
 def main() -> None:
     """Fit, print every score, and write the result."""
@@ -150,10 +153,12 @@ def main() -> None:
             continue
         found = [scores(args.data, fault, fit, seed, options) for seed in args.seeds]
         row = {"fault": fault, "cameras": fit} | across_seeds(found, found[0])
-        rows.append(row | {"machine": result["machine"]})
+        row |= {"machine": result["machine"]}
+        rows.append(row)
         known.add((fault, fit))
-        told = ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items() if isinstance(v, float))
+        told = ", ".join(f"{k} {v:.3f}" for k, v in row.items() if isinstance(v, float))
         print(f"{fault}, {fit}: {told}", flush=True)
+        rows.sort(key=lambda row: (ORDER.index(row["fault"]), CAMERAS.index(row["cameras"])))
         write_json(args.out, result | {"rows": rows})
 
 
