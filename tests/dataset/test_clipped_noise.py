@@ -71,6 +71,25 @@ def test_pixels_that_do_not_count_tell_nothing():
     assert without_clipped_noise(clipped, nothing, CAMERA, SENSOR) is clipped
 
 
+def test_what_is_clipped_at_white_stays_a_bound():
+    """A small light in a dark room, whose window is dark in the mean."""
+    clipped = np.maximum(photograph(0.005), 0)
+    lights = np.arange(7, SIDE * SIDE, 997)
+    clipped[lights] = 0.3
+    found = without_clipped_noise(clipped, ALL, CAMERA, SENSOR, limit=0.3)
+    assert (found[lights] == np.float32(0.3)).all()
+    bounds = np.isin(np.arange(SIDE * SIDE), lights)
+    assert (found[~bounds] < clipped[~bounds]).mean() > 0.9
+
+
+@pytest.mark.filterwarnings("error")
+def test_enormous_pixels_are_no_trouble():
+    rgb = np.maximum(photograph(0.01), 0)
+    rgb[1000:1010] = np.finfo(np.float32).max
+    found = without_clipped_noise(rgb, ALL, CAMERA, SENSOR)
+    assert np.isfinite(found).all() and (found[1000:1010] == rgb[1000:1010]).all()
+
+
 def test_units_do_not_matter():
     clipped = np.maximum(photograph(0.01), 0)
     found = without_clipped_noise(clipped, ALL, CAMERA, SENSOR)

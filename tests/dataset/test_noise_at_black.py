@@ -47,6 +47,31 @@ def test_the_noise_of_a_sensor_is_found(noise, unit):
     assert finding.level == "warning" and f'"read": {told.read:.2g}' in finding.what
 
 
+@pytest.mark.parametrize("edge", [100, 120, 150])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dark_surface_beside_a_bright_one_tells_its_noise(edge, seed):
+    """Blocks on the edge, with some of both, tell nothing of it."""
+    light = np.where(np.arange(SIDE) < edge, 0.02, 0.5)[None, :, None]
+    light = np.broadcast_to(light, (SIDE, SIDE, 3))
+    told = found(*(photograph(light, SensorNoise(0.0, 0.02), 10 * seed + i) for i in range(4)))
+    assert told.read == pytest.approx(0.02, rel=0.25)
+
+
+@pytest.mark.parametrize("light", [0.005, 0.01, 0.02])
+def test_light_that_is_the_same_everywhere_tells_its_noise(light):
+    even = np.full((SIDE, SIDE, 3), light)
+    told = found(*(photograph(even, SensorNoise(0.0, 0.02), i) for i in range(4)))
+    deviation = np.sqrt(told.shot * light + told.read**2)
+    assert deviation == pytest.approx(0.02, rel=0.05)
+
+
+@pytest.mark.filterwarnings("error")
+def test_enormous_pixels_are_no_trouble():
+    noisy = photograph(scene(), SensorNoise(0.005, 0.02))
+    noisy[::50, ::50] = np.finfo(np.float32).max
+    assert found(noisy, noisy, noisy, noisy).read == pytest.approx(0.02, rel=0.15)
+
+
 def test_photographs_without_noise_at_black_are_not_doubted():
     assert noise_at_black(None) is None
     bright = [photograph(scene(0.2), SensorNoise(0.0, 0.01), seed) for seed in range(4)]

@@ -354,6 +354,11 @@ def test_gains_and_responses_are_the_same_in_steps_and_in_evaluations():
     np.testing.assert_allclose(model.light(middle), middle, rtol=1e-6)
     assert np.abs(model.light(np.ones((1, 3))) - 1).min() > 0.01
     np.testing.assert_allclose(model.photographed(light), values, rtol=1e-3, atol=1e-5)
+    # About black it is straight: noise keeps its mean, and both ways agree
+    noise = np.tile([[-0.001], [0.001]], (1, 3)).astype(np.float32)
+    about = np.array(model.exposed(mi.Color3f([mi.Float(x) for x in noise.T]))).T
+    np.testing.assert_allclose(about.mean(0), 0, atol=1e-7)
+    np.testing.assert_allclose(about, model.light(noise), rtol=1e-3)
     # Gradients reach all of it, but the anchor through exposures of its own; below zero, none does
     below = mi.Float(values[:12, 0] - 0.1)
     loss = dr.sum(dr.sum(gain) + dr.sum(model.exposed(mi.Color3f(below))))

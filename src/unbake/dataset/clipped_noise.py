@@ -22,13 +22,17 @@ from .views import SensorNoise
 #: Half the edge of the window that tells how much light there is, in pixels.
 RADIUS = 2
 #: From so many standard deviations on, nothing is clipped.
-_BRIGHT = 4.0
+BRIGHT = 4.0
 #: Entries of the table of f.
 _TABLE = 513
 
 
 def without_clipped_noise(
-    rgb: np.ndarray, counted: np.ndarray, camera: Camera, sensor: SensorNoise | None
+    rgb: np.ndarray,
+    counted: np.ndarray,
+    camera: Camera,
+    sensor: SensorNoise | None,
+    limit: float = math.inf,
 ) -> np.ndarray:
     """A photograph less what its clipped noise adds to it on average.
 
@@ -37,10 +41,11 @@ def without_clipped_noise(
     noise stays as it is: values may now be below zero, as they were in the sensor.
 
     Args:
-        rgb: linear, in the sensor's units, shape (pixels, 3).
+        rgb: linear, in the units of the noise, shape (pixels, 3).
         counted: whether pixels count, shape (pixels,).
         camera: of the photograph.
         sensor: what its noise is; None: nobody has told.
+        limit: value from which on the photograph is clipped, and stays as it is.
 
     Returns:
         The same photograph where noise is not known, has no part that is the same for all light, or
@@ -50,16 +55,18 @@ def without_clipped_noise(
         return rgb
     shape = (camera.height, camera.width, -1)
     weight = counted.astype(np.float32).reshape(shape)
-    mean = mean_of_counted(rgb.reshape(shape), weight, RADIUS).reshape(rgb.shape)
     light, clipped = _means(sensor)
-    added = mean - np.interp(mean, clipped, light)
-    return rgb - np.where(mean < clipped[-1], added, 0).astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is infinite is no dark mean
+        mean = mean_of_counted(rgb.reshape(shape), weight, RADIUS).reshape(rgb.shape)
+        added = mean - np.interp(mean, clipped, light)
+    dark = (mean < clipped[-1]) & (rgb < limit)
+    return rgb - np.where(dark, added, 0).astype(np.float32)
 
 
 def _means(sensor: SensorNoise) -> tuple[np.ndarray, np.ndarray]:
     """Light x in rising order, and f(x)."""
-    half = 0.5 * _BRIGHT**2 * sensor.shot
-    brightest = half + math.sqrt(half**2 + (_BRIGHT * sensor.read) ** 2)  # x = _BRIGHT σ(x)
+    half = 0.5 * BRIGHT**2 * sensor.shot
+    brightest = half + math.sqrt(half**2 + (BRIGHT * sensor.read) ** 2)  # x = BRIGHT σ(x)
     light = brightest * np.linspace(0, 1, _TABLE) ** 2
     deviation = np.sqrt(sensor.shot * light + sensor.read**2)
     return light, light * below(light / deviation) + deviation * density(light / deviation)

@@ -19,9 +19,10 @@ import numpy as np
 
 from ..errors import UserError
 from ..io import locked, read_object, remove_unfinished, temporary_beside, write_json
+from .clipped_noise import BRIGHT
 from .clipped_noise import RADIUS as BLACK_RADIUS
 from .data_folder import DataFolder
-from .decoding import RADIUS, WITH_BLURRED, Decoded, Plan, Told
+from .decoding import PEAK, RADIUS, WITH_BLURRED, Decoded, Plan, Told
 
 
 def in_file(plan: Plan) -> Decoded:
@@ -43,8 +44,8 @@ def in_file(plan: Plan) -> Decoded:
         key["exposures"] = [view.exposure for view in views]
     if any(view.noise is not None for view in views):
         key["noise"] = [None if view.noise is None else asdict(view.noise) for view in views]
-        key["black"] = {"radius": BLACK_RADIUS, "less": "what clipped noise adds"}
-        key["reference"] = "of others, and of peaks beyond the noise"
+        key["black"] = {"radius": BLACK_RADIUS, "bright": BRIGHT, "less": "what noise adds"}
+        key["reference"] = {"of": "others", "peaks": PEAK}
     data.require_own_cache()
     found = _find_cache(data, key)
     if found is not None:

@@ -24,7 +24,7 @@ RADIUS = 2
 #: (Immerkær 1996, Fast Noise Variance Estimation).
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
 #: So many standard deviations of known noise are no peak.
-_PEAK = 3.0
+PEAK = 3.0
 #: An image with its camera: linear RGB, shape (pixels, 3), and whether pixels count, (pixels,);
 #: then its noise, if that is known.
 Image = tuple[Camera, np.ndarray, np.ndarray, SensorNoise | None]
@@ -126,7 +126,7 @@ class Plan:
                     hot_pixels.append(asdict(found))
                 noise = None if view.noise is None else view.noise.divided(view.exposure)
                 radiance = _in_radiance(pixels, view)
-                rgb = without_clipped_noise(radiance[:, :3], counted, camera, noise)
+                rgb = without_clipped_noise(radiance[:, :3], counted, camera, noise, view.limit)
                 yield camera, rgb, counted, noise
 
         made = fill(table, images(), self.chooses, first)
@@ -204,18 +204,30 @@ def _reference(
     mean = np.where(np.isnan(mean), image, mean)
     # Pixels that do not count are no peaks, and no noise is told from them.
     known = np.where(weight > 0, image, mean)
-    response, inside = np.zeros_like(known), np.ones_like(weight)
     first, second = (np.full_like(known, -np.inf) for _ in range(2))
-    neighbours = zip(_NOISE.ravel(), around(known, 1), around(weight, 1), strict=True)
-    for share, there, counted in neighbours:
-        response += share * there
-        inside *= counted
+    for there in around(known, 1):
         np.maximum(second, np.minimum(first, there), out=second)
         np.maximum(first, there, out=first)
     if sensor is None:
-        noise = np.nan_to_num(mean_of_counted(response**2, inside, RADIUS))
+        noise = _noise_around(known, weight)
     else:
         noise = sensor.variance(mean)
-        second += _PEAK * np.sqrt(noise)
+        second += PEAK * np.sqrt(noise)
     peak = np.maximum(known - second, 0)
     return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)
+
+
+def _noise_around(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The variance of the noise of the 5 x 5 pixels around each one, as far as neighbours tell it.
+
+    Args:
+        image: shape (height, width, channels).
+        weight: 1 where a pixel counts, else 0, shape (height, width, 1).
+    """
+    response, inside = np.zeros_like(image), np.ones_like(weight)
+    for share, there, counted in zip(
+        _NOISE.ravel(), around(image, 1), around(weight, 1), strict=True
+    ):
+        response += share * there
+        inside *= counted
+    return np.nan_to_num(mean_of_counted(response**2, inside, RADIUS))

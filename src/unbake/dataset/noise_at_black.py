@@ -30,6 +30,10 @@ _SETS, _LEAST, _TELLING = 30, 0.05, 0.5
 #: Noise clips half of all values, where there is no light. Sets with more zeros, but not of zeros
 #: alone, tell that light itself is rare, as where paths do not find it; one may be chance.
 _RARE, _NONE = 0.6, 0.98
+#: Light of sets that differs by less of a factor, in quartiles, does not tell shot from read noise.
+_WIDE = 1.5
+#: Steps of least absolute deviations, and a relative error that counts as none.
+_STEPS, _SMALL = 20, 0.02
 #: Views that are looked at: as many as have so many pixels together, within these bounds.
 _PIXELS, _FEWEST_VIEWS, _MOST_VIEWS = 1 << 22, 4, 24
 #: Columns of `blocks`: light around it, its mean, its zeros, pairs of them side by side.
@@ -44,11 +48,12 @@ def blocks(rgb: np.ndarray, counted: np.ndarray) -> np.ndarray:
         counted: whether pixels count, (height, width).
 
     Returns:
-        Shape (n, `COLUMNS`), of blocks that count as a whole, as those on both sides do.
+        Shape (n, `COLUMNS`), of blocks that count as a whole, as those on both sides do. Where
+        light differs much between these two, as at an edge, a block tells nothing.
     """
     height, width = (side // _EDGE for side in counted.shape)
     if height < 1 or width < 3:
-        return np.zeros((0, COLUMNS), np.float32)
+        return np.zeros((0, COLUMNS))
 
     step = -(-height * width // _MOST)  # of many rows, some
 
@@ -58,14 +63,15 @@ def blocks(rgb: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
     values = cut(rgb)
     zero = (values <= 0).astype(np.float32)
-    zeros, mean = zero.sum((1, 3)), values.mean((1, 3))
+    zeros, mean = zero.sum((1, 3)), values.mean((1, 3), dtype=np.float64)
     pairs = (zero[:, 1:] * zero[:, :-1]).sum((1, 3))
     pairs += (zero[:, :, :, 1:] * zero[:, :, :, :-1]).sum((1, 3))
     whole = cut(counted).min((1, 3))[..., 0] > 0
     whole = whole[:, 1:-1] & whole[:, :-2] & whole[:, 2:]
     around = 0.5 * (mean[:, :-2] + mean[:, 2:])
+    alike = np.abs(mean[:, :-2] - mean[:, 2:]) <= around
     columns = (around, mean[:, 1:-1], zeros[:, 1:-1], pairs[:, 1:-1])
-    return np.stack([column[whole].ravel() for column in columns], 1).astype(np.float32)
+    return np.stack([column[whole[..., None] & alike] for column in columns], 1).astype(np.float64)
 
 
 def told_noise(rows: np.ndarray) -> SensorNoise | None:
@@ -75,10 +81,10 @@ def told_noise(rows: np.ndarray) -> SensorNoise | None:
         rows: of the blocks of all views.
 
     Returns:
-        None where there is none, or so little that it does not matter; and where zeros have
-        another cause: shadows, or pictures of a path tracer whose paths found no light.
+        To three digits. None where there is none, or so little that it does not matter; and where
+        zeros have another cause: shadows, or pictures of a path tracer whose paths found no light.
     """
-    around, mean, zeros, pairs = rows.astype(np.float64).T
+    around, mean, zeros, pairs = rows.T
     some = (zeros >= 1) & (zeros <= _MOST_ZEROS)
     if some.sum() < max(_FEWEST, _SHARE * len(rows)):
         return None
@@ -95,11 +101,25 @@ def told_noise(rows: np.ndarray) -> SensorNoise | None:
     z = _deviations(1 - share[telling])
     deviation = light[telling] / (z * below(z) + density(z))
     line = np.stack([z * deviation, np.ones_like(z)], 1) / deviation[:, None] ** 2
-    shot, square = np.linalg.lstsq(line, np.ones(len(z)), rcond=None)[0].tolist()
+    if not np.isfinite(line).all():
+        return None
+    shot, square = _solved(line)
+    low, high = np.quantile(z * deviation, (0.25, 0.75))
+    if shot < 0 or high < _WIDE * low:
+        shot, square = 0.0, _solved(line[:, 1:])[0]
     # Without a part that all light has, zeros are where there was none.
     if square < 0.25 * float(deviation.min()) ** 2:
         return None
-    return SensorNoise(max(shot, 0.0), square**0.5)
+    return SensorNoise(float(f"{shot:.3g}"), float(f"{square**0.5:.3g}"))
+
+
+def _solved(rows: np.ndarray) -> list[float]:
+    """The unknowns by which rows are 1, by least absolute deviations: a set may hold an edge."""
+    weight, found = np.ones(len(rows)), np.zeros(rows.shape[1])
+    for _ in range(_STEPS):
+        found = np.linalg.lstsq(weight[:, None] * rows, weight, rcond=None)[0]
+        weight = 1 / np.sqrt(np.maximum(np.abs(rows @ found - 1), _SMALL))
+    return found.tolist()
 
 
 def _deviations(share: np.ndarray) -> np.ndarray:

@@ -171,8 +171,14 @@ class Photographs:
                 cannot be written to.
         """
         ranks = ranks or Ranks()
-        noise = ranks.together(lambda: found_noise(dataset, clip_negative), math.inf)
-        if noise is not None:
+        first = ranks.rank == 0
+        noise = ranks.together(
+            lambda: found_noise(dataset, clip_negative) if first else None, math.inf
+        )
+        # All read photographs alike: by what the first one found.
+        known = ranks.told(None if noise is None else asdict(noise))[0]
+        if known is not None:
+            noise = SensorNoise(**known)
             views = [replace(v, noise=v.noise or noise) for v in dataset.views]
             dataset = replace(dataset, views=tuple(views))
         plan = Plan.of(dataset, clip_negative, WITH_BLURRED if smoothed else COLUMNS, ranks.size)

@@ -57,7 +57,7 @@ def pose_problems(
     numbers = photographs.numbers(places)
     sky = photographs.chosen is None and scene.environment() is not None
     if photographs.chosen is None and not sky:
-        numbers = numbers[photographs.radiance(numbers).any(axis=1)]
+        numbers = numbers[(photographs.radiance(numbers) > 0).any(axis=1)]
     seen = _seen(scene, cameras, numbers)
     share = float(seen.mean()) if len(seen) else 1.0
     if share < (_DOUBTFUL_WITH_SKY if sky else _DOUBTFUL):

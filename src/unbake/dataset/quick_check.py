@@ -9,13 +9,7 @@ import numpy as np
 
 from .agreement import exposures, shared_points, turning_light
 from .alignment import FEWEST_VIEWS, SHORTEST_SIDE, alignment
-from .findings import (
-    Finding,
-    light_that_turns,
-    misaligned,
-    noise_at_black,
-    unequal_exposures,
-)
+from .findings import Finding, light_that_turns, misaligned, unequal_exposures
 from .photographs import Photographs
 from .small_views import SmallView, seen_by, small_camera, small_view
 from .views import View
@@ -29,7 +23,7 @@ _CHANNELS = 4
 def quick_findings(
     scene: mi.Scene, views: Sequence[View], photographs: Photographs
 ) -> list[Finding]:
-    """Look for poses, exposures and light that do not belong together; and what noise was found.
+    """Look for poses, exposures and light that do not belong together.
 
     Args:
         scene: that the photographs show.
@@ -37,14 +31,12 @@ def quick_findings(
         photographs: of these views.
 
     Returns:
-        Nothing but noise where views are too few or too small to tell.
+        Nothing where views are too few or too small to tell.
     """
-    noise = noise_at_black(photographs.noise)
-    told = [] if noise is None else [noise]
     chosen = np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int)
     large = [i for i in chosen.tolist() if _shorter_side(views[i]) >= SHORTEST_SIDE]
     if len(large) < FEWEST_VIEWS:
-        return told
+        return []
     small = _small_views(views, photographs, large)
     better = misaligned(alignment(scene, small))
     if better is not None:
@@ -53,7 +45,7 @@ def quick_findings(
     found = exposures(points, len(small))
     names = [view.name for view in small]
     both = unequal_exposures(found, names), light_that_turns(turning_light(points, found))
-    return [finding for finding in both if finding is not None] + told
+    return [finding for finding in both if finding is not None]
 
 
 def _shorter_side(view: View) -> int:

@@ -221,14 +221,17 @@ class CameraModel:
     def _inverse(self, value: mi.Float, heights: mi.Float, channel: int) -> mi.Float:
         """One channel through f: pieces of positive slope, equal ones for 8-bit files.
 
-        No file has values below zero. Those that noise has, once it is corrected, stay as they are.
+        No file has values below zero, but noise has, once it is corrected. As u^2.2, the first
+        piece is straight, and goes on there: noise about black keeps its mean.
         """
         place = dr.power(dr.maximum(value, 0), 1 / GAMMA) * PIECES
         piece = dr.minimum(mi.UInt32(place), PIECES - 1)
         index = piece + channel * (PIECES + 1)
         low, high = read_small(heights, index), read_small(heights, index + 1)
         height = dr.fma(high - low, place - mi.Float(piece), low)
-        return dr.power(dr.maximum(height, 1e-6), GAMMA) + dr.minimum(value, 0)
+        first = PIECES * read_small(heights, dr.full(mi.UInt32, channel * (PIECES + 1) + 1))
+        slope = dr.power(dr.detach(first), GAMMA)
+        return dr.power(dr.maximum(height, 1e-6), GAMMA) + slope * dr.minimum(value, 0)
 
     # ----------------------------------------------------------------------------- as numbers
 
@@ -293,7 +296,7 @@ def _places() -> np.ndarray:
 
 
 def _through(values: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Channels through curves of u, of which values are u^2.2; straight beyond the last piece.
+    """Channels through curves of u, of which values are u^2.2; straight beyond both ends.
 
     Args:
         values: linear RGB, shape (..., 3).
@@ -303,7 +306,8 @@ def _through(values: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.nd
     for x, y, channel in zip(before, after, np.moveaxis(values, -1, 0), strict=True):
         u = np.maximum(channel, 0) ** (1 / GAMMA)
         last = (y[-1] - y[-2]) / (x[-1] - x[-2])
-        found.append(np.where(u > x[-1], y[-1] + (u - x[-1]) * last, np.interp(u, x, y)) ** GAMMA)
+        light = np.where(u > x[-1], y[-1] + (u - x[-1]) * last, np.interp(u, x, y)) ** GAMMA
+        found.append(light + (y[1] / x[1]) ** GAMMA * np.minimum(channel, 0))
     return np.stack(found, -1).astype(values.dtype)
 
 

@@ -1,11 +1,14 @@
-"""Sums over windows of pixels around each pixel of a picture, edges repeated."""
+"""Means over windows of pixels around each pixel of a picture."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import reduce
+from typing import Literal
 
 import numpy as np
+
+Beyond = Literal["edge", "constant"]
 
 
 def mean_of_counted(
@@ -17,34 +20,38 @@ def mean_of_counted(
         image: shape (height, width, channels).
         weight: 0 or 1, shape (height, width, 1).
         radius: of the window, whose edge has 2 radius + 1 pixels.
-        others: leave the pixel in the middle out.
+        others: leave the pixel in the middle out; beyond edges there is nothing. Else edges are
+            repeated.
 
     Returns:
         Of the shape of the image; NaN where no pixel has weight.
     """
     if weight.all() and not others:
         return _sums(image, radius) / np.float32((2 * radius + 1) ** 2)
-    share, total = _sums(weight, radius), _sums(image * weight, radius)
+    beyond = "constant" if others else "edge"
+    share, total = _sums(weight, radius, beyond), _sums(image * weight, radius, beyond)
     if others:
         share, total = share - weight, total - image * weight
     return total / np.where(share > 0, share, np.nan)
 
 
 def around(image: np.ndarray, radius: int) -> Iterator[np.ndarray]:
-    """The image moved to every place of a window, row by row."""
+    """The image moved to every place of a window, row by row, edges repeated."""
     for moved in along(image, 0, radius):
         yield from along(moved, 1, radius)
 
 
-def along(image: np.ndarray, axis: int, radius: int) -> Iterator[np.ndarray]:
-    """The image moved along an axis by -radius to radius pixels."""
-    padded = np.pad(image, [(radius, radius) if i == axis else (0, 0) for i in range(3)], "edge")
+def along(
+    image: np.ndarray, axis: int, radius: int, beyond: Beyond = "edge"
+) -> Iterator[np.ndarray]:
+    """The image moved along an axis by -radius to radius pixels; beyond edges as NumPy's pad."""
+    padded = np.pad(image, [(radius, radius) if i == axis else (0, 0) for i in range(3)], beyond)
     for start in range(2 * radius + 1):
         part = slice(start, start + image.shape[axis])
         yield padded[part] if axis == 0 else padded[:, part]
 
 
-def _sums(image: np.ndarray, radius: int) -> np.ndarray:
+def _sums(image: np.ndarray, radius: int, beyond: Beyond = "edge") -> np.ndarray:
     for axis in (0, 1):
-        image = reduce(np.add, along(image, axis, radius))
+        image = reduce(np.add, along(image, axis, radius, beyond))
     return image

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..dataset.findings import noise_at_black
 from ..dataset.hot_pixels import told_hot_pixels
 from ..dataset.pixels import PixelSource
 from ..dataset.poses import pose_warnings
@@ -63,7 +64,9 @@ def data_warnings(
     light = _placeholder(dataset, problem)
     response = untold_response(dataset.train, problem.camera)
     hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
-    return [line for line in (*found, units, light, response, hot_pixels) if line]
+    noise = noise_at_black(pixels.photographs.noise)
+    told = (*found, units, light, response, hot_pixels, noise and str(noise))
+    return [line for line in told if line]
 
 
 def _placeholder(dataset: Dataset, problem: Problem) -> str | None:
