@@ -12,6 +12,7 @@ on that, and a fit would explain it by albedo.
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 
@@ -25,6 +26,7 @@ RADIUS = 2
 BRIGHT = 4.0
 #: Entries of the table of f.
 _TABLE = 513
+_NORMAL = NormalDist()
 
 
 def without_clipped_noise(
@@ -69,14 +71,11 @@ def _means(sensor: SensorNoise) -> tuple[np.ndarray, np.ndarray]:
     brightest = half + math.sqrt(half**2 + (BRIGHT * sensor.read) ** 2)  # x = BRIGHT σ(x)
     light = brightest * np.linspace(0, 1, _TABLE) ** 2
     deviation = np.sqrt(sensor.shot * light + sensor.read**2)
-    return light, light * below(light / deviation) + deviation * density(light / deviation)
+    return light, clipped_mean(light, deviation)
 
 
-def below(z: np.ndarray) -> np.ndarray:
-    """Φ(z), the share of normal numbers below z, shape (n,)."""
-    return np.array([0.5 * math.erfc(-value / math.sqrt(2)) for value in z.tolist()])
-
-
-def density(z: np.ndarray) -> np.ndarray:
-    """φ(z), the density of normal numbers."""
-    return np.exp(-0.5 * np.square(z)) / math.sqrt(2 * math.pi)
+def clipped_mean(light: np.ndarray, deviation: np.ndarray | float) -> np.ndarray:
+    """f(x), the mean of what files hold of light x in noise of the deviation σ, shape (n,)."""
+    z = light / deviation
+    share, density = (np.array([of(x) for x in z.tolist()]) for of in (_NORMAL.cdf, _NORMAL.pdf))
+    return light * share + deviation * density

@@ -8,10 +8,12 @@ its mean m: light x and deviation σ are those with p = Φ(−x / σ) and m = f(
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 
 from ..errors import UserError
-from .clipped_noise import below, density
+from .clipped_noise import clipped_mean
 from .data_folder import DataFolder
 from .views import Dataset, SensorNoise, read_masked
 
@@ -71,7 +73,7 @@ def blocks(rgb: np.ndarray, counted: np.ndarray) -> np.ndarray:
     around = 0.5 * (mean[:, :-2] + mean[:, 2:])
     alike = np.abs(mean[:, :-2] - mean[:, 2:]) <= around
     columns = (around, mean[:, 1:-1], zeros[:, 1:-1], pairs[:, 1:-1])
-    return np.stack([column[whole[..., None] & alike] for column in columns], 1).astype(np.float64)
+    return np.stack([column[whole[..., None] & alike] for column in columns], 1)
 
 
 def told_noise(rows: np.ndarray) -> SensorNoise | None:
@@ -98,8 +100,8 @@ def told_noise(rows: np.ndarray) -> SensorNoise | None:
     telling = (share > _LEAST) & (share < _TELLING)
     if telling.sum() < 2 or ((share > _RARE) & (share < _NONE)).sum() > 1:
         return None
-    z = _deviations(1 - share[telling])
-    deviation = light[telling] / (z * below(z) + density(z))
+    z = np.array([-NormalDist().inv_cdf(p) for p in share[telling].tolist()])
+    deviation = light[telling] / clipped_mean(z, 1.0)
     line = np.stack([z * deviation, np.ones_like(z)], 1) / deviation[:, None] ** 2
     if not np.isfinite(line).all():
         return None
@@ -120,12 +122,6 @@ def _solved(rows: np.ndarray) -> list[float]:
         found = np.linalg.lstsq(weight[:, None] * rows, weight, rcond=None)[0]
         weight = 1 / np.sqrt(np.maximum(np.abs(rows @ found - 1), _SMALL))
     return found.tolist()
-
-
-def _deviations(share: np.ndarray) -> np.ndarray:
-    """Places where Φ is a share between `_TELLING` and 1 − `_LEAST`."""
-    places = np.linspace(-0.1, 2, 512)
-    return np.interp(share, below(places), places)
 
 
 def found_noise(dataset: Dataset, clip_negative: bool = False) -> SensorNoise | None:
