@@ -33,7 +33,7 @@ from ..dataset.noise_at_black import found_noise
 from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, seen_by, small_camera, small_view
-from ..dataset.views import Dataset, View, check_cameras, read_masked
+from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
 from ..errors import UserError, printable
 from ..scene import edit, free_space
 from ..scene.parse import parse
@@ -200,9 +200,7 @@ def _checked(
     camera, hidden = view.camera, dataset.background == "hidden"
     photograph, mask = read_masked(view, clip_negative)
     pixels = photograph.reshape(-1, 4)
-    counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
-    if hidden:
-        counted &= pixels[:, 3] > 0
+    counted = fitted(photograph, mask, dataset.background).ravel()
     cleaned, hot_pixels = without_hot_pixels(pixels, counted, view.name, camera.width)
     if hot_pixels is not None and (told := told_hot_pixels([hot_pixels])):
         result.warn("hot pixels", told, None, "Remove them where they are no light that is seen")

@@ -14,7 +14,7 @@ from .camera import Camera
 from .clipped_noise import without_clipped_noise
 from .hot_pixels import without_hot_pixels
 from .shares import dealt
-from .views import Dataset, SensorNoise, View, read_masked
+from .views import Dataset, SensorNoise, View, fitted, read_masked
 
 #: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
 COLUMNS, WITH_BLURRED = 3, 6
@@ -117,10 +117,8 @@ class Plan:
         def images() -> Iterator[Image]:
             for view in views:
                 pixels, mask = read_masked(view, self.clip_negative)
+                counted = fitted(pixels, mask, self.dataset.background).ravel()
                 pixels, camera = pixels.reshape(-1, 4), view.camera
-                counted = np.ones(len(pixels), bool) if mask is None else mask.ravel()
-                if self.hidden:
-                    counted &= pixels[:, 3] > 0
                 pixels, found = without_hot_pixels(pixels, counted, view.name, camera.width)
                 if found is not None:
                     hot_pixels.append(asdict(found))

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import UserError
 from .clipped_noise import clipped_mean
 from .data_folder import DataFolder
-from .views import Dataset, SensorNoise, read_masked
+from .views import Dataset, SensorNoise, fitted, read_masked
 
 #: Edge of a block, in pixels.
 _EDGE = 5
@@ -147,8 +147,5 @@ def found_noise(dataset: Dataset, clip_negative: bool = False) -> SensorNoise | 
             pixels, mask = read_masked(views[i], clip_negative)
         except UserError:
             return None
-        counted = np.ones(pixels.shape[:2], bool) if mask is None else mask
-        if dataset.background == "hidden":
-            counted = counted & (pixels[..., 3] > 0)
-        rows.append(blocks(pixels[..., :3], counted))
+        rows.append(blocks(pixels[..., :3], fitted(pixels, mask, dataset.background)))
     return told_noise(np.concatenate(rows))

@@ -348,6 +348,15 @@ def read_masked(view: View, clip_negative: bool = False) -> tuple[np.ndarray, np
     return pixels, counted_by(codes)
 
 
+def fitted(pixels: np.ndarray, mask: np.ndarray | None, background: str) -> np.ndarray:
+    """Which pixels of a photograph are fitted, (H, W) bool; arguments as of `read_masked`.
+
+    They are not masked and, where the background is hidden, have alpha > 0.
+    """
+    counted = np.ones(pixels.shape[:2], bool) if mask is None else mask
+    return counted & (pixels[..., 3] > 0) if background == "hidden" else counted
+
+
 def counted_by(codes: np.ndarray) -> np.ndarray:
     """Whether pixels count by the code values of a mask, (H, W, C): (H, W) bool."""
     return codes[..., : 1 if codes.shape[2] < 3 else 3].max(axis=2) > 0
