@@ -23,7 +23,9 @@ from unbake.config import (
     read_toml,
     to_toml,
 )
+from unbake.config.migration import as_before
 from unbake.errors import UserError
+from unbake.fields.settings import LEAK
 from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
 
@@ -348,6 +350,15 @@ def test_settings_of_format_1_mean_the_same_today(number):
     )
     assert old.radiance["grid"] == DenseGridConfig(7, 0.625)
     assert from_toml(to_toml(old)) == old
+
+
+def test_fields_of_earlier_runs_do_not_leak():
+    text = to_toml(preset("cpu"))
+    lines = [line for line in text.splitlines() if not line.startswith("leak = ")]
+    found = [from_toml(x).radiance["neural"].leak for x in (text, "\n".join(lines))]
+    assert found == [LEAK, 0]
+    assert as_before("radiance.neural") == as_before("radiance.triplane") == {"leak": 0}
+    assert as_before("radiance.grid") == as_before("radiance") == {}
 
 
 def test_a_file_without_a_format_may_have_keys_of_today():

@@ -1,18 +1,21 @@
 """Networks are the same on all engines; fields are positive, alive and never poisoned."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support import TINY, randomised, seeded
 
+from unbake.config import preset
 from unbake.fields.domain import Domain, SurfacePoint
 from unbake.fields.field import FieldSpec
 from unbake.fields.materials import Materials, with_joint_gradients
 from unbake.fields.network import Network
 from unbake.fields.perceptron import can_record_layout
 from unbake.fields.radiance import RadianceField
-from unbake.fields.settings import GridConfig, NetworkConfig
+from unbake.fields.settings import LEAK, GridConfig, NetworkConfig
 from unbake.quantities import QUANTITIES
 
 LANES = 200
@@ -22,6 +25,7 @@ WIDE = NetworkConfig(
     grid=GridConfig(levels=3, features=4, table_log2=6, base_resolution=3, growth=1.6),
     width=24,
     hidden=3,
+    leak=0.1,
 )
 
 
@@ -105,17 +109,44 @@ def test_without_gradients_values_are_the_same(engine):
     np.testing.assert_allclose(np.array(live), np.array(still), rtol=1e-5)
 
 
-def test_network_is_a_matrix_product_with_rectified_layers():
+@pytest.mark.parametrize("leak", [0.0, 0.1])
+def test_network_is_a_matrix_product_with_rectified_layers(leak):
     """Against NumPy, the features taken as they are."""
-    network = Network(WIDE, FieldSpec(outputs=3, extra=2, seed=5))
+    network = Network(replace(WIDE, leak=leak), FieldSpec(outputs=3, extra=2, seed=5))
     randomised(network)
     more = [points(seed=2).x, points(seed=3).y]
     x = np.array([np.array(f) for f in [*network.grid(list(points())), *more]], np.float64)
     for i, (weights, bias) in enumerate(network.perceptron.layers):
         x = np.array(weights, np.float64) @ x + np.array(bias, np.float64)
-        x = np.maximum(x, 0) if i < WIDE.hidden else x
+        x = np.maximum(x, leak * x) if i < WIDE.hidden else x
     values = np.array([np.array(v) for v in network.evaluate(SurfacePoint(points()), more)])
     np.testing.assert_allclose(values, x, rtol=1e-3, atol=1e-4 * np.abs(x).max())
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("leak", [0.0, LEAK])
+def test_a_layer_below_zero_learns_with_a_leak_alone(leak, engine):
+    """No neuron of the last layer is above zero: its output is a constant, unless it leaks."""
+    network = Network(replace(TINY, leak=leak), FieldSpec(outputs=1, seed=3))
+    parameters = randomised(network)
+    last = TINY.hidden - 1
+    shape = parameters[f"{last}.bias"].shape
+    parameters[f"{last}.bias"] = dr.full(mi.TensorXf, -100, shape)
+    dr.enable_grad(parameters)
+    network.assign(parameters)
+    (value,) = network.evaluate(SurfacePoint(points()), [], engine)
+    dr.backward(dr.sum(value * points(seed=4).x))
+    assert (np.ptp(np.array(value)) > 0) == (leak > 0)
+    for name in ("grid", f"{last}.weights"):
+        assert np.any(np.array(dr.grad(parameters[name])) != 0) == (leak > 0), name
+
+
+def test_radiance_leaks_and_materials_do_not():
+    config = preset("cpu")
+    for form in ("neural", "triplane"):
+        assert config.radiance[form].leak == LEAK
+        assert config.materials["albedo"][form].leak == 0
+    assert preset("paper").radiance["neural"].leak == 0
 
 
 def test_grid_interpolates_between_the_corners_of_a_cell():

@@ -1,6 +1,7 @@
 """The forward problem: the radiance of known scenes, from the residual alone."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import drjit as dr
@@ -100,6 +101,14 @@ def test_what_is_written_is_told_and_can_be_read_again(solved):
     found = radiance.evaluate(p, mi.Vector3f(n), n, mi.Color3f(0.5), mi.Bool(True))
     # Reflected light alone: emission is added analytically.
     np.testing.assert_allclose(np.array(found), TRUTH - 1, rtol=0.05)
+
+
+def test_a_field_of_before_does_not_leak(solved, tmp_path):
+    shutil.copy(solved / "radiance.safetensors", tmp_path)
+    told = read_object(solved / "solve.json")
+    del told["radiance"]["settings"]["leak"]
+    (tmp_path / "solve.json").write_text(json.dumps(told))
+    assert read_solved(tmp_path).settings.leak == 0
 
 
 def test_a_damaged_folder_is_refused(solved, tmp_path):

@@ -34,21 +34,36 @@ _MOVED = {
 }
 _GROUPS = ("grid", "bitmap")
 #: Settings that came later, at their value before: a run of an earlier version goes on as it began.
-_AS_BEFORE = {
-    "held_aside": 0.0,
-    "guide.cells": 0,
-    "materials.albedo.neural.pieces.most": 0,
-    "materials.albedo.neural.pieces.variation": False,
-    "materials.roughness.neural.pieces.most": 0,
-    "materials.roughness.neural.pieces.colours": 0,
-    "materials.roughness.neural.pieces.variation": False,
-    "regularization.albedo_smoothness": 0.0,
-    "roughness_search.times": 0,
-    "roughness_search.pixels_as_one": 0.0,
-    "roughness_search.pixels_at_most": 0,
+#: By the table that they are in, where there is one.
+_AS_BEFORE: dict[str, dict[str, Any]] = {
+    "": {
+        "held_aside": 0.0,
+        "guide.cells": 0,
+        "regularization.albedo_smoothness": 0.0,
+        "roughness_search.times": 0,
+        "roughness_search.pixels_as_one": 0.0,
+        "roughness_search.pixels_at_most": 0,
+    },
+    "radiance.neural": {"leak": 0.0},
+    "radiance.triplane": {"leak": 0.0},
+    "materials.albedo.neural": {"pieces.most": 0, "pieces.variation": False},
+    "materials.roughness.neural": {
+        "pieces.most": 0,
+        "pieces.colours": 0,
+        "pieces.variation": False,
+    },
 }
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
 _OF_RUN = {"preset", "unknown", "method", "seed", "steps", "seconds", "pixels", "spp"}
+
+
+def as_before(outer: str) -> dict[str, Any]:
+    """Settings of a table that came later, at their value before.
+
+    Args:
+        outer: the dotted key of the table.
+    """
+    return dict(_AS_BEFORE.get(outer, {}))
 
 
 def migrated(table: dict[str, Any]) -> dict[str, Any]:
@@ -67,10 +82,13 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
     # Where unbake wrote the file, all settings are in it but those of later versions.
     written = version is not None or _OF_RUN <= table.keys()
     found = table if version == FORMAT else _moved(table, version)
-    for key, value in _AS_BEFORE.items() if written else ():
-        outer = key.rpartition(".")[0].rpartition(".")[0]
-        if not _has(found, key) and (not outer or _has(found, outer)):
-            _put(found, key, value, key)
+    for outer, settings in _AS_BEFORE.items() if written else ():
+        if outer and not _has(found, outer):
+            continue
+        for inner, value in settings.items():
+            key = f"{outer}.{inner}".lstrip(".")
+            if not _has(found, key):
+                _put(found, key, value, key)
     return found
 
 

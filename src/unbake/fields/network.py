@@ -50,7 +50,9 @@ class Network(Field):
         self._bounded = spec.bounded and self.pieces is not None
         self._first = first_value(spec) if self._bounded else 0.0
         of_layers = replace(spec, bounded=False) if self._bounded else spec
-        self.perceptron = Perceptron(inputs, settings.width, settings.hidden, of_layers, rng)
+        self.perceptron = Perceptron(
+            inputs, settings.width, settings.hidden, of_layers, rng, leak=settings.leak
+        )
         self.prepare_recordable = can_record_layout()
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:

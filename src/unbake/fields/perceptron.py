@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import drjit as dr
 import drjit.nn as nn
@@ -35,13 +36,23 @@ class Perceptron:
         spec: outputs and their bounds. In half precision matrices are multiplied so; weights and
             results stay single.
         rng: of the initial weights.
+        leak: slope of activations below zero, less than 1. Where it is 0 and all neurons of a layer
+            are below zero, outputs are constant and no gradient changes that.
 
     Paper: Sec. 5.3.
     """
 
     def __init__(
-        self, inputs: int, width: int, hidden: int, spec: FieldSpec, rng: np.random.Generator
+        self,
+        inputs: int,
+        width: int,
+        hidden: int,
+        spec: FieldSpec,
+        rng: np.random.Generator,
+        *,
+        leak: float = 0.0,
     ) -> None:
+        self.leak = leak
         self.half = spec.half
         self.bounded = spec.bounded
         self.outputs = spec.outputs
@@ -105,7 +116,7 @@ class Perceptron:
         match engine:
             case "fused":
                 if dr.grad_enabled(self.layers, features):
-                    return dr.custom(_Fused, features, self.layers)
+                    return dr.custom(_Fused, features, self.layers, self.leak)
                 outputs = self._coopvec(features)  # there is nothing to keep
                 dr.eval(outputs)
                 return outputs
@@ -123,7 +134,7 @@ class Perceptron:
         kind = mi.TensorXf16 if self.half else mi.TensorXf
         x = kind(mi.TensorXf(mi.ArrayXf(features)))
         for weights, bias in self.layers[:-1]:
-            x = dr.maximum(kind(weights) @ x + kind(bias), 0)
+            x = _activated(kind(weights) @ x + kind(bias), self.leak)
         weights, bias = self.layers[-1]
         x = mi.TensorXf(kind(weights) @ x + kind(bias))
         width = x.shape[1]
@@ -135,7 +146,7 @@ class Perceptron:
         number = mi.Float16 if self.half else mi.Float
         x = nn.CoopVec([number(f) for f in features])
         for weights, bias in packed[:-1]:
-            x = dr.maximum(nn.matvec(weights, x, bias), 0)
+            x = _activated(nn.matvec(weights, x, bias), self.leak)
         weights, bias = packed[-1]
         return [mi.Float(y) for y in nn.matvec(weights, x, bias)]
 
@@ -148,12 +159,13 @@ class _Fused(dr.CustomOp):
     lanes), so that neither needs to be transposed.
     """
 
-    def eval(self, features, layers):
+    def eval(self, features, layers, leak):
+        self.leak = leak
         self.layers = [(nn.view(weights), nn.view(_flat(bias))) for weights, bias in layers]
         x = nn.CoopVec(features)
         self.inputs = [_to_rows(list(x))]
         for weights, bias in self.layers[:-1]:
-            x = dr.maximum(nn.matvec(weights, x, bias), 0)
+            x = _activated(nn.matvec(weights, x, bias), leak)
             self.inputs.append(_to_rows(list(x)))
         weights, bias = self.layers[-1]
         outputs = list(nn.matvec(weights, x, bias))
@@ -172,7 +184,9 @@ class _Fused(dr.CustomOp):
             gradient = list(nn.matvec(weights, nn.CoopVec(gradient), transpose=True))
             if number > 0:
                 active = [x > 0 for x in _from_rows(self.inputs[number])]
-                gradient = [dr.select(on, g, 0) for on, g in zip(active, gradient, strict=True)]
+                gradient = [
+                    dr.select(on, g, self.leak * g) for on, g in zip(active, gradient, strict=True)
+                ]
                 # One kernel a layer: a longer one would run out of registers.
                 dr.eval(kept, gradient)
         dr.eval(kept, gradient)
@@ -184,6 +198,11 @@ class _Fused(dr.CustomOp):
 
     def name(self):
         return "perceptron"
+
+
+def _activated(x: Any, leak: float) -> Any:
+    """Neurons of a layer, as a tensor or a cooperative vector."""
+    return dr.maximum(x, x * leak if leak else 0)
 
 
 def _flat(bias: mi.TensorXf) -> mi.TensorXf:

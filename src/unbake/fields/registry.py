@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import require_name
 from .settings import (
+    LEAK,
     BitmapConfig,
     DenseGridConfig,
     FieldSettings,
@@ -114,7 +115,7 @@ register_representation(
         "network",
         NetworkConfig(),
         make="unbake.fields.network:Network",
-        radiance=NetworkConfig(GridConfig(footprints=2.0)),
+        radiance=NetworkConfig(GridConfig(footprints=2.0), leak=LEAK),
         size="grid.table_log2",
     )
 )
@@ -144,7 +145,7 @@ register_representation(
         "tri-plane",
         TriPlaneConfig(),
         make="unbake.fields.triplane:TriPlane",
-        radiance=TriPlaneConfig(hidden=2),
+        radiance=TriPlaneConfig(hidden=2, leak=LEAK),
         size="base_resolution",
     )
 )

@@ -18,7 +18,12 @@ _FINEST = f"base_resolution * growth^(levels - 1) is 2^{FINEST} or less"
 RATES = (POSITIVE, 10.0)
 #: Sizes up to which the kernels of a step are compiled in a minute or two: 32 levels of three
 #: fields took 96 s on two cores, 64 layers 9 s and 512 neurons 12 s, 64 levels more than 200 s.
-_LEVELS, _WIDTH, _HIDDEN = (0, 32), (1, 1024), (1, 32)
+_LEVELS = (0, 32)
+_PERCEPTRON = {"width": (1, 1024), "hidden": (1, 32), "leak": (0, 1)}
+#: Slope of activations below zero that keeps L_θ learning everywhere: with rectified ones all
+#: neurons of a layer came to lie below zero in the brightest or darkest part of some rooms (3 to
+#: 26 % of what cameras saw), where the output then was a constant that no gradient moved.
+LEAK = 0.01
 
 
 class FieldSettings(Protocol):
@@ -118,9 +123,10 @@ class NetworkConfig:
     hidden: int = 2  #: number of hidden layers
     learning_rate: float = 0.01  #: Adam (Sec. 5.4: 5e-4)
     pieces: PieceConfig = field(default_factory=PieceConfig)
+    leak: float = 0.0  #: slope of activations below zero (ours)
 
     def __post_init__(self) -> None:
-        require_ranges(self, {"width": _WIDTH, "hidden": _HIDDEN, "learning_rate": RATES})
+        require_ranges(self, _PERCEPTRON | {"learning_rate": RATES})
 
     def numbers(self, outputs: int, extra: int = 0, materials: int = 1) -> int:
         """How many numbers are learned; see `SizedSettings`."""
@@ -173,11 +179,11 @@ class TriPlaneConfig:
     width: int = 32  #: neurons of a hidden layer
     hidden: int = 1  #: number of hidden layers
     learning_rate: float = 0.03  #: Adam
+    leak: float = 0.0  #: slope of activations below zero
 
     def __post_init__(self) -> None:
         sizes = {"levels": (1, 13), "base_resolution": (2, 8192)}
-        perceptron = {"width": _WIDTH, "hidden": _HIDDEN}
-        require_ranges(self, sizes | perceptron | {"learning_rate": RATES})
+        require_ranges(self, sizes | _PERCEPTRON | {"learning_rate": RATES})
         require(self.features in (2, 4, 8), "features", "2, 4 or 8", self.features)
         bound = "such that base_resolution * 2^(levels - 1) is 8192 or less"
         require(self.finest <= 8192, "levels", bound, self.levels)

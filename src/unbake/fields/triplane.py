@@ -44,7 +44,9 @@ class TriPlane(Field):
             plane.data = from_numpy(mi.Float, rng.uniform(-1e-4, 1e-4, plane.n_params))
             self.planes[name] = plane
         inputs = settings.levels * settings.features + spec.extra
-        self.perceptron = Perceptron(inputs, settings.width, settings.hidden, spec, rng)
+        self.perceptron = Perceptron(
+            inputs, settings.width, settings.hidden, spec, rng, leak=settings.leak
+        )
         self.prepare_recordable = can_record_layout()
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:

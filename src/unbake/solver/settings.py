@@ -8,7 +8,7 @@ from typing import Annotated
 from ..config.fit import DEEPEST
 from ..config.flag import Flag
 from ..errors import UserError, require_ranges
-from ..fields.settings import GridConfig, NetworkConfig
+from ..fields.settings import LEAK, GridConfig, NetworkConfig
 
 #: Samples of a pixel are all in flight at once; see `transport/render.py`.
 MOST_SAMPLES = 1 << 20
@@ -18,7 +18,7 @@ MOST_BOUNCES = 1 << 22
 
 def _network() -> NetworkConfig:
     """The network of L_θ; the sizes of its hash grid are chosen from the pictures."""
-    return NetworkConfig(grid=GridConfig(levels=0, table_log2=0))
+    return NetworkConfig(grid=GridConfig(levels=0, table_log2=0), leak=LEAK)
 
 
 @dataclass(frozen=True)

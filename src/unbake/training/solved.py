@@ -24,6 +24,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save_file
 
+from ..config.migration import as_before
 from ..config.tables import update
 from ..errors import UserError
 from ..fields.arrays import from_numpy
@@ -103,7 +104,7 @@ def read_solved(folder: Path | str) -> Solved:
         base = representation(form).radiance
         if base is None:
             raise ValueError(f"{form} cannot represent it")
-        settings = update(base, told["settings"])
+        settings = update(base, as_before(f"radiance.{form}") | told["settings"])
         geometry = [float(x) for x in told["geometry"]]
         centre = tuple(float(x) for x in told["domain"]["centre"])
         extent, scale = float(told["domain"]["extent"]), float(told["scale"])
