@@ -361,6 +361,15 @@ def test_fields_of_earlier_runs_do_not_leak():
     assert as_before("radiance.grid") == as_before("radiance") == {}
 
 
+def test_a_setting_that_is_no_more_is_passed_over_in_runs_alone():
+    text = to_toml(preset("cpu"))
+    assert "\n[camera]\n" in text
+    old = text.replace("\n[camera]\n", "\n[camera]\nsmoothness = 0.25\n")
+    assert from_toml(old) == from_toml(text)
+    with pytest.raises(UserError, match="smoothness"):
+        from_toml("[camera]\nsmoothness = 0.25\n")
+
+
 def test_a_file_without_a_format_may_have_keys_of_today():
     config = from_toml("learning_rate = 0.5\n[radiance.grid]\ncells = 9\nlearning_rate = 0.25\n")
     assert config.materials["albedo"]["neural"].learning_rate == 0.5

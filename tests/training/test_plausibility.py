@@ -11,11 +11,10 @@ from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config import update
 from unbake.dataset.views import Dataset
-from unbake.fields.camera import CameraModel
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training import plausibility
 from unbake.training.fresh_fit import begin_fit
-from unbake.training.plausibility import data_warnings, untold_response
+from unbake.training.plausibility import data_warnings
 from unbake.training.run_folder import RunFolder
 
 
@@ -112,14 +111,3 @@ def test_a_pixel_that_is_far_too_bright_is_told(times):
     assert line.startswith("1 pixel is over 10,000 times as bright as the others: ")
     assert "train_001 at (5, 3): 1e+08, taken as " in line
     assert np.isfinite(float(line.rsplit(" ", 1)[1]))
-
-
-def test_a_response_that_no_exposure_tells_is_doubted(cornell):
-    views = Dataset.load(cornell).train
-    differ = [replace(view, exposure=2.0**i) for i, view in enumerate(views)]
-    unknown = CameraModel(len(views), response=True)
-    assert "all photographs have about the same exposure" in untold_response(views, unknown)
-    assert untold_response(differ, unknown) is None
-    assert untold_response(views, CameraModel(len(views), response=True, exposure=True)) is None
-    assert untold_response(views, CameraModel(len(views), vignetting=True)) is None
-    assert untold_response(views, None) is None

@@ -74,10 +74,10 @@ def test_rates_of_the_unknowns_are_multiples_of_the_fields_own():
         assert scaled[name] == pytest.approx(factors.get(name, 1.0) * rate), name
 
 
-def test_vignetting_is_found_faster_than_exposures_and_responses_slower():
+def test_vignetting_is_found_faster_than_exposures_and_responses_stay():
     camera = CameraConfig("per-image", vignetting="radial", response="monotone")
     rates = learning_rates(changed(camera=camera), 9, 0.5)
-    assert rates["vignetting"] > rates["exposure"] > rates["response"] > 0
+    assert rates["vignetting"] > rates["exposure"] > rates["response"] == 0
 
 
 @pytest.mark.parametrize(

@@ -67,8 +67,7 @@ class CameraConfig:
         float,
         Flag("Uncertainty of what is refined: standard deviation of its corrections in pixels"),
     ] = 1.0
-    learning_rate: float = 0.005  #: Adam; of logs of gains and slopes, and of coefficients
-    smoothness: float = 1e-3  #: weight of differences along the response, and between its channels
+    learning_rate: float = 0.005  #: Adam; of logs of gains, and of coefficients
     pose_learning_rate: float = 0.05  #: Adam; of corrections of poses and intrinsics, in pixels
 
     def __post_init__(self) -> None:
@@ -76,7 +75,6 @@ class CameraConfig:
             self,
             {
                 "learning_rate": (0, 1e3),
-                "smoothness": (0, 1e6),
                 "pose_learning_rate": (0, 1e3),
                 "pose_sigma": (1e-3, 1e3),
             },
@@ -84,16 +82,16 @@ class CameraConfig:
 
     @property
     def unknowns(self) -> tuple[str, ...]:
-        """What is fitted, each with parameters of its own."""
+        """What is unknown, each with parameters of its own."""
         return self.of_light + self.of_places
 
     @property
     def of_light(self) -> tuple[str, ...]:
-        """What is fitted of how cameras turn light into photographs."""
+        """What is unknown of how cameras turn light into photographs."""
         names = ("exposure", "white_balance", "vignetting", "response")
         return tuple(name for name in names if getattr(self, name) != "known")
 
     @property
     def of_places(self) -> tuple[str, ...]:
-        """What is fitted of where cameras stood and looked."""
+        """What is unknown of where cameras stood and looked."""
         return tuple(name for name in ("poses", "intrinsics") if getattr(self, name) != "given")

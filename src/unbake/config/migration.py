@@ -53,6 +53,8 @@ _AS_BEFORE: dict[str, dict[str, Any]] = {
         "pieces.variation": False,
     },
 }
+#: Keys that are no more.
+_GONE = (("camera", "smoothness"),)
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
 _OF_RUN = {"preset", "unknown", "method", "seed", "steps", "seconds", "pixels", "spp"}
 
@@ -89,6 +91,9 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
             key = f"{outer}.{inner}".lstrip(".")
             if not _has(found, key):
                 _put(found, key, value, key)
+    for outer, key in _GONE if written else ():
+        if _has(found, f"{outer}.{key}"):
+            found[outer] = {k: v for k, v in found[outer].items() if k != key}
     return found
 
 

@@ -19,7 +19,8 @@ Photographs alone leave some of it open, which conventions decide:
   which is where cameras put a surface of 18 % (ISO 12232: code 118 of 255). Photographs have most
   of their pixels around there; where white is, 1, few of them say anything.
 - f is told by photographs of the same points with exposures that differ, and by next to nothing
-  else: with one exposure any f explains the photographs, each with another albedo.
+  else: with one exposure any f explains the photographs, each with another albedo. It is found
+  before the first step, and stays (`first_response.py`).
 - A power of f, of all exposures and of all radiance explains the same differences between
   photographs. What lights and geometry say of radiance decides the exponent; where they say
   little, the smoothness of f does, and that white stays close to white (`first_response.py`).
@@ -59,7 +60,7 @@ _UNIT = math.log(math.e - 1)
 class CameraModel:
     """The unknown exposures, white balance, vignetting and response of training views.
 
-    Before it is trained all is as the data set tells: every gain is 1, and f(P) = P.
+    Before it is begun or trained all is as the data set tells: every gain is 1, and f(P) = P.
 
     Args:
         views: number of training views.
@@ -172,30 +173,16 @@ class CameraModel:
             gain *= dr.maximum(falloff, _DARKEST)
         return gain
 
-    def exposed(self, photograph: mi.Color3f, *, learns: bool = True) -> mi.Color3f:
+    def exposed(self, photograph: mi.Color3f) -> mi.Color3f:
         """Photographs through f, linear RGB; the same where the response is known.
 
-        Args:
-            learns: whether f gets gradients; photographs do in any case.
+        Gradients arrive in photographs. f gets none: in steps noise of photographs and what is
+        still wrong of materials would move it.
         """
         if not self.has_response:
             return photograph
-        heights = self._heights() if learns else dr.detach(self._heights())
+        heights = dr.detach(self._heights())
         return mi.Color3f([self._inverse(photograph[i], heights, i) for i in range(3)])
-
-    def roughness_of_response(self) -> mi.Float:
-        """How uneven f is, and how different in its channels.
-
-        The mean squared difference between neighbouring pieces, of the logs of their slopes, and
-        that between each channel and the next, which may be unlike each other but seldom are.
-        """
-        logs = self._arrays["response.log"]
-        piece = dr.arange(mi.UInt32, 3 * (PIECES - 1))
-        index = piece // (PIECES - 1) * PIECES + piece % (PIECES - 1)
-        along = dr.mean(dr.square(read_small(logs, index + 1) - read_small(logs, index)))
-        lane = dr.arange(mi.UInt32, 3 * PIECES)
-        other = (lane + PIECES) % (3 * PIECES)
-        return along + dr.mean(dr.square(read_small(logs, other) - read_small(logs, lane)))
 
     def _relative(self, key: str, view: mi.UInt32, offset: int, stride: int) -> mi.Float:
         """Entries of views less that of the first view, which is the anchor."""
@@ -230,7 +217,7 @@ class CameraModel:
         low, high = read_small(heights, index), read_small(heights, index + 1)
         height = dr.fma(high - low, place - mi.Float(piece), low)
         first = PIECES * read_small(heights, dr.full(mi.UInt32, channel * (PIECES + 1) + 1))
-        slope = dr.power(dr.detach(first), GAMMA)
+        slope = dr.power(first, GAMMA)
         return dr.power(dr.maximum(height, 1e-6), GAMMA) + slope * dr.minimum(value, 0)
 
     # ----------------------------------------------------------------------------- as numbers

@@ -19,9 +19,9 @@ RATES = (POSITIVE, 10.0)
 #: Sizes up to which the kernels of a step are compiled in a minute or two: 32 levels of three
 #: fields took 96 s on two cores, 64 layers 9 s and 512 neurons 12 s, 64 levels more than 200 s.
 _LEVELS = (0, 32)
-_PERCEPTRON = {"width": (1, 1024), "hidden": (1, 32), "leak": (0, 1)}
+_PERCEPTRON = {"width": (1, 1024), "hidden": (1, 32), "leak": (0, 0.99)}
 #: Slope of activations below zero that keeps L_θ learning everywhere: with rectified ones all
-#: neurons of a layer came to lie below zero in the brightest or darkest part of some rooms (3 to
+#: neurons of a layer came to lie below zero in the brightest or darkest part of some rooms (1 to
 #: 26 % of what cameras saw), where the output then was a constant that no gradient moved.
 LEAK = 0.01
 

@@ -27,6 +27,11 @@ _FEWEST = 8
 _PRIOR = 0.1
 #: Pixels count where they are brighter than this part of the photograph's mean.
 _DARK = 0.01
+_UNTOLD = (
+    "the response of the camera is unknown, and no photographs of the same surfaces with exposures "
+    "that differ tell it: it is taken as known. Take photographs of several exposures, or leave "
+    "out --response"
+)
 
 
 @final
@@ -154,20 +159,25 @@ def first_gains(shared: SharedPoints) -> np.ndarray:
     return np.exp(_solved(shared.whole, known))
 
 
-def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> None:
+def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> str | None:
     """Let unknown exposures, white balances and responses begin where photographs say.
 
     Beside an unknown response, vignetting does so, too, if it is unknown.
+
+    Returns:
+        A line if a response is unknown that photographs do not tell. Each point of a surface has an
+        albedo of its own: photographs of one exposure are explained by any response, each with
+        another albedo; two photographs of a point with exposures that differ are not.
     """
     camera, views = problem.camera, dataset.train
     solves = Cameras(camera, views).solves
     if camera is None or not (solves or camera.has_response):
-        return
+        return None
     shared = shared_points(problem.scene_view.scene, views, pixels)
     gains = np.log(first_gains(shared)) if solves else np.zeros((len(views), 3))
     if not camera.has_response:
         camera.start(np.exp(gains))
-        return
+        return None
     # Green tells what all channels have in common. Where each photograph has gains of red and blue
     # of its own, these are told by any response of red and blue: all have that of green.
     told, balanced = np.log([view.exposure for view in views]), camera.white_balance == "per-image"
@@ -180,24 +190,31 @@ def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> No
         camera.start_vignetting(lambda radius2: np.exp(log_falloff(falloff, radius2)))
     if green.gains is not None:
         common = common + green.gains
+    gains = np.repeat((common - told)[:, None], 3, 1)
+    curve = green.curve
+    if curve is not None:
+        # With what is known now, photographs tell the response once more, and of each channel.
+        seen = shared.seen(told, gains + told[:, None], falloff)
+        if green.gains is not None or green.falloff is not None:
+            curve = _or(first_response(seen[1]).curve, curve)
+        channels = [curve] * 3
+        if not balanced:
+            channels[::2] = (_or(first_response(seen[i]).curve, curve) for i in (0, 2))
+        camera.start_response(np.stack(channels))
     if balanced:
-        camera.start_response(np.repeat(green.curve[None], 3, 0))
         exposure = told[shared.views][..., None]
         light = np.log(camera.light(np.exp(shared.logs + exposure))) - exposure
         light -= log_falloff(falloff, shared.radius2)[..., None]
         gains = np.log(first_gains(replace(shared, logs=light)))
         if camera.has_exposures:
             gains += (common - told - gains[:, 1])[:, None]
-    else:
-        gains = np.repeat((common - told)[:, None], 3, 1)
-        seen = shared.seen(told, gains + told[:, None], falloff)
-        same = green.gains is None and green.falloff is None
-        curves = [
-            green.curve if same and channel == 1 else first_response(seen[channel]).curve
-            for channel in range(3)
-        ]
-        camera.start_response(np.stack(curves))
     camera.start(np.exp(gains))
+    return None if curve is not None else _UNTOLD
+
+
+def _or(curve: np.ndarray | None, other: np.ndarray) -> np.ndarray:
+    """A curve, or another where photographs do not tell it."""
+    return other if curve is None else curve
 
 
 def _solved(whole: np.ndarray, known: Sequence[tuple[int, int, float, np.ndarray]]) -> np.ndarray:

@@ -67,12 +67,12 @@ class Told:
     """What photographs of the same points tell of their camera.
 
     Args:
-        curve: the response, as one of `CameraModel.curves`.
+        curve: the response, as one of `CameraModel.curves`; None: they do not tell it.
         gains: logs, over those that were told, by view, the first 0; None: they are known.
         falloff: a, b and c of log v = a r² + b r⁴ + c r⁶; None: it is known.
     """
 
-    curve: np.ndarray
+    curve: np.ndarray | None
     gains: np.ndarray | None = None
     falloff: np.ndarray | None = None
 
@@ -89,7 +89,8 @@ def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -
     what the mesh lacks are few of the photographs. Points weigh less the less their photographs
     agree, as those that shine. The noise is in u. The other way around, with g explained by u,
     noise would make curves too flat (regression dilution). Of values that are bounds only
-    deviations beyond them count. Where gains hardly differ, f(P) = P.
+    deviations beyond them count; where gains are known, points that any photograph shows clipped
+    are left out. Where gains hardly differ, photographs do not tell the response.
 
     Gains and exponent of the response explain the same: with gains unknown, it is the curve's
     smoothness, and white that stays white, that decides.
@@ -98,14 +99,13 @@ def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -
         views: how many there are, each with an unknown gain; 0: gains are known.
         vignetting: whether it is unknown.
     """
-    places = np.linspace(0, 1, PIECES + 1)
-    known = Told(places, np.zeros(views) if views else None, np.zeros(3) if vignetting else None)
-    seen = seen.some(_comparable(seen))
+    nothing = Told(None, np.zeros(views) if views else None, np.zeros(3) if vignetting else None)
+    seen = seen.some(_comparable(seen, clipped=views > 0))
     # Points are in the order of views.
     order = np.random.default_rng(0).permutation(seen.point.max(initial=-1) + 1)
     seen = seen.some(order[seen.point] < (_FEWER_POINTS if views else _POINTS))
     if (seen.bound == 0).sum() < _FEWEST:
-        return known
+        return nothing
     found = _Fit(seen, views, vignetting).solved()
     falloff = found[len(found) - _TERMS :] * GAMMA if vignetting else None
     gains = (found[_ENDS:][:views] - found[_ENDS]) * GAMMA if views else None
@@ -196,13 +196,22 @@ def _curve(deviation: np.ndarray) -> np.ndarray:
     return 0.5 * heights / heights[PIECES // 2]
 
 
-def _comparable(seen: SeenPoints) -> np.ndarray:
-    """Whether the point of a photograph is shown by others, with gains that differ."""
+def _comparable(seen: SeenPoints, *, clipped: bool) -> np.ndarray:
+    """Whether the point of a photograph is shown by others, with gains that differ.
+
+    Args:
+        clipped: whether some may be clipped there. Noise decides which are, and taken for bounds
+            they made curves of path traced rooms too low near white. But where gains are unknown,
+            they tell the exponent.
+    """
     count, told = seen.point.max(initial=-1) + 1, seen.bound == 0
     least, most = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(least, seen.point[told], seen.gains[told])
     np.maximum.at(most, seen.point[told], seen.gains[told])
-    return (most > least + _APART)[seen.point]
+    apart = most > least + _APART
+    if not clipped:
+        apart[seen.point[seen.bound == 1]] = False
+    return apart[seen.point]
 
 
 def log_falloff(terms: np.ndarray, radius2: np.ndarray) -> np.ndarray:

@@ -219,11 +219,13 @@ def _begin(
         _require_same_data(folder, before, origin)
         origin = dataclasses.replace(origin, warm_start=before.warm_start)
     problem = problem_of(dataset, config, origin.mean_radiance)
-    begin_cameras(problem, dataset, pixels)
+    untold = begin_cameras(problem, dataset, pixels)
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
     odd = [] if solved is None else start_radiance(problem, solved)
     doubts = data_warnings(dataset, pixels, problem, allow_doubtful=allow_doubtful)
+    if untold is not None and not resume:
+        doubts.append(untold)
     for warning in [*odd, *doubts]:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     if recovered is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,10 +11,9 @@ from ..dataset.hot_pixels import told_hot_pixels
 from ..dataset.pixels import PixelSource
 from ..dataset.poses import pose_warnings
 from ..dataset.quick_check import quick_findings
-from ..dataset.views import Dataset, View, check_cameras
+from ..dataset.views import Dataset, check_cameras
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..fields.camera import CameraModel
 from ..transport.render import RayGenerator, render_radiance
 from .problem import Problem
 
@@ -25,8 +22,6 @@ from .problem import Problem
 #: many reflections, there is less.
 FACTOR = 50.0
 _PIXELS, _SAMPLES, _DEPTH = 1024, 8, 8
-#: Stops by which exposures differ, at least, that tell a response.
-_SPREAD = 0.5
 _GREY = 0.5
 
 
@@ -62,10 +57,9 @@ def data_warnings(
         found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
         units = None if found else _other_units(pixels, problem)
     light = _placeholder(dataset, problem)
-    response = untold_response(dataset.train, problem.camera)
     hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
     noise = noise_at_black(pixels.photographs.noise)
-    told = (*found, units, light, response, hot_pixels, noise and str(noise))
+    told = (*found, units, light, hot_pixels, noise and str(noise))
     return [line for line in told if line]
 
 
@@ -76,29 +70,6 @@ def _placeholder(dataset: Dataset, problem: Problem) -> str | None:
     return (
         "the data set says that its light is unknown, and what stands for it in the scene is taken "
         "for the true light. Leave out --unknown, and lighting is recovered with the materials"
-    )
-
-
-def untold_response(views: Sequence[View], camera: CameraModel | None) -> str | None:
-    """A line if a response is unknown that no two exposures tell.
-
-    Each point of a surface has an albedo of its own. Photographs of one exposure are explained by
-    any response, each with another albedo; two photographs of a point with exposures that differ
-    are not.
-
-    Args:
-        views: the training views.
-        camera: what is unknown of their cameras.
-    """
-    if camera is None or not camera.has_response or camera.has_exposures:
-        return None
-    stops = np.log2([view.exposure for view in views])
-    if np.ptp(stops) >= _SPREAD:
-        return None
-    return (
-        "the response of the camera is unknown, and all photographs have about the same exposure: "
-        "they can be explained by any response, each with another albedo. Take photographs of "
-        "several exposures, or leave out --response"
     )
 
 

@@ -7,9 +7,9 @@ from ..config.fit import OWN_FINAL_RATE, OWN_WARM_UP
 
 #: Fraction of a fit over which the rates of what is unknown of cameras rise, as its square.
 _CAMERA_WAITS = 0.2
-#: Rates over that of exposures. Vignetting begins far from where it belongs. A response begins
-#: where photographs of several exposures say; what else a fit knows of it is mixed with albedo.
-_CAMERA = {"vignetting": 4.0, "response": 0.2}
+#: Rates over that of exposures. Vignetting begins far from where it belongs. A response is told by
+#: photographs of several exposures; what else a fit knows of it is mixed with albedo.
+_CAMERA = {"vignetting": 4.0, "response": 0.0}
 
 
 def learning_rates(config: FitConfig, step: int, done: float) -> dict[str, float]:

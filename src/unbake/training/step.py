@@ -555,10 +555,7 @@ class TrainingStep:
             subset = _subset(config, inputs)
             terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
             terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))
-            camera, poses = self._problem.camera, self._problem.poses
-            if camera is not None and camera.has_response and config.camera.smoothness:
-                value = camera.roughness_of_response()
-                terms["response_smoothness"] = config.camera.smoothness * value
+            poses = self._problem.poses
             if poses is not None:
                 sigma, count = config.camera.pose_sigma, self._pixels.photographs.count
                 terms["pose_prior"] = poses.prior(sigma, terms.get(PHOTOMETRIC), count)
@@ -635,15 +632,9 @@ class TrainingStep:
             assert inputs.told is not None
             # The response is of the photograph, before it was divided by its exposure.
             told = dr.gather(mi.Float, inputs.told, view)
-            if reference is None:
-                target = camera.exposed(target * told) / told
-            else:
-                # Where light is too bright by chance, so is its photograph. Curves that learned at
-                # that place would become too flat (regression dilution): they learn at the
-                # smoothed one, which has next to nothing of the pixel's noise.
-                smooth = camera.exposed(reference * told) / told
-                reference = dr.detach(smooth)
-                target = camera.exposed(target * told, learns=False) / told + (smooth - reference)
+            target = camera.exposed(target * told) / told
+            if reference is not None:
+                reference = dr.detach(camera.exposed(reference * told) / told)
         return target, reference, gain
 
 
