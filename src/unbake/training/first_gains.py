@@ -198,8 +198,8 @@ def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> st
         if green.gains is not None or green.falloff is not None:
             curve = _or(first_response(seen[1]).curve, curve)
         channels = [curve] * 3
-        if not balanced:
-            channels[::2] = (_or(first_response(seen[i]).curve, curve) for i in (0, 2))
+        for i in () if balanced else (0, 2):
+            channels[i] = _or(first_response(seen[i]).curve, curve)
         camera.start_response(np.stack(channels))
     if balanced:
         exposure = told[shared.views][..., None]
