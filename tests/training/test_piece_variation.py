@@ -24,11 +24,12 @@ from unbake.training.roughness_curves import (
     albedo_errors,
     in_range,
     of_roughness,
+    pieces_of,
     points,
     squared_errors,
 )
 from unbake.training.roughness_search import searched
-from unbake.training.seen_pieces import chances, outputs_of, values_of
+from unbake.training.seen_pieces import SeenPieces, chances, outputs_of, values_of
 
 VARIED = replace(SMALL, pieces=replace(SMALL.pieces, variation=True))
 
@@ -202,6 +203,62 @@ def test_an_albedo_that_photographs_show_to_differ_differs():
     found = expected_albedo(field, rows, np.full(len(rows), 0.33), SEARCH)
     np.testing.assert_allclose(np.array(found["variation"])[:2], 1, atol=0.02)
     np.testing.assert_allclose(albedo_at(field, found, rows), rows["albedo"], atol=0.01)
+
+
+def brightest(rows, values):
+    """The fifth of each piece's rows with the largest values."""
+    chosen = np.zeros(len(rows), bool)
+    for number in (0, 1):
+        own = rows["piece"] == number
+        chosen |= own & (values >= np.quantile(values[own], 0.8))
+    return chosen
+
+
+def test_an_albedo_whose_bright_parts_alone_are_told_stays():
+    rows = sampled()
+    field = albedo_field(rows)
+    told = rows[brightest(rows, rows["albedo"][:, 1])].copy()
+    told["weight"][:, [0, 2]] = 0  # green tells all
+    means = np.array([told["albedo"][told["piece"] == number].mean(0) for number in (0, 1)])
+    of_albedo(told, means[told["piece"]], 0.33)
+    roughness = np.full(len(told), 0.33)
+    alone = expected_albedo(field, told, roughness, SEARCH)
+    assert (np.array(alone["variation"])[:2] < 0.2).all()
+    found = expected_albedo(field, told, roughness, SEARCH, rows)
+    assert (np.array(found["variation"])[:2] > 0.7).all()
+    errors = [np.abs(albedo_at(field, x, rows) - rows["albedo"])[:, 1] for x in (found, alone)]
+    assert errors[0].mean() < 0.3 * errors[1].mean()
+
+
+def test_a_roughness_whose_high_parts_alone_are_told_stays():
+    rows, field = sampled(), varied_field()
+    before = roughness_at(field, {}, Curves.of(rows, 2, 6, albedo=True).point)
+    chosen = brightest(rows, before)
+    told = rows[chosen].copy()
+    means = np.array([before[chosen & (rows["piece"] == number)].mean() for number in (0, 1)])
+    photographed(told, means[told["piece"]])
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    alone, found = (
+        with_expected_variation(field, Curves.of(told, 2, 6, True, None, x), numbers, SEARCH)
+        for x in (None, rows)
+    )
+    assert (np.array(alone["variation"])[:2] < 0.3).all()
+    assert (np.array(found["variation"])[:2] > 0.6).all()
+
+
+def test_the_middle_of_a_piece_is_that_of_all_that_shows_it():
+    rows = sampled()
+    field = albedo_field(rows)
+    shown, told = rows[rows["piece"] == 0].copy(), rows[:200]
+    shown["piece"][::2] = 5  # which no pixel tells
+    of_rows = (points(told, albedo=False), pieces_of(told), {}, None)
+    found, own = (
+        SeenPieces(field, *of_rows, x).middles() for x in (points(shown, albedo=False), None)
+    )
+    wanted = outputs_of(albedo_at(field, {}, shown[1::2]).T).mean(1)
+    np.testing.assert_allclose(found[:, 0], wanted, rtol=1e-5)
+    np.testing.assert_allclose(found[:, 1], own[:, 1], rtol=1e-12)
+    assert np.abs(found[:, 0] - own[:, 0]).max() > 1e-3
 
 
 def test_another_search_of_albedo_goes_on_from_what_is_left():

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from searches import SEARCH, SMALL, made_up
-from support import MPIEXEC, TINY_FIT, built_in_cameras, needs_mpi, nothing_compiled
+from support import MPIEXEC, TINY_FIT, built_in_cameras, needs_mpi, nothing_compiled, randomised
 
 from unbake.config import FitConfig, preset, read_toml, to_toml
 from unbake.dataset.pixels import PixelBatch, PixelSource
@@ -22,13 +22,15 @@ from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
 from unbake.quantities import QUANTITIES
 from unbake.ranks import Ranks
-from unbake.training import loop
+from unbake.training import loop, roughness_search
+from unbake.training.piece_variation import expected_albedo
 from unbake.training.problem import make_problem
 from unbake.training.roughness_curves import (
     NODES,
     Curves,
     groups,
     losses_by_roughness,
+    points,
     precision,
 )
 from unbake.training.roughness_search import RoughnessSearch, descend
@@ -124,6 +126,26 @@ def test_nothing_is_compiled_for_another_draw_of_pixels(built_in):
     step.by_roughness(state, (3, 0), 64, 64, (0.4, 0.6))
     with nothing_compiled():
         step.by_roughness(state, (4, 1), 64, 64, (0.4, 0.6))
+
+
+def test_places_are_of_any_pixels(built_in, monkeypatch):
+    problem, pixels, step, state = started(built_in)
+    field = problem.materials["albedo"]
+    differing = randomised(field)  # from place to place
+    differing["grid"] *= 10
+    state.replace({f"albedo.{key}": x for key, x in differing.items()})
+    found = step.places(state, (1, 2), 4096)
+    # All of them show a material; not so many show one piece alone.
+    assert len(found) == 4096
+    monkeypatch.setattr(step, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
+    assert len(step.by_roughness(state, (1, 2), 256, 16, NODES)) < 0.8 * 256
+    values = np.array([np.array(x) for x in field.evaluate(points(found, albedo=False))])
+    assert values.std() > 0.01
+    np.testing.assert_allclose(found["albedo"], values.T, atol=1e-5)
+    again, other = (step.places(state, (1, seed), 4096) for seed in (2, 3))
+    assert np.array_equal(found, again) and not np.array_equal(found, other)
+    with nothing_compiled():
+        step.places(state, (4, 5), 4096)
 
 
 def test_products_of_pairs_have_no_noise_of_their_own(built_in):
@@ -282,7 +304,7 @@ def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
     assert moved == {"roughness.pieces.0", "roughness.colours"}
 
 
-def test_the_last_search_tells_how_much_albedo_varies(built_in):
+def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):
     defaults = FitConfig().materials
     pieces = {name: defaults[name]["neural"].pieces for name in ("albedo", "roughness")}
     fields = {name: {"neural": replace(SMALL, pieces=pieces[name])} for name in pieces}
@@ -296,8 +318,18 @@ def test_the_last_search_tells_how_much_albedo_varies(built_in):
     assert search.search_between(0.3, 0.5, state, 4)
     assert factors("albedo").tolist() == [1]
     assert factors("roughness").min() < 1
+    shown = []
+
+    def seen(*args):
+        shown.extend(args[4:])
+        return expected_albedo(*args)
+
+    monkeypatch.setattr(roughness_search, "expected_albedo", seen)
     assert search.search_between(0.7, 0.8, state, 8)
     assert 0.1 < factors("albedo").min() < 1
+    # As many as the pixels of the search, of which fewer show one piece alone.
+    pixels = SHARE * SETTINGS.samples_per_step * 8 / 0.8 / SETTINGS.roughness_search.spp
+    assert len(shown[0]) == pixels
 
 
 def test_fits_of_few_samples_do_not_search(built_in):
@@ -386,6 +418,7 @@ SHARED = """
 import numpy as np
 from unbake import backend
 backend.activate()
+from dataclasses import replace
 from searches import SEARCH, SMALL, made_up
 from unbake.training.roughness_curves import Curves
 from unbake.training.roughness_search import searched
@@ -395,10 +428,11 @@ from unbake.ranks import Ranks
 rows, found = made_up(noise=0.02)[:10_001], []
 rows["weight"] /= 0.02**2
 every = Curves.of(rows, 2, 6, True)
+varied = replace(SMALL, pieces=replace(SMALL.pieces, variation=True))
 for ranks in (Ranks(), Ranks.of_environment()):
-    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    field = Network(varied, FieldSpec(1, bounded=True, initial=0.4, seed=2))
     before = dict(field.parameters())
-    curves = Curves.of(rows, 2, 6, True, ranks)
+    curves = Curves.of(rows, 2, 6, True, ranks, rows[::3])
     assert curves.total == len(rows)
     assert abs(len(np.array(curves.losses)) - 8 * len(rows) / ranks.size) <= 8
     field.assign(before | searched(field, curves, SEARCH, 0.02, ranks))

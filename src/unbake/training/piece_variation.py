@@ -7,6 +7,9 @@ any larger part of what was found is as probable as any other. Errors of pixels 
 each part is afterwards. The mean over all parts has the least squared error, of outputs before
 their bounds.
 
+A piece varies about its mean over any pixels that show it. A search can use those alone that show
+nothing else, which of a leaf are its broad parts: towards their mean the whole leaf would go.
+
 What varies was fitted to the same photographs, noise included, albedo more so than roughness: so
 they ask for more than there is. What is taken away is that of which even they show nothing.
 """
@@ -45,8 +48,8 @@ def with_expected_variation(
     """
     if "variation" not in found:
         return found
-    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks)
-    (outputs,), about = seen.outputs, _means(seen)
+    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks, curves.shown)
+    (outputs,), about = seen.outputs, seen.middles()
     here = about[0, seen.piece_of]
     errors = (errors_of(curves, here + part * (outputs - here)) for part in PARTS)
     parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
@@ -64,12 +67,16 @@ def with_all_variation(field: Field, curves: Curves, ranks: Ranks | None = None)
     numbers = {key: field.parameters()[key] for key in field.shared()}
     if "variation" not in numbers:
         return numbers
-    seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks)
-    return numbers | seen.varied(_means(seen), np.ones(len(seen.pixels)))
+    seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks, curves.shown)
+    return numbers | seen.varied(seen.middles(), np.ones(len(seen.pixels)))
 
 
 def expected_albedo(
-    field: Field, rows: np.ndarray, roughness: np.ndarray, settings: RoughnessSearchConfig
+    field: Field,
+    rows: np.ndarray,
+    roughness: np.ndarray,
+    settings: RoughnessSearchConfig,
+    shown: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """Let each piece vary in its albedo as much as is to be expected of it, about its mean.
 
@@ -78,6 +85,7 @@ def expected_albedo(
         rows: of `row_type`, whose weights are inverse variances, from all ranks.
         roughness: of these pixels, shape (n,).
         settings: how probable one albedo is, and how many pixels tell as much as one.
+        shown: what any pixels show, of `PLACE`; None: the rows are all.
 
     Returns:
         The numbers and factors of pieces that change; none where pieces have no factors.
@@ -85,8 +93,9 @@ def expected_albedo(
     factors = field.parameters().get("variation")
     if factors is None:
         return {}
-    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {})
-    about = outputs_of(seen.means(values_of(seen.outputs)).T)
+    others = None if shown is None or not len(shown) else points(shown, albedo=False)
+    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {}, shown=others)
+    about = outputs_of(seen.middles(values_of))
     here = about[:, seen.piece_of]
     errors = (
         albedo_errors(rows, roughness, values_of(here + part * (seen.outputs - here)).T)
@@ -95,11 +104,6 @@ def expected_albedo(
     parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo, settings)
     present = np.array(factors)[np.array(seen.pieces.number)]
     return seen.varied(about, np.maximum(parts * present, PARTS[0]))
-
-
-def _means(seen: SeenPieces) -> np.ndarray:
-    """The means of outputs over pieces, shape (outputs, pieces)."""
-    return seen.means(seen.outputs).T
 
 
 def _expected(

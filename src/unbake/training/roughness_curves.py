@@ -41,6 +41,7 @@ class Curves:
         nodes: their logarithms.
         total: how many pixels all ranks have.
         pieces: of surface that pixels of any rank see, in the order of their numbers.
+        shown: points that any pixels of all ranks show; None: those with a curve are all.
     """
 
     point: SurfacePoint
@@ -49,10 +50,16 @@ class Curves:
     nodes: mi.Float
     total: int
     pieces: Piece
+    shown: SurfacePoint | None = None
 
     @staticmethod
     def of(
-        rows: np.ndarray, cells: int, colours: int, albedo: bool, ranks: Ranks | None = None
+        rows: np.ndarray,
+        cells: int,
+        colours: int,
+        albedo: bool,
+        ranks: Ranks | None = None,
+        shown: np.ndarray | None = None,
     ) -> Curves:
         """The curves of sampled pixels.
 
@@ -62,6 +69,7 @@ class Curves:
             colours: along each channel of albedo, the same.
             albedo: whether it is unknown.
             ranks: that have an equal part of the curves each; None: this one has them all.
+            shown: what any pixels of all ranks show, of `PLACE`; None: the rows are all.
         """
         ranks, total = ranks or Ranks(), len(rows)
         # A squared error is not below zero. What is far below has few samples of a sharp lobe.
@@ -72,7 +80,8 @@ class Curves:
         here = slice(ranks.rank, None, ranks.size)
         rows, losses, slopes = rows[here], losses[here], slopes[here]
         flat = [from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, np.log(NODES))]
-        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total, pieces)
+        others = None if shown is None or not len(shown) else points(shown, albedo)
+        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total, pieces, others)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
@@ -125,7 +134,7 @@ def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
     """Where pixels are seen.
 
     Args:
-        rows: of `row_type`.
+        rows: of `row_type`, or of `PLACE`.
         albedo: whether it is unknown, and so told.
     """
 

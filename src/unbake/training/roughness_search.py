@@ -37,7 +37,7 @@ from ..fields.arrays import from_numpy
 from ..fields.field import Field, holding
 from ..memory import lacks_memory
 from ..ranks import Ranks
-from ..transport.by_roughness import row_type
+from ..transport.by_roughness import PLACE, row_type
 from .gradients import flat_gradients, set_gradients
 from .piece_levels import with_expected_levels
 from .piece_variation import expected_albedo, with_all_variation, with_expected_variation
@@ -153,23 +153,26 @@ class RoughnessSearch:
         batches = -(-pixels // most)
         each = -(-pixels // batches)
         entropy = [self._config.seed, _SEED, number, self._ranks.rank]
-        words = np.random.SeedSequence(entropy).generate_state(2 * batches).tolist()
-        seeds = zip(words[::2], words[1::2], strict=True)
+        words = np.random.SeedSequence(entropy).generate_state(2 * batches + 2).tolist()
+        *seeds, of_places = zip(words[::2], words[1::2], strict=True)
 
         def sample() -> np.ndarray:
             parts = [
                 self._step.by_roughness(state, pair, each, search.spp, NODES) for pair in seeds
             ]
-            rows = np.concatenate(parts)
-            return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
+            return _as_bytes(np.concatenate(parts))
+
+        def look() -> np.ndarray:
+            return _as_bytes(self._step.places(state, of_places, min(pixels, _AT_ONCE)))
 
         rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
+        shown = self._ranks.joined(look).reshape(-1).view(PLACE)
         if len(rows):
             albedo = "albedo" in materials
             present = roughness_of(field, points(rows, albedo)).numpy()
             rows["weight"] *= precision(rows, present)
             ranks = self._ranks if len(rows) >= self._ranks.size else Ranks()
-            curves = Curves.of(rows, search.cells, search.colours, albedo, ranks)
+            curves = Curves.of(rows, search.cells, search.colours, albedo, ranks, shown)
             own = self._config.material_settings["roughness"].learning_rate
             found = searched(field, curves, search, search.rate * own, ranks)
             for key, x in found.items():
@@ -179,7 +182,7 @@ class RoughnessSearch:
             if last and search.pixels_as_one and albedo:
                 with holding(field, found):
                     now = roughness_of(field, points(rows, albedo)).numpy()
-                told = expected_albedo(materials["albedo"], rows, now, search)
+                told = expected_albedo(materials["albedo"], rows, now, search, shown)
                 changed |= {f"albedo.{key}": self._of_first(x) for key, x in told.items()}
             state.replace(changed)
         state.publish(self._problem)
@@ -191,6 +194,11 @@ class RoughnessSearch:
             return array
         found = from_numpy(mi.Float, self._ranks.as_first(array.numpy()))
         return mi.TensorXf(found, array.shape) if dr.is_tensor_v(array) else found
+
+
+def _as_bytes(rows: np.ndarray) -> np.ndarray:
+    """An array of some type as bytes, shape (n, bytes)."""
+    return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
 
 
 def searched(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import drjit as dr
@@ -31,6 +31,7 @@ class SeenPieces:
         pieces: that pixels of any rank see, in the order of their numbers.
         numbers: that points share, in the place of the field's.
         ranks: that have a part of the pixels each; None: there is one.
+        shown: points that any pixels of all ranks show; None: those of `point` are all.
     """
 
     def __init__(
@@ -40,23 +41,22 @@ class SeenPieces:
         pieces: Piece,
         numbers: dict[str, Any],
         ranks: Ranks | None = None,
+        shown: SurfacePoint | None = None,
     ) -> None:
         self._field, self._numbers, self._ranks = field, numbers, ranks or Ranks()
+        self._shown = shown
         assert point.piece is not None
-        with holding(field, numbers):
-            values = field.evaluate(point)
         #: Of the field at pixels, before their bounds, shape (outputs, n).
-        self.outputs = outputs_of(np.stack([np.array(x, float) for x in values]))
-        # The smallest pieces may share the last number of the field. It cannot stand for a level of
-        # all of them where it counts more for some than for others, and is left as it is.
-        most = field.most_pieces - 1
-        own, strengths = np.minimum(pieces.number, most), np.array(pieces.strength)
+        self.outputs = self._outputs_at(point)
+        # A number that pieces share cannot stand for a level of all of them where it counts more
+        # for some than for others, and is left as it is.
+        own, strengths = self._numbered(pieces), np.array(pieces.strength)
         present, first, of_own = np.unique(own, return_index=True, return_inverse=True)
         alike = np.bincount(of_own, strengths != strengths[first[of_own]]) == 0
         strengths = np.where(alike, strengths[first], 0)
         self.pieces = Piece(from_numpy(mi.UInt32, present), from_numpy(mi.Float, strengths))
         #: The piece of each pixel, from 0, shape (n,).
-        self.piece_of = np.searchsorted(present, np.minimum(point.piece.number, most))
+        self.piece_of = np.searchsorted(present, self._numbered(point.piece))
         #: The pixels of each piece, shape (pieces,).
         self.pixels = self.sums([np.ones(len(self.piece_of))])[:, 0]
 
@@ -69,6 +69,35 @@ class SeenPieces:
     def means(self, columns: Iterable[np.ndarray]) -> np.ndarray:
         """Means over the pixels of each piece; see `sums`."""
         return self.sums(columns) / self.pixels[:, None]
+
+    def middles(self, of: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
+        """Means over what photographs show of each piece, shape (outputs, pieces).
+
+        A piece of which `shown` has no point has the mean over its pixels.
+
+        Args:
+            of: what is to have the mean, of outputs of shape (outputs, n).
+        """
+        told = self.means(of(self.outputs))
+        if self._shown is None or self._shown.piece is None:
+            return told.T
+        present, number = np.array(self.pieces.number), self._numbered(self._shown.piece)
+        at = np.minimum(np.searchsorted(present, number), len(present) - 1)
+        known = present[at] == number
+        at, columns = at[known], of(self._outputs_at(self._shown))[:, known]
+        count = np.bincount(at, minlength=len(present))[:, None]
+        sums = np.stack([np.bincount(at, x, len(present)) for x in columns], 1)
+        return np.where(count > 0, sums / np.maximum(count, 1), told).T
+
+    def _numbered(self, pieces: Piece) -> np.ndarray:
+        """The numbers of the field that are of pieces: the smallest may share the last one."""
+        return np.minimum(pieces.number, self._field.most_pieces - 1)
+
+    def _outputs_at(self, point: SurfacePoint) -> np.ndarray:
+        """Outputs of the field before their bounds, shape (outputs, n)."""
+        with holding(self._field, self._numbers):
+            values = self._field.evaluate(point)
+        return outputs_of(np.stack([np.array(x, float) for x in values]))
 
     def raised(self, by: np.ndarray) -> dict[str, Any]:
         """See `Field.raised`; shape (pieces,)."""

@@ -25,7 +25,7 @@ from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..ranks import Ranks
-from ..transport.by_roughness import by_roughness, meet_one_piece, stratified
+from ..transport.by_roughness import PLACE, by_roughness, meet_one_piece, places, stratified
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
@@ -398,6 +398,28 @@ class TrainingStep:
             rows["weight"] = self._weight * np.array(weight).T[chosen]
             rows["gain"] = 1 if loss.gain is None else np.array(loss.gain).T[chosen]
         return rows[np.isfinite(rows.view(np.float32).reshape(len(rows), -1)).all(1)]
+
+    @carrying()
+    def places(self, state: State, seeds: Sequence[int], count: int) -> np.ndarray:
+        """What some random pixels show, those that `by_roughness` cannot tell included.
+
+        Args:
+            seeds: as of `by_roughness`.
+            count: of pixels, where processes have equally many each.
+
+        Returns:
+            Those that show a material, as an array of `by_roughness.PLACE`.
+        """
+        problem, sampler, count = self._problem, stratified(1), round(self._weight * count)
+        if not count:  # this process has no pixels
+            return np.zeros(0, PLACE)
+        of_pixels, of_samples = map(int, seeds)
+        with dr.suspend_grad():
+            state.publish(problem)
+            pixels = self._pixels.draw(of_pixels, count)
+            sampler.seed(dr.opaque(mi.UInt32, of_samples), count)
+            ray = pixels.batch(self._placed(self._inputs(0, 1)), sampler, 1).ray
+            return places(problem.scene_view, ray, sampler, hide_emitters=problem.hide_emitters)
 
     def _of_one_piece(self, inputs: Inputs, seed: int, count: int) -> PixelBatch:
         """Some random pixels that `by_roughness` can tell, as far as a few samples show.

@@ -32,12 +32,20 @@ from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_we
 _SHARP = 0.2
 
 
+#: What a pixel shows, told by its first sample.
+PLACE = [
+    ("position", "f4", 3),  # in the unit cube of fields
+    ("piece", "u4"),  # of surface, by number
+    ("strength", "f4"),  # of that piece
+    ("albedo", "f4", 3),  # as it is by now, linear RGB; zero where it is not unknown
+]
+
+
 def row_type(nodes: int) -> np.dtype:
     """A pixel as a function of roughness r and of a factor g of the albedo, S(r) + g · D(r).
 
     Products are means over all pairs of different sets of a pixel's samples (`stratified`): their
-    expectation is the product of the expected values. Where the pixel is seen is told by its first
-    sample.
+    expectation is the product of the expected values.
 
     Args:
         nodes: how many values of r there are.
@@ -45,10 +53,7 @@ def row_type(nodes: int) -> np.dtype:
     of_nodes = ("f4", (nodes, 3))
     return np.dtype(
         [
-            ("position", "f4", 3),  # in the unit cube of fields
-            ("piece", "u4"),  # of surface, by number
-            ("strength", "f4"),  # of that piece
-            ("albedo", "f4", 3),  # as it is by now, linear RGB; zero where it is not unknown
+            *PLACE,
             ("target", "f4", 3),  # the photograph as light, linear RGB radiance
             ("weight", "f4", 3),  # of squared errors
             ("gain", "f4", 3),  # by which light is multiplied before it is compared
@@ -117,20 +122,12 @@ def by_roughness(
 
     Paper: Eq. 1, Eq. 12.
     """
-    materials = scene_view.materials
-    assert materials is not None
     with dr.suspend_grad():
         x, point, piece = _met(scene_view, ray, sampler, hide_emitters=hide_emitters)
-        material = materials.evaluate_at(point)
-        albedo = mi.Color3f(material["albedo"]) if "albedo" in material else dr.zeros(mi.Color3f)
-        dr.eval(material, albedo, point.position, piece)
+        material = _material(scene_view, point)
         chosen = np.flatnonzero(_of_one_piece(scene_view, x, piece, spp))
         rows = np.zeros(len(chosen), row_type(len(nodes)))
-        lanes = chosen * spp
-        rows["piece"] = np.array(piece.number)[lanes]
-        rows["strength"] = np.array(piece.strength)[lanes]
-        rows["position"] = np.array(point.position).T[lanes]
-        rows["albedo"] = np.broadcast_to(np.array(albedo).T, (dr.width(x.valid), 3))[lanes]
+        _tell(rows, chosen * spp, point, piece, material)
         lights = _lights(scene_view, radiance, guide, x, material, sampler)
         for number, node in enumerate(nodes):
             r = dr.opaque(mi.Float, node)
@@ -162,6 +159,29 @@ def meet_one_piece(
         return _of_one_piece(scene_view, x, piece, spp)
 
 
+def places(
+    scene_view: SceneView, ray: mi.Ray3f, sampler: mi.Sampler, *, hide_emitters: bool
+) -> np.ndarray:
+    """What pixels show, also those that `by_roughness` cannot tell; within `carrying`.
+
+    Args:
+        scene_view, sampler, hide_emitters: as of `by_roughness`.
+        ray: camera rays, world space, one a pixel.
+
+    Returns:
+        An array of `PLACE`, of those that meet a surface of unknown material, and no light on the
+        way, and whose numbers are finite.
+    """
+    with dr.suspend_grad():
+        x, point, piece = _met(scene_view, ray, sampler, hide_emitters=hide_emitters)
+        material = _material(scene_view, point)
+        lanes = np.flatnonzero(np.array(_counted(scene_view, x)))
+        found = np.zeros(len(lanes), PLACE)
+        _tell(found, lanes, point, piece, material)
+    finite = [np.isfinite(found[name]).reshape(len(found), -1).all(1) for name in found.dtype.names]
+    return found[np.logical_and.reduce(finite)]
+
+
 def _met(
     scene_view: SceneView, ray: mi.Ray3f, sampler: mi.Sampler, *, hide_emitters: bool
 ) -> tuple[Vertex, SurfacePoint, Piece]:
@@ -173,10 +193,35 @@ def _met(
     return x, point, point.piece
 
 
+def _material(scene_view: SceneView, point: SurfacePoint) -> Material:
+    """What fields say of points, evaluated."""
+    assert scene_view.materials is not None
+    material = scene_view.materials.evaluate_at(point)
+    dr.eval(material, point.position, point.piece)
+    return material
+
+
+def _tell(
+    rows: np.ndarray, lanes: np.ndarray, point: SurfacePoint, piece: Piece, material: Material
+) -> None:
+    """Write what some lanes show, as of `PLACE`, one a row."""
+    rows["piece"] = np.array(piece.number)[lanes]
+    rows["strength"] = np.array(piece.strength)[lanes]
+    rows["position"] = np.array(point.position).T[lanes]
+    if "albedo" in material:
+        albedo = np.array(mi.Color3f(material["albedo"])).T
+        rows["albedo"] = np.broadcast_to(albedo, (dr.width(piece.number), 3))[lanes]
+
+
+def _counted(scene_view: SceneView, x: Vertex) -> mi.Bool:
+    """Whether vertices are on a surface of unknown material, and no light was met on the way."""
+    return x.valid & (dr.max(x.emitted) <= 0) & scene_view.is_optimized(x.si.shape)
+
+
 def _of_one_piece(scene_view: SceneView, x: Vertex, piece: Piece, spp: int) -> np.ndarray:
     """The same, where the vertices of the samples and their pieces are known."""
     first = dr.arange(mi.UInt32, dr.width(x.valid)) // spp * spp
-    counted = x.valid & (dr.max(x.emitted) <= 0) & scene_view.is_optimized(x.si.shape)
+    counted = _counted(scene_view, x)
     counted &= dr.gather(mi.UInt32, piece.number, first) == piece.number
     return np.logical_and.reduce(np.array(counted).reshape(-1, spp), axis=1)
 
