@@ -7,8 +7,9 @@ any larger part of what was found is as probable as any other. Errors of pixels 
 each part is afterwards. The mean over all parts has the least squared error, of outputs before
 their bounds.
 
-A piece varies about its mean over any pixels that show it. A search can use those alone that show
-nothing else, which of a leaf are its broad parts: towards their mean the whole leaf would go.
+A piece varies about its median over any pixels that show it. A search can use those alone that show
+nothing else, which of a leaf are its broad parts: towards their mean the whole leaf would go. What
+is astray at edges moves a mean, but no median.
 
 What varies was fitted to the same photographs, noise included, albedo more so than roughness: so
 they ask for more than there is. What is taken away is that of which even they show nothing.
@@ -26,7 +27,7 @@ from ..fields.field import Field
 from ..ranks import Ranks
 from .piece_levels import errors_of
 from .roughness_curves import Curves, albedo_errors, pieces_of, points
-from .seen_pieces import SeenPieces, chances, normalized, outputs_of, values_of
+from .seen_pieces import SeenPieces, chances, normalized, values_of
 
 #: Parts of the variation. Of the least one, which stands for none, all can be had back.
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
@@ -48,8 +49,8 @@ def with_expected_variation(
     """
     if "variation" not in found:
         return found
-    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks, curves.shown)
-    (outputs,), about = seen.outputs, seen.middles()
+    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks)
+    (outputs,), about = seen.outputs, seen.middles(curves.shown)
     here = about[0, seen.piece_of]
     errors = (errors_of(curves, here + part * (outputs - here)) for part in PARTS)
     parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
@@ -67,8 +68,8 @@ def with_all_variation(field: Field, curves: Curves, ranks: Ranks | None = None)
     numbers = {key: field.parameters()[key] for key in field.shared()}
     if "variation" not in numbers:
         return numbers
-    seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks, curves.shown)
-    return numbers | seen.varied(seen.middles(), np.ones(len(seen.pixels)))
+    seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks)
+    return numbers | seen.varied(seen.middles(curves.shown), np.ones(len(seen.pixels)))
 
 
 def expected_albedo(
@@ -78,14 +79,14 @@ def expected_albedo(
     settings: RoughnessSearchConfig,
     shown: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Let each piece vary in its albedo as much as is to be expected of it, about its mean.
+    """Let each piece vary in its albedo as much as is to be expected of it, about its median.
 
     Args:
         field: of albedo.
         rows: of `row_type`, whose weights are inverse variances, from all ranks.
         roughness: of these pixels, shape (n,).
         settings: how probable one albedo is, and how many pixels tell as much as one.
-        shown: what any pixels show, of `PLACE`; None: the rows are all.
+        shown: what any pixels show, of `PLACE`; None: that of the rows.
 
     Returns:
         The numbers and factors of pieces that change; none where pieces have no factors.
@@ -93,9 +94,8 @@ def expected_albedo(
     factors = field.parameters().get("variation")
     if factors is None:
         return {}
-    others = None if shown is None or not len(shown) else points(shown, albedo=False)
-    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {}, shown=others)
-    about = outputs_of(seen.middles(values_of))
+    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {})
+    about = seen.middles(points(rows if shown is None else shown, albedo=False))
     here = about[:, seen.piece_of]
     errors = (
         albedo_errors(rows, roughness, values_of(here + part * (seen.outputs - here)).T)

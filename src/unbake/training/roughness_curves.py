@@ -41,7 +41,7 @@ class Curves:
         nodes: their logarithms.
         total: how many pixels all ranks have.
         pieces: of surface that pixels of any rank see, in the order of their numbers.
-        shown: points that any pixels of all ranks show; None: those with a curve are all.
+        shown: what any pixels of all ranks show, whether they have a curve or not.
     """
 
     point: SurfacePoint
@@ -50,7 +50,7 @@ class Curves:
     nodes: mi.Float
     total: int
     pieces: Piece
-    shown: SurfacePoint | None = None
+    shown: SurfacePoint
 
     @staticmethod
     def of(
@@ -69,9 +69,9 @@ class Curves:
             colours: along each channel of albedo, the same.
             albedo: whether it is unknown.
             ranks: that have an equal part of the curves each; None: this one has them all.
-            shown: what any pixels of all ranks show, of `PLACE`; None: the rows are all.
+            shown: what any pixels of all ranks show, of `PLACE`; None: those of the rows.
         """
-        ranks, total = ranks or Ranks(), len(rows)
+        ranks, total, every = ranks or Ranks(), len(rows), rows if shown is None else shown
         # A squared error is not below zero. What is far below has few samples of a sharp lobe.
         losses = np.maximum(losses_by_roughness(rows, groups(rows, cells, colours)), _LEAST)
         piece = np.unique(rows["piece"], return_inverse=True)[1]
@@ -80,8 +80,8 @@ class Curves:
         here = slice(ranks.rank, None, ranks.size)
         rows, losses, slopes = rows[here], losses[here], slopes[here]
         flat = [from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, np.log(NODES))]
-        others = None if shown is None or not len(shown) else points(shown, albedo)
-        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total, pieces, others)
+        of_every = points(every, albedo)
+        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total, pieces, of_every)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""

@@ -168,6 +168,7 @@ class RoughnessSearch:
         rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
         shown = self._ranks.joined(look).reshape(-1).view(PLACE)
         if len(rows):
+            shown = shown if len(shown) else rows
             albedo = "albedo" in materials
             present = roughness_of(field, points(rows, albedo)).numpy()
             rows["weight"] *= precision(rows, present)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
@@ -31,7 +31,6 @@ class SeenPieces:
         pieces: that pixels of any rank see, in the order of their numbers.
         numbers: that points share, in the place of the field's.
         ranks: that have a part of the pixels each; None: there is one.
-        shown: points that any pixels of all ranks show; None: those of `point` are all.
     """
 
     def __init__(
@@ -41,10 +40,8 @@ class SeenPieces:
         pieces: Piece,
         numbers: dict[str, Any],
         ranks: Ranks | None = None,
-        shown: SurfacePoint | None = None,
     ) -> None:
         self._field, self._numbers, self._ranks = field, numbers, ranks or Ranks()
-        self._shown = shown
         assert point.piece is not None
         #: Of the field at pixels, before their bounds, shape (outputs, n).
         self.outputs = self._outputs_at(point)
@@ -70,24 +67,20 @@ class SeenPieces:
         """Means over the pixels of each piece; see `sums`."""
         return self.sums(columns) / self.pixels[:, None]
 
-    def middles(self, of: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
-        """Means over what photographs show of each piece, shape (outputs, pieces).
-
-        A piece of which `shown` has no point has the mean over its pixels.
+    def middles(self, shown: SurfacePoint) -> np.ndarray:
+        """Medians of outputs over what photographs show of each piece, shape (outputs, pieces).
 
         Args:
-            of: what is to have the mean, of outputs of shape (outputs, n).
+            shown: what any pixels of all ranks show. A piece that is not among them has the mean
+                over its pixels instead.
         """
-        told = self.means(of(self.outputs))
-        if self._shown is None or self._shown.piece is None:
-            return told.T
-        present, number = np.array(self.pieces.number), self._numbered(self._shown.piece)
+        assert shown.piece is not None
+        present, number = np.array(self.pieces.number), self._numbered(shown.piece)
         at = np.minimum(np.searchsorted(present, number), len(present) - 1)
         known = present[at] == number
-        at, columns = at[known], of(self._outputs_at(self._shown))[:, known]
-        count = np.bincount(at, minlength=len(present))[:, None]
-        sums = np.stack([np.bincount(at, x, len(present)) for x in columns], 1)
-        return np.where(count > 0, sums / np.maximum(count, 1), told).T
+        at, columns = at[known], self._outputs_at(shown)[:, known]
+        found = np.stack([_medians(column, at, len(present)) for column in columns])
+        return np.where(np.isnan(found), self.means(self.outputs).T, found)
 
     def _numbered(self, pieces: Piece) -> np.ndarray:
         """The numbers of the field that are of pieces: the smallest may share the last one."""
@@ -109,6 +102,16 @@ class SeenPieces:
         levels = [_of_field(level) for level in about]
         with holding(self._field, self._numbers):
             return self._field.varied(self.pieces, levels, _of_field(factor))
+
+
+def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """The median of values (n,) in each group, from 0; NaN where there is none."""
+    ordered = np.append(values[np.lexsort((values, group))], np.nan)
+    size = np.bincount(group, minlength=count)
+    end = np.cumsum(size)
+    low, high = end - size + (size - 1) // 2, end - size + size // 2
+    middle = (ordered[low] + ordered[high]) / 2
+    return np.where(size > 0, middle, np.nan)
 
 
 def _of_field(values: np.ndarray) -> mi.Float:

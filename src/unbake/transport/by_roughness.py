@@ -195,7 +195,7 @@ def _met(
 
 def _material(scene_view: SceneView, point: SurfacePoint) -> Material:
     """What fields say of points, evaluated."""
-    assert scene_view.materials is not None
+    assert scene_view.materials is not None and point.piece is not None
     material = scene_view.materials.evaluate_at(point)
     dr.eval(material, point.position, point.piece)
     return material

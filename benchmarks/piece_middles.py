@@ -1,0 +1,118 @@
+"""What searches take from the albedo of pieces, by what these vary about.
+
+    python benchmarks/piece_middles.py --runs RUN [RUN ...] [--pixels 32768] [--spp 64]
+        --out FILE.json
+
+A search can use those pixels alone that show a single piece of surface: of a leaf its broad parts.
+Each run is one without searches (`[roughness_search] times = 0`), from which nothing was taken. At
+its end the albedo of pieces is let vary as much as samples say, with roughness as it is: about the
+median over the pixels that can be used, and about that over any pixels, which is the default. Told
+are the albedo of the held-out views, PSNR in dB of linear RGB; the share of the variance within
+pieces that is kept, over all pixels of pieces that can be used; and by how much the two medians
+differ, linear RGB, root mean square over these.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "src"))
+os.environ["PYTHONPATH"] = str(ROOT / "src")
+
+from roughness_curves import opened  # noqa: E402
+from roughness_limits import AT_ONCE, means_of, told_of_runs  # noqa: E402
+
+from unbake.config import RoughnessSearchConfig  # noqa: E402
+
+
+def main() -> None:
+    """Let the albedo of every run vary less, and tell what is left of it."""
+    told_of_runs(__doc__.splitlines()[0], middles_of, 1 << 15, 64)
+
+
+def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
+    """What is left of a run's albedo, by the mean that pieces vary about.
+
+    Args:
+        pixels: how many are sampled; those that searches cannot use are left out.
+        spp: camera samples of each.
+    """
+    from unbake.training.piece_variation import expected_albedo
+    from unbake.training.problem import pixels_of
+    from unbake.training.roughness_curves import (
+        NODES,
+        pieces_of,
+        points,
+        precision,
+        roughness_of,
+    )
+    from unbake.training.seen_pieces import SeenPieces, values_of
+    from unbake.training.step import TrainingStep, without_garbage_collection
+    from unbake.training.validation import Score
+
+    run, steps = opened(folder)
+    if run.config.roughness_search.times:
+        raise SystemExit(f"{folder}: its searches have taken something already")
+    photographs = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
+    step = TrainingStep(run.problem, photographs, run.config)
+    each = min(pixels, AT_ONCE // spp)
+    with without_garbage_collection():
+        rows = np.concatenate(
+            [
+                step.by_roughness(run.state, (2 * number, 2 * number + 1), each, spp, NODES)
+                for number in range(-(-pixels // each))
+            ]
+        )
+        places = step.places(run.state, (1, 0), 4 * pixels)
+    roughness = roughness_of(run.problem.materials["roughness"], points(rows, albedo=True)).numpy()
+    rows["weight"] *= precision(rows, roughness)
+    field, shown = run.problem.materials["albedo"], points(places, albedo=False)
+    seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {})
+    by_rows, by_any = (values_of(seen.middles(points(x, albedo=False))) for x in (rows, places))
+    known = np.isin(places["piece"], rows["piece"])
+    piece = places["piece"][known]
+    # Of pieces that have a number of their own; a plant has fewer than there are.
+    number = np.searchsorted(np.unique(rows["piece"]), piece)
+    score = Score(run.problem, run.dataset.heldout)
+
+    def told(found: dict[str, Any]) -> dict[str, float]:
+        before = dict(run.state.phi.items())
+        run.state.replace({f"albedo.{key}": x for key, x in found.items()})
+        run.state.publish(run.problem)
+        values = np.array([np.array(x, float) for x in field.evaluate(shown)])[:, known]
+        variance = np.mean([np.square(x - means_of(x, piece)).mean() for x in values])
+        found = {"albedo_psnr": score.measure()["albedo_psnr"], "variance": float(variance)}
+        run.state.replace(before)
+        run.state.publish(run.problem)
+        return found
+
+    search = RoughnessSearchConfig()
+    variants = {
+        "as fitted": told({}),
+        "pixels that can be used": told(expected_albedo(field, rows, roughness, search)),
+        "any pixels": told(expected_albedo(field, rows, roughness, search, places)),
+    }
+    fitted = variants["as fitted"]["variance"]
+    for variant in variants.values():
+        variant["variance_kept"] = variant.pop("variance") / fitted
+    name = run.dataset.folder.name
+    print(name, variants, flush=True)
+    apart = (by_rows - by_any)[:, number]
+    return {
+        "data": name,
+        "steps": steps,
+        "pixels": len(rows),
+        "pieces": len(np.unique(rows["piece"])),
+        "medians_apart": float(np.sqrt(np.square(apart).mean())),
+        "variants": variants,
+    }
+
+
+if __name__ == "__main__":
+    main()
