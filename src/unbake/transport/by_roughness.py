@@ -178,8 +178,8 @@ def places(
         lanes = np.flatnonzero(np.array(_counted(scene_view, x)))
         found = np.zeros(len(lanes), PLACE)
         _tell(found, lanes, point, piece, material)
-    finite = [np.isfinite(found[name]).reshape(len(found), -1).all(1) for name in found.dtype.names]
-    return found[np.logical_and.reduce(finite)]
+    numbers = np.column_stack([found[name] for name in ("position", "strength", "albedo")])
+    return found[np.isfinite(numbers).all(1)]
 
 
 def _met(
