@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
-    """What is left of a run's albedo, by the mean that pieces vary about.
+    """What is left of a run's albedo, by the median that pieces vary about.
 
     Args:
         pixels: how many are sampled; those that searches cannot use are left out.
@@ -74,10 +74,10 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     rows["weight"] *= precision(rows, roughness)
     field, shown = run.problem.materials["albedo"], points(places, albedo=False)
     seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {})
-    by_rows, by_any = (values_of(seen.middles(points(x, albedo=False))) for x in (rows, places))
+    by_rows = values_of(seen.middles(points(rows, albedo=False)))
+    by_any = values_of(seen.middles(shown))
     known = np.isin(places["piece"], rows["piece"])
     piece = places["piece"][known]
-    # Of pieces that have a number of their own; a plant has fewer than there are.
     number = np.searchsorted(np.unique(rows["piece"]), piece)
     score = Score(run.problem, run.dataset.heldout)
 
@@ -87,10 +87,10 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         run.state.publish(run.problem)
         values = np.array([np.array(x, float) for x in field.evaluate(shown)])[:, known]
         variance = np.mean([np.square(x - means_of(x, piece)).mean() for x in values])
-        found = {"albedo_psnr": score.measure()["albedo_psnr"], "variance": float(variance)}
+        psnr = score.measure()["albedo_psnr"]
         run.state.replace(before)
         run.state.publish(run.problem)
-        return found
+        return {"albedo_psnr": psnr, "variance": float(variance)}
 
     search = RoughnessSearchConfig()
     variants = {
