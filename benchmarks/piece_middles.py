@@ -52,6 +52,7 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         precision,
         roughness_of,
     )
+    from unbake.training.search_samples import SearchSamples
     from unbake.training.seen_pieces import SeenPieces, values_of
     from unbake.training.step import TrainingStep, without_garbage_collection
     from unbake.training.validation import Score
@@ -60,16 +61,16 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     if run.config.roughness_search.times:
         raise SystemExit(f"{folder}: its searches have taken something already")
     photographs = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
-    step = TrainingStep(run.problem, photographs, run.config)
+    samples = SearchSamples(run.problem, TrainingStep(run.problem, photographs, run.config))
     each = min(pixels, AT_ONCE // spp)
     with without_garbage_collection():
         rows = np.concatenate(
             [
-                step.by_roughness(run.state, (2 * number, 2 * number + 1), each, spp, NODES)
+                samples.by_roughness(run.state, (2 * number, 2 * number + 1), each, spp, NODES)
                 for number in range(-(-pixels // each))
             ]
         )
-        places = step.places(run.state, (1, 0), 4 * pixels)
+        places = samples.places(run.state, (1, 0), 4 * pixels)
     roughness = roughness_of(run.problem.materials["roughness"], points(rows, albedo=True)).numpy()
     rows["weight"] *= precision(rows, roughness)
     field, shown = run.problem.materials["albedo"], points(places, albedo=False)

@@ -49,16 +49,17 @@ def main() -> None:
         losses_by_roughness,
         squared_errors,
     )
+    from unbake.training.search_samples import SearchSamples
     from unbake.training.step import TrainingStep
     from unbake.training.truth_fit import TrueMaps
 
     run, steps = opened(args.run)
     pixels = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
-    step = TrainingStep(run.problem, pixels, run.config)
+    samples = SearchSamples(run.problem, TrainingStep(run.problem, pixels, run.config))
     each = 2048
     rows = np.concatenate(
         [
-            step.by_roughness(run.state, (seed, seed), each, args.spp, NODES)
+            samples.by_roughness(run.state, (seed, seed), each, args.spp, NODES)
             for seed in range(-(-args.pixels // each))
         ]
     )

@@ -146,11 +146,12 @@ def sampled(
     """
     from unbake.training.problem import pixels_of
     from unbake.training.roughness_curves import NODES
+    from unbake.training.search_samples import SearchSamples
     from unbake.training.step import TrainingStep, without_garbage_collection
     from unbake.training.truth_fit import TrueMaps
 
     photographs = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
-    step = TrainingStep(run.problem, photographs, run.config)
+    samples = SearchSamples(run.problem, TrainingStep(run.problem, photographs, run.config))
     table = photographs.photographs.table[:, :3]
     maps = TrueMaps.load(run.dataset, ("roughness", "albedo"))
     truth = np.full((len(table), 4), np.nan, np.float32)
@@ -161,7 +162,7 @@ def sampled(
     def sample(number: int) -> list[np.ndarray]:
         with without_garbage_collection():
             found = [
-                step.by_roughness(run.state, (number, 2 * number + i), each, count, NODES)
+                samples.by_roughness(run.state, (number, 2 * number + i), each, count, NODES)
                 for i, count in enumerate(spps)
             ]
         kinds = [numbers_of(rows["target"], table) for rows in found]

@@ -35,6 +35,7 @@ from unbake.training.roughness_curves import (
 )
 from unbake.training.roughness_search import RoughnessSearch, descend
 from unbake.training.run_folder import RunFolder
+from unbake.training.search_samples import SearchSamples
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
 from unbake.transport.by_roughness import moments, row_type, stratified
@@ -65,12 +66,13 @@ def started(built_in, config=SETTINGS):
 def test_pixels_at_the_present_roughness_are_those_of_steps(built_in, guided):
     config = SETTINGS if guided else replace(SETTINGS, guide=replace(SETTINGS.guide, cells=0))
     problem, pixels, step, state = started(built_in, config)
+    samples = SearchSamples(problem, step)
     flat = {key: type(x)(x) * 0 for key, x in state.phi.items() if key == "roughness.grid"}
     state.replace(flat)  # a network without inputs: roughness is the same everywhere
     state.publish(problem)
     point = problem.materials.locate(dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False))
     value = float(problem.materials.evaluate_at(point)["roughness"][0])
-    rows = step.by_roughness(state, (3, 4), 512, 512, (value, 0.9))
+    rows = samples.by_roughness(state, (3, 4), 512, 512, (value, 0.9))
     number = np.round(rows["target"][:, 0] * pixels.photographs.count).astype(int) - 1
     one = {n: i for i, n in enumerate(number)}  # drawn with replacement: one of each pixel
     chosen = np.fromiter(one.values(), int)
@@ -114,44 +116,48 @@ def test_products_of_stratified_samples_are_without_bias():
 
 
 def test_pixels_are_drawn_that_show_one_piece(built_in, monkeypatch):
-    _, pixels, step, state = started(built_in)
-    chosen = len(step.by_roughness(state, (1, 2), 256, 16, NODES))
-    monkeypatch.setattr(step, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
-    drawn = len(step.by_roughness(state, (1, 2), 256, 16, NODES))
+    problem, pixels, step, state = started(built_in)
+    samples = SearchSamples(problem, step)
+    chosen = len(samples.by_roughness(state, (1, 2), 256, 16, NODES))
+    monkeypatch.setattr(samples, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
+    drawn = len(samples.by_roughness(state, (1, 2), 256, 16, NODES))
     assert drawn < 0.8 * chosen and chosen > 0.85 * 256
 
 
 def test_nothing_is_compiled_for_another_draw_of_pixels(built_in):
-    _, _, step, state = started(built_in)
-    step.by_roughness(state, (3, 0), 64, 64, (0.4, 0.6))
+    problem, _, step, state = started(built_in)
+    samples = SearchSamples(problem, step)
+    samples.by_roughness(state, (3, 0), 64, 64, (0.4, 0.6))
     with nothing_compiled():
-        step.by_roughness(state, (4, 1), 64, 64, (0.4, 0.6))
+        samples.by_roughness(state, (4, 1), 64, 64, (0.4, 0.6))
 
 
 def test_places_are_of_any_pixels(built_in, monkeypatch):
     problem, pixels, step, state = started(built_in)
+    samples = SearchSamples(problem, step)
     field = problem.materials["albedo"]
     differing = randomised(field)  # from place to place
     differing["grid"] *= 10
     state.replace({f"albedo.{key}": x for key, x in differing.items()})
-    found = step.places(state, (1, 2), 4096)
+    found = samples.places(state, (1, 2), 4096)
     # All of them show a material; not so many show one piece alone.
     assert len(found) == 4096
-    monkeypatch.setattr(step, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
-    assert len(step.by_roughness(state, (1, 2), 256, 16, NODES)) < 0.8 * 256
+    monkeypatch.setattr(samples, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
+    assert len(samples.by_roughness(state, (1, 2), 256, 16, NODES)) < 0.8 * 256
     values = np.array([np.array(x) for x in field.evaluate(points(found, albedo=False))])
     assert values.std() > 0.01
     np.testing.assert_allclose(found["albedo"], values.T, atol=1e-5)
-    again, other = (step.places(state, (1, seed), 4096) for seed in (2, 3))
+    again, other = (samples.places(state, (1, seed), 4096) for seed in (2, 3))
     assert np.array_equal(found, again) and not np.array_equal(found, other)
     with nothing_compiled():
-        step.places(state, (4, 5), 4096)
+        samples.places(state, (4, 5), 4096)
 
 
 def test_products_of_pairs_have_no_noise_of_their_own(built_in):
-    _, _, step, state = started(built_in)
-    many = step.by_roughness(state, (3, 0), 512, 256, (0.4,))
-    every = [step.by_roughness(state, (3, seed), 512, 2, (0.4,)) for seed in range(1, 13)]
+    problem, _, step, state = started(built_in)
+    samples = SearchSamples(problem, step)
+    many = samples.by_roughness(state, (3, 0), 512, 256, (0.4,))
+    every = [samples.by_roughness(state, (3, seed), 512, 2, (0.4,)) for seed in range(1, 13)]
     few = np.concatenate(every)
     few = few[np.isin(few["target"][:, 0], many["target"][:, 0])]  # the same pixels
     assert not np.array_equal(every[0]["coloured"][:50], every[1]["coloured"][:50])
@@ -164,8 +170,8 @@ def test_photographs_of_clipped_channels_do_not_count(built_in):
     _, pixels, *_ = started(built_in)
     clipped = replace(pixels, limits=np.array([0.25, 9.0], np.float32))
     problem = make_problem(built_in("cornell"), "visible", SETTINGS, 0.2)
-    step = TrainingStep(problem, clipped, SETTINGS)
-    rows = step.by_roughness(initial_state(problem), (3, 4), 512, 4, (0.4,))
+    samples = SearchSamples(problem, TrainingStep(problem, clipped, SETTINGS))
+    rows = samples.by_roughness(initial_state(problem), (3, 4), 512, 4, (0.4,))
     first = rows["target"][:, 0] <= 0.5
     over = first & (rows["target"][:, 0] >= 0.25)
     assert over.any() and (rows["weight"][over] == 0).all()

@@ -43,6 +43,7 @@ from .piece_levels import with_expected_levels
 from .piece_variation import expected_albedo, with_all_variation, with_expected_variation
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
+from .search_samples import SearchSamples
 from .state import State
 from .step import TrainingStep, without_garbage_collection
 
@@ -62,7 +63,7 @@ class RoughnessSearch:
     Args:
         problem: what is learned.
         config: of the fit.
-        step: of the same fit; samples pixels.
+        step: of the same fit.
         ranks: that sample an equal share each.
     """
 
@@ -70,6 +71,7 @@ class RoughnessSearch:
         self, problem: Problem, config: FitConfig, step: TrainingStep, ranks: Ranks
     ) -> None:
         self._problem, self._config, self._step, self._ranks = problem, config, step, ranks
+        self._samples = SearchSamples(problem, step)
         search, materials = config.roughness_search, problem.materials
         self._field = None
         if materials is not None and problem.radiance is not None:
@@ -158,12 +160,12 @@ class RoughnessSearch:
 
         def sample() -> np.ndarray:
             parts = [
-                self._step.by_roughness(state, pair, each, search.spp, NODES) for pair in seeds
+                self._samples.by_roughness(state, pair, each, search.spp, NODES) for pair in seeds
             ]
             return _as_bytes(np.concatenate(parts))
 
         def look() -> np.ndarray:
-            return _as_bytes(self._step.places(state, of_places, min(pixels, _AT_ONCE)))
+            return _as_bytes(self._samples.places(state, of_places, min(pixels, _AT_ONCE)))
 
         rows = self._ranks.joined(sample).reshape(-1).view(row_type(len(NODES)))
         shown = self._ranks.joined(look).reshape(-1).view(PLACE)

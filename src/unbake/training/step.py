@@ -25,7 +25,6 @@ from ..fields.camera import CameraModel
 from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..ranks import Ranks
-from ..transport.by_roughness import PLACE, by_roughness, meet_one_piece, places, stratified
 from ..transport.loss import RelativeL2, pixel_means
 from ..transport.methods import PHOTOMETRIC
 from ..transport.path_sample import SampleSubset
@@ -43,10 +42,6 @@ from .state import State
 _PLANNED_PATHS = 1 << 15
 #: The largest gradient whose square is finite in single precision, with some room.
 _LARGEST_GRADIENT = 1e18
-#: Camera samples that look whether a pixel shows one piece of surface.
-_LOOKS = 4
-#: How often pixels are drawn, at most, for those that do.
-_DRAWS = 16
 
 
 @dataclass
@@ -122,7 +117,7 @@ class TrainingStep:
         if problem.materials is not None:
             problem.materials.carried = True  # a run that was read back may stand alone
         self._problem = problem
-        self._pixels = pixels
+        self.pixels = pixels
         self._config = config
         self._path_sampler = make_sampler(_context(problem, config))
         self._told = None
@@ -207,7 +202,7 @@ class TrainingStep:
             return
         config, path_sampler = self._config, self._path_sampler
         with dr.suspend_grad(), path_sampler.prepared():
-            inputs = self._inputs(0, min(config.pixels, max(1, _PLANNED_PATHS // config.spp)))
+            inputs = self.inputs(0, min(config.pixels, max(1, _PLANNED_PATHS // config.spp)))
             state.publish(self._problem)
             inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
             batch = inputs.pixels.batch(self._rays(inputs), inputs.sampler, config.spp)
@@ -242,7 +237,7 @@ class TrainingStep:
         self.plan(state)
 
         def probe(pixels: int) -> None:
-            terms = self._gradients(self._inputs(0, pixels), state)
+            terms = self._gradients(self.inputs(0, pixels), state)
             for _, optimizer in state.optimizers():
                 dr.eval(terms, [dr.grad(value) for value in optimizer.values()])
                 dr.clear_grad(dict(optimizer.items()))
@@ -274,7 +269,7 @@ class TrainingStep:
 
     def loss_of_black(self) -> float:
         """About the photometric loss of black pictures."""
-        _, colours = self._pixels.draw(self._config.seed, _PLANNED_PATHS).read()
+        _, colours = self.pixels.draw(self._config.seed, _PLANNED_PATHS).read()
         target = colours[:, :3].astype(np.float64)
         smoothed = self._config.loss_reference == "smoothed"
         reference = colours[:, 3:] if smoothed else target
@@ -285,7 +280,7 @@ class TrainingStep:
     def replay(self, state: State, number: int) -> Replay:
         """A step taken apart, for a diagnosis; the state stays as it is."""
         self.plan(state)
-        inputs, config = self._inputs(number), self._config
+        inputs, config = self.inputs(number), self._config
         terms = self._gradients(inputs, state)
         gradients = {
             key: dr.grad(value)
@@ -353,99 +348,9 @@ class TrainingStep:
             dr.eval(halves)
         return halves
 
-    @carrying()
-    def by_roughness(
-        self, state: State, seeds: Sequence[int], count: int, spp: int, nodes: Sequence[float]
-    ) -> np.ndarray:
-        """Some random pixels as functions of the roughness of what they see.
-
-        Args:
-            seeds: the first decides pixels, the second their samples.
-            count: of pixels.
-            spp: camera samples of each.
-            nodes: values of roughness.
-
-        Returns:
-            Those of the pixels that can be told so, and whose numbers are finite, as rows of
-            `by_roughness.row_type`.
-        """
-        problem, sampler = self._problem, stratified(spp)
-        assert problem.radiance is not None
-        of_pixels, of_samples = map(int, seeds)
-        with dr.suspend_grad():
-            state.publish(problem)
-            inputs = self._inputs(0, 1)  # one pixel, which is not used
-            pixels = self._of_one_piece(inputs, of_pixels, count)
-            inputs = replace(inputs, pixels=pixels)
-            sampler.seed(dr.opaque(mi.UInt32, of_samples), count * spp)
-            placed = self._placed(inputs)
-            batch = pixels.batch(placed, sampler, spp)
-            target, loss, _ = self._compared(inputs, batch, placed)
-            weight = loss.weight(target) * (1 if loss.trust is None else loss.trust)
-            if batch.clipped is not None:
-                weight = dr.select(batch.clipped, 0, weight)
-            chosen, rows = by_roughness(
-                problem.scene_view,
-                problem.radiance,
-                problem.guide,
-                batch.ray,
-                sampler,
-                spp,
-                nodes,
-                hide_emitters=problem.hide_emitters,
-            )
-            rows["target"] = np.array(target).T[chosen]
-            rows["weight"] = self._weight * np.array(weight).T[chosen]
-            rows["gain"] = 1 if loss.gain is None else np.array(loss.gain).T[chosen]
-        return rows[np.isfinite(rows.view(np.float32).reshape(len(rows), -1)).all(1)]
-
-    @carrying()
-    def places(self, state: State, seeds: Sequence[int], count: int) -> np.ndarray:
-        """What some random pixels show, those that `by_roughness` cannot tell included.
-
-        Args:
-            seeds: as of `by_roughness`.
-            count: of pixels, where processes have equally many each.
-
-        Returns:
-            Those that show a material, as an array of `by_roughness.PLACE`.
-        """
-        problem, sampler, count = self._problem, stratified(1), round(self._weight * count)
-        if not count:  # this process has no pixels
-            return np.zeros(0, PLACE)
-        of_pixels, of_samples = map(int, seeds)
-        with dr.suspend_grad():
-            state.publish(problem)
-            pixels = self._pixels.draw(of_pixels, count)
-            sampler.seed(dr.opaque(mi.UInt32, of_samples), count)
-            ray = pixels.batch(self._placed(self._inputs(0, 1)), sampler, 1).ray
-            return places(problem.scene_view, ray, sampler, hide_emitters=problem.hide_emitters)
-
-    def _of_one_piece(self, inputs: Inputs, seed: int, count: int) -> PixelBatch:
-        """Some random pixels that `by_roughness` can tell, as far as a few samples show.
-
-        Where there are few of them in many draws, the others are any pixels.
-        """
-        problem, sampler, placed = self._problem, stratified(_LOOKS), self._placed(inputs)
-        seeds = np.random.SeedSequence(seed).generate_state(2 * _DRAWS).tolist()
-        found, last, left = [], np.zeros(0, np.int64), count
-        for of_pixels, of_samples in zip(seeds[::2], seeds[1::2], strict=True):
-            pixels = self._pixels.draw(of_pixels, count)
-            sampler.seed(dr.opaque(mi.UInt32, of_samples), count * _LOOKS)
-            ray = pixels.batch(placed, sampler, _LOOKS).ray
-            good = meet_one_piece(
-                problem.scene_view, ray, sampler, _LOOKS, hide_emitters=problem.hide_emitters
-            )
-            last = pixels.read()[0].astype(np.int64)
-            found.append(last[good][:left])
-            left -= len(found[-1])
-            if not left:
-                break
-        return self._pixels.of_numbers(np.concatenate([*found, last[:left]]))
-
     def place(self, pixel: int) -> tuple[int, int, int]:
         """The training view of a pixel, from 0, and its column and row in it."""
-        return self._pixels.place(pixel)
+        return self.pixels.place(pixel)
 
     @property
     def recordable(self) -> bool:
@@ -462,7 +367,7 @@ class TrainingStep:
     def unfrozen(self, state: State, number: int) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
         self.plan(state)
-        return self._step(self._inputs(number), state)
+        return self._step(self.inputs(number), state)
 
     def gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float | mi.TensorXf]:
         """The gradients of the unknowns φ, by name, without a step: for measurements.
@@ -481,16 +386,21 @@ class TrainingStep:
     def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:
         """The part of a replayed step that runs in Python."""
         state.set_learning_rates(rates)
-        return self._inputs(number)
+        return self.inputs(number)
 
-    def _inputs(self, number: int, probe: int | None = None) -> Inputs:
-        """The inputs of a step, or of so many pixels of all views, which stand for one."""
+    def inputs(self, number: int, probe: int | None = None) -> Inputs:
+        """The inputs of a step.
+
+        Args:
+            number: of the step.
+            probe: how many pixels of all views stand for its batch, where another one is wanted.
+        """
         entropy = [self._config.seed, number]
         entropy += [self._ranks.rank] if self._ranks.rank else []
         seeds = np.random.SeedSequence(entropy).generate_state(2)
         return Inputs(
             scene=self._problem.scene_view.scene,
-            rays=self._pixels.rays,
+            rays=self.pixels.rays,
             pixels=self._drawn(int(seeds[0]), probe),
             sampler=self._sampler,
             second=self._second,
@@ -503,8 +413,8 @@ class TrainingStep:
 
     def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
         if probe is None and self._config.pixel_sampling == "one-view-crop":
-            return self._pixels.draw_crop(seed, self._config.pixels)
-        return self._pixels.draw(seed, probe or self._config.pixels)
+            return self.pixels.draw_crop(seed, self._config.pixels)
+        return self.pixels.draw(seed, probe or self._config.pixels)
 
     def _shared_step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         """The same step on all ranks, with the mean of their gradients."""
@@ -563,7 +473,7 @@ class TrainingStep:
         scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
         state.publish(self._problem)
         sampler.seed(inputs.seed, pixels.count * config.spp)
-        placed = self._placed(inputs)
+        placed = self.placed(inputs)
         rays = inputs.rays if self._problem.poses is None else dr.detach(placed)
         batch = pixels.batch(rays, sampler, config.spp)
         with path_sampler.prepared():
@@ -573,13 +483,13 @@ class TrainingStep:
                     again = pixels.batch(rays, sampler, config.spp)
                     image = path_sampler.image(scene, again.ray, sampler)
                     primal = pixel_means(image, config.spp)
-            target, loss, roots = self._compared(inputs, batch, placed)
+            target, loss, roots = self.compared(inputs, batch, placed)
             subset = _subset(config, inputs)
             terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
             terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))
             poses = self._problem.poses
             if poses is not None:
-                sigma, count = config.camera.pose_sigma, self._pixels.photographs.count
+                sigma, count = config.camera.pose_sigma, self.pixels.photographs.count
                 terms["pose_prior"] = poses.prior(sigma, terms.get(PHOTOMETRIC), count)
             outliers = self._problem.outliers
             if outliers is not None and roots is not None and PHOTOMETRIC in terms:
@@ -588,7 +498,7 @@ class TrainingStep:
             dr.backward(total if state.scale is None else total * state.scale)
         return terms
 
-    def _compared(
+    def compared(
         self, inputs: Inputs, batch: RayBatch, placed: CameraRays
     ) -> tuple[mi.Color3f, RelativeL2, mi.Float | None]:
         """What pixels are compared with, by what is known of the cameras by now, and how.
@@ -632,10 +542,10 @@ class TrainingStep:
 
     def _rays(self, inputs: Inputs) -> CameraRays:
         """The camera rays, by what is known of the cameras by now."""
-        return dr.detach(self._placed(inputs))
+        return dr.detach(self.placed(inputs))
 
-    def _placed(self, inputs: Inputs) -> CameraRays:
-        """The same, which pass gradients to corrections of poses."""
+    def placed(self, inputs: Inputs) -> CameraRays:
+        """The same, which pass gradients to corrections of poses where there are any."""
         poses, units = self._problem.poses, inputs.units
         return inputs.rays if poses is None else poses.placed(inputs.rays, units)
 
