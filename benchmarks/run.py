@@ -2,11 +2,11 @@
 
     python benchmarks/run.py [JOB ...] [--plan] [--scale smoke]
 
-Jobs: machine steps demo rivals equal long ablation lighting emission sparse prior rates rates-check
-(default: all; hours). What `rates` finds changes the other jobs when it is in `METHOD_DEFAULTS`.
-STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names its data set
-(docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept in --out, so
-that the same command continues what was stopped. Results go to --results; `python
+Jobs: machine steps demo rivals equal long staircase ablation lighting emission sparse prior rates
+rates-check (default: all; hours). What `rates` finds changes the other jobs when it is in
+`METHOD_DEFAULTS`. STAIRCASE takes part where --staircase, or STAIRCASE of the environment, names
+its data set (docs/staircase.md says how to make it). Data sets, runs and records of jobs are kept
+in --out, so that the same command continues what was stopped. Results go to --results; `python
 benchmarks/tables.py` prints them as tables. Methods are compared over three seeds, over two at
 equal time: results have the mean of a number, and its sample standard deviation as NUMBER_sd.
 """
@@ -182,7 +182,6 @@ class Rates:
 Benchmark = Compare | EqualSamples | Steps | Machine | Rates
 
 NO_SCORES = ("--score-seconds", 0)
-COARSE_RENDERING = ("--evaluate-spp", 16)
 ABLATION = (
     "direct", "with-prior", "with-biased-prior", "with-stop-gradient", "with-second-bounce", "ours",
     "no-prior",
@@ -195,7 +194,7 @@ STEP_METHODS = (
 #: Whether PRB and AD-PT take two passes by default in rooms. The other estimator, the best one of
 #: one pass otherwise, has rows of its own.
 _TWO_PASSES = method_defaults.method_defaults("prb", "room").estimator == "two-pass"
-ROOM_RIVALS = (
+RIVALS = (
     "ours",
     "prb",
     f"prb:neural:{'all-pairs' if _TWO_PASSES else 'two-pass'}",
@@ -203,8 +202,8 @@ ROOM_RIVALS = (
     f"ad-pt:neural:{'split-halves' if _TWO_PASSES else 'two-pass'}",
     "direct",
     "no-prior",
+    "prb:bitmap",
 )
-RIVALS = (*ROOM_RIVALS, "prb:bitmap")
 
 #: By the name of the file of results; that of `machine` is named after the machine.
 BENCHMARKS: dict[str, Benchmark] = {
@@ -220,7 +219,6 @@ BENCHMARKS: dict[str, Benchmark] = {
         ),
     ),
     "methods-demo": Steps("steps", "demo", STEP_METHODS),
-    "methods-staircase": Steps("steps", STAIRCASE, STEP_METHODS),
     # What `make demo` fits; and the true materials rendered alike, whose error is noise alone.
     "demo": Compare(
         "demo", "demo", ("ours", "direct"), steps=2400, seeds=(0,),
@@ -228,15 +226,12 @@ BENCHMARKS: dict[str, Benchmark] = {
     ),
     # Equal time, and equal samples.
     "rivals-demo": Compare("rivals", "demo", RIVALS, seconds=60, seeds=SEEDS_AT_TIME),
-    "rivals-staircase": Compare(
-        "rivals", STAIRCASE, ROOM_RIVALS, seconds=120, seeds=SEEDS_AT_TIME,
-        options=COARSE_RENDERING,
-    ),
     "equal-demo": EqualSamples("equal", ("ours", "no-prior", "direct"), "rivals-demo", "prb"),
     # What PRB has after 20 minutes; `rivals` shows when ours has it.
     "long-demo": Compare("long", "demo", ("prb",), seconds=1200, seeds=(0,)),
-    "long-staircase": Compare(
-        "long", STAIRCASE, ("prb",), seconds=1200, seeds=(0,), options=COARSE_RENDERING,
+    "staircase": Compare(
+        "staircase", STAIRCASE, ("ours", "prb", "direct"), seconds=120,
+        options=("--evaluate-spp", 16),
     ),
     "ablation-materials": Compare("ablation", "demo", ABLATION, steps=2400, options=NO_SCORES),
     "ablation-lighting": Compare(
@@ -425,6 +420,7 @@ def plan_machine(bench: Bench, benchmark: Machine) -> Planned:
     jobs, files = [], []
     for method, data, settings, steps in benchmark.cases:
         if not bench.has(data):
+            print(f"STAIRCASE is not set: its {method} is left out", flush=True)
             continue
         label = f"step-{data}-{method.replace(':', '-')}"
         files.append(bench.work / "steps" / f"{label}.json")

@@ -10,9 +10,8 @@ import csv
 import math
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -118,15 +117,13 @@ class Facts:
         spread = math.hypot(*(row.get(f"{key}_sd") or 0.0 for row in (first, second)))
         return above(difference, spread)
 
-    def versus(self, *names: str) -> str:
-        """What ours is ahead of each rival in comparisons; blank where one lacks the rival."""
-        rivals = {n: [r for r in self.known(n) if r not in ("ours", "untrained")] for n in names}
-        return side_by_side("`ours` against", rivals, lambda n, r, q: self.gap(n, "ours", r, q))
-
-    def scores(self, *names: str) -> str:
-        """What all methods have in comparisons, after the untrained fields."""
-        known = {name: self.known(name) for name in names}
-        return side_by_side("", known, lambda n, run, q: plus_minus(known[n][run], KEYS[q]) or "")
+    def versus(self, name: str) -> str:
+        """How far ours is above each rival of a comparison, as a table."""
+        rivals = [rival for rival in self.known(name) if rival not in ("ours", "untrained")]
+        rows = [
+            [f"`{rival}`", *(self.gap(name, "ours", rival, q) for q in KEYS)] for rival in rivals
+        ]
+        return markdown(["`ours` against", *KEYS], rows)
 
     def known(self, name: str) -> dict[str, Row]:
         """The rows of a comparison that did not fail, after that of the untrained fields."""
@@ -371,20 +368,40 @@ class Facts:
         found = {m: self.where(experiment, scene=scene, method=m)[key] for m in trained}
         return max(found, key=lambda method: found[method])
 
-    def published_is_smaller(self, experiment: str, method: str) -> bool:
-        """Whether a method's published multiple of ours is below its own in every scene."""
+    def published_is_smaller(self, experiment: str, method: str) -> list[bool]:
+        """Of each published scene, whether a method's multiple of ours is smaller there."""
         rows = [row for row in self.rows(experiment) if row["method"] == method]
         pairs = [(row.get("published_times_ours"), row["times_ours"]) for row in rows]
-        return all(published < own for published, own in pairs if published is not None)
+        return [published < own for published, own in pairs if published is not None]
+
+    def fastest_by_scene(self, experiment: str, *methods: str) -> list[Row]:
+        """`fastest` of these methods in each scene, those that are nearest to ours first."""
+        found = [self.fastest(experiment, *methods, scene=s) for s in self.by_scene(experiment)]
+        return sorted(found, key=lambda row: row["times_ours"])
+
+    def as_fast_as_ours(self, experiment: str) -> list[Row]:
+        """The records of methods that follow paths, and whose step takes no longer than ours."""
+        return [
+            row
+            for row in self.rows(experiment)
+            if row["method"].startswith(("PRB", "AD-PT")) and round(row["times_ours"], 2) <= 1
+        ]
 
     def experiments_machine(self) -> str:
-        """The one machine of all experiments, in words."""
+        """What the machines of all experiments have in common, in words: not their processors."""
         found = {
             f"{file.parent.name}-{i}": machine
             for file in sorted(self.kept.glob("*/about.json"))
             for i, machine in enumerate(self.about(file.parent.name)["machines"])
         }
-        return machine_words(found)
+        require_same(found, ("cores", "variant", "mitsuba"))
+        machine = next(iter(found.values()))
+        return f"{cores_of(machine)}, `{machine['variant']}`, Mitsuba {machine['mitsuba']}"
+
+    def processors(self, experiment: str) -> str:
+        """The processors that an experiment ran on."""
+        machines = self.about(experiment)["machines"]
+        return ", ".join(dict.fromkeys(machine["processor"] for machine in machines))
 
 
 # ---------------------------------------------------------------------------- How they are printed
@@ -439,13 +456,23 @@ def made_by(name: str) -> str:
 
 def machine_words(found: Mapping[str, Row]) -> str:
     """A machine in words, the same for all results."""
+    require_same(found, ("processor", "cores", "variant", "mitsuba"))
+    first = next(iter(found.values()))
+    software = f"`{first['variant']}`, Mitsuba {first['mitsuba']}"
+    return f"{cores_of(first)} of an {first['processor']}, {software}"
+
+
+def require_same(found: Mapping[str, Row], keys: Sequence[str]) -> None:
+    """Refuse machines that differ in one of these keys."""
     first_name, first = next(iter(found.items()))
-    keys = ("processor", "cores", "variant", "mitsuba")
     for name, machine in found.items():
         if any(machine[key] != first[key] for key in keys):
             raise Unfounded(f"a page mixes machines: {first_name}: {first}; {name}: {machine}")
-    cores = {1: "one core", 2: "two cores"}.get(first["cores"], f"{first['cores']} cores")
-    return f"{cores} of an {first['processor']}, `{first['variant']}`, Mitsuba {first['mitsuba']}"
+
+
+def cores_of(machine: Row) -> str:
+    """The number of cores of a machine, in words."""
+    return {1: "one core", 2: "two cores"}.get(machine["cores"], f"{machine['cores']} cores")
 
 
 def number_or_text(text: str) -> float | str | None:
@@ -453,24 +480,6 @@ def number_or_text(text: str) -> float | str | None:
     if not text:
         return None
     return float(text) if _NUMBER.fullmatch(text) else text
-
-
-def side_by_side(
-    title: str, runs: Mapping[str, Collection[str]], cell: Callable[[str, str, str], str]
-) -> str:
-    """A table of the comparisons of the demo and of STAIRCASE, with two columns a quantity.
-
-    Args:
-        title: of the first column, the names of runs.
-        runs: by the name of the comparison.
-        cell: what is told of a comparison, a run and a quantity.
-    """
-    titles = [f"{q}, {scene}" for q in KEYS for scene in ("demo", "STAIRCASE")]
-    rows = [
-        [f"`{run}`", *(cell(n, run, q) if run in runs[n] else "" for q in KEYS for n in runs)]
-        for run in dict.fromkeys(chain.from_iterable(runs.values()))
-    ]
-    return markdown([title, *titles], rows)
 
 
 def above(difference: float, spread: float = 0.0, digits: int = 1) -> str:

@@ -6,7 +6,7 @@
 
 The last one first takes over what `unbake reproduce` wrote: tables, data, pictures and the scenes'
 licences go to docs/reproduction. The template of a page lies beside it, as `PAGE.jinja`;
-`scripts/facts.py` has what templates call.
+`docs/macros.jinja` has what several of them tell alike, `scripts/facts.py` what they call.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ def render(template: Path, facts: Facts) -> str:
     from unbake.experiments.scenes import SCENES
 
     environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
+        loader=jinja2.FileSystemLoader(ROOT / "docs"),
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+        trim_blocks=True,
     )
     environment.filters |= FILTERS
     scenes = {scene.folder: scene.label for scene in SCENES}
