@@ -199,7 +199,7 @@ def test_whether_a_fit_was_still_improving_is_told(made, tmp_path: Path):
     lines = [{"step": s, "seconds": 1.0 * s, "held_aside": 1 / s} for s in (50, 100, 150, 200)]
     log.write_text("".join(json.dumps(line) + "\n" for line in lines))
     text = write_report(made[1], tmp_path / "report.html").read_text()
-    told = "still improving (the error on held-aside pixels fell by 3.1 % over the last 25 % of"
+    told = "still improving (the error on held-aside pixels fell by 3.1 ± 0.4 % over the last 25 %"
     assert text.count(told) == 1
     assert "<title>Photometric loss, held-aside pixels over" in text
 

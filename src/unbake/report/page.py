@@ -383,11 +383,13 @@ def _details(run: Run) -> list[tuple[str, str, str]]:
 def _trend(run: Run) -> list[str]:
     """Whether the fit was still improving, by the error on pixels that it did not learn from."""
     found = run.metrics.get("convergence") or {}
-    change, share = (display.number(found.get(key)) for key in ("change", "share"))
+    keys = ("change", "share", "noise")
+    change, share, noise = (display.number(found.get(key)) for key in keys)
     word = {"improving": "still improving", "plateau": "at a plateau", "rising": "getting worse"}
     if change is None or share is None or found.get("trend") not in word:
         return []
-    moved = f"{'rose' if change > 0 else 'fell'} by {100 * abs(change):.1f} %"
+    spread = "" if noise is None else f" ± {100 * noise:.1f}"
+    moved = f"{'rose' if change > 0 else 'fell'} by {100 * abs(change):.1f}{spread} %"
     told = f"the error on held-aside pixels {moved} over the last {100 * share:.0f} % of the fit"
     return [f"{word[found['trend']]} ({told})"]
 
