@@ -135,15 +135,6 @@ class Facts:
         count = len(self.result(name)["seeds"])
         return "one seed" if count == 1 else f"{count} seeds"
 
-    def best_of(self, name: str, method: str, quantity: str) -> str:
-        """The run of a method with networks, with any estimator, that comes nearest."""
-        estimators = ("two-pass", "split-halves", "all-pairs")
-        runs = {method, *(f"{method}-neural-{e}" for e in estimators)}
-        found = [run for run in self.known(name) if run in runs]
-        if not found:
-            raise Unfounded(f"{name}.json has no {method}")
-        return max(found, key=lambda run: self.of(name, run, quantity))
-
     def at_end(self, name: str, rival: str, quantity: str) -> Row:
         """When ours has what a rival has at the end of its time, in an equal schedule."""
         for row in benchmark_tables.at_end(self.result(name), quantity):
