@@ -214,11 +214,12 @@ def log_of(errors, spread=0.0, by="step"):
     ("errors", "spread", "trend", "change"),
     [
         ([8, 4, 2, 1.5, 1.2, 1.1, 1.0, 0.9], 0.0, "improving", 0.9 / 1.1 - 1),
-        ([8, 4, 2, 1.5, 1.2, 1.1, 1.0, 0.9], 2.0, "plateau", 0.9 / 1.1 - 1),
+        ([8, 4, 2, 1.5, 1.2, 1.1, 1.0, 0.9], 2.0, "unclear", 0.9 / 1.1 - 1),
+        ([8, 4, 2, 1, 1, 1, 1, 1.002], 0.05, "plateau", 0.002),
         ([8, 4, 2, 1, 1, 1, 1, 0.998], 0.0, "plateau", -0.002),
         ([8, 4, 2, 1, 1, 1, 1.1, 1.3], 0.0, "rising", 0.3),
     ],
-    ids=["improving", "noise", "plateau", "rising"],
+    ids=["improving", "noise", "little noise", "plateau", "rising"],
 )
 def test_a_change_counts_where_it_is_larger_than_its_noise(errors, spread, trend, change):
     found = convergence(log_of(errors, spread))

@@ -385,7 +385,12 @@ def _trend(run: Run) -> list[str]:
     found = run.metrics.get("convergence") or {}
     keys = ("change", "share", "noise")
     change, share, noise = (display.number(found.get(key)) for key in keys)
-    word = {"improving": "still improving", "plateau": "at a plateau", "rising": "getting worse"}
+    word = {
+        "improving": "still improving",
+        "plateau": "at a plateau",
+        "rising": "getting worse",
+        "unclear": "perhaps still improving",
+    }
     if change is None or share is None or found.get("trend") not in word:
         return []
     spread = "" if noise is None else f" ± {100 * noise:.1f}"

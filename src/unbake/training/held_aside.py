@@ -29,10 +29,12 @@ _SHARE = 0.005
 LAST = 0.25
 #: The least relative change of the error that is told as one, and how many standard errors it is.
 _LEAST, _SURE = 0.005, 2.0
+#: A plateau is told only where a relative change of this size would have been seen.
+_SEEN = 0.05
 #: Keys of a line of the log: the error, and those of groups of the pixels.
 ERROR, GROUPS = "held_aside", "held_aside_groups"
 
-Trend = Literal["improving", "plateau", "rising"]
+Trend = Literal["improving", "plateau", "rising", "unclear"]
 
 
 class _Probe:
@@ -301,6 +303,10 @@ class Convergence:
                 "a longer fit explains photographs no better; materials may still gain",
             ),
             "rising": ("getting worse", "more views would help, or a shorter fit"),
+            "unclear": (
+                "too noisy",
+                "held-out views of a longer fit would show whether it is better",
+            ),
         }[self.trend]
         return f"held-aside pixels: {word}; error {verb} {sizes} in {part}\n  {advice}"
 
@@ -328,7 +334,7 @@ def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergen
     falls = np.subtract(end[GROUPS], start[GROUPS])
     change = (error - before) / before
     noise = float(falls.std(ddof=1) / math.sqrt(len(falls)) / before)
-    trend: Trend = "plateau"
+    trend: Trend = "plateau" if _SURE * noise <= _SEEN else "unclear"
     if abs(change) > max(_LEAST, _SURE * noise):
         trend = "improving" if change < 0 else "rising"
     return Convergence(trend, error, before, change, noise, 1 - start[by] / last)
