@@ -44,35 +44,12 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         spp: camera samples of each.
     """
     from unbake.training.piece_variation import expected_albedo
-    from unbake.training.problem import pixels_of
-    from unbake.training.roughness_curves import (
-        NODES,
-        pieces_of,
-        points,
-        precision,
-        roughness_of,
-    )
-    from unbake.training.search_samples import SearchSamples
+    from unbake.training.roughness_curves import pieces_of, points, roughness_of
     from unbake.training.seen_pieces import SeenPieces, values_of
-    from unbake.training.step import TrainingStep, without_garbage_collection
     from unbake.training.validation import Score
 
-    run, steps = opened(folder)
-    if run.config.roughness_search.times:
-        raise SystemExit(f"{folder}: its searches have taken something already")
-    photographs = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
-    samples = SearchSamples(run.problem, TrainingStep(run.problem, photographs, run.config))
-    each = min(pixels, AT_ONCE // spp)
-    with without_garbage_collection():
-        rows = np.concatenate(
-            [
-                samples.by_roughness(run.state, (2 * number, 2 * number + 1), each, spp, NODES)
-                for number in range(-(-pixels // each))
-            ]
-        )
-        places = samples.places(run.state, (1, 0), 4 * pixels)
+    run, steps, rows, places = searchable(folder, pixels, spp)
     roughness = roughness_of(run.problem.materials["roughness"], points(rows, albedo=True)).numpy()
-    rows["weight"] *= precision(rows, roughness)
     field, shown = run.problem.materials["albedo"], points(places, albedo=False)
     seen = SeenPieces(field, points(rows, albedo=False), pieces_of(rows), {})
     by_rows = values_of(seen.middles(points(rows, albedo=False)))
@@ -113,6 +90,41 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         "medians_apart": float(np.sqrt(np.square(apart).mean())),
         "variants": variants,
     }
+
+
+def searchable(folder: Path, pixels: int, spp: int) -> tuple[Any, int, np.ndarray, np.ndarray]:
+    """A run without searches, and what one of it would sample.
+
+    Args:
+        folder: of the run.
+        pixels: how many are sampled; those that searches cannot use are left out.
+        spp: camera samples of each.
+
+    Returns:
+        The run, its steps, samples whose weights are inverse variances, and places of any pixels.
+    """
+    from unbake.training.problem import pixels_of
+    from unbake.training.roughness_curves import NODES, points, precision, roughness_of
+    from unbake.training.search_samples import SearchSamples
+    from unbake.training.step import TrainingStep, without_garbage_collection
+
+    run, steps = opened(folder)
+    if run.config.roughness_search.times:
+        raise SystemExit(f"{folder}: its searches have taken something already")
+    photographs = pixels_of(run.dataset, run.config, clip_negative=run.clip_negative)
+    samples = SearchSamples(run.problem, TrainingStep(run.problem, photographs, run.config))
+    each = min(pixels, AT_ONCE // spp)
+    with without_garbage_collection():
+        rows = np.concatenate(
+            [
+                samples.by_roughness(run.state, (2 * number, 2 * number + 1), each, spp, NODES)
+                for number in range(-(-pixels // each))
+            ]
+        )
+        places = samples.places(run.state, (1, 0), min(4 * pixels, AT_ONCE))
+    present = roughness_of(run.problem.materials["roughness"], points(rows, albedo=True)).numpy()
+    rows["weight"] *= precision(rows, present)
+    return run, steps, rows, places
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from unbake.config import FitConfig, read_toml, to_toml
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
 from unbake.training.piece_levels import LEVELS, expected, with_expected_levels
-from unbake.training.roughness_curves import NODES, Curves, in_range
+from unbake.training.roughness_curves import NODES, Curves, in_range, points
 from unbake.training.roughness_search import descend, searched
+from unbake.transport.by_roughness import PLACE
 
 RED, BLUE = (0.9, 0.3, 0.3), (0.2, 0.3, 0.9)
 
@@ -105,6 +106,28 @@ def test_pieces_move_as_a_whole_and_nothing_else_does():
     change = apart["found"] - apart["first"]
     for piece in (known, ~known):
         np.testing.assert_allclose(change[piece], change[piece].mean(), atol=1e-3)
+
+
+def test_a_piece_without_a_curve_is_as_others_of_its_colour():
+    rows = made_up(true=(0.24, 0.7))
+    rows["weight"] *= 1e5
+    rows["albedo"] = np.where(rows["piece"][:, None], BLUE, RED)
+    shown = np.zeros(len(rows), PLACE)
+    for name in shown.dtype.names:
+        shown[name] = rows[name]
+    more = shown.copy()
+    more["piece"] += 2  # of which no pixel shows nothing else
+    field = Network(SMALL, FieldSpec(1, bounded=True, initial=0.5, seed=2))
+    curves = Curves.of(rows, 2, 6, True, None, np.concatenate([shown, more]))
+    found = searched(field, curves, SEARCH, 0.02)
+    for piece, (true, other) in enumerate(((0.24, 0.7), (0.7, 0.24))):
+        of_piece = shown[shown["piece"] == piece], more[more["piece"] == 2 + piece]
+        told, untold = (roughness_at(field, found, points(x, albedo=True)) for x in of_piece)
+        assert told.mean() == pytest.approx(true, abs=0.02)
+        # One piece of a like colour counts as much as what all pieces have in common.
+        assert untold.mean() == pytest.approx((3 * true + other) / 4, abs=0.05)
+        # What varies within it is not known either.
+        assert untold.std() < 0.02
 
 
 def test_a_piece_moves_further_than_a_short_descent():

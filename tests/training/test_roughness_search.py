@@ -16,7 +16,7 @@ import pytest
 from searches import SEARCH, SMALL, made_up
 from support import MPIEXEC, TINY_FIT, built_in_cameras, needs_mpi, nothing_compiled, randomised
 
-from unbake.config import FitConfig, preset, read_toml, to_toml
+from unbake.config import FitConfig, from_toml, preset, read_toml, to_toml
 from unbake.dataset.pixels import PixelBatch, PixelSource
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
@@ -293,14 +293,18 @@ def test_errors_have_the_variance_1_however_bright_pixels_are():
 # --------------------------------------------------------------------------------------- a fit
 
 
-def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
+def test_searches_come_at_their_places_and_steps_hardly_move_roughness(built_in):
     problem, _, step, state = started(built_in)
     search = RoughnessSearch(problem, SETTINGS, step, Ranks())
     assert not search.due(0.0, 0.39) and search.rates({}, 0, 0.0) == {}
     assert search.due(0.39, 0.4) and not search.due(0.4, 0.45)
     assert search.due(0.7, 0.8) and not search.due(0.8, 1.0)
     rates = {"albedo": 1.0, "roughness": 1.0}
-    assert search.rates(rates, 39, 0.39) == rates
+    before = rates | {"roughness": SETTINGS.roughness_search.rate_before}
+    assert 0 < before["roughness"] < 1
+    assert search.rates(rates, 39, 0.39) == before
+    none = replace(SETTINGS, roughness_search=replace(SETTINGS.roughness_search, times=0))
+    assert RoughnessSearch(problem, none, step, Ranks()).rates(rates, 39, 0.39) == rates
     assert search.rates(rates, 40, 0.4) == {"albedo": 1.0, "roughness": 0.0}
     before = {key: np.array(x.array) for key, x in state.phi.items()}
     assert search.search_between(0.1, 0.2, state, 4) == 0
@@ -308,6 +312,13 @@ def test_searches_come_at_their_places_and_roughness_then_rests(built_in):
     assert samples == pytest.approx(SHARE * 4 / 0.5 * SETTINGS.samples_per_step, rel=0.01)
     moved = {k for k, x in state.phi.items() if (np.array(x.array) != before[k]).any()}
     assert moved == {"roughness.pieces.0", "roughness.colours"}
+
+
+def test_steps_of_older_runs_move_roughness_as_before():
+    text = to_toml(FitConfig())
+    kept = "\n".join(x for x in text.splitlines() if not x.startswith("rate_before"))
+    found = [from_toml(x).roughness_search.rate_before for x in (text, kept)]
+    assert found == [FitConfig().roughness_search.rate_before, 1]
 
 
 def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):

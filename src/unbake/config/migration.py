@@ -43,6 +43,7 @@ _AS_BEFORE: dict[str, dict[str, Any]] = {
         "roughness_search.times": 0,
         "roughness_search.pixels_as_one": 0.0,
         "roughness_search.pixels_at_most": 0,
+        "roughness_search.rate_before": 1.0,
     },
     "radiance.neural": {"leak": 0.0},
     "radiance.triplane": {"leak": 0.0},

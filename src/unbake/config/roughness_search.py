@@ -41,14 +41,15 @@ class RoughnessSearchConfig:
     one_roughness: float = 0.7
     #: The same of albedo, which keeps an eighth of what was found, to be learned on
     one_albedo: float = 0.7
-    #: Of the fit's steps after the first search, as a multiple of the field's own
+    #: Of the fit's steps before the first search, and after it, as multiples of the field's own
+    rate_before: float = 0.25
     rate_between: float = 0.0
 
     def __post_init__(self) -> None:
         ranges = {"times": (0, 1000), "first": (0, 1), "last": (0, 1)}
         ranges |= {"share": (POSITIVE, 1000), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
         ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
-        ranges |= {"rate": (POSITIVE, 1e4), "rate_between": (0, 1e4)}
+        ranges |= {"rate": (POSITIVE, 1e4), "rate_before": (0, 1e4), "rate_between": (0, 1e4)}
         ranges |= {"pixels_as_one": (0, 1e6), "pixels_at_most": (0, 1 << 30)}
         ranges |= {"like_colours": (1e-3, 1e3), "one_roughness": (0, 1), "one_albedo": (0, 1)}
         spreads = ("piece_spread", "brightness_spread", "colour_spread")

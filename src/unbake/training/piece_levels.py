@@ -7,7 +7,8 @@ photograph is seen, the pieces tell: many are of few materials, and those of lik
 often of one. So the distribution is found together with them, about as the one under which what
 photographs show is most probable (nonparametric maximum likelihood, Laird 1978; by expectation
 maximization with smoothing, Silverman et al. 1990). For each piece it is that of the others: a
-piece by itself would confirm its own noise.
+piece by itself would confirm its own noise. A piece that photographs show, but no pixel by itself,
+has no curve: of it is expected what is of others of its colour.
 
 Each piece moves as a whole: how its roughness varies with brightness and place stays as it is.
 """
@@ -16,11 +17,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
+from ..fields.domain import SurfacePoint
 from ..fields.field import Field
 from ..ranks import Ranks
 from .roughness_curves import NODES, Curves, in_range, of_roughness
@@ -63,15 +66,27 @@ def with_expected_levels(
     (outputs,) = seen.outputs
     error = seen.sums(errors_of(curves, outputs + shift) for shift in SHIFTS)
     value = seen.means(values_of(outputs + shift) for shift in SHIFTS)
+    colours = seen.means(_brightness(curves.point))
+    without = seen.pixels == 0
+    if without.any():
+        (middle,) = seen.middles(curves.shown)
+        value[without] = values_of(middle[without, None] + SHIFTS)
+        colours[without] = seen.medians(curves.shown, _brightness(curves.shown)).T[without]
     levels = np.stack([np.interp(LEVELS, x, y) for x, y in zip(value, error, strict=True)])
-    albedo = curves.point.albedo
-    bright = np.zeros((3, len(outputs))) if albedo is None else np.clip(np.array(albedo), 0, 1)
-    wanted = expected(levels, seen.pixels, seen.means(np.sqrt(bright)), settings)
+    wanted = expected(levels, seen.pixels, colours, settings)
     by = np.array([np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)])
     # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
     now = value[:, len(SHIFTS) // 2]
     by[(now < LEVELS[0]) & (wanted < LEVELS[2])] = 0
     return found | seen.raised(by)
+
+
+def _brightness(point: SurfacePoint) -> np.ndarray:
+    """Square roots of the albedo at points, shape (3, n); 0 where it is known."""
+    assert point.piece is not None
+    if point.albedo is None:
+        return np.zeros((3, dr.width(point.piece.number)))
+    return np.sqrt(np.clip(np.array(point.albedo), 0, 1))
 
 
 def errors_of(curves: Curves, outputs: np.ndarray) -> np.ndarray:
@@ -88,7 +103,7 @@ def expected(
     Args:
         errors: sums of the squared errors of each piece, in units of their variance, at each of
             `LEVELS`, shape (pieces, levels).
-        pixels: of each piece, shape (pieces,).
+        pixels: of each piece, shape (pieces,); some have none, and no errors.
         colours: the mean of the square roots of albedo, linear RGB, shape (pieces, 3).
         settings: how many pixels tell as much as one, and which colours are alike.
 
@@ -103,7 +118,7 @@ def expected(
     near = np.exp((2 * kinds @ kinds.T - square[:, None] - square) / 8)
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
-    weight = (weight / weight.mean())[:, None]
+    weight = (weight / weight[pixels > 0].mean())[:, None]
     probable = normalized(chance)
     for _ in range(_STEPS):
         own = weight * _mixed(probable)

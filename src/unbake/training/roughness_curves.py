@@ -40,7 +40,7 @@ class Curves:
         slopes: by the logarithm of roughness, the same.
         nodes: their logarithms.
         total: how many pixels all ranks have.
-        pieces: of surface that pixels of any rank see, in the order of their numbers.
+        pieces: of surface that any pixels of all ranks show, in the order of their numbers.
         shown: what any pixels of all ranks show, whether they have a curve or not.
     """
 
@@ -75,7 +75,7 @@ class Curves:
         # A squared error is not below zero. What is far below has few samples of a sharp lobe.
         losses = np.maximum(losses_by_roughness(rows, groups(rows, cells, colours)), _LEAST)
         piece = np.unique(rows["piece"], return_inverse=True)[1]
-        pieces = pieces_of(rows)
+        pieces = pieces_of(rows, every)
         slopes = _slopes(losses, piece.ravel())
         here = slice(ranks.rank, None, ranks.size)
         rows, losses, slopes = rows[here], losses[here], slopes[here]
@@ -143,19 +143,20 @@ def points(rows: np.ndarray, albedo: bool) -> SurfacePoint:
 
     return SurfacePoint(
         mi.Point3f(arrays("position")),
-        piece=_pieces(rows),
+        piece=_pieces(rows["piece"], rows["strength"]),
         albedo=mi.Color3f(arrays("albedo")) if albedo else None,
     )
 
 
-def pieces_of(rows: np.ndarray) -> Piece:
+def pieces_of(*rows: np.ndarray) -> Piece:
     """The different pieces of surface that pixels see, in the order of their numbers."""
-    return _pieces(rows[np.unique(rows["piece"], return_index=True)[1]])
+    number, strength = (np.concatenate([x[name] for x in rows]) for name in ("piece", "strength"))
+    number, first = np.unique(number, return_index=True)
+    return _pieces(number, strength[first])
 
 
-def _pieces(rows: np.ndarray) -> Piece:
-    """The piece of surface that each pixel sees."""
-    return Piece(from_numpy(mi.UInt32, rows["piece"]), from_numpy(mi.Float, rows["strength"]))
+def _pieces(number: np.ndarray, strength: np.ndarray) -> Piece:
+    return Piece(from_numpy(mi.UInt32, number), from_numpy(mi.Float, strength))
 
 
 def roughness_of(field: Field, point: SurfacePoint) -> mi.Float:

@@ -19,8 +19,11 @@ tell little, too. So the most probable ones are sought: squared errors are in un
 variance, which the pixels themselves tell, by how bright they are, and numbers of one piece, or of
 like colours, are expected to differ as little as the settings say. Each piece then varies as much
 as is to be expected of it (`piece_variation.py`), and moves to the roughness that is
-(`piece_levels.py`); in the last search, albedo varies so, too. After the first search, steps leave
-roughness alone; from the second one on, the mean of what searches find is kept.
+(`piece_levels.py`); in the last search, albedo varies so, too. From the second search on, the mean
+of what they find is kept.
+
+After the first search steps leave roughness alone, and before it they move it slowly: what noise
+does to it differs within a piece, and a search starts from there.
 """
 
 from __future__ import annotations
@@ -90,10 +93,11 @@ class RoughnessSearch:
 
     def rates(self, rates: dict[str, float], step: int, done: float) -> dict[str, float]:
         """The learning rates of a step, after a fraction of the fit."""
-        if not (self._places <= done).any() or not self._pixels(step, done):
+        if not len(self._places) or not self._pixels(step, done):
             return rates
-        between = self._config.roughness_search.rate_between
-        return rates | {"roughness": rates["roughness"] * between}
+        search, after = self._config.roughness_search, (self._places <= done).any()
+        factor = search.rate_between if after else search.rate_before
+        return rates | {"roughness": rates["roughness"] * factor}
 
     def _pixels(self, step: int, done: float) -> int:
         """How many pixels a search samples after a step and a fraction of the fit; 0: none."""

@@ -1,4 +1,4 @@
-"""The pieces of surface that a search of roughness has sampled, and sums over their pixels."""
+"""The pieces of surface that photographs show, and sums over what a search has sampled of them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _ASTRAY = 1e-6
 
 
 class SeenPieces:
-    """The pieces that pixels see; pixels are those of this rank, pieces those of all.
+    """Pieces, and the pixels that see them; pixels are those of this rank, pieces those of all.
 
     Args:
         field: with numbers of pieces.
         point: of each pixel.
-        pieces: that pixels of any rank see, in the order of their numbers.
+        pieces: in the order of their numbers; at least those that pixels of any rank see.
         numbers: that points share, in the place of the field's.
         ranks: that have a part of the pixels each; None: there is one.
     """
@@ -64,8 +64,8 @@ class SeenPieces:
         return self._ranks.size * self._ranks.mean(own)
 
     def means(self, columns: Iterable[np.ndarray]) -> np.ndarray:
-        """Means over the pixels of each piece; see `sums`."""
-        return self.sums(columns) / self.pixels[:, None]
+        """Means over the pixels of each piece, 0 where there are none; see `sums`."""
+        return self.sums(columns) / np.maximum(self.pixels, 1)[:, None]
 
     def middles(self, shown: SurfacePoint) -> np.ndarray:
         """Medians of outputs over what photographs show of each piece, shape (outputs, pieces).
@@ -74,13 +74,21 @@ class SeenPieces:
             shown: what any pixels of all ranks show. A piece that is not among them has the mean
                 over its pixels instead.
         """
+        found = self.medians(shown, self._outputs_at(shown))
+        return np.where(np.isnan(found), self.means(self.outputs).T, found)
+
+    def medians(self, shown: SurfacePoint, columns: Iterable[np.ndarray]) -> np.ndarray:
+        """Medians over what photographs show of each piece, shape (columns, pieces).
+
+        Args:
+            shown: as of `middles`. A piece that is not among them has NaN.
+            columns: of each of them, shape (n,).
+        """
         assert shown.piece is not None
         present, number = np.array(self.pieces.number), self._numbered(shown.piece)
         at = np.minimum(np.searchsorted(present, number), len(present) - 1)
         known = present[at] == number
-        at, columns = at[known], self._outputs_at(shown)[:, known]
-        found = np.stack([_medians(column, at, len(present)) for column in columns])
-        return np.where(np.isnan(found), self.means(self.outputs).T, found)
+        return np.stack([_medians(column[known], at[known], len(present)) for column in columns])
 
     def _numbered(self, pieces: Piece) -> np.ndarray:
         """The numbers of the field that are of pieces: the smallest may share the last one."""
