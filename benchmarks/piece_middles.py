@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -60,14 +62,10 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     score = Score(run.problem, run.dataset.heldout)
 
     def told(found: dict[str, Any]) -> dict[str, float]:
-        before = dict(run.state.phi.items())
-        run.state.replace({f"albedo.{key}": x for key, x in found.items()})
-        run.state.publish(run.problem)
-        values = np.array([np.array(x, float) for x in field.evaluate(shown)])[:, known]
-        variance = np.mean([np.square(x - means_of(x, piece)).mean() for x in values])
-        psnr = score.measure()["albedo_psnr"]
-        run.state.replace(before)
-        run.state.publish(run.problem)
+        with replaced(run, "albedo", found):
+            values = np.array([np.array(x, float) for x in field.evaluate(shown)])[:, known]
+            variance = np.mean([np.square(x - means_of(x, piece)).mean() for x in values])
+            psnr = score.measure()["albedo_psnr"]
         return {"albedo_psnr": psnr, "variance": float(variance)}
 
     search = RoughnessSearchConfig()
@@ -90,6 +88,17 @@ def middles_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         "medians_apart": float(np.sqrt(np.square(apart).mean())),
         "variants": variants,
     }
+
+
+@contextmanager
+def replaced(run: Any, name: str, found: dict[str, Any]) -> Iterator[None]:
+    """Meanwhile the field of a quantity has other numbers."""
+    before = dict(run.state.phi.items())
+    run.state.replace({f"{name}.{key}": x for key, x in found.items()})
+    run.state.publish(run.problem)
+    yield
+    run.state.replace(before)
+    run.state.publish(run.problem)
 
 
 def searchable(folder: Path, pixels: int, spp: int) -> tuple[Any, int, np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "src"))
 os.environ["PYTHONPATH"] = str(ROOT / "src")
 
-from piece_middles import searchable  # noqa: E402
+from piece_middles import replaced, searchable  # noqa: E402
 from roughness_limits import told_of_runs  # noqa: E402
 
 from unbake.config import RoughnessSearchConfig  # noqa: E402
@@ -55,13 +55,8 @@ def untold_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     def told(pieces: Any) -> float:
         field = run.problem.materials["roughness"]
         found = searched(field, replace(curves, pieces=pieces), search, rate)
-        before = dict(run.state.phi.items())
-        run.state.replace({f"roughness.{key}": x for key, x in found.items()})
-        run.state.publish(run.problem)
-        psnr = score.measure()["roughness_psnr"]
-        run.state.replace(before)
-        run.state.publish(run.problem)
-        return psnr
+        with replaced(run, "roughness", found):
+            return score.measure()["roughness_psnr"]
 
     found = {
         "as fitted": score.measure()["roughness_psnr"],
