@@ -389,7 +389,7 @@ def _trend(run: Run) -> list[str]:
         "improving": "still improving",
         "plateau": "at a plateau",
         "rising": "getting worse",
-        "unclear": "perhaps still improving",
+        "unclear": "too noisy",
     }
     if change is None or share is None or found.get("trend") not in word:
         return []

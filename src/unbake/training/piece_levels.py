@@ -7,8 +7,8 @@ photograph is seen, the pieces tell: many are of few materials, and those of lik
 often of one. So the distribution is found together with them, about as the one under which what
 photographs show is most probable (nonparametric maximum likelihood, Laird 1978; by expectation
 maximization with smoothing, Silverman et al. 1990). For each piece it is that of the others: a
-piece by itself would confirm its own noise. A piece that photographs show, but no pixel by itself,
-has no curve: of it is expected what is of others of its colour.
+piece by itself would confirm its own noise. A piece that no pixel shows by itself has no curve: it
+goes to what is to be expected of its colour.
 
 Each piece moves as a whole: how its roughness varies with brightness and place stays as it is.
 """
