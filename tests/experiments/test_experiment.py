@@ -298,6 +298,27 @@ def test_each_seed_has_a_job_and_a_folder_of_its_own(tmp_path, monkeypatch):
     assert times == [times[0]] * 3 and times[0] > 120 * len(ABLATION)
 
 
+@pytest.mark.parametrize("name", ["fig6", "fig7", "fig8"])
+def test_jobs_of_fewer_seeds_are_among_those_of_more(tmp_path, name):
+    figure = load(name)
+    for folder in ("envmaps_blender", *(scene.folder for scene in SCENES)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+    cpu = ExperimentContext("cpu", tmp_path, tmp_path, Console(quiet=True))
+    one, two = (figure.jobs(dataclasses.replace(cpu, seeds=seeds)) for seeds in (1, 2))
+    kept = {job.name: dict(job.settings) for job in two}
+    assert len(one) < len(two)
+    assert all(kept[job.name] == dict(job.settings) for job in one)
+    seeds = {job.settings["fit"]["seed"] for job in one if "fit" in job.settings}
+    assert seeds == {0}
+
+
+def test_seeds_are_refused_where_there_are_none(tmp_path):
+    done = []
+    with pytest.raises(UserError) as caught:
+        reproduce(squares(done), context(tmp_path, seeds=2))
+    assert caught.value.where == "--seeds" and not done
+
+
 def test_smoothing_keeps_cubics_and_takes_noise_away():
     values = np.linspace(0.2, 0.9, 15)
     rng = np.random.default_rng(3)

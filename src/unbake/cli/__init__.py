@@ -965,6 +965,7 @@ def reproduce(
     scale: Scale = "cpu",
     out: Out = Path("reproduction"),
     scenes: Path = Path("scenes"),
+    seeds: Count = None,
     plan: Flag = False,
 ) -> None:
     """Make a table or a figure of the paper again: data, table and picture.
@@ -982,14 +983,19 @@ def reproduce(
             or paper (for a GPU).
         out: Folder to write to, shared by all experiments.
         scenes: Folder of the published scenes, each in a folder or as .tar.xz.
+        seeds: Number of fits of each kind in fig6, fig7 and fig8 (by default three, two in rooms of
+            fig6, and one at paper scale). More seeds later keep what is there.
         plan: Only tell what is left to do, and how long it will take on this machine.
     """
     backend.activate()
     from ..experiments.experiment import ExperimentContext
     from ..experiments.experiment import reproduce as run
 
+    if seeds is not None:
+        require("seeds", seeds, 1)
+    context = ExperimentContext(scale, out, scenes, seeds=seeds)
     with _ranks() as ranks:
-        run(experiments.load(what), ExperimentContext(scale, out, scenes), plan=plan, ranks=ranks)
+        run(experiments.load(what), context, plan=plan, ranks=ranks)
 
 
 def doctor() -> int:

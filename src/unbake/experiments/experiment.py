@@ -15,6 +15,7 @@ import drjit as dr
 from rich.console import Console
 
 from .. import backend
+from ..errors import UserError
 from ..io import write_atomically, write_json, write_text
 from ..machine import machine
 from ..ranks import Agreed, Ranks
@@ -41,12 +42,14 @@ class ExperimentContext:
             OUT/work.
         scenes: folder of the published scenes.
         console: shows progress.
+        seeds: number of fits of each kind, with seeds 0, 1, …; None: the scale's.
     """
 
     scale: Scale
     out: Path
     scenes: Path
     console: Console = field(default_factory=lambda: Console(highlight=False))
+    seeds: int | None = None
 
     @property
     def work(self) -> Path:
@@ -89,12 +92,14 @@ class Experiment:
         jobs: makes its jobs, in the order in which they run. Raises `UserError` if scenes are
             missing.
         result: makes the result from the findings of the jobs, by name.
+        seeded: whether its fits are repeated with several seeds.
     """
 
     name: str
     title: str
     jobs: Callable[[ExperimentContext], list[Job]]
     result: Callable[[ExperimentContext, Mapping[str, Findings]], ExperimentResult]
+    seeded: bool = False
 
 
 def reproduce(
@@ -114,13 +119,17 @@ def reproduce(
             writes the results.
 
     Raises:
-        UserError: a scene is missing, a job failed, or a file cannot be written.
+        UserError: a scene is missing, a job failed, a file cannot be written, or seeds are asked of
+            an experiment without any.
         OSError: the folder cannot be made.
         KeyboardInterrupt: SIGINT or SIGTERM arrived. The same call continues.
 
     Paper: Table 1, 2, Fig. 3–8.
     """
     ranks = ranks or Ranks()
+    if context.seeds is not None and not experiment.seeded:
+        remedy = "Leave it out: only fits are repeated with several seeds"
+        raise UserError(f"{experiment.name} has no seeds", "--seeds", remedy)
     if not ranks.leads:
         context = replace(context, console=Console(quiet=True))
     jobs = ranks.together(lambda: experiment.jobs(context))

@@ -46,4 +46,4 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
     return ExperimentResult(rows, caption + table, lambda path: write_png(path, sheet))
 
 
-EXPERIMENT = Experiment("fig7", "The ablation, for materials (Fig. 7)", _jobs, _result)
+EXPERIMENT = Experiment("fig7", "The ablation, for materials (Fig. 7)", _jobs, _result, seeded=True)

@@ -76,4 +76,6 @@ def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
     return montage([[tonemap(p[..., :3]) for p in row] for row in ([*maps, truth], images)])
 
 
-EXPERIMENT = Experiment("fig8", "The ablation, for the environment (Fig. 8)", _jobs, _result)
+EXPERIMENT = Experiment(
+    "fig8", "The ablation, for the environment (Fig. 8)", _jobs, _result, seeded=True
+)

@@ -93,7 +93,7 @@ class SceneFits:
         """Fits with the length of the scale: the paper's steps, or a time on a CPU.
 
         Args:
-            seeds: number of seeds; None: three at cpu scale.
+            seeds: number of seeds where the context has none; None: three at cpu scale.
         """
         config = dataclasses.replace(
             scene.settings(context),
@@ -102,7 +102,7 @@ class SceneFits:
             score_seconds=context.pick(0.2, 10.0, 60.0),
             checkpoint_seconds=120.0,
         )
-        numbers = range(seeds or context.pick(1, 3, 1))
+        numbers = range(context.seeds or seeds or context.pick(1, 3, 1))
         return SceneFits(scene, list(methods), config, context.pick(2, 32, 128), tuple(numbers))
 
     # -------------------------------------------------------------------------------- Jobs
