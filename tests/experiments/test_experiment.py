@@ -312,11 +312,26 @@ def test_jobs_of_fewer_seeds_are_among_those_of_more(tmp_path, name):
     assert seeds == {0}
 
 
-def test_seeds_are_refused_where_there_are_none(tmp_path):
+@pytest.mark.parametrize("name", ["table1", "fig3", "fig6"])
+def test_experiments_by_scene_have_jobs_of_those_that_are_chosen(tmp_path, name):
+    for folder in ("envmaps_blender", "kitchen", "lego"):
+        (tmp_path / folder).mkdir()
+    jobs = load(name).jobs(context(tmp_path, only=("lego", "kitchen")))
+    scenes = list(dict.fromkeys(job.name.split("-")[0] for job in jobs))
+    assert scenes == ["kitchen", "lego"]
+
+
+def test_scenes_that_are_unknown_are_all_named(tmp_path):
+    with pytest.raises(UserError, match="'attic' or 'cellar'"):
+        load("fig6").jobs(context(tmp_path, only=("attic", "kitchen", "cellar")))
+
+
+@pytest.mark.parametrize(("option", "value"), [("seeds", 2), ("only", ("kitchen",))])
+def test_a_choice_that_an_experiment_does_not_have_is_refused(tmp_path, option, value):
     done = []
     with pytest.raises(UserError) as caught:
-        reproduce(squares(done), context(tmp_path, seeds=2))
-    assert caught.value.where == "--seeds" and not done
+        reproduce(squares(done), context(tmp_path, **{option: value}))
+    assert caught.value.where == f"--{option}" and not done
 
 
 def test_smoothing_keeps_cubics_and_takes_noise_away():

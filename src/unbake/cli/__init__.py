@@ -58,6 +58,7 @@ from .options import (
     Runs,
     Scale,
     Scene,
+    Scenes,
     Source,
     any_light,
     chosen_light,
@@ -965,6 +966,7 @@ def reproduce(
     scale: Scale = "cpu",
     out: Out = Path("reproduction"),
     scenes: Path = Path("scenes"),
+    only: Scenes = (),
     seeds: Count = None,
     plan: Flag = False,
 ) -> None:
@@ -983,6 +985,8 @@ def reproduce(
             or paper (for a GPU).
         out: Folder to write to, shared by all experiments.
         scenes: Folder of the published scenes, each in a folder or as .tar.xz.
+        only: Folders of scenes, such as kitchen lego, for table1, fig3 and fig6: their results are
+            of these alone (by default of all).
         seeds: Number of fits of each kind in fig6, fig7 and fig8 (by default three, two in rooms of
             fig6, and one at paper scale). More seeds later keep what is there.
         plan: Only tell what is left to do, and how long it will take on this machine.
@@ -993,7 +997,7 @@ def reproduce(
 
     if seeds is not None:
         require("seeds", seeds, 1)
-    context = ExperimentContext(scale, out, scenes, seeds=seeds)
+    context = ExperimentContext(scale, out, scenes, seeds=seeds, only=only)
     with _ranks() as ranks:
         run(experiments.load(what), context, plan=plan, ranks=ranks)
 

@@ -36,6 +36,7 @@ Folder = Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")]
 FromRun = Annotated[Path | None, arg(name="from", metavar="RUN", help_behavior_hint="")]
 Source = Annotated[Path, arg(metavar="SOURCE")]
 Meshes = UseAppendAction[Annotated[tuple[Path, ...], arg(metavar="MESH", help_behavior_hint="")]]
+Scenes = Annotated[tuple[str, ...], arg(metavar="SCENES", help_behavior_hint="")]
 Folders = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="INT", help_behavior_hint="")]
 Preset = Annotated[

@@ -43,6 +43,7 @@ class ExperimentContext:
         scenes: folder of the published scenes.
         console: shows progress.
         seeds: number of fits of each kind, with seeds 0, 1, …; None: the scale's.
+        only: folders of the scenes that an experiment by scene has; empty: the scale's.
     """
 
     scale: Scale
@@ -50,6 +51,7 @@ class ExperimentContext:
     scenes: Path
     console: Console = field(default_factory=lambda: Console(highlight=False))
     seeds: int | None = None
+    only: tuple[str, ...] = ()
 
     @property
     def work(self) -> Path:
@@ -93,6 +95,7 @@ class Experiment:
             missing.
         result: makes the result from the findings of the jobs, by name.
         seeded: whether its fits are repeated with several seeds.
+        by_scene: whether it has a part for each published scene.
     """
 
     name: str
@@ -100,6 +103,7 @@ class Experiment:
     jobs: Callable[[ExperimentContext], list[Job]]
     result: Callable[[ExperimentContext, Mapping[str, Findings]], ExperimentResult]
     seeded: bool = False
+    by_scene: bool = False
 
 
 def reproduce(
@@ -119,8 +123,8 @@ def reproduce(
             writes the results.
 
     Raises:
-        UserError: a scene is missing, a job failed, a file cannot be written, or seeds are asked of
-            an experiment without any.
+        UserError: a scene is missing, a job failed, a file cannot be written, or seeds or scenes
+            are asked of an experiment without any.
         OSError: the folder cannot be made.
         KeyboardInterrupt: SIGINT or SIGTERM arrived. The same call continues.
 
@@ -130,6 +134,9 @@ def reproduce(
     if context.seeds is not None and not experiment.seeded:
         remedy = "Leave it out: only fits are repeated with several seeds"
         raise UserError(f"{experiment.name} has no seeds", "--seeds", remedy)
+    if context.only and not experiment.by_scene:
+        remedy = "Leave it out: only table1, fig3 and fig6 are made scene by scene"
+        raise UserError(f"{experiment.name} has no choice of scenes", "--only", remedy)
     if not ranks.leads:
         context = replace(context, console=Console(quiet=True))
     jobs = ranks.together(lambda: experiment.jobs(context))

@@ -138,4 +138,4 @@ def _draw(path: Path, rows: list[dict]) -> None:
     save_figure(figure, path)
 
 
-EXPERIMENT = Experiment("fig3", "Step time by scene (Fig. 3)", _jobs, _result)
+EXPERIMENT = Experiment("fig3", "Step time by scene (Fig. 3)", _jobs, _result, by_scene=True)

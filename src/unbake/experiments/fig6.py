@@ -133,5 +133,10 @@ def _tables(rows: list[Row]) -> str:
 
 
 EXPERIMENT = Experiment(
-    "fig6", "Materials of the eight scenes (Fig. 1, 6)", _jobs, _result, seeded=True
+    "fig6",
+    "Materials of the eight scenes (Fig. 1, 6)",
+    _jobs,
+    _result,
+    seeded=True,
+    by_scene=True,
 )

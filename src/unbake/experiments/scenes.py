@@ -266,7 +266,18 @@ SCENES = (
 
 
 def scenes_at(context: ExperimentContext) -> tuple[PaperScene, ...]:
-    """The scenes of an experiment: all, or at smoke scale the quickest one."""
+    """The scenes of an experiment: those that are chosen, or all, or at smoke scale the quickest.
+
+    Raises:
+        UserError: there is no scene of a chosen name.
+    """
+    known = {scene.folder: scene for scene in SCENES}
+    unknown = [name for name in context.only if name not in known]
+    if unknown:
+        what = f"there is no scene {' or '.join(map(repr, unknown))}"
+        raise UserError(what, "--only", f"The scenes are {', '.join(known)}")
+    if context.only:
+        return tuple(scene for name, scene in known.items() if name in context.only)
     return SCENES[-1:] if context.scale == "smoke" else SCENES
 
 

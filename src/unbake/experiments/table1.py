@@ -23,7 +23,7 @@ from ..transport.render import parts_of, render_radiance
 from ..transport.vertex import SceneView
 from .experiment import Experiment, ExperimentContext, ExperimentResult, copy_file
 from .jobs import Findings, Job
-from .scenes import SCENES, PaperScene
+from .scenes import PaperScene, scenes_at
 from .tables import markdown
 
 #: By scene: mean path length, views, samples per pixel, log2 of pixels per step.
@@ -47,9 +47,8 @@ FIRST_LOST = {"path_length": 5, "prb_path_length": PathConfig().rr_depth + 2}
 
 def _jobs(context: ExperimentContext) -> list[Job]:
     pixels, spp = context.pick((8, 4), (64, 16), (128, 64))
-    scenes = SCENES[:1] if context.scale == "smoke" else SCENES
     jobs = []
-    for scene in scenes:
+    for scene in scenes_at(context):
         scene.require(context)
         jobs.append(
             Job(
@@ -123,9 +122,7 @@ def _mean_length(scene_view: SceneView, rays: CameraRays, spp: int, first_lost: 
 
 def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> ExperimentResult:
     rows = []
-    for scene in SCENES:
-        if scene.folder not in findings:
-            continue
+    for scene in scenes_at(context):
         copy_file(_views(context, scene), context.out / "table1")
         config, shots = scene.settings(context), scene.capture_settings(context)
         length, views, spp, batch = PUBLISHED[scene.name]
@@ -185,4 +182,6 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
     return ExperimentResult(rows, table)
 
 
-EXPERIMENT = Experiment("table1", "Scenes, views and path lengths (Table 1)", _jobs, _result)
+EXPERIMENT = Experiment(
+    "table1", "Scenes, views and path lengths (Table 1)", _jobs, _result, by_scene=True
+)
