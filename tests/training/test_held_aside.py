@@ -159,6 +159,26 @@ def test_the_error_is_the_product_of_both_halves_over_the_reference(cornell, con
     assert aside.measure(None)["held_aside"] == pytest.approx(expected.mean(), rel=1e-5)
 
 
+def test_pixels_without_a_finite_estimate_are_left_out(cornell, config):
+    pixels = begin_fit(Dataset.load(cornell), config).pixels.holding_aside(0.25, 0)
+    numbers, _ = pixels.held_aside().read()
+
+    def measured(*broken):
+        def halves(found):
+            return np.where(np.isin(found, broken), np.nan, 0.1 + found / 100)
+
+        step = Halves(halves, lambda n: 0.2 + n / 50)
+        return HeldAside(step, pixels.rays, pixels.held_aside(), config).measure(None)
+
+    whole, part = measured(), measured(numbers[3])
+    assert np.isfinite(part["held_aside"])
+    assert part["held_aside"] == pytest.approx(whole["held_aside"], rel=0.2)
+    other = [n for n in range(16) if n != 3]
+    assert all(part["held_aside_groups"][n] == whole["held_aside_groups"][n] for n in other)
+    assert part["held_aside_groups"][3] != whole["held_aside_groups"][3]
+    assert measured(*numbers[3::16]) == {}
+
+
 def test_photographs_of_held_out_views_are_compared_in_full(cornell, config):
     dataset = Dataset.load(cornell)
     (view,) = dataset.heldout

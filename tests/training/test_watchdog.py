@@ -210,6 +210,24 @@ def test_a_fit_does_not_end_with_an_exploded_loss(begun):
         read(1e9, last=True)
 
 
+@pytest.mark.parametrize("few", [1, 2, 4])
+def test_a_firefly_in_the_last_steps_does_not_end_a_fit(begun, few):
+    """The last reading may have a few steps only, of which one says nothing."""
+    dog, _, progress, read = watching(begun)
+    for _ in range(4):
+        read(0.5)
+    assert read([1e3, *[0.5] * (few - 1)], last=True) == []
+    assert dog.trusts and progress.rate == 1
+
+
+def test_short_readings_show_an_explosion_when_it_lasts(begun):
+    _, _, progress, read = watching(begun, steps=1)
+    for _ in range(8):
+        assert read(0.5) == []
+    told = [line for _ in range(5) for line in read(1e3)]
+    assert len(told) == 1 and "the loss rose" in told[0] and progress.rate == SLOWER
+
+
 def test_fireflies_and_noise_are_no_explosion(begun):
     dog, _, progress, read = watching(begun)
     rng = np.random.default_rng(0)

@@ -132,7 +132,11 @@ class HeldAside:
             self._told = told[self._views, None].astype(np.float64)
 
     def measure(self, state: State) -> dict[str, Any]:
-        """The error now, as numbers of a line of the log: its mean, and those of 16 groups."""
+        """The error now, as numbers of a line of the log: its mean, and those of 16 groups.
+
+        Pixels without a finite estimate are left out, as steps skip them. Where a group has no
+        other, nothing is told.
+        """
         halves, camera = self._probe.halves(state), self._camera
         target, reference, gain = self._probe.target, self._reference, 1.0
         if camera is not None:
@@ -145,8 +149,13 @@ class HeldAside:
         weight = 1 / (reference**2 + self._epsilon * np.square(gain))
         errors = (_squared_errors(halves, target, self._clipped) * weight).mean(-1)
         # Pixels are in the order of views: every 16th is in a group, so that each has all views.
-        groups = errors.reshape(-1, HELD_GROUPS).mean(0)
-        return {ERROR: float(errors.mean()), GROUPS: [round(float(e), 7) for e in groups]}
+        errors = errors.reshape(-1, HELD_GROUPS)
+        known = np.isfinite(errors)
+        if not known.any(0).all():
+            return {}
+        groups = errors.mean(0, where=known)
+        mean = float(errors.mean(where=known))
+        return {ERROR: mean, GROUPS: [round(float(e), 7) for e in groups]}
 
 
 @final

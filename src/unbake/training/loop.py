@@ -537,8 +537,9 @@ def _show(
         found = begun.photographs.measure(begun.state)
         lines += [{**progress.counted(), "validation": found}] if found else []
     elif not lines and begun.aside is not None:
-        error = begun.aside.measure(begun.state)[ERROR]
-        lines.append({**progress.counted(), "validation": {ERROR: error}})
+        found = begun.aside.measure(begun.state)
+        if ERROR in found:
+            lines.append({**progress.counted(), "validation": {ERROR: found[ERROR]}})
     for line in lines:
         monitor.validation(line)
     return []

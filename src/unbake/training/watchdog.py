@@ -22,6 +22,9 @@ GIVE_UP_AFTER = 100
 #: `READ_EVERY` steps, one after the other. Compared are medians over the steps of a reading, in
 #: which single fireflies do not count.
 EXPLOSION = 30.0
+#: Steps that a median has at least. A reading may have fewer, such as the last one of a fit: those
+#: before it are counted as well.
+_FEWEST_STEPS = 5
 #: Readings that say how high the loss was lately, and how many there must be.
 _LATELY, _FEWEST = 25, 3
 #: Readings between snapshots. The older of two is the one to go back to: at least so many readings
@@ -69,6 +72,7 @@ class Watchdog:
     ) -> None:
         self._state, self._step, self._progress, self._views = state, step, progress, views
         self._lately: deque[float] = deque(maxlen=_LATELY)
+        self._last_losses: deque[float] = deque(maxlen=_FEWEST_STEPS)
         self._good: deque[tuple[int, Snapshot]] = deque(maxlen=2)
         self._good.append((progress.step, state.snapshot()))
         self._readings = self._suspicious = self._in_a_row = 0
@@ -99,7 +103,7 @@ class Watchdog:
         """
         self._note_untrained(readings)
         told = self._count_skipped(readings, last)
-        level = median([abs(_total(r)) for r in readings if not r["skipped"]] or [math.nan])
+        level = self._level(readings)
         broken = self._state.broken()
         if math.isnan(self._first):
             self._first = abs(_total(readings[0]))
@@ -163,6 +167,14 @@ class Watchdog:
             f"fields (loss {end:.4g}, and {start:.4g} at the start). {_LOOK}"
         )
 
+    def _level(self, readings: Sequence[Reading]) -> float:
+        """How high the loss of a reading is; NaN if all its steps were skipped."""
+        losses = [abs(_total(reading)) for reading in readings if not reading["skipped"]]
+        self._last_losses.extend(losses)
+        if not losses:
+            return math.nan
+        return median(losses if len(losses) >= _FEWEST_STEPS else self._last_losses)
+
     def _note_untrained(self, readings: Sequence[Reading]) -> None:
         """Note the losses of the first steps, in which next to nothing has been learned."""
         noted, first = self._progress.untrained, self._progress.step - len(readings)
@@ -197,6 +209,7 @@ class Watchdog:
         self._state.restore(snapshot)
         self._good.clear()
         self._good.append((number, snapshot))
+        self._last_losses.clear()
         self._suspicious = 0
         again = " again" if self._progress.rate < 1 else ""
         if again or last:
