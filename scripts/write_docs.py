@@ -18,6 +18,7 @@ import shutil
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
@@ -32,6 +33,7 @@ RESULTS, KEPT = ROOT / "benchmarks" / "results", ROOT / "docs" / "reproduction"
 WIDTH = 120
 #: Headings, tables, pictures, comments and what is set in stay as they are.
 _KEPT = re.compile(r"^(\||#|!\[|<!--|\[//\]|\s{4,})", re.MULTILINE)
+Row = dict[str, Any]
 #: A comment of Markdown.
 NOTE = "[//]: # (Made by scripts/write_docs.py from {}: edit that.)\n\n"
 
@@ -133,13 +135,17 @@ def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
         about = json.loads(data.read_text(encoding="utf-8"))
         if about["scale"] != "cpu":
             raise SystemExit(f"{data}: the page is of cpu scale, this is {about['scale']} scale")
-        del about["rows"]
-        folder = kept / data.parent.name
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        (folder / "about.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-        for name in ("data.csv", "table.md"):
-            shutil.copy(data.with_name(name), folder / name)
+        rows, folder = about.pop("rows"), kept / data.parent.name
+        if joined := with_other_scenes(folder, about, rows):
+            about, texts = joined
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+            names = ("data.csv", "table.md")
+            texts = {name: data.with_name(name).read_text(encoding="utf-8") for name in names}
+        folder.mkdir(parents=True, exist_ok=True)
+        texts["about.json"] = json.dumps(about, indent=1) + "\n"
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
         for picture in data.parent.glob("*.png"):
             bitmap = mi.Bitmap(str(picture))
             rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True)
@@ -148,6 +154,38 @@ def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
         licences = kept / "licences"
         licences.mkdir(parents=True, exist_ok=True)
         shutil.copy(scenes / scene.folder / "LICENSE.txt", licences / f"{scene.folder}.txt")
+
+
+def with_other_scenes(
+    folder: Path, about: Row, rows: list[Row]
+) -> tuple[Row, dict[str, str]] | None:
+    """Results of Figure 6 with those that are kept of scenes that they lack.
+
+    `unbake reproduce fig6 --only SCENES` makes it a part at a time.
+
+    Returns:
+        What is known of the run, and the texts of files; None if there is nothing to keep.
+    """
+    from unbake.experiments import fig6
+    from unbake.experiments.scenes import SCENES
+    from unbake.experiments.tables import csv_text
+
+    if about["experiment"] != "fig6" or not (folder / "about.json").is_file():
+        return None
+    facts = Facts(RESULTS, folder.parent)
+    before, new = facts.about("fig6"), {row["scene"] for row in rows}
+    others = [row for row in facts.rows("fig6") if row["scene"] not in new]
+    if "made_with" in before or not others:
+        return None
+    order = [scene.label for scene in SCENES]
+    every = [{k: v for k, v in row.items() if v is not None} for row in [*rows, *others]]
+    every.sort(key=lambda row: order.index(row["scene"]))
+    machines = [*before["machines"], *about["machines"]]
+    joined = about | {
+        "machines": [m for n, m in enumerate(machines) if m not in machines[:n]],
+        "seconds": before["seconds"] + about["seconds"],
+    }
+    return joined, {"data.csv": csv_text(every), "table.md": fig6.tables(every) + "\n"}
 
 
 def main() -> None:

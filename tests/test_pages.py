@@ -17,6 +17,7 @@ except ModuleNotFoundError:  # Python 3.10
     import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 SETTINGS = Path(__file__).with_name("allowed_numbers.toml")
 REMEDY = (
     "A measured number comes from a committed result: {{ db('rivals-demo', 'ours', 'albedo') }}, "
@@ -205,6 +206,30 @@ def test_older_results_do_not_carry_a_conclusion_that_they_do_not_show(writer, t
         file.write_text(json.dumps(about | older))
         page = writer["page"]("docs/reproduction.md", kept=kept)
         assert (sentence in page) != bool(older)
+
+
+def test_a_figure_of_some_scenes_keeps_what_there_is_of_others(writer, tmp_path):
+    kept, join = tmp_path / "reproduction", writer["with_other_scenes"]
+    shutil.copytree(ROOT / "docs" / "reproduction" / "fig6", kept / "fig6")
+    facts = runpy.run_path(str(ROOT / "scripts" / "facts.py"))["Facts"](RESULTS, kept)
+    about, scenes = facts.about("fig6"), facts.by_scene("fig6")
+    again = [row | {"albedo_psnr": 77.7} for row in facts.rows("fig6") if row["scene"] == "KITCHEN"]
+    assert join(kept / "fig6", about, facts.rows("fig6")) is None
+    joined, texts = join(kept / "fig6", about | {"machines": [{"processor": "a new one"}]}, again)
+    assert joined["machines"] == [*about["machines"], {"processor": "a new one"}]
+    assert joined["seconds"] == 2 * about["seconds"]
+    for name, text in texts.items():
+        (kept / "fig6" / name).write_text(text)
+    after = type(facts)(RESULTS, kept)
+    assert after.by_scene("fig6") == scenes and len(scenes) > 4
+    for row in facts.rows("fig6"):
+        same = {key: row[key] for key in ("scene", "method", "views", "seed")}
+        found = after.where("fig6", **same)["albedo_psnr"]
+        assert found == (77.7 if row["scene"] == "KITCHEN" else row["albedo_psnr"])
+    table = after.experiment_table("fig6")
+    lines = facts.experiment_table("fig6").splitlines()
+    other = [line for line in lines if line.startswith("| STAIRCASE |")]
+    assert other and set(other) <= set(table.splitlines()) and "77.7" in table
 
 
 def test_methods_whose_steps_are_as_fast_as_ours_are_told(writer, tmp_path):

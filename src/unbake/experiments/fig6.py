@@ -73,7 +73,7 @@ def _result(context: ExperimentContext, findings: Mapping[str, Findings]) -> Exp
             views = scene_fits.qualities(context, fits[0])
             head = {"method": title, "scene": scene_fits.scene.label}
             rows += [head | views[number] for number in VIEWS]
-    return ExperimentResult(rows, _tables(rows))
+    return ExperimentResult(rows, tables(rows))
 
 
 def _beside(rows: list[Row], equal: list[Row]) -> list[Row]:
@@ -97,13 +97,14 @@ def _estimators(by_scene: Mapping[str, str]) -> str:
     return ", ".join(f"{ESTIMATORS[e]} in {', '.join(scenes)}" for e, scenes in used.items())
 
 
-def _tables(rows: list[Row]) -> str:
+def tables(rows: list[Row]) -> str:
+    """The tables of rows of some scenes, as Markdown."""
     means = {(row["scene"], row["method"]): row for row in rows if "seeds" in row}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     by_scene = {m: {scene: means[scene, m]["estimator"] for scene in scenes} for m in METHODS}
     estimators = "; ".join(f"{m}: {_estimators(by_scene[m])}" for m in WITH_CHOICE)
     others = {e for m in METHODS if m not in WITH_CHOICE for e in by_scene[m].values()}
-    tables = [
+    parts = [
         "PSNR in dB, mean over held-out views; ± is the standard deviation over so many seeds. "
         f"Samples are camera samples traced in all passes. Estimators: {estimators}; "
         f"the others: {' or '.join(ESTIMATORS[e] for e in sorted(others))}"
@@ -118,18 +119,18 @@ def _tables(rows: list[Row]) -> str:
             lines = [
                 [
                     scene,
-                    means[scene, SLOW]["seeds"],
+                    int(means[scene, SLOW]["seeds"]),
                     *(plus_minus(means[scene, m], key + end) for m in columns),
                 ]
                 for scene in scenes
             ]
             table = markdown(["scene", "seeds", *columns], lines)
-            tables.append(f"{title}: {names[key]}\n\n{table}")
+            parts.append(f"{title}: {names[key]}\n\n{table}")
     lines = [
         [scene, *(f"{means[scene, m]['samples'] / 1e6:.0f} M" for m in METHODS)] for scene in scenes
     ]
-    tables.append(f"Samples in equal time\n\n{markdown(['scene', *METHODS], lines)}")
-    return "\n\n".join(tables)
+    parts.append(f"Samples in equal time\n\n{markdown(['scene', *METHODS], lines)}")
+    return "\n\n".join(parts)
 
 
 EXPERIMENT = Experiment(
