@@ -20,6 +20,7 @@ from ..fields.shapes import met_shapes
 from .files import find
 from .images import IMAGES, check_image
 from .meshes import FORMATS, check_mesh
+from .normals import repair_normals
 from .preflight import check_xml
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
@@ -73,6 +74,7 @@ class ParsedScene:
             del scene
             self.state = mi.parser.ParserState()
             raise UserError(fault[0], self.path, fault[1])
+        repair_normals(scene)
         return scene
 
     def _forget_queries(self) -> None:
