@@ -135,8 +135,8 @@ def reproduce(
         remedy = "Leave it out: only fits are repeated with several seeds"
         raise UserError(f"{experiment.name} has no seeds", "--seeds", remedy)
     if context.only and not experiment.by_scene:
-        remedy = "Leave it out: only table1, fig3 and fig6 are made scene by scene"
-        raise UserError(f"{experiment.name} has no choice of scenes", "--only", remedy)
+        what = f"{experiment.name} is not made scene by scene"
+        raise UserError(what, "--only", "Leave it out")
     if not ranks.leads:
         context = replace(context, console=Console(quiet=True))
     jobs = ranks.together(lambda: experiment.jobs(context))

@@ -22,11 +22,12 @@ import numpy as np
 from ..imaging.pictures import png_bytes
 from ..io import write_atomically
 from ..scene.parse import ParsedScene
+from ..scene.triangles import unit
 from ..version import VERSION
 from .bake import Baked
 from .lights import Light
 from .parts import Part
-from .tessellate import Triangles, unit
+from .tessellate import Triangles
 from .textures import picture
 
 _FLOAT, _UINT, _ARRAY, _INDEX = 5126, 5125, 34962, 34963

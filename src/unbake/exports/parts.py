@@ -15,7 +15,8 @@ from ..fields.pieces import Pieces
 from ..fields.shapes import PlacedShape, placed_shapes
 from ..scene import edit
 from ..scene.parse import ParsedScene, parse
-from .tessellate import TESSELLATED, Triangles, tessellated, unit
+from ..scene.triangles import unit
+from .tessellate import TESSELLATED, Triangles, tessellated
 
 #: By which a shape that was made is found among the nodes.
 _ID = "shape node {}"

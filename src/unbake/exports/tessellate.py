@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..scene.triangles import unit
+
 #: Around a circle, and from pole to pole.
 _AROUND, _ALONG = 128, 64
 #: Plugins that become triangles.
@@ -50,14 +52,6 @@ class Triangles:
         """The areas of the triangles, (m,) float64."""
         a, b, c = np.moveaxis(self.positions[self.faces].astype(np.float64), 1, 0)
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (n, 3) of length 1, float32; those of length 0 become +z."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    known = np.isfinite(length) & (length > 0)
-    scaled = np.where(known, vectors, [0.0, 0.0, 1.0]) / np.where(known, length, 1)
-    return scaled.astype(np.float32)
 
 
 def tessellated(plugin: str) -> Triangles:

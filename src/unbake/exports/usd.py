@@ -24,11 +24,12 @@ import numpy as np
 from ..errors import UserError
 from ..imaging.pictures import write_png
 from ..scene.parse import ParsedScene
+from ..scene.triangles import unit
 from .bake import Baked
 from .gltf import Document, plain_material
 from .lights import Light
 from .parts import Part
-from .tessellate import Triangles, unit
+from .tessellate import Triangles
 from .textures import COLOUR_SPACES, file_names, picture
 
 #: Of the shader: the quantity, and its type and the channels of the texture that it takes.

@@ -11,13 +11,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.shapes import met_shapes
+from .triangles import normal_sums, unit
 
 
 def repair_normals(scene: mi.Scene) -> int:
     """Give vertices without a finite normal the mean normal of their triangles, by area.
 
     Other normals stay as they are. A vertex that has only triangles without area, which no ray
-    hits, gets some unit vector.
+    hits, gets +z.
 
     Args:
         scene: changed in place.
@@ -35,28 +36,12 @@ def repair_normals(scene: mi.Scene) -> int:
             continue
         positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
         faces = np.array(shape.faces_buffer()).reshape(-1, 3)
-        sums = _sums(positions, faces)
+        sums = normal_sums(positions, faces)
         # Meshes may be turned inside out, their normals with them.
         inward = (sums[~broken] * normals[~broken]).sum() < 0
-        normals[broken] = _unit(-sums[broken] if inward else sums[broken])
+        normals[broken] = unit(-sums[broken] if inward else sums[broken])
         params = mi.traverse(shape)
         params["vertex_normals"] = normals.ravel()
         params.update()
         count += int(broken.sum())
     return count
-
-
-def _sums(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The normals of the triangles of each vertex, times twice their area, added up."""
-    a, b, c = (positions[faces[:, corner]] for corner in range(3))
-    normals, sums = np.cross(b - a, c - a), np.zeros_like(positions)
-    for corner in range(3):
-        np.add.at(sums, faces[:, corner], normals)
-    return sums
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    found = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-    found[length[:, 0] == 0] = (0, 0, 1)
-    return found

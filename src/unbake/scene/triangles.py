@@ -67,3 +67,25 @@ def save_mesh(file: Path, mesh: mi.Mesh) -> None:
         UserError: the file cannot be written.
     """
     write_atomically(file, lambda path: mesh.write_ply(str(path)), what="mesh")
+
+
+def normal_sums(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The normals of the triangles at each vertex, times twice their areas, added up; (n, 3).
+
+    Args:
+        positions: (n, 3).
+        faces: (m, 3) indices.
+    """
+    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
+    sums = np.zeros((len(positions), 3))
+    for corner in faces.T:
+        np.add.at(sums, corner, np.cross(b - a, c - a))
+    return sums
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) of length 1, float32; those of length 0 become +z."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    known = np.isfinite(length) & (length > 0)
+    scaled = np.where(known, vectors, [0.0, 0.0, 1.0]) / np.where(known, length, 1)
+    return scaled.astype(np.float32)

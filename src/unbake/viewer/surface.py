@@ -13,6 +13,7 @@ from ..exports.observed import Views
 from ..exports.parts import Part
 from ..exports.tessellate import Triangles
 from ..fields.arrays import from_numpy
+from ..scene.triangles import normal_sums
 
 #: Vertices, about; scenes that have more of their own keep them.
 VERTICES = 120_000
@@ -122,10 +123,7 @@ def _with_normals(triangles: Triangles) -> tuple[Triangles, np.ndarray]:
         uv = None if triangles.uv is None else triangles.uv[corners]
         faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
         triangles = Triangles(triangles.positions[corners], faces, None, uv)
-    a, b, c = np.moveaxis(triangles.positions[triangles.faces].astype(np.float64), 1, 0)
-    normals = np.zeros((len(triangles.positions), 3))
-    for corner in triangles.faces.T:
-        np.add.at(normals, corner, np.cross(b - a, c - a))
+    normals = normal_sums(triangles.positions, triangles.faces)
     return triangles, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
