@@ -353,12 +353,6 @@ class Facts:
         ]
         return sum(self.ahead(experiment, key, *pair).startswith("+") for pair in pairs)
 
-    def best_in(self, experiment: str, scene: str, key: str) -> str:
-        """The method that has most of something in a scene; untrained fields are none."""
-        trained = [m for m in self.methods_in(experiment) if m != "untrained"]
-        found = {m: self.where(experiment, scene=scene, method=m)[key] for m in trained}
-        return max(found, key=lambda method: found[method])
-
     def published_is_smaller(self, experiment: str, method: str) -> list[bool]:
         """Of each published scene, whether a method's multiple of ours is smaller there."""
         rows = [row for row in self.rows(experiment) if row["method"] == method]

@@ -182,7 +182,7 @@ def with_other_scenes(
     every.sort(key=lambda row: order.index(row["scene"]))
     machines = [*before["machines"], *about["machines"]]
     joined = about | {
-        "machines": [m for n, m in enumerate(machines) if m not in machines[:n]],
+        "machines": list({json.dumps(machine): machine for machine in machines}.values()),
         "seconds": before["seconds"] + about["seconds"],
     }
     return joined, {"data.csv": csv_text(every), "table.md": fig6.tables(every) + "\n"}
