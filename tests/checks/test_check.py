@@ -17,6 +17,7 @@ from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
 from unbake.scene.parse import parse
+from unbake.scene.triangles import write_mesh
 
 FLIP = np.diag([*np.diag(OPENCV), 1.0])
 
@@ -58,6 +59,25 @@ def test_three_faults_are_told_in_one_go(spoilt, unbake):
     assert "poses seem to be in OpenCV's axes" in text
     assert "Negate columns 2 and 3 of the matrix" in text
     assert "3 errors; a fit makes no sense yet" in text
+
+
+def test_vertex_normals_that_are_not_numbers_are_told(spoilt, unbake):
+    data = spoilt("cornell")
+    assert found(data.folder, "normals") == []
+    scene = data.folder / data.content["scene"]
+    corners, normals = np.eye(3) * 0.1, np.array([[np.nan, 0, 0], [0, 0, 1], [np.inf, 0, 0]])
+    write_mesh(scene.parent / "chip.ply", corners, np.array([[0, 1, 2]]), normals)
+    chip = (
+        '<shape type="ply"><string name="filename" value="chip.ply"/>'
+        '<bsdf type="twosided"><bsdf type="principled"/></bsdf></shape></scene>'
+    )
+    scene.write_text(scene.read_text().replace("</scene>", chip))
+    (finding,) = found(data.folder, "normals")
+    assert finding.level == "hint" and finding.what.endswith("not numbers: 2")
+    assert finding.where == data.content["scene"]
+    outcome = unbake("data", "check", data.folder)
+    assert outcome.status == 0
+    assert "hint: " in outcome.out and "geometry   hint" in outcome.out
 
 
 def test_every_fault_of_a_frame_is_told_before_a_fit(spoilt):

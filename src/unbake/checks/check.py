@@ -169,6 +169,11 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
     except UserError as error:
         result.findings += [replace(f, check="scene") for f in _grouped([error], dataset.folder)]
         return
+    if parsed.repaired_normals:
+        what = f"vertex normals that are not numbers: {parsed.repaired_normals}"
+        remedy = "Normals of the triangles take their place. Compute them anew if you want others"
+        where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
+        result.add(Finding("hint", "normals", what, where, remedy))
     faults: list[UserError] = []
     cameras = [small_camera(view.camera) for view in dataset.views]
     for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):

@@ -12,7 +12,7 @@ from .check import CheckedView, DataCheck
 #: The checks in the order in which they are told, and those that each row stands for.
 _ROWS = {
     "files": ("files", "scene", "masks", "hot pixels"),
-    "geometry": ("geometry", "units"),
+    "geometry": ("geometry", "units", "normals"),
     "alignment": ("alignment",),
     "exposure": ("exposure",),
     "light": ("light",),

@@ -43,6 +43,8 @@ class ParsedScene:
     root: Path  #: folder that holds all its files
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
+    #: Vertex normals that were not numbers, and were replaced when the scene was made.
+    repaired_normals: int = 0
 
     def instantiate(self, *, merge: bool = True) -> mi.Scene:
         """Make the scene, once: the nodes cannot be used again.
@@ -74,7 +76,7 @@ class ParsedScene:
             del scene
             self.state = mi.parser.ParserState()
             raise UserError(fault[0], self.path, fault[1])
-        repair_normals(scene)
+        self.repaired_normals = repair_normals(scene)
         return scene
 
     def _forget_queries(self) -> None:
