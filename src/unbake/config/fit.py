@@ -151,6 +151,11 @@ UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
 #: Schedule of methods for which no other one was found best.
 OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
+#: Least slope of the bounds of materials, of methods with L_θ; others have none.
+LEAST_SLOPE = 0.01
+#: Adam's β₂ for the unknowns of methods with L_θ, and of all others. Where roughness is not
+#: searched for, noise moves it farther with that slope or with the shorter memory.
+FORGETFUL_BETA2, OWN_BETA2 = 0.99, 0.999
 
 #: Bounces that can be differentiated before the radiance field takes over.
 MOST_BOUNCES = 16
@@ -298,6 +303,10 @@ class FitConfig:
     #: Steps over which the unknowns' rates rise (ours). None: what was found best for the method,
     #: else `OWN_WARM_UP`, so that L_θ stays ahead, and none without L_θ.
     warm_up: int | None = None
+    #: Adam's β₂ for the unknowns: how long it remembers the squares of gradients (ours). Those of
+    #: the first steps may be a hundred times as large as later ones. 0: `FORGETFUL_BETA2` with L_θ,
+    #: and the usual `OWN_BETA2` without; a run that was started has a number.
+    beta2: float = 0.0
     #: Unbiased squared error (Sec. 5.2). auto: what was found best for the method; see
     #: `chosen_estimator`.
     estimator: Estimator = "auto"
@@ -306,6 +315,10 @@ class FitConfig:
 
     #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
+    #: Of materials by numbers before their bounds, in gradients (ours; `fields/arrays.py`). With 0,
+    #: what the first steps moved far beyond a bound comes back slowly or never. -1: `LEAST_SLOPE`
+    #: with L_θ, and 0 without; a run that was started has a number.
+    least_slope: float = -1.0
     #: Of L_θ, by representation (Sec. 5.3).
     radiance: Mapping[str, FieldSettings] = field(default_factory=dict)
     #: Where bounces of methods with L_θ look for light (ours).
@@ -333,6 +346,8 @@ class FitConfig:
                 "pixels": (1, MOST_SAMPLES),
                 "sync_every": (1, READ_EVERY),  # what is told is of one state
                 "held_aside": (0, 0.5),
+                "beta2": (0, 0.99999),
+                "least_slope": (-1, 0.25),  # that of the middle
                 "final_learning_rate": (POSITIVE, 1e3),
                 "loss_epsilon": (1e-12, 1e20),  # its inverse is a weight, in single precision
             },

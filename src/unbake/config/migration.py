@@ -38,6 +38,8 @@ _GROUPS = ("grid", "bitmap")
 _AS_BEFORE: dict[str, dict[str, Any]] = {
     "": {
         "held_aside": 0.0,
+        "beta2": 0.999,
+        "least_slope": 0.0,
         "guide.cells": 0,
         "regularization.albedo_smoothness": 0.0,
         "roughness_search.times": 0,

@@ -34,10 +34,12 @@ def _paper() -> FitConfig:
         radiance_spp=0,
         final_learning_rate=1.0,
         warm_up=0,
+        beta2=0.999,
         estimator="two-pass",
         guide=GuideConfig(cells=0),
         loss_reference="photograph",
         loss_epsilon=0.01,
+        least_slope=0.0,
         lighting=LightingConfig(resolution=128, learning_rate=5e-4, initial_radiance=1.0),
         regularization=RegularizationConfig(albedo_smoothness=0.0),
         roughness_search=RoughnessSearchConfig(
@@ -139,6 +141,8 @@ def with_method(config: FitConfig, name: str) -> FitConfig:
             estimator="auto",
             final_learning_rate=own.final_learning_rate,
             warm_up=own.warm_up,
+            beta2=own.beta2,
+            least_slope=own.least_slope,
         )
     return dataclasses.replace(config, method=name)
 

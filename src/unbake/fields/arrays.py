@@ -10,10 +10,47 @@ import numpy as np
 
 from .field import FieldSpec
 
+#: How far from 0 numbers are let go by more than the slope of `sigmoid`: it is 0.0025 there.
+_FAR = 6.0
 
-def sigmoid(x: mi.Float) -> mi.Float:
-    """1 / (1 + exp(−x))."""
+
+def sigmoid(x: mi.Float, least_slope: float = 0.0) -> mi.Float:
+    """1 / (1 + exp(−x)).
+
+    Args:
+        x: any number.
+        least_slope: backwards, gradients are multiplied with this where the slope is less (ours).
+            Those by which a descent would move away from 0 keep their slope beyond ±6, so that
+            numbers come back from wherever they are, and do not run away.
+    """
+    if least_slope and dr.grad_enabled(x):
+        return dr.custom(_Sigmoid, x, least_slope)
+    return _sigmoid(x)
+
+
+def _sigmoid(x: mi.Float) -> mi.Float:
     return dr.rcp(1 + dr.exp(-x))
+
+
+class _Sigmoid(dr.CustomOp):
+    """The function with a least slope, which is that of the backward direction alone."""
+
+    def eval(self, x, least_slope):
+        value = _sigmoid(x)
+        self.x, self.least_slope, self.slope = x, least_slope, value * (1 - value)
+        return value
+
+    def forward(self):
+        self.set_grad_out(self.slope * self.grad_in("x"))
+
+    def backward(self):
+        gradient = self.grad_out()
+        away = (dr.abs(self.x) > _FAR) & (self.x * gradient < 0)
+        slope = dr.select(away, self.slope, dr.maximum(self.slope, self.least_slope))
+        self.set_grad_in("x", slope * gradient)
+
+    def name(self):
+        return "sigmoid"
 
 
 def first_value(spec: FieldSpec) -> float:

@@ -33,6 +33,7 @@ class Bitmaps(Field):
         self.names = spec.materials
         self.channels = spec.outputs
         self.bounded = spec.bounded
+        self._least_slope = spec.least_slope
         count = len(self.names) * size * size * self.channels
         if count >= 1 << 32:
             raise UserError(
@@ -102,4 +103,4 @@ class Bitmaps(Field):
         ]
 
     def _bound(self, x: mi.Float) -> mi.Float:
-        return sigmoid(x) if self.bounded else x
+        return sigmoid(x, self._least_slope) if self.bounded else x

@@ -27,6 +27,7 @@ class FieldSpec:
         bounded: every output lies in (0, 1), and `initial` between; otherwise outputs are any
             numbers, and start near zero.
         initial: value of every output of an untrained field that is bounded.
+        least_slope: of bounded outputs by numbers before their bounds, in gradients; see `sigmoid`.
         seed: of random initial parameters.
         half: products may be in half precision.
         materials: names of the scene's materials, in the order of `SurfacePoint.material`.
@@ -36,6 +37,7 @@ class FieldSpec:
     extra: int = 0
     bounded: bool = False
     initial: float = 0.5
+    least_slope: float = 0.0
     seed: int = 0
     half: bool = False
     materials: tuple[str, ...] = ()

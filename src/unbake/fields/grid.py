@@ -29,6 +29,7 @@ class DenseGrid(Field):
     def __init__(self, settings: DenseGridConfig, spec: FieldSpec) -> None:
         self.outputs = spec.outputs
         self.bounded = spec.bounded
+        self._least_slope = spec.least_slope
         self._corners = corners = settings.cells + 1
         features = features_of(spec.outputs)
         # A hash grid of one level whose table has room for every corner hashes nothing.
@@ -62,7 +63,7 @@ class DenseGrid(Field):
         # At 1 the corners beyond the last weigh nothing, but are read: from outside of the array.
         inside = [dr.minimum(x, _LAST) for x in point.position]
         outputs = list(self.grid(inside))[: self.outputs]
-        return [sigmoid(x) for x in outputs] if self.bounded else outputs
+        return [sigmoid(x, self._least_slope) for x in outputs] if self.bounded else outputs
 
     def differences(self) -> list[mi.Float]:
         """Values of outputs at corners less those of the neighbours before them, by axis."""

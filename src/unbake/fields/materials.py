@@ -223,6 +223,7 @@ def make_materials(
     *,
     seed: int,
     half: bool = False,
+    least_slope: float = 0.0,
 ) -> Materials:
     """Fresh materials.
 
@@ -232,6 +233,7 @@ def make_materials(
         names: of the scene's materials, for representations with a field for each.
         seed: of initial parameters.
         half: products may be in half precision.
+        least_slope: of what bounds quantities, in gradients; see `FieldSpec`.
 
     Raises:
         UserError: there is no such representation or quantity, or a field would be too large.
@@ -248,6 +250,7 @@ def make_materials(
             initial=(quantity.initial - quantity.lower) / (quantity.upper - quantity.lower),
             seed=seed + number,
             half=half,
+            least_slope=least_slope,
             materials=tuple(names),
         )
         fields[name] = registry.representation(representation).field(settings[name], spec)

@@ -48,6 +48,7 @@ class Network(Field):
         self.most_pieces = pieces.most
         self._pace, self._learned = pieces.network, pieces.learned
         self._bounded = spec.bounded and self.pieces is not None
+        self._least_slope = spec.least_slope
         self._first = first_value(spec) if self._bounded else 0.0
         of_layers = replace(spec, bounded=False) if self._bounded else spec
         self.perceptron = Perceptron(
@@ -109,7 +110,7 @@ class Network(Field):
             return beside
         beside = [dr.fma(self._pace, x, self._first) for x in beside]
         outputs = self.pieces.evaluate(point, beside)
-        return [sigmoid(x) for x in outputs] if self._bounded else outputs
+        return [sigmoid(x, self._least_slope) for x in outputs] if self._bounded else outputs
 
     def cost(self) -> Cost:
         """The products of all layers, and eight corners of each level of the grid."""

@@ -55,6 +55,7 @@ class Perceptron:
         self.leak = leak
         self.half = spec.half
         self.bounded = spec.bounded
+        self._least_slope = spec.least_slope
         self.outputs = spec.outputs
         self.layers: list[tuple[mi.TensorXf, mi.TensorXf]] = []
         for layer, (fan_in, fan_out) in enumerate(
@@ -110,7 +111,7 @@ class Perceptron:
             One array for each output, in (0, 1) where they are bounded.
         """
         outputs = self._outputs(features, engine or self._usual_engine())
-        return [sigmoid(x) for x in outputs] if self.bounded else outputs
+        return [sigmoid(x, self._least_slope) for x in outputs] if self.bounded else outputs
 
     def _outputs(self, features: list[mi.Float], engine: Engine) -> list[mi.Float]:
         match engine:

@@ -57,6 +57,7 @@ class TorchField(Field):
             self.module = build(3 + spec.extra, spec.outputs)
         self.outputs = spec.outputs
         self.bounded = spec.bounded
+        self._least_slope = spec.least_slope
         self._first = first_value(spec)
         self._parameters: dict[str, mi.TensorXf] = {}
         for name, value in self.module.named_parameters():
@@ -89,7 +90,7 @@ class TorchField(Field):
         lane = dr.arange(mi.UInt32, lanes)
         values = [dr.gather(mi.Float, found.array, lane + i * lanes) for i in range(self.outputs)]
         values = [x + self._first for x in values]
-        return [sigmoid(x) for x in values] if self.bounded else values
+        return [sigmoid(x, self._least_slope) for x in values] if self.bounded else values
 
     def cost(self) -> Cost:
         """One product a parameter, as if all of them were weights of dense layers."""

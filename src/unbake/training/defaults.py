@@ -6,7 +6,14 @@ from dataclasses import replace
 from typing import TypeVar
 
 from ..config import FitConfig
-from ..config.fit import BOUNCES_OF_OBJECTS, OWN_FINAL_RATE, OWN_WARM_UP
+from ..config.fit import (
+    BOUNCES_OF_OBJECTS,
+    FORGETFUL_BETA2,
+    LEAST_SLOPE,
+    OWN_BETA2,
+    OWN_FINAL_RATE,
+    OWN_WARM_UP,
+)
 from ..config.method_defaults import MethodDefaults, method_defaults
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
@@ -100,6 +107,8 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
             config.final_learning_rate, found.final_learning_rate, OWN_FINAL_RATE
         ),
         warm_up=_first_known(config.warm_up, found.warm_up, own_warm_up(config)),
+        beta2=config.beta2 or own_beta2(config),
+        least_slope=config.least_slope if config.least_slope >= 0 else own_least_slope(config),
     )
 
 
@@ -112,6 +121,16 @@ def own_bounces(config: FitConfig, kind: SceneKind) -> int:
 def own_warm_up(config: FitConfig) -> int:
     """The warm-up of a method for which no other one was found: none without L_θ."""
     return OWN_WARM_UP if has_radiance(config.chosen_method) else 0
+
+
+def own_beta2(config: FitConfig) -> float:
+    """Adam's β₂ for the unknowns of a method where the settings leave it open."""
+    return FORGETFUL_BETA2 if has_radiance(config.chosen_method) else OWN_BETA2
+
+
+def own_least_slope(config: FitConfig) -> float:
+    """The least slope of the bounds of materials where the settings leave it open."""
+    return LEAST_SLOPE if has_radiance(config.chosen_method) else 0.0
 
 
 def _first_known(*values: Number | None) -> Number:

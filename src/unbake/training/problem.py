@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import CameraConfig, FitConfig, ObjectiveConfig
+from ..config.fit import OWN_BETA2
 from ..dataset.data_folder import TRANSFORMS
 from ..dataset.photographs import Photographs
 from ..dataset.pixels import CameraRays, PixelSource
@@ -58,6 +59,7 @@ class Problem:
     poses: PoseModel | None = None  #: corrections of the training views' cameras; None: as given
     outliers: OutlierModel | None = None  #: of the training views; None: all pixels count alike
     guide: LightGuide | None = None  #: of bounces; None: BSDFs alone draw directions
+    beta2: float = 0.999  #: of Adam, for the unknowns
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -209,6 +211,7 @@ def make_problem(
         _unknown_poses(config.camera, unchanged, views),
         _unknown_outliers(config.objective, views),
         guide,
+        config.beta2 or OWN_BETA2,
     )
 
 
@@ -286,6 +289,7 @@ def _unknown_materials(parsed: ParsedScene, config: FitConfig, seed: int) -> Mat
         names,
         seed=seed,
         half=config.half_precision,
+        least_slope=max(config.least_slope, 0.0),
     )
     if representation(config.representation).unwrapped:
         each = [material_textures(materials, number) for number in range(len(names))]

@@ -157,7 +157,8 @@ def initial_state(problem: Problem) -> State:
 
     Paper: Sec. 5.4.
     """
-    phi = mi.ad.Adam(1e-3, problem.parameters(), mask_updates=True)
+    parameters, beta2 = problem.parameters(), problem.beta2
+    phi = mi.ad.Adam(1e-3, parameters, beta_2=beta2, mask_updates=True)
     theta = None
     if problem.radiance is not None:
         theta = mi.ad.Adam(1e-3, problem.learned_parameters(), mask_updates=True)
