@@ -151,10 +151,10 @@ UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
 #: Schedule of methods for which no other one was found best.
 OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
-#: Least slope of the bounds of materials, of methods with L_θ; others have none.
+#: Least slope of the bounds of albedo, of methods with L_θ; others have none.
 LEAST_SLOPE = 0.01
 #: Adam's β₂ for the unknowns of methods with L_θ, and of all others. Where roughness is not
-#: searched for, noise moves it farther with that slope or with the shorter memory.
+#: searched for, noise moves it farther with the shorter memory.
 FORGETFUL_BETA2, OWN_BETA2 = 0.99, 0.999
 
 #: Bounces that can be differentiated before the radiance field takes over.
@@ -315,7 +315,7 @@ class FitConfig:
 
     #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
-    #: Of materials by numbers before their bounds, in gradients (ours; `fields/arrays.py`). With 0,
+    #: Of albedo by numbers before its bounds, in gradients (ours; `fields/arrays.py`). With 0,
     #: what the first steps moved far beyond a bound comes back slowly or never. -1: `LEAST_SLOPE`
     #: with L_θ, and 0 without; a run that was started has a number.
     least_slope: float = -1.0

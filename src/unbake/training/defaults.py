@@ -129,7 +129,7 @@ def own_beta2(config: FitConfig) -> float:
 
 
 def own_least_slope(config: FitConfig) -> float:
-    """The least slope of the bounds of materials where the settings leave it open."""
+    """The least slope of the bounds of albedo where the settings leave it open."""
     return LEAST_SLOPE if has_radiance(config.chosen_method) else 0.0
 
 
