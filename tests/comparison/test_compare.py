@@ -95,12 +95,13 @@ def test_two_methods_side_by_side(compare, tmp_path):
     assert "all pairs" in page and "Validation during training" not in page
 
 
-def test_only_the_method_differs(compare, tmp_path):
+def test_only_the_method_differs_and_what_belongs_to_it(compare, tmp_path):
     assert compare("ours", "direct", steps=2).status == 0
     ours, direct = (
         vars(read_toml(tmp_path / "out" / n / "config.toml")) for n in ("ours", "direct")
     )
-    assert {key for key in ours if ours[key] != direct[key]} == {"method"}
+    differing = {key for key in ours if ours[key] != direct[key]}
+    assert differing == {"method", "beta2", "least_slope"}
 
 
 def test_the_untrained_fields_stand_beside_the_methods(compare, tmp_path):
