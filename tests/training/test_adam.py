@@ -89,9 +89,7 @@ def test_the_slope_of_the_settings_reaches_albedo_alone(representation, slope, l
 def slope_far_below(field):
     """The share of a gradient upwards that reaches numbers which give outputs an offset."""
     parameters = field.parameters()
-    offsets = [key for key in parameters if key in ("corners", "texels") or key.endswith("bias")][
-        -1
-    ]
+    *_, offsets = (k for k in parameters if k in ("corners", "texels") or k.endswith("bias"))
     lower = dr.full(mi.Float, -30, dr.width(parameters[offsets].array))
     if dr.is_tensor_v(parameters[offsets]):
         lower = mi.TensorXf(lower, parameters[offsets].shape)
