@@ -30,6 +30,9 @@ class Quantity:
         default: what `principled` takes where a scene does not say.
         display: how pictures show it: a colour through the sRGB curve, or data without one.
         gltf: where it goes in a glTF 2.0 material: texture and channels.
+        comes_back: whether a least slope in gradients brings it back from far beyond a bound
+            (`FitConfig.least_slope`). Not for what searches move: they seek the most probable
+            numbers, for which they need the true slope.
         settings: by representation, what differs from that representation's own settings, as nested
             tables of the settings file.
     """
@@ -44,6 +47,7 @@ class Quantity:
     default: float
     display: Literal["colour", "data"]
     gltf: str
+    comes_back: bool = False
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
@@ -63,6 +67,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 default=0.5,
                 display="colour",
                 gltf="baseColorTexture.rgb",
+                comes_back=True,
                 settings={
                     "neural": {
                         "hidden": 1,

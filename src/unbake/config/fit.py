@@ -153,8 +153,8 @@ UNKNOWNS = (*QUANTITIES, "environment", "emission")
 OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
 #: Least slope of the bounds of albedo, of methods with L_θ; others have none.
 LEAST_SLOPE = 0.01
-#: Adam's β₂ for the unknowns of methods with L_θ, and of all others. Where roughness is not
-#: searched for, noise moves it farther with the shorter memory.
+#: Adam's first β₂ for the unknowns of methods with L_θ, and that of all others. Where roughness
+#: is not searched for, noise moves it farther with the shorter memory.
 FORGETFUL_BETA2, OWN_BETA2 = 0.99, 0.999
 
 #: Bounces that can be differentiated before the radiance field takes over.
@@ -303,9 +303,10 @@ class FitConfig:
     #: Steps over which the unknowns' rates rise (ours). None: what was found best for the method,
     #: else `OWN_WARM_UP`, so that L_θ stays ahead, and none without L_θ.
     warm_up: int | None = None
-    #: Adam's β₂ for the unknowns: how long it remembers the squares of gradients (ours). Those of
-    #: the first steps may be a hundred times as large as later ones. 0: `FORGETFUL_BETA2` with L_θ,
-    #: and the usual `OWN_BETA2` without; a run that was started has a number.
+    #: Adam's first β₂ for the unknowns: how long it remembers the squares of gradients (ours).
+    #: Those of the first steps may be a hundred times as large as later ones. It grows with the
+    #: steps to `OWN_BETA2`, the usual one (`training/adam.py`). 0: `FORGETFUL_BETA2` with L_θ, and
+    #: `OWN_BETA2` without; a run that was started has a number.
     beta2: float = 0.0
     #: Unbiased squared error (Sec. 5.2). auto: what was found best for the method; see
     #: `chosen_estimator`.

@@ -233,8 +233,7 @@ def make_materials(
         names: of the scene's materials, for representations with a field for each.
         seed: of initial parameters.
         half: products may be in half precision.
-        least_slope: of what bounds albedo, in gradients; see `FieldSpec`. Searches of roughness
-            seek the most probable numbers, for which they need its true slope.
+        least_slope: of what bounds quantities that come back; see `FieldSpec`.
 
     Raises:
         UserError: there is no such representation or quantity, or a field would be too large.
@@ -251,7 +250,7 @@ def make_materials(
             initial=(quantity.initial - quantity.lower) / (quantity.upper - quantity.lower),
             seed=seed + number,
             half=half,
-            least_slope=least_slope if name == "albedo" else 0.0,
+            least_slope=least_slope if quantity.comes_back else 0.0,
             materials=tuple(names),
         )
         fields[name] = registry.representation(representation).field(settings[name], spec)

@@ -59,7 +59,7 @@ class Problem:
     poses: PoseModel | None = None  #: corrections of the training views' cameras; None: as given
     outliers: OutlierModel | None = None  #: of the training views; None: all pixels count alike
     guide: LightGuide | None = None  #: of bounces; None: BSDFs alone draw directions
-    beta2: float = OWN_BETA2  #: of Adam, for the unknowns
+    beta2: float = OWN_BETA2  #: Adam's first one, for the unknowns
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""

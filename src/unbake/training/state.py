@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.arrays import from_numpy
+from .adam import GrowingAdam
 from .loss_scaling import first_scale
 from .problem import Problem
 
@@ -158,7 +159,7 @@ def initial_state(problem: Problem) -> State:
     Paper: Sec. 5.4.
     """
     parameters, beta2 = problem.parameters(), problem.beta2
-    phi = mi.ad.Adam(1e-3, parameters, beta_2=beta2, mask_updates=True)
+    phi = GrowingAdam(1e-3, parameters, beta_2=beta2, mask_updates=True)
     theta = None
     if problem.radiance is not None:
         theta = mi.ad.Adam(1e-3, problem.learned_parameters(), mask_updates=True)
