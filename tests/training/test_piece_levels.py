@@ -11,6 +11,7 @@ from searches import SEARCH, SMALL, made_up
 from unbake.config import FitConfig, read_toml, to_toml
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
+from unbake.training import piece_levels
 from unbake.training.piece_levels import LEVELS, expected, with_expected_levels
 from unbake.training.roughness_curves import NODES, Curves, in_range, points
 from unbake.training.roughness_search import descend, searched
@@ -65,6 +66,19 @@ def test_errors_are_as_small_as_with_the_true_distribution():
 def test_a_piece_alone_does_not_confirm_its_own_noise():
     (found,) = levels_of(parabolas([LEVELS[0]], [1.0]), [RED], pixels=1e4)
     assert found == pytest.approx(LEVELS.mean(), abs=0.1)
+
+
+def test_a_piece_does_not_confirm_its_own_noise_through_the_others(monkeypatch):
+    # Ten pieces are known to be rough, of ten photographs tell nothing, and one seems smooth.
+    sharp = 100 * (LEVELS - 0.85) ** 2
+    errors = np.stack([sharp] * 10 + [0 * sharp] * 10 + [24.0 * (LEVELS > 0.2)])
+
+    def of_the_odd_one():
+        return levels_of(errors, [RED] * 21, replace(SEARCH, pixels_as_one=3.0))[-1]
+
+    assert of_the_odd_one() > 0.75
+    monkeypatch.setattr(piece_levels, "_MOST_ODD", 0)
+    assert of_the_odd_one() < 0.45
 
 
 def test_a_piece_that_differs_from_a_crowd_stays_what_photographs_show():

@@ -7,7 +7,8 @@ photograph is seen, the pieces tell: many are of few materials, and those of lik
 often of one. So the distribution is found together with them, about as the one under which what
 photographs show is most probable (nonparametric maximum likelihood, Laird 1978; by expectation
 maximization with smoothing, Silverman et al. 1990). For each piece it is that of the others: a
-piece by itself would confirm its own noise. A piece that no pixel shows by itself has no curve: it
+piece by itself would confirm its own noise. It would do so through the others, too: for pieces that
+are odd it is found once more, without them. A piece that no pixel shows by itself has no curve: it
 goes to what is to be expected of its colour.
 
 Each piece moves as a whole: how its roughness varies with brightness and place stays as it is.
@@ -39,6 +40,9 @@ _EVEN = 0.005
 _AS_MANY = 1.0
 #: Steps of expectation maximization.
 _STEPS = 40
+#: A piece is odd if what it shows is less probable than this, by what the others show, as a part of
+#: the most that it could be; and so many are looked at, those that are the most odd.
+_ODD, _MOST_ODD = 0.5, 32
 #: Weights by which neighbouring levels are mixed.
 _MIXED = (0.25, 0.5, 0.25)
 
@@ -118,17 +122,47 @@ def expected(
     near = np.exp((2 * kinds @ kinds.T - square[:, None] - square) / 8)
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
-    weight = (weight / weight[pixels > 0].mean())[:, None]
-    probable = normalized(chance)
-    for _ in range(_STEPS):
-        own = weight * _mixed(probable)
-        of_kinds = np.zeros((len(kinds), len(LEVELS)))
-        np.add.at(of_kinds, kind.ravel(), own)
-        others = own.sum(0) - own
-        prior = (near @ of_kinds)[kind.ravel()] - own + _AS_MANY * normalized(others)
-        prior = (1 - _EVEN) * normalized(prior) + _EVEN / len(LEVELS)
-        probable = normalized(chance * prior)
-    return probable @ LEVELS
+    weight = weight / weight[pixels > 0].mean()
+    prior = _prior(chance, weight, near, kind.ravel())
+    # What an odd piece tells the others they tell each other, and then it: so it is left out.
+    usual = (chance * prior).sum(1) / chance.max(1)
+    seen = np.flatnonzero(pixels > 0)
+    of_seen, kind = np.unique(kind.ravel()[seen], return_inverse=True)
+    near = near[np.ix_(of_seen, of_seen)]
+    odd = np.flatnonzero(usual[seen] < _ODD)
+    for number in odd[np.argsort(usual[seen][odd], kind="stable")][:_MOST_ODD]:
+        others = np.where(np.arange(len(seen)) == number, 0, weight[seen])
+        if others.any():
+            found = _prior(chance[seen], others, near, kind.ravel())
+            prior[seen[number]] = found[number]
+    return normalized(chance * prior) @ LEVELS
+
+
+def _prior(
+    chance: np.ndarray, weight: np.ndarray, near: np.ndarray, kind: np.ndarray
+) -> np.ndarray:
+    """How probable levels of each piece are by what the others show.
+
+    Args:
+        chance: of photographs at each of `LEVELS`, shape (pieces, levels).
+        weight: of what each piece tells the others, shape (pieces,); some tell nothing.
+        near: how much alike kinds of colours are, shape (kinds, kinds).
+        kind: of each piece, shape (pieces,).
+    """
+    telling = np.flatnonzero(weight)
+    own = np.zeros_like(chance)
+    prior = np.ones_like(chance)
+    for step in range(_STEPS):
+        last = step == _STEPS - 1  # that is the one of all pieces
+        wanted = slice(None) if last else telling
+        probable = normalized(chance[telling] * prior[telling])
+        own[telling] = weight[telling, None] * _mixed(probable)
+        of_kinds = np.zeros((len(near), len(LEVELS)))
+        np.add.at(of_kinds, kind[telling], own[telling])
+        of_others = own[telling].sum(0) - own[wanted]
+        found = (near @ of_kinds)[kind[wanted]] - own[wanted] + _AS_MANY * normalized(of_others)
+        prior[wanted] = (1 - _EVEN) * normalized(found) + _EVEN / len(LEVELS)
+    return prior
 
 
 def _mixed(distributions: np.ndarray) -> np.ndarray:
