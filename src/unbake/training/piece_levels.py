@@ -118,23 +118,23 @@ def expected(
     # Pieces of one cell of colours are alike, and those of near cells are by their distance.
     cell = np.floor(colours / (settings.like_colours / 2))
     kinds, kind = np.unique(cell, axis=0, return_inverse=True)
+    kind = kind.ravel()
     square = (kinds**2).sum(1)
     near = np.exp((2 * kinds @ kinds.T - square[:, None] - square) / 8)
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
     weight = weight / weight[pixels > 0].mean()
-    prior = _prior(chance, weight, near, kind.ravel())
+    prior = _prior(chance, weight, near, kind)
     # What an odd piece tells the others they tell each other, and then it: so it is left out.
     usual = (chance * prior).sum(1) / chance.max(1)
     seen = np.flatnonzero(pixels > 0)
-    of_seen, kind = np.unique(kind.ravel()[seen], return_inverse=True)
+    of_seen, kind = np.unique(kind[seen], return_inverse=True)
     near = near[np.ix_(of_seen, of_seen)]
-    odd = np.flatnonzero(usual[seen] < _ODD)
-    for number in odd[np.argsort(usual[seen][odd], kind="stable")][:_MOST_ODD]:
-        others = np.where(np.arange(len(seen)) == number, 0, weight[seen])
-        if others.any():
-            found = _prior(chance[seen], others, near, kind.ravel())
-            prior[seen[number]] = found[number]
+    order = np.argsort(usual[seen], kind="stable")
+    for number in order[usual[seen][order] < _ODD][:_MOST_ODD]:
+        others = weight[seen]
+        others[number] = 0
+        prior[seen[number]] = _prior(chance[seen], others, near, kind)[number]
     return normalized(chance * prior) @ LEVELS
 
 
