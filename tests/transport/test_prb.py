@@ -25,7 +25,14 @@ from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.problem import make_problem
 from unbake.transport.loss import pixel_means, squared_error
-from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
+from unbake.transport.path_tracer import path_traced
+from unbake.transport.prb import (
+    light_through_holes,
+    materials_along_paths,
+    path_radiance,
+    path_replay,
+)
+from unbake.transport.vertex import SceneView
 
 DEPTH = 4
 
@@ -161,15 +168,66 @@ def leaves(tmp_path, *, instanced):
     return path, Camera.look_at((1.5, -2, 2), (0, 0, 0.2), (0, 0, 1), 40.0, 12, 12)
 
 
+@pytest.mark.parametrize("hidden", [False, True], ids=["seen", "hidden"])
 @pytest.mark.parametrize("instanced", [False, True], ids=["shape", "instance"])
-def test_cut_outs_are_those_of_mitsubas_volumetric_path_tracer(tmp_path, instanced):
+def test_cut_outs_are_those_of_mitsubas_volumetric_path_tracer(tmp_path, instanced, hidden):
     path, camera = leaves(tmp_path, instanced=instanced)
     scene = mi.load_file(str(path))
     ray = pixel_rays([camera], 1024, seed=1)
-    ours = path_radiance(path_replay(24, 5, False), scene, seeded(2, dr.width(ray)), ray, {})
+    ours = path_radiance(path_replay(24, 5, hidden), scene, seeded(2, dr.width(ray)), ray, {})
+    if hidden:
+        ours -= light_through_holes(scene, ray, 24)
     # `volpath` does not count the surfaces that a path passes.
-    theirs = stock_path(scene, ray, 3, max_depth=12, integrator="volpath")
+    theirs = stock_path(scene, ray, 3, max_depth=12, integrator="volpath", hide_emitters=hidden)
     assert_same_expectation(ours, theirs, 1024)
+
+
+def half_opaque_leaf(*, lamp):
+    """A leaf before the sky, or before a lamp, and rays that it fills."""
+    material = {"type": "principled", "roughness": 0.5}
+    mask = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "bsdf": material}}
+    content = {
+        "type": "scene",
+        "sky": {"type": "constant", "radiance": 1.0},
+        "leaf": {"type": "rectangle", "bsdf": mask},
+    }
+    if lamp:
+        content["lamp"] = {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -1]),
+            "bsdf": {"type": "diffuse", "reflectance": 0.0},
+            "emitter": {"type": "area", "radiance": 5.0},
+        }
+    camera = Camera.look_at((0.3, 0, 4), (0, 0, 0), (0, 1, 0), 40.0, 8, 8)
+    return mi.load_dict(content), pixel_rays([camera], 1024, seed=1)
+
+
+@pytest.mark.parametrize("lamp", [False, True], ids=["sky", "lamp"])
+def test_no_method_sees_hidden_lights_through_cut_outs(lamp):
+    scene, ray = half_opaque_leaf(lamp=lamp)
+    theirs = stock_path(scene, ray, 3, max_depth=12, integrator="volpath", hide_emitters=True)
+    scene_view = SceneView.of(scene, None, 8)
+    traced = path_traced(scene_view, ray, 2, max_depth=12, rr_depth=5, hide_emitters=True)
+    assert_same_expectation(traced, theirs, 1024)
+    replayed = path_radiance(path_replay(24, 5, True), scene, seeded(2, dr.width(ray)), ray, {})
+    through = light_through_holes(scene, ray, 24)
+    assert np.array(through).max() > 0.4, "there was nothing to see"
+    assert_same_expectation(replayed - through, theirs, 1024)
+
+
+def test_light_through_holes_passes_gradients_to_the_sky():
+    scene, ray = half_opaque_leaf(lamp=False)
+    parameters = mi.traverse(scene)
+    sky = parameters["sky.radiance.value"]
+    dr.enable_grad(sky)
+    parameters["sky.radiance.value"] = sky
+    parameters.update()
+    light = light_through_holes(scene, ray, 24)
+    dr.backward(dr.sum(light, axis=None))
+    # The sky's radiance is 1, so that light and gradient are the same numbers.
+    assert np.array(light).sum() > 0
+    gradient = np.array(dr.grad(parameters["sky.radiance.value"])).sum()
+    np.testing.assert_allclose(gradient, np.array(light).sum(), rtol=1e-4)
 
 
 @pytest.mark.parametrize(

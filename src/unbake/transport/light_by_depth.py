@@ -49,7 +49,7 @@ def light_by_depth(
         pi = scene.ray_intersect_preliminary(ray, True, True)
         if hide_emitters:
             pi, ray = behind_area_emitters(scene, pi, ray, mi.Bool(True))
-        sums = _follow(scene, pi, ray, sampler, group, groups, max_depth, rr_depth)
+        sums = _follow(scene, pi, ray, sampler, group, groups, max_depth, rr_depth, hide_emitters)
     light = np.array(sums, np.float64).reshape(max_depth, groups)
     total = light.sum(0)
     lit = light[:, (total > 0) & np.isfinite(total)]
@@ -86,6 +86,7 @@ def _follow(
     groups: int,
     max_depth: int,
     rr_depth: int,
+    hide_emitters: bool,
 ) -> mi.Float:
     """Sums of radiance by depth and group, in one kernel: Mitsuba's `path`, its light sorted."""
     ctx = mi.BSDFContext()
@@ -94,6 +95,7 @@ def _follow(
     depth, active = mi.UInt32(0), mi.Bool(True)
     si_prev, pdf_prev = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1)
     delta_prev = mi.Bool(True)
+    hidden = mi.Bool(hide_emitters)  # nor are emitters seen through cut-outs alone
 
     while dr.hint(active, max_iterations=max_depth, label="light by depth"):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
@@ -103,8 +105,9 @@ def _follow(
 
         ds = mi.DirectionSample3f(scene, si, si_prev)
         pdf_em = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
-        met = β * mis_weight(pdf_prev, pdf_em) * ds.emitter.eval(si, active)
-        dr.scatter_add(sums, dr.mean(met), depth * groups + group, active & (depth > 0))
+        seen = active & (depth > 0) & ~hidden
+        met = β * mis_weight(pdf_prev, pdf_em) * ds.emitter.eval(si, seen)
+        dr.scatter_add(sums, dr.mean(met), depth * groups + group, seen)
 
         # ------------------------------ Emitter sampling -------------------------------
 
@@ -121,6 +124,7 @@ def _follow(
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
         β *= weight
         η *= bs.eta
+        hidden &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         depth[active] += 1
         survival = dr.minimum(dr.max(β) * dr.square(η), 0.95)
         roulette = depth >= rr_depth

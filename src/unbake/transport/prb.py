@@ -13,7 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..fields.materials import Materials, carry, carrying
-from .vertex import evaluate
+from .vertex import behind_area_emitters, evaluate
+
+#: What `materials_along_paths` passes over.
+_WITHOUT_MATERIAL = mi.RayFlags.All | mi.RayFlags.Minimal
 
 
 def path_replay(max_depth: int, rr_depth: int, hide_emitters: bool) -> mi.CppADIntegrator:
@@ -94,6 +97,61 @@ def path_radiance(
     Paper: Sec. 5.2, Sec. 6.
     """
     return dr.custom(_ReplayedPaths, arrays, integrator, scene, sampler, ray)
+
+
+def light_through_holes(scene: mi.Scene, ray: mi.Ray3f, max_depth: int) -> mi.Color3f:
+    """The expected light of emitters that paths see through cut-outs alone.
+
+    Mitsuba's `prb` hides emitters from the camera only where nothing is before them, and
+    photographs whose background is hidden hide them behind cut-outs as well: what it sees there is
+    to be subtracted. What lamps behind cut-outs reflect stays.
+
+    Args:
+        ray: world space rays from cameras.
+        max_depth: of the paths, in which each cut-out counts.
+
+    Returns:
+        Linear RGB radiance; it passes gradients to lights.
+    """
+    with dr.suspend_grad():
+        ray, everywhere = mi.Ray3f(ray), mi.Bool(True)
+        pi = scene.ray_intersect_preliminary(ray, True, everywhere)
+        pi, ray = behind_area_emitters(scene, pi, ray, everywhere)
+        pi, ray, share, light, reached = _through_holes(scene, pi, ray, max_depth)
+        si = pi.compute_surface_interaction(ray, _WITHOUT_MATERIAL, reached)
+    return light + share * si.emitter(scene, reached).eval(si, reached)
+
+
+@dr.syntax
+def _through_holes(
+    scene: mi.Scene, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, max_depth: int
+):
+    """Follow rays through cut-outs to the first surface without holes, or to none.
+
+    Returns:
+        What is met there (an invalid `pi`: nothing), the last ray, the share that arrives, the
+        emission of cut-outs on the way, and whether there was a cut-out.
+    """
+    pi, ray = mi.PreliminaryIntersection3f(pi), mi.Ray3f(ray)
+    share, light = mi.Float(1), mi.Color3f(0)
+    depth = mi.UInt32(0)
+    active = pi.is_valid()
+
+    while dr.hint(active, label="holes"):
+        si = pi.compute_surface_interaction(ray, _WITHOUT_MATERIAL, active)
+        bsdf = si.bsdf()
+        cut_out = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (depth + 1 < max_depth)
+        passing = dr.mean(bsdf.eval_null_transmission(si, cut_out))
+        active = cut_out & (passing > 0)
+        seen = active & (depth > 0)
+        light += share * si.emitter(scene, seen).eval(si, seen)
+        share = dr.select(active, share * passing, share)
+        ray = dr.select(active, si.spawn_ray(ray.d), ray)
+        pi = dr.select(active, scene.ray_intersect_preliminary(ray, False, active), pi)
+        depth = dr.select(active, depth + 1, depth)
+        active &= pi.is_valid()
+
+    return pi, ray, share, light, depth > 0
 
 
 class _ReplayedPaths(dr.CustomOp):

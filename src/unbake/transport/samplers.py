@@ -23,7 +23,7 @@ from .methods import BOUNCES, KEPT_PATHS, PATH_REPLAY, PHOTOMETRIC, Method
 from .objective import objective, requirements
 from .operator import transported
 from .path_sample import PathSample, SampleSubset, rhs, trace
-from .prb import materials_along_paths, path_radiance, path_replay
+from .prb import light_through_holes, materials_along_paths, path_radiance, path_replay
 from .vertex import SceneView
 from .wavefront import PathLimits, Plan, path_light, plan_widths
 
@@ -286,8 +286,11 @@ class PathReplaySampler(_WholePathSampler):
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Radiance of camera samples."""
-        arrays = self._context.read_by_scene()
-        return path_radiance(self._integrator, scene, sampler, ray, arrays)
+        c = self._context
+        light = path_radiance(self._integrator, scene, sampler, ray, c.read_by_scene())
+        if c.hide_emitters and c.scene_view.has_chains:
+            light -= light_through_holes(scene, ray, c.max_depth)
+        return light
 
 
 SamplerFactory = Callable[[SamplerContext], PathSampler]

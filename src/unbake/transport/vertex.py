@@ -114,7 +114,7 @@ def find_vertex(
     Args:
         origin: the BSDF sample that made the ray; None for a ray from the camera.
         hide_emitters: whether a camera ray passes through area emitters and sees no environment,
-            as in Mitsuba's integrators.
+            as in Mitsuba's integrators. Through cut-outs it sees neither, as in `volpath`.
 
     Returns:
         The vertex, evaluated; its material is not yet attached. Only `emitted` passes gradients, to
@@ -135,7 +135,8 @@ def find_vertex(
         direct_view = mi.Bool(valid)
         passed, moved = mi.Color3f(0), mi.Bool(False)
         if scene_view.has_chains:
-            chain = _follow_chain(scene_view, pi, ray, valid, sampler)
+            hidden = hide_emitters and origin is None
+            chain = _follow_chain(scene_view, pi, ray, valid, sampler, hidden)
             pi, ray, β, passed, opacity, specular, moved = chain
             direct_view &= ~specular
             valid = valid & pi.is_valid()
@@ -185,14 +186,18 @@ def _follow_chain(
     ray: mi.Ray3f,
     active: mi.Bool,
     sampler: mi.Sampler,
+    hide_emitters: bool,
 ):
     """Follow specular and cut-out surfaces, as long as there are any.
+
+    Args:
+        hide_emitters: whether no light is seen through holes alone, as in `find_vertex`.
 
     Returns:
         Where the chain ends (an invalid `pi`: nowhere), its last ray, its throughput, the emission
         of surfaces passed on the way, the probability with which a cut-out stopped it at the end,
         whether there was anything specular, and whether light met at the end comes in addition (the
-        ray has left its first surface and has not ended in black).
+        ray has left its first surface, has not ended in black, and may see lights).
     """
     scene, limit, ctx = scene_view.scene, scene_view.max_specular, mi.BSDFContext()
     pi = mi.PreliminaryIntersection3f(pi)
@@ -202,6 +207,8 @@ def _follow_chain(
     opacity = mi.Float(1)
     any_specular = mi.Bool(False)
     lost = mi.Bool(False)
+    hidden = mi.Bool(hide_emitters)
+    looks_behind = scene_view.has_area_emitters and hide_emitters
     depth = mi.UInt32(0)
 
     while dr.hint(active, label="specular chain"):
@@ -217,10 +224,11 @@ def _follow_chain(
 
         specular = active & ~smooth
         any_specular |= specular
-        passed = (passes | specular) & (depth > 0)
+        passed = (passes | specular) & (depth > 0) & ~hidden
         emitted += β * si.emitter(scene, passed).eval(si, passed)
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), specular)
         β = dr.select(specular, β * weight, β)
+        hidden &= ~specular | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
         # A chain that outgrows the limit, or is absorbed, ends in black.
         active = passes | specular
@@ -229,13 +237,15 @@ def _follow_chain(
         ray_next = si.spawn_ray(dr.select(passes, ray.d, si.to_world(bs.wo)))
         ray = dr.select(active, ray_next, ray)
         pi_next = scene.ray_intersect_preliminary(ray, False, active)
+        if looks_behind:
+            pi_next, ray = behind_area_emitters(scene, pi_next, ray, active & hidden)
         pi = dr.select(active, pi_next, pi)
         pi.valid &= ~black
         lost |= black
         depth = dr.select(active, depth + 1, depth)
         active &= pi.is_valid()
 
-    return pi, ray, β, emitted, opacity, any_specular, (depth > 0) & ~lost
+    return pi, ray, β, emitted, opacity, any_specular, (depth > 0) & ~lost & ~hidden
 
 
 def evaluate(sampler: mi.Sampler, *values: object) -> None:
