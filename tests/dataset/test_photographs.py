@@ -519,6 +519,19 @@ def test_a_lamp_in_a_dark_room_is_no_hot_pixel():
     assert without_hot_pixels(pixels, np.ones(4096, bool), "a", 64)[1] is None
 
 
+@pytest.mark.parametrize("edge", [5, 6], ids=["firefly", "bulb"])
+def test_what_is_larger_than_a_spread_firefly_is_seen(edge):
+    """A filter of 5 x 5 pixels spreads a firefly over as many; a bulb of 6 x 6 is as it is."""
+    room = np.random.default_rng(1).uniform(0.02, 0.05, (256, 256, 4)).astype(np.float32)
+    room[100 : 100 + edge, 253 - edge : 253, :3] = 2000
+    room[3, 4, :3] = 1e5  # by itself, and hot in both
+    pixels = room.reshape(-1, 4)
+    kept, found = without_hot_pixels(pixels, np.ones(256 * 256, bool), "a", 256)
+    assert found.count == (26 if edge == 5 else 1)
+    assert (kept[:, 0] == 2000).sum() == (0 if edge == 5 else 36)
+    assert (found.column, found.row) == (4, 3)
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_limit_beyond_32_bits_is_none():
     """NumPy would warn of an overflow, with a line of our source."""

@@ -13,8 +13,11 @@ import numpy as np
 from ..errors import printable
 
 #: A pixel is hot if it is so many times as bright as the brightest of the others. A lamp
-#: that is seen in a dark room is some hundred times as bright as the room.
+#: that is seen in a dark room is some hundred times as bright as the room, a bulb or the sun more.
 EXTREME = 1e4
+#: What has more such pixels than filters of renderers spread a firefly over, within so many pixels
+#: of one of them, is seen and not hot.
+_THING, _WITHIN = 25, 4
 #: How many of the brightest pixels of a view may be hot: a share, but some of a small view.
 _SHARE, _LEAST = 1e-3, 8
 #: Views that are told; of more there is the number.
@@ -64,11 +67,27 @@ def without_hot_pixels(
     over = counted & (brightness > np.float64(EXTREME * limit))  # too large for 32 bits, maybe
     if limit <= 0 or not over.any():
         return pixels, None
+    over &= ~_of_things(over, width)
+    if not over.any():
+        return pixels, None
     row, column = divmod(int(np.argmax(np.where(over, brightness, 0))), width)
     pixels = pixels.copy()
     pixels[over, :3] *= limit / brightness[over, None]
     value = float(brightness[row * width + column])
     return pixels, HotPixels(view, int(over.sum()), column, row, value, limit)
+
+
+def _of_things(over: np.ndarray, width: int) -> np.ndarray:
+    """Which of the pixels that are too bright belong to a lamp, or the sun, shape (pixels,)."""
+    places = np.flatnonzero(over)
+    found = np.zeros_like(over)
+    rows, columns = np.divmod(places, width)
+    for row, column in zip(rows, columns, strict=True):
+        low, high = np.searchsorted(rows, (row - _WITHIN, row + _WITHIN + 1))
+        near = low + np.flatnonzero(np.abs(columns[low:high] - column) <= _WITHIN)
+        if len(near) > _THING:
+            found[places[near]] = True
+    return found
 
 
 def told_hot_pixels(found: Iterable[HotPixels]) -> str | None:
