@@ -26,13 +26,14 @@ SCENE = f"""<scene version="3.0.0">
     <float name="radius" value="{{s_half}}"/>{PRINCIPLED}</shape>
   <emitter type="point"><point name="position" x="{{s}}" y="-{{s}}" z="{{s4}}"/>
     <rgb name="intensity" value="{{light}}"/></emitter>
-  <emitter type="constant"><rgb name="radiance" value="0.3 0.2 0.1"/></emitter>
+  <emitter type="constant"><rgb name="radiance" value="{{sky}}"/></emitter>
 </scene>"""
 
 
-def write_scene(path, scale=1.0):
+def write_scene(path, scale=1.0, light=1.0):
     numbers = {"s": scale, "s2": 2 * scale, "s_half": scale / 2, "s4": 4 * scale}
-    path.write_text(SCENE.format(**numbers, light=12 * scale**2))
+    sky = " ".join(str(light * x) for x in (0.3, 0.2, 0.1))
+    path.write_text(SCENE.format(**numbers, light=12 * light * scale**2, sky=sky))
     return path
 
 
@@ -126,20 +127,31 @@ def test_a_crop_of_training_pixels_is_a_slice_of_a_photograph():
     pytest.fail("no crop of the first view in 20 draws")
 
 
+def losses(method, path, scale=1.0, light=1.0):
+    """Those of four steps."""
+    depths = dataclasses.replace(TINY_FIT.path, max_depth=3)
+    config = dataclasses.replace(TINY_FIT, method=method, path=depths, representation="grid")
+    file = write_scene(path / f"{scale}-{light}.xml", scale, light)
+    problem = make_problem(file, "visible", config, 0.3 * light)
+    pixels = grey_photographs(cameras(scale), 0.3 * light)
+    step = TrainingStep(problem, pixels, config)
+    state = initial_state(problem)
+    rates = dict.fromkeys((*config.quantities, "radiance"), 0.01)
+    terms = [step(state, i, rates) for i in range(4)]
+    return [[float(value[0]) for value in t.values()] for t in terms]
+
+
 @pytest.mark.parametrize("method", ["ours", "prb", "ad-pt"])
 def test_a_fit_does_not_depend_on_the_unit_of_length(method, tmp_path):
     """Fields are functions in the scene's box: twice as large, everything is the same."""
-    path = dataclasses.replace(TINY_FIT.path, max_depth=3)
-    config = dataclasses.replace(TINY_FIT, method=method, path=path, representation="grid")
-    found = []
-    for scale in (1.0, 2.0):
-        file = write_scene(tmp_path / f"{scale}.xml", scale)
-        problem = make_problem(file, "visible", config, 0.3)
-        step = TrainingStep(problem, grey_photographs(cameras(scale)), config)
-        state = initial_state(problem)
-        rates = dict.fromkeys((*config.quantities, "radiance"), 0.01)
-        terms = [step(state, i, rates) for i in range(4)]
-        found.append([[float(value[0]) for value in t.values()] for t in terms])
-        del step
+    found = [losses(method, tmp_path, scale=scale) for scale in (1.0, 2.0)]
+    print(found)
+    np.testing.assert_allclose(found[1], found[0], rtol=5e-3)
+
+
+@pytest.mark.parametrize("method", ["ours", "prb", "ad-pt"])
+def test_a_dim_fit_does_not_depend_on_the_unit_of_light(method, tmp_path):
+    """A power of two, so that roundings are the same as well."""
+    found = [losses(method, tmp_path, light=light) for light in (2**-4, 2**-14)]
     print(found)
     np.testing.assert_allclose(found[1], found[0], rtol=5e-3)

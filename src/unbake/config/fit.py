@@ -153,6 +153,9 @@ UNKNOWNS = (*QUANTITIES, "environment", "emission")
 OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
 #: Least slope of the bounds of albedo, of methods with L_θ; others have none.
 LEAST_SLOPE = 0.01
+
+#: Mean radiance below which photographs are dim: the darkest of the published scenes has more.
+DIM = 0.08
 #: Adam's first β₂ for the unknowns of methods with L_θ, and that of all others. Where roughness
 #: is not searched for, noise moves it farther with the shorter memory.
 FORGETFUL_BETA2, OWN_BETA2 = 0.99, 0.999
@@ -312,7 +315,8 @@ class FitConfig:
     #: `chosen_estimator`.
     estimator: Estimator = "auto"
     loss_reference: Reference = "smoothed"  #: what errors are relative to (Sec. 5.4: photograph)
-    loss_epsilon: float = 0.001  #: added to the denominator of the relative L2 loss (release: 0.01)
+    #: Added to the denominator of the relative L2 loss (release: 0.01), see `epsilon`.
+    loss_epsilon: float = 0.001
 
     #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
@@ -440,6 +444,20 @@ class FitConfig:
             ("radiance", radiance),
         ):
             object.__setattr__(self, key, value)
+
+    def epsilon(self, mean: float) -> float:
+        """What is added to the denominator of the relative L2 loss (ours).
+
+        Where photographs are darker than `DIM`, it falls with the square of their mean, so that
+        errors stay relative and no fit depends on the unit of light. The presets of the paper and
+        of its authors add the same to all.
+
+        Args:
+            mean: radiance of the photographs, linear RGB, mean over channels and pixels.
+        """
+        if self.preset != "cpu":
+            return self.loss_epsilon
+        return self.loss_epsilon * min(1.0, mean / DIM) ** 2
 
     @property
     def chosen_estimator(self) -> ChosenEstimator:

@@ -120,7 +120,7 @@ class HeldAside:
     ) -> None:
         numbers, colours = held.read()
         self._probe = _Probe(step, rays, numbers, colours, config)
-        self._clipped, self._epsilon = held.read_clipped(), config.loss_epsilon
+        self._clipped, self._epsilon = held.read_clipped(), step.epsilon
         smoothed = config.loss_reference == "smoothed"
         self._reference = colours[:, 3:].astype(np.float64) if smoothed else self._probe.target
         self._camera = camera

@@ -119,6 +119,7 @@ class TrainingStep:
         self._problem = problem
         self.pixels = pixels
         self._config = config
+        self.epsilon = config.epsilon(pixels.photographs.mean)
         self._path_sampler = make_sampler(_context(problem, config))
         self._told = None
         if problem.camera is not None and problem.camera.has_response:
@@ -273,7 +274,7 @@ class TrainingStep:
         target = colours[:, :3].astype(np.float64)
         smoothed = self._config.loss_reference == "smoothed"
         reference = colours[:, 3:] if smoothed else target
-        loss = (target**2 / (reference**2 + self._config.loss_epsilon)).mean()
+        loss = (target**2 / (reference**2 + self.epsilon)).mean()
         return float(self._ranks.mean(self._weighted(np.array([loss])))[0])
 
     @carrying()
@@ -525,7 +526,7 @@ class TrainingStep:
             roots = problem.outliers.roots(inputs.rays, pixels.numbers(), inputs.blocks)
             trust = dr.square(roots)
         pairs = config.chosen_estimator == "all-pairs"
-        loss = RelativeL2(config.loss_epsilon, reference, batch.clipped, gain, trust, pairs)
+        loss = RelativeL2(self.epsilon, reference, batch.clipped, gain, trust, pairs)
         return target, loss, roots
 
     def _regularization(
