@@ -120,7 +120,7 @@ def expected(
     kinds, kind = np.unique(cell, axis=0, return_inverse=True)
     kind = kind.ravel()
     square = (kinds**2).sum(1)
-    near = np.exp((2 * kinds @ kinds.T - square[:, None] - square) / 8)
+    near = np.exp((2 * kinds @ kinds.T - square[:, None] - square) / 8).astype(np.float32)
     # Large pieces tell more of what there is, but each is one piece of one material.
     weight = np.sqrt(pixels)
     weight = weight / weight[pixels > 0].mean()
@@ -157,8 +157,8 @@ def _prior(
         wanted = slice(None) if last else telling
         probable = normalized(chance[telling] * prior[telling])
         own[telling] = weight[telling, None] * _mixed(probable)
-        of_kinds = np.zeros((len(near), len(LEVELS)))
-        np.add.at(of_kinds, kind[telling], own[telling])
+        of_kinds = np.zeros((len(near), len(LEVELS)), np.float32)
+        np.add.at(of_kinds, kind[telling], own[telling].astype(np.float32))
         of_others = own[telling].sum(0) - own[wanted]
         found = (near @ of_kinds)[kind[wanted]] - own[wanted] + _AS_MANY * normalized(of_others)
         prior[wanted] = (1 - _EVEN) * normalized(found) + _EVEN / len(LEVELS)
