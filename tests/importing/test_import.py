@@ -524,7 +524,10 @@ def set_frame(key, value):
         (set_top("scene", "scene.xml"), "the folder is a data set already"),
         (set_frame("transform_matrix", np.diag([-1.0, 1, 1, 1]).tolist()), "left-handed"),
         (set_frame("file_path", "../secret.png"), "lies outside the source"),
-        (set_frame("file_path", "images/train_000.png"), "a photograph has two poses"),
+        (set_frame("file_path", "images/train_000.png"), "two poses: images/train_000.png"),
+        (set_frame("split", "holdout"), "unknown split 'holdout'.* There are train, heldout, test"),
+        (set_frame("split", ["train"]), "unknown split"),
+        (set_top("train_filenames", 5), "'train_filenames' is not a list of names"),
         (lambda c: c["frames"].__setitem__(0, 7), "the frame is not an object"),
         (lambda c: c.pop("fl_x"), "the key 'fl_x' is missing"),
     ],
@@ -534,6 +537,67 @@ def test_a_wrong_entry_is_a_fault(edit, fault, nerfstudio, meshes, tmp_path):
     with pytest.raises(ImportFaults, match=fault):
         import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
     assert not (tmp_path / "data").exists()
+
+
+def test_both_of_what_was_applied_are_told(nerfstudio, meshes, tmp_path):
+    change(nerfstudio, lambda c: c.update(applied_transform="x", applied_scale=0))
+    with pytest.raises(ImportFaults) as caught:
+        import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    assert ["applied_transform" in fault for fault in caught.value.faults] == [True, False]
+    assert "'applied_scale' is not positive" in caught.value.faults[1]
+
+
+@pytest.mark.parametrize("split", ["test", "val", "eval", "heldout"])
+def test_a_split_of_a_frame_decides_what_is_held_out(split, nerfstudio, meshes, tmp_path):
+    def mark(content):
+        for key in ("train_filenames", "val_filenames", "test_filenames"):
+            content.pop(key, None)
+        for frame in content["frames"]:
+            frame["split"] = "train"
+        content["frames"][1]["split"] = split
+
+    change(nerfstudio, mark)
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    held = [view.name for view in Dataset.load(tmp_path / "data").heldout]
+    assert held == [Path(json.loads((nerfstudio / "transforms.json").read_text())
+                         ["frames"][1]["file_path"]).stem]  # fmt: skip
+
+
+def test_names_in_lists_of_splits_that_are_of_no_frame_are_told(nerfstudio, meshes, tmp_path):
+    change(nerfstudio, set_top("test_filenames", ["images/none.png", "images/train_000.png"]))
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    assert any(line.endswith("name images that no frame has: images/none.png") for line in told)
+
+
+def test_names_with_a_dot_may_lack_their_suffix(captured, meshes, tmp_path):
+    source = tmp_path / "blender"
+    write_blender(captured, source)
+    names = {}
+    for file in source.glob("transforms_*.json"):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            old = source / f"{frame['file_path']}.png"
+            new = old.with_name(f"shot.{len(names):04}.png")
+            frame["file_path"] = str(new.relative_to(source).with_suffix(""))
+            names[new.stem] = old.rename(new) if old.exists() else new
+        file.write_text(json.dumps(content))
+    import_data(source, tmp_path / "data", meshes, tell=quiet)
+    views = [view.name for view in Dataset.load(tmp_path / "data").views]
+    assert views and set(views) <= names.keys() and all(name.startswith("shot.0") for name in views)
+
+
+def test_an_angle_of_a_frame_stands_before_a_focal_length_at_the_top(
+    captured, nerfstudio, meshes, tmp_path
+):
+    def angles(content):
+        for frame in content["frames"]:
+            frame["camera_angle_x"] = 2 * float(np.arctan(8 / content["fl_x"]))
+        content["fl_x"] = content["fl_y"] = 999
+
+    change(nerfstudio, angles)
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    same_as_captured(captured, tmp_path / "data")
 
 
 def test_a_source_that_is_none_is_told_what_there_could_be(meshes, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -414,7 +414,7 @@ def camera_from_frame(
         UserError: a key is missing or of the wrong type, the lens is distorted, or the values are
             no valid camera.
     """
-    both = {**top, **frame}
+    both = with_top(top, frame)
     _check_lens(both, where)
     if size is None or ("w" in both and "h" in both):
         size = (integer(both, "w", where), integer(both, "h", where))
@@ -434,6 +434,18 @@ def camera_from_frame(
         return Camera(matrix, fl_x, fl_y, cx, cy, width, height)
     except UserError as error:
         raise UserError(error.what, where, error.remedy) from None
+
+
+def with_top(top: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a frame, with those at the top of the file where it has none of its own.
+
+    An angle of the frame takes the place of focal lengths at the top.
+    """
+    angle = "camera_angle_x" in frame and "fl_x" not in frame
+    replaced = {"fl_x", "fl_y", "camera_angle_y"} if angle else set()
+    if "camera_angle_y" in frame and "fl_y" not in frame:
+        replaced.add("fl_y")
+    return {key: value for key, value in top.items() if key not in replaced} | dict(frame)
 
 
 def frame_of(camera: Camera) -> dict[str, Any]:

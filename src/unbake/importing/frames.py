@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera, camera_from_frame
+from ..dataset.camera import Camera, camera_from_frame, with_top
 from ..dataset.data_folder import TRANSFORMS
-from ..errors import UserError
+from ..errors import UserError, printable
 from ..io import array, inside, number, read_object, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
@@ -24,6 +24,17 @@ SPLIT_FILES = {
 }
 #: Lists of file names at the top of a nerfstudio file, by what they become.
 _SPLIT_LISTS = {"train_filenames": "train", "val_filenames": "heldout", "test_filenames": "heldout"}
+#: What frames call their split, by what it becomes.
+_SPLITS = {
+    "train": "train",
+    "heldout": "heldout",
+    "test": "heldout",
+    "val": "heldout",
+    "validation": "heldout",
+    "eval": "heldout",
+}
+#: Names of images that a note tells.
+_TOLD = 3
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _LENSES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
@@ -47,7 +58,7 @@ def read_one_file(
         faults.add(f"the folder is a data set already: {file.name} names a 'scene'")
         return Source("data set", ())
     back, notes = _taken_back(top, file, keep_frame, faults)
-    splits = _listed_splits(top)
+    splits = _listed_splits(top, file, faults)
     shots = _read_frames(file, top, images, None, allow_outside, faults)
     placed = [
         Shot(
@@ -60,7 +71,22 @@ def read_one_file(
         )
         for shot in shots
     ]
-    return Source("nerfstudio", tuple(placed), notes)
+    return Source("nerfstudio", tuple(placed), (*notes, *_unknown_names(top, splits)))
+
+
+def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> tuple[str, ...]:
+    """A note of the images that lists of splits name, and no frame."""
+    frames = top.get("frames")
+    frames = frames if isinstance(frames, list) else []
+    given = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
+    ends = {PurePosixPath(name).name for name in given if isinstance(name, str)}
+    ends |= {PurePosixPath(end).stem for end in ends}
+    unknown = [str(name) for name in splits if name.name not in ends and name.stem not in ends]
+    if not unknown:
+        return ()
+    more = f" and {len(unknown) - _TOLD} more" if len(unknown) > _TOLD else ""
+    told = ", ".join(printable(name) for name in unknown[:_TOLD])
+    return (f"lists of splits name images that no frame has: {told}{more}",)
 
 
 def read_split_files(
@@ -124,7 +150,7 @@ def _shot(
     with faults.collected(name):
         image = _image(file.parent, name, images, allow_outside)
         header = image_header(image)
-        lens = _lens({**top, **frame}, header.width, header.height, name)
+        lens = _lens(with_top(top, frame), header.width, header.height, name)
     with faults.collected(f"{file.name}: {name}"):
         pose = _pose(frame, name)
     if "mask_path" in frame:
@@ -134,10 +160,24 @@ def _shot(
             image_header(mask)
     if image is None or lens is None or pose is None:
         return None
-    if split is None and frame.get("split") in ("train", "heldout"):
-        split = frame["split"]
-    short = Path(name).with_suffix(image.suffix).as_posix() if not Path(name).suffix else name
+    with faults.collected(f"{file.name}: {name}"):
+        split = split or _own_split(frame)
+    # A suffix that the name lacks; a photograph by another name stands for it, as camera RAW does.
+    short = (
+        name + image.suffix if image.name == f"{PurePosixPath(name).name}{image.suffix}" else name
+    )
     return Shot(short.removeprefix("./"), split, image, lens, pose, mask)
+
+
+def _own_split(frame: dict[str, Any]) -> str | None:
+    """The split that a frame names; None where it names none."""
+    said = frame.get("split")
+    if said is None:
+        return None
+    if not isinstance(said, str) or said not in _SPLITS:
+        names = ", ".join(_SPLITS)
+        raise UserError(f"unknown split {printable(repr(said))}", None, f"There are {names}")
+    return _SPLITS[said]
 
 
 def _image(folder: Path, name: str, images: Path | None, allow_outside: bool) -> Path:
@@ -207,20 +247,20 @@ def _taken_back(
 
     if keep or ("applied_transform" not in top and "applied_scale" not in top):
         return same, ()
-    try:
-        applied = np.eye(4)
+    applied, scale = np.eye(4), 1.0
+    with faults.collected(file.name):
         if "applied_transform" in top:
             rows = top["applied_transform"]
             shape = (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 4)
             applied[:3] = array(top, "applied_transform", shape, str(file))[:3]
-        scale = number(top, "applied_scale", file.name) if "applied_scale" in top else 1.0
         rotation = applied[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
             raise UserError("'applied_transform' is no rotation with a translation")
+    with faults.collected(file.name):
+        scale = number(top, "applied_scale", file.name) if "applied_scale" in top else 1.0
         if scale <= 0:
             raise UserError("'applied_scale' is not positive")
-    except UserError as error:
-        faults.add(error.what, file.name)
+    if faults:
         return same, ()
     undo = np.linalg.inv(applied)
 
@@ -234,15 +274,18 @@ def _taken_back(
     return back, (note,) if moved else ()
 
 
-def _listed_splits(top: dict[str, Any]) -> dict[PurePosixPath, str]:
+def _listed_splits(top: dict[str, Any], file: Path, faults: Faults) -> dict[PurePosixPath, str]:
     """Splits by the paths of images, where the file has lists of them."""
-    return {
-        PurePosixPath(name): split
-        for key, split in _SPLIT_LISTS.items()
-        if isinstance(top.get(key), list)
-        for name in top[key]
-        if isinstance(name, str)
-    }
+    splits = {}
+    for key, split in _SPLIT_LISTS.items():
+        names = top.get(key)
+        if names is None:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            faults.add(f"{key!r} is not a list of names", file.name)
+            continue
+        splits |= {PurePosixPath(name): split for name in names}
+    return splits
 
 
 def _listed(name: str, splits: Mapping[PurePosixPath, str]) -> str | None:
@@ -254,9 +297,11 @@ def _listed(name: str, splits: Mapping[PurePosixPath, str]) -> str | None:
     if path in splits:
         return splits[path]
 
-    def same(listed: PurePosixPath) -> bool:
-        count = min(len(listed.parts), len(path.parts))
-        return count > 0 and listed.parts[-count:] == path.parts[-count:]
-
-    found = {split for listed, split in splits.items() if same(listed)}
+    found = {split for listed, split in splits.items() if _same_end(listed, path)}
     return found.pop() if len(found) == 1 else None
+
+
+def _same_end(one: PurePosixPath, other: PurePosixPath) -> bool:
+    """Whether one path is the end of the other."""
+    count = min(len(one.parts), len(other.parts))
+    return count > 0 and one.parts[-count:] == other.parts[-count:]

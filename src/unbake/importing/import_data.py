@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -205,8 +206,9 @@ def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
         other = taken.setdefault(names[shot.name], shot.name)
         if other != shot.name:
             faults.add("two photographs have one name but for their suffix", shot.name)
-    if len({shot.name for shot in shots}) < len(shots):
-        faults.add("a photograph has two poses")
+    for name, count in Counter(shot.name for shot in shots).items():
+        if count > 1:
+            faults.add("a photograph has two poses", name)
     return names
 
 

@@ -139,11 +139,15 @@ def _read_ply(file: Path) -> Part | None:
     """
     if file.suffix.lower() != ".ply" or not file.is_file():
         return None
+    told = mi.log_level()
     try:
         check_mesh("ply", file)
+        mi.set_log_level(mi.LogLevel.Error)  # it would warn that files of text are slow
         mesh: Any = mi.load_dict({"type": "ply", "filename": str(file)})
     except (UserError, RuntimeError):
         return None
+    finally:
+        mi.set_log_level(told)
     params = mi.traverse(mesh)
 
     def table(name: str, columns: int) -> np.ndarray:
