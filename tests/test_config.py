@@ -245,6 +245,10 @@ def test_a_mistake_is_named_with_its_key(text, message):
         ("[materials.albedo.grid]\ncells = 513", "materials.albedo.grid.cells: must be 512 or le"),
         # All of a table at once
         (
+            "stepz = 1\nunknown = 3\n[radiance]\nx = 1",
+            "stepz: unknown key.*; unknown: must be .*; radiance.x: unknown key",
+        ),
+        (
             "steps = -1\npixels = 0\nseconds = nan",
             "seconds: must be a finite number, not nan; steps: must be 0 or more, not -1; "
             "pixels: must be 1 or more, not 0$",

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from unbake.checks.check import check_data
 from unbake.checks.pictures import PictureFacts, blurred, picture_facts
@@ -144,6 +145,35 @@ def test_a_world_that_is_turned_is_told(spoilt):
     (finding,) = found(data.save(), "alignment")
     assert finding.level == "error" and "of a world with z up" in finding.what
     assert finding.remedy == "Turn them by 90° about x"
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_masks_that_leave_nothing_are_told(some, spoilt, unbake, tmp_path):
+    data = spoilt("cornell")
+    size = data.frames[0]["w"], data.frames[0]["h"]
+    (data.folder / "masks").mkdir()
+    for i, frame in enumerate(data.frames):
+        mask = Image.new("L", size, 255 if some and i else 0)
+        mask.save(data.folder / "masks" / f"{i}.png")
+        frame["mask_path"] = f"masks/{i}.png"
+    findings = [f for f in found(data.save(), "masks") if "counts" in f.what]
+    (finding,) = findings
+    assert finding.level == ("warning" if some else "error")
+    assert finding.where == ("train_000" if some else None)
+    assert unbake("data", "check", data.folder).status == (0 if some else 2)
+
+
+def test_no_other_poses_are_named_where_nothing_agrees(spoilt):
+    """Noise in the place of photographs agrees with no poses."""
+    data, rng = spoilt("cornell"), np.random.default_rng(0)
+
+    def noise(pixels):
+        pixels[..., :3] = rng.uniform(0.1, 0.9, pixels[..., :3].shape)
+        return pixels
+
+    for frame in data.frames:
+        data.picture(frame, noise)
+    assert not found(data.save(), "alignment")
 
 
 def test_photographs_upside_down_are_told(spoilt):

@@ -250,6 +250,29 @@ def test_a_wrong_entry_is_one_clear_error(folder, edit, message):
     refused(folder, message)
 
 
+def test_all_wrong_entries_at_the_top_are_told_at_once(folder):
+    wrong = {"background": "x", "light": 3, "light_by_depth": "x", "coverage": "x", "render": 5}
+    change(folder, lambda content: content.update(wrong))
+    faults = []
+    Dataset.load(folder, faults=faults)
+    assert len(faults) == 5
+    assert all(any(key in fault.what for fault in faults) for key in wrong)
+
+
+def test_training_views_that_cannot_be_used_are_not_said_to_be_missing(folder):
+    change(folder, lambda c: [frame.update(fl_x=-1) for frame in c["frames"]])
+    faults = []
+    with pytest.raises(UserError, match="none of the training views can be used"):
+        Dataset.load(folder, faults=faults)
+    assert faults
+
+
+def test_the_file_of_a_data_set_in_its_place_is_told(folder):
+    with pytest.raises(UserError, match="not a data folder") as caught:
+        Dataset.load(folder / "transforms.json")
+    assert caught.value.remedy == f"Give its folder: {folder}"
+
+
 @pytest.mark.parametrize("content", ["", "{", "[1]", "\x80", "[" * 100000])
 def test_a_file_that_is_no_json_object_is_refused(folder, content):
     (folder / "transforms.json").write_text(content, encoding="latin-1")

@@ -226,7 +226,14 @@ def _checked(
 
 
 def _check_masks(result: DataCheck) -> None:
-    """A warning where some views have a mask, and others not."""
+    """Whether views have pixels that count, and a warning where only some have a mask."""
+    empty = [v.view.name for v in result.views if not v.small.alpha.any()]
+    remedy = "Masks are white where pixels count. Where the background is hidden, alpha says so"
+    if empty and all(v.view.name in empty for v in result.views if v.view.split == "train"):
+        what = "no pixel of any training view counts"
+        result.add(Finding("error", "masks", what, None, remedy))
+    elif empty:
+        result.warn("masks", "no pixel of the view counts", named(empty), remedy)
     bare = [v.view.name for v in result.views if v.view.mask is None]
     if 0 < len(bare) < len(result.views):
         what = "the view has no mask, as others have"

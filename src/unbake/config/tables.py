@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from textwrap import shorten
 from typing import Any, Literal, TypeVar, cast
 
-from ..errors import UserError, printable
+from ..errors import UserError, printable, raise_together
 
 Settings = TypeVar("Settings")
 
@@ -33,7 +33,7 @@ def update(
         values: type of the values by name.
 
     Raises:
-        UserError: a key is unknown, or a value has the wrong type or range.
+        UserError: keys are unknown, or values have the wrong type or range.
     """
     if isinstance(settings, Mapping):
         current = dict(settings)
@@ -41,19 +41,17 @@ def update(
     else:
         hints = typing.get_type_hints(type(settings))
         current = {key: getattr(settings, key) for key in hints}
-    changes = {}
+    changes, faults = {}, []
     for key, value in table.items():
         here = (*path, key)
-        dotted = ".".join(here)
-        if key not in current:
-            raise UserError("unknown key", where=dotted, remedy=_known(key, list(current)))
-        if dataclasses.is_dataclass(current[key]) or isinstance(current[key], Mapping):
-            if not isinstance(value, Mapping):
-                raise UserError("must be a table", where=dotted)
-            _, inner = typing.get_args(hints[key]) or (None, None)
-            changes[key] = update(current[key], value, here, inner)
-        else:
-            changes[key] = typed(value, hints[key], dotted)
+        try:
+            if key not in current:
+                known = _known(key, list(current))
+                raise UserError("unknown key", where=".".join(here), remedy=known)
+            changes[key] = _changed(current[key], value, hints[key], here)
+        except UserError as error:
+            faults.append(error)
+    raise_together(faults)
     if isinstance(settings, Mapping):
         return cast(Settings, {**current, **changes})
     try:
@@ -61,6 +59,16 @@ def update(
     except UserError as error:
         where = ".".join((*path, *([error.where] if error.where else [])))
         raise UserError(error.what, where, error.remedy) from None
+
+
+def _changed(current: Any, value: object, hint: Any, path: tuple[str, ...]) -> Any:
+    """One value, or one table, in the place of the current one."""
+    if not dataclasses.is_dataclass(current) and not isinstance(current, Mapping):
+        return typed(value, hint, ".".join(path))
+    if not isinstance(value, Mapping):
+        raise UserError("must be a table", where=".".join(path))
+    _, inner = typing.get_args(hint) or (None, None)
+    return update(current, value, path, inner)
 
 
 def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -77,7 +77,11 @@ def from_toml(text: str, where: str = "settings") -> FitConfig:
         name = typed(table.get("preset", "cpu"), PresetName, "preset")
         return update(preset(name), table)
     except UserError as error:
-        raise UserError(error.what, where=f"{where}: {error.where}", remedy=error.remedy) from None
+        raise UserError(
+            error.what,
+            where=f"{where}: {error.where}" if error.where else where,
+            remedy=error.remedy,
+        ) from None
 
 
 def to_tables(text: str, where: str = "settings") -> dict[str, Any]:
@@ -97,7 +101,9 @@ def to_tables(text: str, where: str = "settings") -> dict[str, Any]:
     try:
         return migrated(table)
     except UserError as error:
-        raise UserError(error.what, f"{where}: {error.where}", error.remedy) from None
+        raise UserError(
+            error.what, f"{where}: {error.where}" if error.where else where, error.remedy
+        ) from None
 
 
 def _require_registered(table: Mapping[str, Any]) -> None:

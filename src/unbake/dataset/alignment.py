@@ -110,7 +110,7 @@ def _smaller(view: SmallView) -> SmallView:
 
 def _clearly_better(scores: np.ndarray, given: np.ndarray) -> bool:
     gain = scores - given
-    return bool(gain.mean() > MARGIN and (gain > 0).mean() >= AGREEING)
+    return bool(min(gain.mean(), scores.mean()) > MARGIN and (gain > 0).mean() >= AGREEING)
 
 
 def _drawn(

@@ -173,6 +173,9 @@ class DataFolder:
             UserError: there is no data set, or the file is damaged or of a newer version.
         """
         require_utf8(self.path, _KIND)
+        if self.path.is_file() and self.path.name == TRANSFORMS:
+            remedy = f"Give its folder: {self.path.parent}"
+            raise UserError("is a file, not a data folder", self.path, remedy)
         if self.path.is_file():
             raise UserError("is a file, not a data folder", self.path, _MAKE_DATA)
         if not self.path.is_dir():

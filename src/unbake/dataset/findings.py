@@ -62,7 +62,7 @@ def misaligned(found: Alignment | None) -> Finding | None:
     """Whether other poses than those that are given put edges where photographs have them."""
     if found is None or found.best is None:
         return None
-    much = f"their edges agree with the photographs' by {max(found.score, 0):.2f}, without that by"
+    much = f"their edges agree with the photographs' by {found.score:.2f}, without that by"
     if found.mirrored is not None:
         what = f"photographs seem to be {found.mirrored}: {much} {found.best:.2f}"
         return Finding("error", "alignment", what, None, "Flip them, or write them again")

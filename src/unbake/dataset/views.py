@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import mitsuba as mi
 import numpy as np
@@ -232,16 +232,20 @@ class Dataset:
         scene = data.inside(text(top, "scene", str(file)), f"{file}: 'scene'")
         require_file(scene, "scene file", f"Set 'scene' in {file}")
         views = _read_views(data, file, top, found)
+        render = _or_none(found, _render, top, file) or {}
+        seen = _or_none(found, _coverage, top, file)
+        by_depth = _or_none(found, _light_by_depth, top, file) or ()
+        background = _or_none(found, _one_of, top, "background", BACKGROUNDS, file)
+        light = _or_none(found, _one_of, top, "light", LIGHTS, file)
         if faults is not None:
             faults += found
         else:
             raise_together(found, ", all of which `unbake data check` tells")
         if not any(view.split == "train" for view in views):
+            if found and any(_is_to_train(frame) for frame in top["frames"]):
+                raise UserError("none of the training views can be used", file)
             raise UserError("no view has the split 'train'", file, "There is nothing to learn from")
-        render, seen = _provenance(top, file)
-        by_depth = _light_by_depth(top, file)
-        background = _one_of(top, "background", BACKGROUNDS, file)
-        light = _one_of(top, "light", LIGHTS, file)
+        background, light = background or BACKGROUNDS[0], light or LIGHTS[0]
         return cls(
             data.path, scene, background, views, render, seen, by_depth, allow_outside, light
         )
@@ -553,19 +557,39 @@ def _one_of(top: dict[str, Any], key: str, names: Sequence[str], file: Path) -> 
     return word
 
 
-def _provenance(top: dict[str, Any], file: Path) -> tuple[dict[str, Any], float | None]:
-    render, coverage = top.get("render", {}), top.get("coverage")
+Read = TypeVar("Read")
+
+
+def _or_none(found: list[UserError], read: Callable[..., Read], *args: Any) -> Read | None:
+    """What is read of a file; None, and what is wrong, where it cannot be."""
+    try:
+        return read(*args)
+    except UserError as error:
+        found.append(error)
+        return None
+
+
+def _is_to_train(frame: object) -> bool:
+    return isinstance(frame, dict) and frame.get("split", "train") == "train"
+
+
+def _render(top: dict[str, Any], file: Path) -> dict[str, Any]:
+    render = top.get("render", {})
     if not isinstance(render, dict):
         raise UserError("'render' is not an object", file, "Remove it if it is unknown")
-    if coverage is None:
-        return render, None
+    return render
+
+
+def _coverage(top: dict[str, Any], file: Path) -> float | None:
+    if top.get("coverage") is None:
+        return None
     try:
         share = number(top, "coverage", str(file))
     except UserError:
         share = -1.0
     if not 0 <= share <= 1:
         raise UserError("'coverage' is not a number from 0 to 1", file, "Set it to null")
-    return render, share
+    return share
 
 
 def _light_by_depth(top: dict[str, Any], file: Path) -> tuple[float, ...]:

@@ -345,7 +345,8 @@ def training_pixels(
         )
     photographs = Photographs.load(dataset, clip_negative, smoothed=smoothed, ranks=ranks)
     if not photographs.count:
-        raise UserError("no foreground pixel in any training view", dataset.folder)
+        remedy = "Masks are white where pixels count: see `unbake data check`"
+        raise UserError("no foreground pixel in any training view", dataset.folder, remedy)
     if photographs.mean <= 0:
         raise UserError("all training images are black", dataset.folder)
     limits = None
