@@ -33,6 +33,13 @@ def degraded(cornell, tmp_path):
     return make
 
 
+def test_a_degraded_data_set_is_not_degraded_again(degraded, tmp_path):
+    dataset, _ = degraded(exposure=1.0)
+    with pytest.raises(UserError, match="degraded already"):
+        degrade(dataset.folder, tmp_path / "twice", DegradeSettings(), tell=lambda line: None)
+    assert not (tmp_path / "twice").exists()
+
+
 def pictures(dataset):
     return {view.name: read_exr(view.image) for view in dataset.views}
 

@@ -23,7 +23,9 @@ from unbake.dataset.pixels import CameraRays
 from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
 from unbake.exports import export as exporting
+from unbake.exports import gltf
 from unbake.exports.bake import WANTED
+from unbake.exports.gltf import Document
 from unbake.exports.observed import Views, filled
 from unbake.exports.parts import parsed_principled, read_parts
 from unbake.exports.tessellate import Triangles
@@ -272,6 +274,16 @@ def gltf_near(exported, folder):
         rough = np.abs(both[:, 1] - 255 * truth["roughness"]) <= 2
         found[name] = close.mean(), rough.mean(), both[:, 2], material
     return found
+
+
+def test_a_gltf_file_that_would_be_too_large_is_told(monkeypatch):
+    document = Document()
+    document.view(bytes(1000))
+    assert len(b"".join(document.content())) > 1000
+    monkeypatch.setattr(gltf, "LARGEST", 999)
+    with pytest.raises(UserError, match=r"would have .* GiB, glTF has at most 4") as caught:
+        document.content()
+    assert "--texels" in caught.value.remedy
 
 
 def test_gltf_has_the_recovered_materials(exported):

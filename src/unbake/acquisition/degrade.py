@@ -27,6 +27,7 @@ from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
 from ..dataset.views import Dataset, SensorNoise, View, read_masked
+from ..errors import UserError
 from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
@@ -88,11 +89,15 @@ def degrade(
         tell: called with lines of progress.
 
     Raises:
-        UserError: the data set cannot be read, or `out` is not empty.
+        UserError: the data set cannot be read, or is degraded already, or `out` is not empty.
     """
     out = Path(out)
     require_new_folder(out)
     dataset = Dataset.load(data, allow_outside=allow_outside)
+    if DataFolder(dataset.folder).degraded_file.exists():
+        what = "the data set is degraded already, and the truth of that would be lost"
+        remedy = "Degrade what it was made of, with all options at once"
+        raise UserError(what, dataset.folder, remedy)
     cameras, diagonal = [view.camera for view in dataset.views], 0.0
     if settings.pose_jitter or settings.displace:
         scene = parse(dataset.scene, dataset.root).instantiate()

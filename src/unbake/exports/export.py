@@ -134,7 +134,8 @@ def _require_sound(
         with _collected(wrong):
             require_usd()
     if texels is not None and not 0 < texels < 1e9:
-        wrong.append(str(UserError(f"must be a positive number, not {texels:g}", "--texels")))
+        what = f"must be a positive number below 1e9, not {texels:g}"
+        wrong.append(str(UserError(what, "--texels")))
     if wrong:
         raise UserError("; ".join(wrong))
     return tuple(name for name in FORMATS if name in formats)

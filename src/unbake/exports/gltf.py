@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import UserError
 from ..imaging.pictures import png_bytes
 from ..io import write_atomically
 from ..scene.parse import ParsedScene
@@ -36,6 +37,9 @@ _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _GLASS = ("dielectric", "thindielectric", "roughdielectric")
 _CONDUCTORS = ("conductor", "roughconductor")
 _SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
+
+#: Bytes that the header of a file can tell.
+LARGEST = 2**32 - 1
 
 
 class Document:
@@ -103,14 +107,20 @@ class Document:
         return self.add("textures", {"sampler": 0, "source": image})
 
     def content(self) -> list[bytes]:
-        """The file, in pieces."""
+        """The file, in pieces.
+
+        Raises:
+            UserError: it would be larger than files can be.
+        """
         self.json["buffers"] = [{"byteLength": self._length}]
         if self._extensions:
             self.json["extensionsUsed"] = sorted(self._extensions)
         text = json.dumps(self.json, allow_nan=False, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + self._length
-
+        if total > LARGEST:
+            what = f"the file would have {total / 2**30:.1f} GiB, glTF has at most 4"
+            raise UserError(what, None, "Export fewer texels (--texels), or to usd (--format)")
         return [
             struct.pack("<4sII", b"glTF", 2, total),
             struct.pack("<I4s", len(text), b"JSON") + text,
