@@ -499,7 +499,7 @@ def test_a_pixel_that_is_far_too_bright_is_told_and_made_as_dark_as_others(
         assert [o.view for o in found.hot_pixels] == ["0", "1", "2", "4"]
         line = told_hot_pixels(found.hot_pixels)
         assert line.startswith(
-            "4 pixels are over 10,000 times as bright as the others: "
+            "4 pixels are over 100,000 times as bright as the others: "
             f"0 at (11, 7): 1e+08, taken as {limit:.3g}; 1 at (11, 7)"
         )
         assert line.endswith("; and 1 more")
@@ -523,12 +523,12 @@ def test_a_lamp_in_a_dark_room_is_no_hot_pixel():
 def test_what_is_larger_than_a_spread_firefly_is_seen(edge):
     """A filter of 5 x 5 pixels spreads a firefly over as many; a bulb of 6 x 6 is as it is."""
     room = np.random.default_rng(1).uniform(0.02, 0.05, (256, 256, 4)).astype(np.float32)
-    room[100 : 100 + edge, 253 - edge : 253, :3] = 2000
-    room[3, 4, :3] = 1e5  # by itself, and hot in both
+    room[100 : 100 + edge, 253 - edge : 253, :3] = 2e4
+    room[3, 4, :3] = 1e6  # by itself, and hot in both
     pixels = room.reshape(-1, 4)
     kept, found = without_hot_pixels(pixels, np.ones(256 * 256, bool), "a", 256)
     assert found.count == (26 if edge == 5 else 1)
-    assert (kept[:, 0] == 2000).sum() == (0 if edge == 5 else 36)
+    assert (kept[:, 0] == 2e4).sum() == (0 if edge == 5 else 36)
     assert (found.column, found.row) == (4, 3)
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from ..errors import printable
 
 #: A pixel is hot if it is so many times as bright as the brightest of the others. A lamp
-#: that is seen in a dark room is some hundred times as bright as the room, a bulb or the sun more.
-EXTREME = 1e4
+#: that is seen in a dark room is some hundred times as bright as the room, a bare bulb some ten
+#: thousand times. What is less extreme does no harm: errors are relative to how far it stands out.
+EXTREME = 1e5
 #: What has more such pixels than filters of renderers spread a firefly over, within so many pixels
 #: of one of them, is seen and not hot.
 _THING, _WITHIN = 25, 4
