@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from .settings import FINEST, FieldSettings, GridConfig, NetworkConfig
 
 #: Levels and tables that are chosen. A level is a dozen launches, and the optimiser reads and
-#: writes whole tables.
-LEVELS, TABLES = (2, 12), (15, 19)
+#: writes whole tables. Objects need up to 9 levels. A scene with a lamp as far away as a sun, or a
+#: floor that ends at the horizon, needs more for the same cells.
+LEVELS, TABLES = (2, 18), (15, 19)
 
 
 @dataclass(frozen=True)
