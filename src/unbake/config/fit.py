@@ -455,9 +455,9 @@ class FitConfig:
         Args:
             mean: radiance of the photographs, linear RGB, mean over channels and pixels.
         """
-        if self.preset != "cpu":
+        if self.preset != "cpu" or not 0 < mean < DIM:
             return self.loss_epsilon
-        return self.loss_epsilon * min(1.0, mean / DIM) ** 2
+        return self.loss_epsilon * (mean / DIM) ** 2
 
     @property
     def chosen_estimator(self) -> ChosenEstimator:

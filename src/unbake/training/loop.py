@@ -239,6 +239,8 @@ def _begin(
     step = TrainingStep(problem, pixels, config, ranks)
     step.plan(state)
     restored = load_checkpoint(folder, state) if resume else None
+    if resume and restored is None:
+        console.print("the run has no checkpoint yet: it begins again", highlight=False)
     preview = Preview(problem, dataset, folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
