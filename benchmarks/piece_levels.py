@@ -8,7 +8,8 @@ roughness of these pixels against the true one, PSNR in dB:
 
 - as it was fitted;
 - where the search's descent ends;
-- with each piece of surface moved to what is to be expected of it;
+- with each piece of surface moved to what is to be expected of it, by what all pieces show, its
+  odd ones too, and with the default: odd pieces by what the others show without them;
 - with each piece varying as much as is to be expected of it, and then moved so: the default;
 - with each piece moved to its true mean, which no fit knows: the most that moving pieces can give;
 - with one roughness, the true mean, on each piece: what is left is how much it truly varies there.
@@ -21,6 +22,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -32,6 +34,9 @@ from roughness_curves import opened  # noqa: E402
 from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs  # noqa: E402
 
 from unbake.config import RoughnessSearchConfig  # noqa: E402
+
+#: A piece counts as moved if its mean roughness did by more.
+MOVED = 0.01
 
 
 def main() -> None:
@@ -46,7 +51,7 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         pixels: how many are sampled; those that searches cannot use are left out.
         spp: camera samples of each.
     """
-    from unbake.training.piece_levels import with_expected_levels
+    from unbake.training import piece_levels
     from unbake.training.roughness_curves import Curves, precision
 
     run, steps = opened(folder)
@@ -58,18 +63,67 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     probable = shared.searched(rows, settings=replace(search, pixels_as_one=0))
     curves = Curves.of(rows, search.cells, search.colours, albedo=True)
     values = shared.values_with(probable)
+    leveled = piece_levels.with_expected_levels
+    with patch.object(piece_levels, "_MOST_ODD", 0):
+        echoing = leveled(shared.field, curves, probable, search)
+    levels = leveled(shared.field, curves, probable, search)
     told = {
         "as fitted": shared.score({}),
         "most probable": shared.score(probable),
-        "levels": shared.score(with_expected_levels(shared.field, curves, probable, search)),
+        "odd ones too": shared.score(echoing),
+        "levels": shared.score(levels),
         "expected": shared.score(shared.searched(rows, settings=search)),
         "true means": psnr(at_means(values, rows["piece"], roughness), roughness),
-        "one true roughness": psnr(means_of(roughness, rows["piece"]), roughness),
+        "one true roughness": finite(psnr(means_of(roughness, rows["piece"]), roughness)),
     }
     name = run.dataset.folder.name
-    print(", ".join([name, *(f"{key} {value:.2f} dB" for key, value in told.items())]), flush=True)
+    print(
+        ", ".join([name, *(f"{key} {value or np.inf:.2f} dB" for key, value in told.items())]),
+        flush=True,
+    )
     about = {"data": name, "steps": steps, "pixels": len(rows)}
-    return about | {"pieces": len(np.unique(rows["piece"])), "roughness_psnr": told}
+    moved = moved_pieces(
+        rows["piece"], roughness, shared.values_with(echoing), shared.values_with(levels)
+    )
+    return about | {
+        "pieces": len(np.unique(rows["piece"])),
+        "roughness_psnr": told,
+        "odd": moved,
+    }
+
+
+def finite(decibels: float) -> float | None:
+    """A PSNR; None where there is no error."""
+    return decibels if np.isfinite(decibels) else None
+
+
+def moved_pieces(
+    pieces: np.ndarray, truth: np.ndarray, echoing: np.ndarray, levels: np.ndarray
+) -> list[dict[str, float]]:
+    """Pieces that the others judge otherwise without them, those that moved the most first.
+
+    Args:
+        pieces: the number of each pixel's piece, shape (n,).
+        truth: roughness of pixels, shape (n,).
+        echoing, levels: as `truth`, as found by what all pieces show, and without odd ones.
+
+    Returns:
+        Of each, pixels and the means of the three.
+    """
+    numbers, piece, pixels = np.unique(pieces, return_inverse=True, return_counts=True)
+    true, before, after = (
+        np.bincount(piece, values, len(numbers)) / pixels for values in (truth, echoing, levels)
+    )
+    order = np.argsort(-np.abs(after - before), kind="stable")
+    return [
+        {
+            "pixels": int(pixels[n]),
+            "true": float(true[n]),
+            "odd ones too": float(before[n]),
+            "levels": float(after[n]),
+        }
+        for n in order[: np.count_nonzero(np.abs(after - before) > MOVED)]
+    ]
 
 
 def at_means(values: np.ndarray, pieces: np.ndarray, truth: np.ndarray) -> np.ndarray:

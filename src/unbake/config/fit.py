@@ -149,13 +149,13 @@ class RegularizationConfig:
 #: What a fit can recover, each with a learning rate of its own.
 UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
+#: Mean radiance below which photographs are dim: the darkest of the published scenes has more.
+DIM = 0.08
+
 #: Schedule of methods for which no other one was found best.
 OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100
 #: Least slope of the bounds of albedo, of methods with L_θ; others have none.
 LEAST_SLOPE = 0.01
-
-#: Mean radiance below which photographs are dim: the darkest of the published scenes has more.
-DIM = 0.08
 #: Adam's first β₂ for the unknowns of methods with L_θ, and that of all others. Where roughness
 #: is not searched for, noise moves it farther with the shorter memory.
 FORGETFUL_BETA2, OWN_BETA2 = 0.99, 0.999
