@@ -77,10 +77,8 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         "one true roughness": finite(psnr(means_of(roughness, rows["piece"]), roughness)),
     }
     name = run.dataset.folder.name
-    print(
-        ", ".join([name, *(f"{key} {value or np.inf:.2f} dB" for key, value in told.items())]),
-        flush=True,
-    )
+    lines = (f"{key} {np.inf if x is None else x:.2f} dB" for key, x in told.items())
+    print(", ".join([name, *lines]), flush=True)
     about = {"data": name, "steps": steps, "pixels": len(rows)}
     moved = moved_pieces(
         rows["piece"], roughness, shared.values_with(echoing), shared.values_with(levels)

@@ -215,6 +215,22 @@ def test_no_method_sees_hidden_lights_through_cut_outs(lamp):
     assert_same_expectation(replayed - through, theirs, 1024)
 
 
+@pytest.mark.parametrize("material", ["thindielectric", "null"])
+def test_no_method_sees_hidden_lights_through_thin_panes(material):
+    """What `path` says of them, by which photographs of such scenes are rendered."""
+    pane = {"type": "rectangle", "bsdf": {"type": material}}
+    ball = {"type": "sphere", "center": [0, 0, -3], "bsdf": {"type": "diffuse"}}
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "pane": pane, "b": ball})
+    scene_view = SceneView.of(scene, None, 8)
+    assert scene_view.has_holes
+    ray = pixel_rays([Camera.look_at((0.3, 0, 4), (0, 0, 0), (0, 1, 0), 40.0, 8, 8)], 1024, seed=1)
+    theirs = stock_path(scene, ray, 3, max_depth=12, hide_emitters=True)
+    traced = path_traced(scene_view, ray, 2, max_depth=12, rr_depth=5, hide_emitters=True)
+    assert_same_expectation(traced, theirs, 1024)
+    replayed = path_radiance(path_replay(12, 5, True), scene, seeded(2, dr.width(ray)), ray, {})
+    assert_same_expectation(replayed - light_through_holes(scene, ray, 12), theirs, 1024)
+
+
 def test_light_through_holes_passes_gradients_to_the_sky():
     scene, ray = half_opaque_leaf(lamp=False)
     parameters = mi.traverse(scene)

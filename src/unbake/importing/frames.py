@@ -297,11 +297,9 @@ def _listed(name: str, splits: Mapping[PurePosixPath, str]) -> str | None:
     if path in splits:
         return splits[path]
 
-    found = {split for listed, split in splits.items() if _same_end(listed, path)}
+    def same(listed: PurePosixPath) -> bool:
+        count = min(len(listed.parts), len(path.parts))
+        return count > 0 and listed.parts[-count:] == path.parts[-count:]
+
+    found = {split for listed, split in splits.items() if same(listed)}
     return found.pop() if len(found) == 1 else None
-
-
-def _same_end(one: PurePosixPath, other: PurePosixPath) -> bool:
-    """Whether one path is the end of the other."""
-    count = min(len(one.parts), len(other.parts))
-    return count > 0 and one.parts[-count:] == other.parts[-count:]

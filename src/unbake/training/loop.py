@@ -356,9 +356,9 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     progress = begun.restored or Progress()
     if begun.restored is not None:
         over = _done(config, progress) >= (config.seconds or config.steps)
-        told = f"the run has {progress.step} steps already, and is to have no more"
-        told = told if over else f"going on after step {progress.step}"
-        console.print(told, highlight=False)
+        more = f"going on after step {progress.step}"
+        none = f"the run has {progress.step} steps already, and is to have no more"
+        console.print(none if over else more, highlight=False)
     log, events = _open(begun, folder, lock, progress, tensorboard)
     errors = ErrorCurve(begun.aside, config, _measured_before(folder), progress)
 

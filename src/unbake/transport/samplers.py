@@ -288,7 +288,7 @@ class PathReplaySampler(_WholePathSampler):
         """Radiance of camera samples."""
         c = self._context
         light = path_radiance(self._integrator, scene, sampler, ray, c.read_by_scene())
-        if c.hide_emitters and c.scene_view.has_chains:
+        if c.hide_emitters and c.scene_view.has_holes:
             light -= light_through_holes(scene, ray, c.max_depth)
         return light
 

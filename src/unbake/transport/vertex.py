@@ -25,6 +25,7 @@ class SceneView:
         materials: fields that stand in for the unknown materials; None: the scene's own are used.
         max_specular: longest chain of specular interactions followed; longer ones end in black.
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
+        has_holes: whether any lets rays pass as they are: cut-outs, thin panes (found by `of`).
         has_area_emitters: whether any surface of the scene emits light (found by `of`).
         optimized: numbers of the shapes whose material is optimized (found by `of`).
     """
@@ -33,6 +34,7 @@ class SceneView:
     materials: Materials | None
     max_specular: int
     has_chains: bool
+    has_holes: bool
     has_area_emitters: bool
     optimized: frozenset[int]
 
@@ -41,10 +43,11 @@ class SceneView:
         """The view of a scene; looks at every BSDF once, also at those inside of instances."""
         shapes = met_shapes(scene)
         flags = [int(shape.bsdf().flags()) for shape in shapes if shape.bsdf() is not None]
-        chains = any(not f & int(mi.BSDFFlags.Smooth) or f & int(mi.BSDFFlags.Null) for f in flags)
+        holes = any(f & int(mi.BSDFFlags.Null) for f in flags)
+        chains = holes or any(not f & int(mi.BSDFFlags.Smooth) for f in flags)
         area_emitters = any(shape.emitter() is not None for shape in shapes)
         optimized = optimized_shapes(scene)
-        return SceneView(scene, materials, max_specular, chains, area_emitters, optimized)
+        return SceneView(scene, materials, max_specular, chains, holes, area_emitters, optimized)
 
     def with_scene(self, scene: mi.Scene) -> SceneView:
         """The same around this handle of the scene (frozen functions bring their own)."""
