@@ -100,7 +100,9 @@ class Run:
         return self.recovered.problem.scene_view.scene
 
     def cameras(self, split: str | None = None) -> list[Camera]:
-        """The cameras of the data set.
+        """The cameras of the data set, as it tells them.
+
+        `render` takes a view, or its name, for its camera as the fit found it.
 
         Args:
             split: "train" or "heldout"; None: all.
@@ -126,7 +128,8 @@ class Run:
         """Path trace a picture with what was recovered, with full global illumination.
 
         Args:
-            camera: a camera, a view of the data set, or the name of one.
+            camera: a camera, a view of the data set, or the name of one. Those of views are as the
+                fit found them, where they were unknown.
             spp: samples a pixel.
             width: in pixels; None: the camera's own, or in the proportions of `height`.
             height: in pixels; None: the camera's own, or in the proportions of `width`.
@@ -189,8 +192,7 @@ class Run:
             remedy = "`export` unwraps it; `material_along` takes rays"
             raise UserError(what, self.dataset.scene, remedy)
         problem = self.recovered.problem
-        cameras = [view.camera for view in self.dataset.train]
-        baker = Baker(materials, {}, Views(problem.scene_view.scene, cameras))
+        baker = Baker(materials, {}, Views(problem.scene_view.scene, self.recovered.cameras))
         values, hit, seen = baker.at(Placed(part, part.triangles, part.triangles.uv), at)
         return values | {"on_mesh": hit, "observed": seen}
 
@@ -348,13 +350,13 @@ class Run:
         if isinstance(camera, Camera):
             return camera
         if isinstance(camera, View):
-            return camera.camera
+            return self.recovered.camera(camera)
         by_name: Mapping[str, View] = {view.name: view for view in self.dataset.views}
         if camera not in by_name:
             names = ", ".join(list(by_name)[:6]) + (", …" if len(by_name) > 6 else "")
             what = f"no view named {printable(camera)!r}"
             raise UserError(what, self.dataset.folder, f"There are {names}")
-        return by_name[camera].camera
+        return self.recovered.camera(by_name[camera])
 
 
 def _coordinates(uv: np.ndarray) -> np.ndarray:

@@ -18,8 +18,9 @@ from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.placing import placed_view, told_of_place
+from unbake.evaluation.rendering import render
 from unbake.evaluation.renderings import render_camera
-from unbake.evaluation.settings import EvaluationSettings
+from unbake.evaluation.settings import EvaluationSettings, RenderSettings
 from unbake.imaging.pictures import write_exr
 from unbake.report.page import write_report
 from unbake.scene import edit
@@ -239,6 +240,13 @@ def test_a_fit_corrects_poses_tells_them_and_goes_on_bit_for_bit(
         assert row["pixels"] > 0 and row["degrees"] > 0 and row["shift"] > 0
         np.testing.assert_array_equal(row["transform_matrix"], moved.to_world)
     assert rows["heldout_000"]["split"] == "heldout"
+    wanted = RenderSettings(spp=1, max_depth=2, views="all")
+    again = render(run, tmp_path / "pictures", wanted, tell=lambda line: None)
+    shown = {frame["name"]: frame for frame in again["frames"]}
+    for view, moved in zip(views, corrected, strict=True):
+        np.testing.assert_allclose(shown[view.name]["transform_matrix"], moved.to_world, rtol=1e-6)
+        assert shown[view.name]["fl_x"] == pytest.approx(moved.fl_x, rel=1e-6)
+    assert shown["heldout_000"]["fl_x"] == pytest.approx(corrected[0].fl_x, rel=1e-6)
     (lens,) = found["intrinsics"]
     assert lens["fl_x"] == corrected[0].fl_x != lens["told_fl_x"] == views[0].camera.fl_x
     assert RunFolder(run).metrics()["camera"] == found

@@ -250,7 +250,7 @@ def _shots(
         return shots, {"kind": "file", "file": os.fspath(cameras.file)}
     if cameras.turntable is not None:
         scene, count = recovered.problem.scene_view.scene, cameras.turntable
-        poses = [view.camera for view in dataset.train]
+        poses = recovered.cameras
         room = dataset.kind == "room"
         table = make_turntable(scene, poses, count, width, height, room)
         tell(table.told())
@@ -262,15 +262,13 @@ def _shots(
     if not chosen:
         tell(f"no view has the split {settings.views!r}: all views are rendered")
         chosen = list(source.views)
-    shots = [
-        _Shot(
-            view.name,
-            view.camera.rescaled(*picture_size(view.camera, settings)),
-            view.split,
-            view if cameras.truth is not None else None,
-        )
-        for view in chosen
-    ]
+    shots = []
+    for view in chosen:
+        # Those of the truth are as it tells them.
+        camera = recovered.camera(view) if cameras.truth is None else view.camera
+        scaled = camera.rescaled(*picture_size(camera, settings))
+        truth = None if cameras.truth is None else view
+        shots.append(_Shot(view.name, scaled, view.split, truth))
     return shots, {"kind": "views", "of": "truth" if cameras.truth else "data"}
 
 

@@ -161,7 +161,7 @@ def _export(
     tell: Callable[[str], None],
 ) -> dict[str, Any]:
     problem, dataset = recovered.problem, recovered.dataset
-    cameras = [view.camera for view in dataset.train]
+    cameras = recovered.cameras
     scene = problem.scene_view.scene
     density = texels
     if density is None:
@@ -270,7 +270,7 @@ def _write(
             baked,
             lights,
             environment,
-            dataset.train[0].camera,
+            recovered.camera(dataset.train[0]),
         )
         notes += scene.notes
     return _Written(files, masks, notes)

@@ -187,7 +187,7 @@ def _views(recovered: Recovered, cameras: Path | str | None) -> dict[str, Camera
     """The cameras of a file, else the held-out views; all views where there are none."""
     dataset = recovered.dataset
     if cameras is None:
-        return {view.name: view.camera for view in dataset.heldout or dataset.views}
+        return {v.name: recovered.camera(v) for v in dataset.heldout or dataset.views}
     first = dataset.train[0].camera
     return _named(read_cameras(Path(cameras), first.width, first.height, keep_size=True))
 

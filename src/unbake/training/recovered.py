@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..config import FitConfig
-from ..dataset.views import Dataset
+from ..dataset.camera import Camera
+from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..scene.parse import ParsedScene
 from .checkpoint import Progress, load_checkpoint
+from .poses import refined_view
 from .problem import Problem, problem_of
 from .run_folder import RunFolder
 from .state import State, initial_state
@@ -30,6 +32,15 @@ class Recovered:
         config = self.config
         told = f"{config.unknown!r} by {config.method!r}, {self.progress.step} steps"
         return f"Recovered({told}, {str(self.dataset.folder)!r})"
+
+    def camera(self, view: View) -> Camera:
+        """The camera of a view of the data set, as the fit found it; see `refined_view`."""
+        return refined_view(self.problem.poses, self.dataset.train, view).camera
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Those of the training views."""
+        return [self.camera(view) for view in self.dataset.train]
 
 
 @dataclass
