@@ -18,7 +18,7 @@ import trimesh
 from support import tiny_fields
 
 import unbake
-from unbake.dataset.camera import LookAt
+from unbake.dataset.camera import Camera, LookAt
 from unbake.dataset.pixels import CameraRays
 from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
@@ -26,6 +26,7 @@ from unbake.exports import export as exporting
 from unbake.exports import gltf
 from unbake.exports.bake import WANTED
 from unbake.exports.gltf import Document
+from unbake.exports.mitsuba import write_scene
 from unbake.exports.observed import Views, filled
 from unbake.exports.parts import parsed_principled, read_parts
 from unbake.exports.tessellate import Triangles
@@ -274,6 +275,27 @@ def gltf_near(exported, folder):
         rough = np.abs(both[:, 1] - 255 * truth["roughness"]) <= 2
         found[name] = close.mean(), rough.mean(), both[:, 2], material
     return found
+
+
+#: A scene that says nothing of cameras.
+WITHOUT_SENSOR = """<scene version="3.0.0">
+  <shape type="rectangle"><bsdf type="diffuse"/></shape><emitter type="constant"/></scene>"""
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1.01])
+def test_a_scene_without_a_sensor_gets_that_of_the_first_photograph(aspect, tmp_path):
+    (tmp_path / "scene.xml").write_text(WITHOUT_SENSOR)
+    wanted = replace(LookAt((0, 0, 3), (0, 0, 0), (0, 1, 0), 40).camera(64, 48), cx=35.0, cy=21.0)
+    wanted = replace(wanted, fl_y=aspect * wanted.fl_x)
+    (tmp_path / "out").mkdir()
+    scene, scratch = (parsed_principled(tmp_path / "scene.xml", tmp_path) for _ in range(2))
+    made = write_scene(tmp_path / "out", scene, scratch, [], [], [], None, wanted)
+    (sensor,) = mi.load_file(str(made.path)).sensors()
+    found = Camera.from_mitsuba(sensor)
+    assert [found.cx, found.cy, found.width, found.height] == pytest.approx([35, 21, 64, 48])
+    np.testing.assert_allclose(found.to_world, wanted.to_world, atol=1e-5)
+    assert found.fl_x == pytest.approx((1 + aspect) / 2 * wanted.fl_x, rel=1e-5)
+    assert ["mean of two focal lengths" in note for note in made.notes] == [True] * (aspect != 1)
 
 
 def test_a_gltf_file_that_would_be_too_large_is_told(monkeypatch):

@@ -179,6 +179,11 @@ class Camera:
             height,
         )
 
+    @property
+    def has_square_pixels(self) -> bool:
+        """Whether both focal lengths agree, as Mitsuba's camera needs it."""
+        return abs(self.fl_x / self.fl_y - 1) <= _SQUARE_TOLERANCE
+
     def rays(self, px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions, (n, 3) each in world space, through film positions.
 
@@ -244,7 +249,7 @@ class Camera:
         Raises:
             UserError: fl_x and fl_y differ, which Mitsuba's camera cannot express.
         """
-        if abs(self.fl_x / self.fl_y - 1) > _SQUARE_TOLERANCE:
+        if not self.has_square_pixels:
             raise UserError(
                 f"pixels are not square: fl_x is {self.fl_x:g} and fl_y is {self.fl_y:g}",
                 remedy="Resample the image so that both focal lengths agree",

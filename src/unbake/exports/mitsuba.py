@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -78,7 +78,7 @@ def write_scene(
             props[STRENGTHS[light.plugin]] = mi.ScalarColor3d(list(light.strength or (0, 0, 0)))
     if environment is not None:
         _replace_environment(folder, scene, environment)
-    _require_sensor(scene, camera)
+    notes += _require_sensor(scene, camera)
     _forget_unused(scene)
     path = write(scene, folder)
     _name_shapes(path, names)
@@ -227,11 +227,21 @@ def _replace_environment(folder: Path, scene: ParsedScene, picture: np.ndarray) 
             node.props["filename"] = str(file)
 
 
-def _require_sensor(scene: ParsedScene, camera: Camera) -> None:
-    """Append a sensor where there is none."""
+def _require_sensor(scene: ParsedScene, camera: Camera) -> list[str]:
+    """Append a sensor where there is none.
+
+    Returns:
+        What is not as it was.
+    """
     nodes = scene.state.nodes
     if any(node.type == mi.ObjectType.Sensor for node in nodes):
-        return
+        return []
+    notes = []
+    if not camera.has_square_pixels:
+        told = f"{camera.fl_x:g} and {camera.fl_y:g} pixels, which Mitsuba's camera has not"
+        notes.append(f"the sensor has the mean of two focal lengths, {told}")
+        mean = (camera.fl_x + camera.fl_y) / 2
+        camera = replace(camera, fl_x=mean, fl_y=mean)
     wanted = camera.sensor(64)
     film = mi.parser.SceneNode()
     film.type = mi.ObjectType.Film
@@ -240,10 +250,11 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> None:
     sensor = mi.parser.SceneNode()
     sensor.type = mi.ObjectType.Sensor
     sensor.props.set_plugin_name("perspective")
-    for key in ("fov", "fov_axis", "near_clip", "far_clip", "to_world"):
+    for key in wanted.keys() - {"type", "film", "sampler"}:
         sensor.props[key] = wanted[key]
     sensor.props["film"] = mi.Properties.ResolvedReference(scene.append(film))
     scene.append_to_root("exported sensor", sensor)
+    return notes
 
 
 def _forget_unused(scene: ParsedScene) -> None:
