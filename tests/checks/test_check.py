@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from unbake.checks.check import check_data
-from unbake.checks.pictures import PictureFacts, blurred, picture_facts
+from unbake.checks.pictures import PictureFacts, blurred, percentage, picture_facts
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
 from unbake.dataset.mistakes import OPENCV, all_mistakes
@@ -60,6 +60,21 @@ def test_three_faults_are_told_in_one_go(spoilt, unbake):
     assert "poses seem to be in OpenCV's axes" in text
     assert "Negate columns 2 and 3 of the matrix" in text
     assert "3 errors; a fit makes no sense yet" in text
+
+
+@pytest.mark.parametrize(
+    ("share", "told"),
+    [
+        (0, "0 %"),
+        (0.0012, "0.12 %"),
+        (0.0996, "10 %"),
+        (0.123, "12 %"),
+        (0.996, "100 %"),
+        (1, "100 %"),
+    ],
+)
+def test_shares_are_told_in_percent(share, told):
+    assert percentage(share) == told
 
 
 def test_vertex_normals_that_are_not_numbers_are_told(spoilt, unbake):

@@ -19,7 +19,7 @@ from support import BROWSERS, found_browser
 
 from unbake.errors import UserError
 from unbake.imaging import pictures
-from unbake.report import charts
+from unbake.report import charts, display
 from unbake.report.page import write_report
 
 SIZE = (24, 32)
@@ -231,6 +231,31 @@ def test_names_cannot_inject_markup(tmp_path: Path):
 def test_a_finished_page_is_the_same_each_time(made, tmp_path: Path):
     first = write_report(made[1], tmp_path / "a.html").read_bytes()
     assert write_report(made[1], tmp_path / "b.html").read_bytes() == first
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_errors_of_renderings_are_of_pixels_that_count(known, tmp_path: Path, monkeypatch):
+    data = _make_data(tmp_path / "data", known=known)
+    half = np.ones((*SIZE, 3))
+    half[:, : SIZE[1] // 2] = 0
+    pictures.write_png(data / "mask.png", pictures.to_bytes(half))
+    transforms = json.loads((data / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["mask_path"] = "mask.png"
+    (data / "transforms.json").write_text(json.dumps(transforms))
+    run = _make_run(tmp_path / "run", data, "ours", 0.01, known=known)
+    painted, paint = [], display.painted
+
+    def kept(values, scale, mask):
+        painted.append(mask)
+        return paint(values, scale, mask)
+
+    monkeypatch.setattr(display, "painted", kept)
+    write_report([run], tmp_path / "page.html")
+    expected = half[..., 0] > 0
+    if known:
+        expected &= _truth(0)["mask"] > 0
+    assert (painted[0] == expected).all() and 0 < expected.sum() < expected.size
 
 
 def test_photographs_without_truth_are_shown_as_recovered(tmp_path: Path):

@@ -15,7 +15,7 @@ from support import nothing_compiled
 
 from unbake.config import from_toml, preset, read_toml
 from unbake.dataset.pixels import HELD_GROUPS, CameraRays
-from unbake.dataset.views import Dataset
+from unbake.dataset.views import Dataset, read_view
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.settings import EvaluationSettings
 from unbake.training.fresh_fit import begin_fit
@@ -24,7 +24,6 @@ from unbake.training.loop import fit
 from unbake.training.monitor import Monitor
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
-from unbake.training.validation import read_view
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
 from ..errors import UserError, printable
 from ..scene import edit, free_space
 from ..scene.parse import parse
-from .pictures import PictureFacts, blurred, picture_facts
+from .pictures import PictureFacts, blurred, percentage, picture_facts
 
 #: Share of the pixels of surfaces that may be clipped, of one view and of all; and of one view
 #: where it is told from which value on they are.
@@ -373,7 +373,7 @@ def _share(
     if not worst and mean <= limits[1]:
         return
     names = named([result.views[i].view.name for i in worst]) or None
-    told = f"{100 * (max(shares) if worst else mean):.2g} % {what}"
+    told = f"{percentage(max(shares) if worst else mean)} {what}"
     result.warn(check, ("up to " if worst else "") + told, names, remedy)
 
 

@@ -36,6 +36,12 @@ class PictureFacts:
     digest: str
 
 
+def percentage(share: float) -> str:
+    """A share in [0, 1] in percent: 0.12 %, 1.2 %, 12 %, 100 %."""
+    percent = 100 * share
+    return f"{percent:.2g} %" if percent < 9.95 else f"{percent:.0f} %"
+
+
 def picture_facts(
     rgb: np.ndarray, surface: np.ndarray, counted: np.ndarray, limit: float | None
 ) -> PictureFacts:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import printable
 from .check import CheckedView, DataCheck
+from .pictures import percentage
 
 #: The checks in the order in which they are told, and those that each row stands for.
 _ROWS = {
@@ -101,13 +102,13 @@ def _pixels(result: DataCheck) -> str | None:
     if not result.views:
         return None
     clipped, black = (
-        100 * float(np.mean(values))
+        percentage(float(np.mean(values)))
         for values in (
             [v.facts.clipped for v in result.views],
             [v.facts.black for v in result.views],
         )
     )
-    return f"{clipped:.2g} % of those of surfaces clipped, {black:.2g} % black"
+    return f"{clipped} of those of surfaces clipped, {black} black"
 
 
 def _blur(result: DataCheck) -> str | None:

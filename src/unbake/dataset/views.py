@@ -325,6 +325,12 @@ def read_radiance(path: Path, width: int, height: int) -> np.ndarray:
     return pixels
 
 
+def read_view(image: Path, view: View) -> np.ndarray:
+    """A true picture of a view, (H, W, 4) float32, with alpha; errors as in `read_image`."""
+    width, height = view.camera.width, view.camera.height
+    return read_image(image, width, height).reshape(height, width, 4)
+
+
 def read_photograph(view: View, clip_negative: bool = False) -> np.ndarray:
     """The photograph of a view, (H, W, 4) float32: linear RGB, and alpha, 0 where it is masked.
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..checks.check import CheckedView, DataCheck
+from ..checks.pictures import percentage
 from ..checks.told import told_rows
 from ..dataset.alignment import geometry_edges
 from ..dataset.camera import Camera
@@ -71,8 +72,8 @@ def _row(result: DataCheck, number: int) -> dict[str, Any]:
         "size": f"{view.view.camera.width} x {view.view.camera.height}",
         "share": f"{100 * view.share:.0f} %",
         "stops": display.DASH if stops is None or np.isnan(stops) else f"{stops:+.2f}",
-        "clipped": f"{100 * view.facts.clipped:.2g} %",
-        "black": f"{100 * view.facts.black:.2g} %",
+        "clipped": percentage(view.facts.clipped),
+        "black": percentage(view.facts.black),
         "detail": display.DASH if view.facts.detail is None else f"{view.facts.detail:+.2f}",
     }
 

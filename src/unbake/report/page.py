@@ -11,7 +11,7 @@ from typing import Any, final
 import jinja2
 import numpy as np
 
-from unbake.dataset.views import Dataset
+from unbake.dataset.views import Dataset, read_photograph, read_view
 from unbake.errors import UserError
 from unbake.evaluation.convergence import WINDOW, score_curve, time_to_quality
 from unbake.fields.registry import representation, representations
@@ -204,13 +204,26 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
     return display.evaluated(run, run.folder.picture(view.split, view.name, quantity))
 
 
+def _reference(view: View, quantity: str) -> tuple[np.ndarray, np.ndarray]:
+    """The truth of a quantity, (H, W, 3), and the pixels whose errors count, (H, W) bool.
+
+    Those of renderings are not masked, and show what is unknown where the data set tells that.
+    """
+    image, counted = display.rgb(view.truth[quantity])
+    if quantity == "render":
+        counted = read_photograph(view.source, clip_negative=True)[..., 3] >= 0.5
+        for path in view.source.truth.values():
+            counted &= read_view(path, view.source)[..., 3] >= 0.5
+    return image, counted
+
+
 def _scales(runs: list[Run], views: list[View]) -> Scales:
     """Exposure and error scales from all pictures of the page."""
     radiance: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in NAMES}
     for view in views:
-        for quantity, path in view.truth.items():
-            reference, mask = display.rgb(path)
+        for quantity in view.truth:
+            reference, mask = _reference(view, quantity)
             if quantity == "render":
                 radiance.append(pictures.sample(reference.mean(axis=2)[mask]))
             for run, parts in zip(runs, errors[quantity], strict=True):
@@ -239,7 +252,7 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
 
     values = [display.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
     scale = scales.error[quantity]
-    reference, mask = display.rgb(view.truth[quantity]) if quantity in view.truth else (None, None)
+    reference, mask = _reference(view, quantity) if quantity in view.truth else (None, None)
     cells = []
     for run, psnr in zip(runs, display.marked(values, display.decibels), strict=True):
         path = _recovered(run, view, quantity)
@@ -472,7 +485,7 @@ def _count(value: object) -> str:
     if number is None:
         return "—"
     for unit, size in (("G", 1e9), ("M", 1e6)):
-        if number >= size:
+        if number >= 0.9995 * size:  # what is rounded up to it, too
             return f"{number / size:.3g}\N{NO-BREAK SPACE}{unit}"
     return f"{number:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 

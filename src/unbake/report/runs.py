@@ -65,6 +65,7 @@ class View:
     name: str
     split: str
     truth: dict[str, Path]
+    source: views.View
 
 
 def labels(runs: Sequence[str | Path]) -> list[tuple[Path, str]]:
@@ -176,4 +177,4 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
 
 
 def _view(view: views.View) -> View:
-    return View(view.name, view.split, {"render": view.image, **view.truth})
+    return View(view.name, view.split, {"render": view.image, **view.truth}, view)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from ..dataset.pixels import CameraRays
-from ..dataset.views import View, read_image
+from ..dataset.views import View, read_view
 from ..imaging.metrics import mean_psnr, psnr
 from ..quantities import QUANTITIES
 from ..transport.render import render_materials
@@ -121,12 +120,6 @@ class Score:
         keys = psnr_keys(self._problem.materials or ())
         means = {key: mean_psnr(row[key] for row in rows) for key in keys}
         return {"views": len(rows)} | means
-
-
-def read_view(image: Path, view: View) -> np.ndarray:
-    """A true picture of a view, (H, W, 4) float32, with alpha; errors as in `read_image`."""
-    width, height = view.camera.width, view.camera.height
-    return read_image(image, width, height).reshape(height, width, 4)
 
 
 def finite(value: float) -> float | None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
-from ..dataset.views import Dataset, View, read_photograph
+from ..dataset.views import Dataset, View, read_photograph, read_view
 from ..errors import UserError
 from ..exports.bake import OwnTextures, look_up, own_textures
 from ..exports.observed import Views
@@ -30,7 +30,7 @@ from ..training.cameras import Cameras
 from ..training.checkpoint import Progress, load_written
 from ..training.poses import refined_view
 from ..training.recovered import open_run
-from ..training.validation import MaterialBuffers, read_view
+from ..training.validation import MaterialBuffers
 from ..transport.path_sample import Requirements, rhs, trace
 from ..transport.render import parts_of, render_radiance
 from .surface import Surface, make_surface
