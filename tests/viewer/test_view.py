@@ -197,6 +197,9 @@ def test_the_page_follows_a_run_and_changes_nothing_in_it(viewer, run):
     viewer._looked = -100.0
     viewer.step(0)
     assert "step 90" in page._facts.content and page._surface.glb_data != first
+    # Where the page moves the slider, nobody asks for that checkpoint
+    page.show_checkpoints(3, 1, "")
+    assert page._checkpoints.value == 1 and page.events.empty()
     page._tell("checkpoint", 1)
     viewer.step(0)
     viewer.step(0)

@@ -232,12 +232,14 @@ class Page:
         if has_checkpoints:
             with gui.add_folder("Checkpoint"):
                 self._checkpoints = gui.add_slider("Which", 1, 2, 1, 1, visible=False)
-                self._checkpoints.on_update(
-                    lambda event: self._tell("checkpoint", int(event.target.value))
-                )
+                self._checkpoints.on_update(self._slid)
                 self._checkpoint = gui.add_html("")
             with gui.add_folder("Log"):
                 self._log = gui.add_html("")
+
+    def _slid(self, event: Any) -> None:
+        if event.client is not None:  # else it is `show_checkpoints` that moved it
+            self._tell("checkpoint", int(event.target.value))
 
     def _stepped(self, event: Any) -> None:
         step = {_STEPS[0]: -1, _STEPS[2]: 1}.get(event.target.value)
