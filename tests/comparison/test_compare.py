@@ -162,8 +162,12 @@ def test_the_ceiling_of_the_fields_stands_below_the_methods(compare, cornell, tm
     gap = found["direct"]["heldout"]["albedo_psnr"] - ceilings["direct"]["albedo_psnr"]
     assert f"<small>{'−' if gap < 0 else '+'}{abs(gap):.2f}</small>" in page
 
+    # An evaluation of before the ceiling was measured does not hide it
+    file = tmp_path / "out/direct/evaluation/metrics.json"
+    file.write_text(json.dumps(metrics | {"yardsticks": metrics["yardsticks"] | {"ceiling": None}}))
     again = compare("direct", "no-prior", "direct:grid", steps=2, data=data)
     assert again.status == 0 and "on the true maps" not in again.out
+    assert result(tmp_path)["methods"]["direct"]["yardsticks"]["ceiling"] == ceilings["direct"]
 
 
 def test_without_true_maps_there_is_no_ceiling(compare, cornell, tmp_path):

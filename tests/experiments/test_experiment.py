@@ -4,6 +4,7 @@ import dataclasses
 import json
 import tarfile
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args
 
@@ -24,10 +25,13 @@ from unbake.experiments.experiment import (
 from unbake.experiments.fig4 import agreement, published_tables, smoothed
 from unbake.experiments.jobs import Job, Unfinished
 from unbake.experiments.scene_fits import ABLATION, Fit, SceneFits, steps_of
-from unbake.experiments.scenes import SCENES, STAIRCASE
+from unbake.experiments.scenes import SCENES, STAIRCASE, _raise_albedo
 from unbake.experiments.seeds import across_seeds, plus_minus, spread
 from unbake.experiments.tables import markdown
+from unbake.imaging.coded import read_picture
 from unbake.imaging.pictures import write_exr
+from unbake.scene.edit import to_principled
+from unbake.scene.parse import parse, referenced
 from unbake.training.fresh_fit import compile_kernels
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
@@ -168,6 +172,32 @@ def test_data_sets_of_other_settings_have_other_folders(tmp_path):
     shots = dataclasses.replace(STAIRCASE.capture_settings(small), spp=7)
     folders = {STAIRCASE.data(small), other.data(small), STAIRCASE.data(small, shots)}
     assert len(folders) == 3 and STAIRCASE.data(small) == STAIRCASE.data(context(tmp_path))
+
+
+def test_an_albedo_that_materials_share_is_raised_once(tmp_path):
+    write_exr(tmp_path / "wood.exr", np.full((2, 2, 3), 0.25))
+    file = '<string name="filename" value="wood.exr"/>'
+    texture = f'<texture type="bitmap" name="base_color" id="wood">{file}</texture>'
+    one = f'<bsdf type="principled" id="one">{texture}</bsdf>'
+    other = '<bsdf type="principled" id="other"><ref name="base_color" id="wood"/></bsdf>'
+    plain = '<bsdf type="principled" id="plain"><rgb name="base_color" value="0.25"/></bsdf>'
+    shapes = "".join(
+        f'<shape type="cube"><ref id="{i}"/></shape>' for i in ("one", "other", "plain")
+    )
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0">{one}{other}{plain}{shapes}</scene>'
+    )
+    scene = parse(tmp_path / "scene.xml")
+    to_principled(scene)
+    _raise_albedo(scene, 0.5, tmp_path)
+    for node in scene.principled_nodes():
+        colour = node.props["base_color"]
+        texture = referenced(scene, colour)
+        if texture is None:
+            assert list(colour) == pytest.approx([0.5] * 3)
+        else:
+            raised = read_picture(Path(texture.props["filename"]))
+            assert raised[..., :3] == pytest.approx(np.full((2, 2, 3), 0.5), abs=0.005)
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.folder)

@@ -75,6 +75,26 @@ def test_a_job_that_is_stopped_goes_on_and_its_time_adds_up(runner, tmp_path):
     assert done == ["b", "a"] and record(tmp_path, "a")["seconds"] >= sleeping
 
 
+def test_time_is_that_of_the_findings_alone(runner, tmp_path):
+    """Not that of an attempt that failed, nor of one whose files are gone."""
+    sleeping, tries, file = 0.3, [], tmp_path / "file"
+
+    def work():
+        tries.append(time.sleep(sleeping if len(tries) < 2 else 0))
+        if len(tries) == 1:
+            raise UserError("no luck")
+        file.touch()
+        return {}
+
+    job = Job("a", {}, work, files=[file])
+    assert list(runner.run([job]).failed) == ["a"]
+    assert not runner.run([job]).failed
+    assert sleeping <= record(tmp_path, "a")["seconds"] < 2 * sleeping
+    file.unlink()
+    assert not runner.run([job]).left and len(tries) == 3
+    assert record(tmp_path, "a")["seconds"] < sleeping
+
+
 def test_no_job_starts_after_the_time_is_up(runner):
     done = []
     until = time.monotonic() + 0.2

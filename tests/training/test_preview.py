@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import math
 import shutil
 
 import mitsuba as mi
@@ -105,6 +106,15 @@ def test_lights_are_told_in_a_line_and_have_no_picture(cornell, tmp_path):
     assert said.getvalue() == f"step 40, 18 s: {name} 0.2 0.2 0.2\n"
     logged = json.loads((tmp_path / "log.jsonl").read_text())
     assert logged["validation"]["emission"].keys() == {name} and logged["step"] == 40
+
+
+def test_a_loss_that_no_step_had_is_left_out_of_the_log(tmp_path):
+    """JSON has no NaN: other programs would not read the file."""
+    entry = {"step": 4, "seconds": 1.5, "samples_per_second": 2e3, "memory_mb": 9.0, "skipped": 4}
+    with Monitor(tmp_path / "log.jsonl", Console(file=io.StringIO()), 100) as monitor:
+        monitor.record(4, entry | {"lhs": math.nan, "prior": math.inf, "photometric": 0.5})
+    logged = (tmp_path / "log.jsonl").read_text()
+    assert json.loads(logged) == entry | {"photometric": 0.5}
 
 
 def test_no_preview_is_written_through_a_link(cornell, tmp_path):

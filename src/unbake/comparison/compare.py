@@ -162,7 +162,7 @@ def compare(
                         allow_outside=allow_outside,
                         allow_doubtful=allow_doubtful,
                     )
-                    metrics = _evaluated(run, progress, evaluation, allow_outside, console)
+                    metrics = _evaluated(dataset, run, progress, evaluation, console)
                 rows[name] = description(fits[name]) | _numbers(run, metrics, fits[name])
             except UserError as error:
                 errors[name] = error
@@ -308,25 +308,30 @@ def _fitted(
 
 
 def _evaluated(
+    dataset: Dataset,
     run: RunFolder,
     progress: Progress,
     settings: EvaluationSettings,
-    allow_outside: bool,
     console: Console,
 ) -> dict[str, Any]:
-    """Metrics of the run. Evaluates it unless they are of this state and these settings."""
+    """Metrics of the run.
+
+    Evaluates it unless they are of this state and these settings, with the ceiling if there is one.
+    """
     if run.metrics_file.is_file():
         metrics = run.metrics()
         same = metrics.get("steps") == progress.step
         same = same and metrics.get("evaluation") == asdict(settings)
         # Version 0.1 had no yardsticks; runs of known materials have none.
         same = same and (YARDSTICKS in metrics or not metrics.get("quantities"))
+        if same and YARDSTICKS in metrics and metrics[YARDSTICKS]["ceiling"] is None:
+            same = find_ceiling(dataset, run.settings()) is None
         if same and NUMBERS <= metrics.keys():
             return metrics
     return evaluate(
         run.path,
         settings,
-        allow_outside=allow_outside,
+        allow_outside=dataset.allow_outside,
         tell=lambda line: console.print(line, soft_wrap=True),
     )
 

@@ -116,8 +116,8 @@ class JobRunner:
                 return {}
             if "found" in record:  # written by unbake 0.1.0 and older
                 record["findings"] = record.pop("found")
-            if not all(file.is_file() for file in job.files):
-                record.pop("findings", None)
+            if "findings" in record and not all(file.is_file() for file in job.files):
+                return {}
             return record
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}
@@ -211,7 +211,8 @@ class JobRunner:
 
     def _run(self, job: Job) -> None:
         """Run a job and write its record, which of a stopped one has the time spent so far."""
-        before, start = self.record(job).get("seconds", 0.0), time.perf_counter()
+        kept, start = self.record(job), time.perf_counter()
+        before = 0.0 if "error" in kept else kept.get("seconds", 0.0)
         record: Record = {"settings": dict(job.settings), "machine": dict(self.machine())}
 
         def keep() -> None:

@@ -316,21 +316,24 @@ def _unpacked(context: ExperimentContext, name: str) -> Path:
 
 def _raise_albedo(scene: ParsedScene, power: float, folder: Path) -> None:
     """Apply an exponent to every albedo, colours and bitmaps, in linear RGB."""
+    done = set()  # several materials may share a texture
     for node in scene.principled_nodes():
         colour = node.props["base_color"]
         node_of_texture = referenced(scene, colour)
         if node_of_texture is None:
             node.props["base_color"] = mi.ScalarColor3d([c**power for c in colour])
             continue
+        if colour.index() in done:
+            continue
+        done.add(colour.index())
         texture = node_of_texture.props
         if "filename" not in texture:
             raise UserError("an albedo is a texture that is no bitmap", scene.path)
         source = Path(texture["filename"])
         raised = folder / "raised" / f"{colour.index()}-{source.stem}.png"
-        if source != raised:  # several materials may share a texture
-            rgb = (mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-            linear = np.array(mi.Bitmap(str(source)).convert(*rgb))
-            write_png(raised, tonemap(linear**power))
+        rgb = (mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+        linear = np.array(mi.Bitmap(str(source)).convert(*rgb))
+        write_png(raised, tonemap(linear**power))
         texture["filename"] = str(raised)
 
 

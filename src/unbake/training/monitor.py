@@ -140,10 +140,12 @@ class Monitor:
     def _write(self, entry: dict) -> None:
         if self._events is not None:
             self._events.add(entry)
-        rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in entry.items()}
+        # JSON has no number for a loss that no step had.
+        known = {k: v for k, v in entry.items() if not isinstance(v, float) or math.isfinite(v)}
+        rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in known.items()}
         told, self.failures = self.failures, []
         try:
-            self._file.write(json.dumps(rounded) + "\n")
+            self._file.write(json.dumps(rounded, allow_nan=False) + "\n")
             self._file.flush()
         except OSError as error:  # what was not written stays in the file's buffer
             what = f"the log cannot be written ({error.strerror})"
