@@ -20,7 +20,14 @@ from unbake.training.problem import make_problem
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
-from unbake.training.watchdog import EXPLOSION, GIVE_UP_AFTER, LONG_ENOUGH, SLOWER, Watchdog
+from unbake.training.watchdog import (
+    COMPARED,
+    EXPLOSION,
+    GIVE_UP_AFTER,
+    LONG_ENOUGH,
+    SLOWER,
+    Watchdog,
+)
 
 RATES = dict.fromkeys(("albedo", "roughness", "radiance"), 1e-2)
 
@@ -292,6 +299,19 @@ def test_only_what_the_batches_tell_is_said_of_a_fit(begun, monkeypatch, before,
     told = dog.verdict({"albedo": 0.01, "roughness": 0.01})
     assert (told is None) == learned, told
     assert learned or "no better than by the untrained fields" in told
+
+
+def test_what_photographs_tell_is_not_lost_in_a_prior_that_rises(begun, monkeypatch):
+    dog, state, progress, _ = watching(begun)
+    first = [{"photometric": 2.0, "prior": 0.5, "skipped": 0} for _ in range(COMPARED)]
+    progress.step = COMPARED
+    dog.read(first, last=False)
+    progress.step = LONG_ENOUGH
+    monkeypatch.setattr(type(state), "moved", lambda _: True)
+    for photometric, learned in ((0.2, True), (2.0, False)):
+        now = [{"photometric": photometric, "prior": 5.0, "skipped": 0}] * COMPARED
+        monkeypatch.setattr(Watchdog, "_looked_at_again", lambda *_, now=now: now)
+        assert (dog.verdict({"albedo": 0.01, "roughness": 0.01}) is None) == learned
 
 
 # ------------------------------------------------------------------------------- whole fits

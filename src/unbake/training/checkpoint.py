@@ -47,7 +47,8 @@ class Progress:
     samples: int = 0  #: from the camera, traced in all passes
     skipped: int = 0  #: steps whose loss was not finite
     rate: float = 1.0  #: factor on all learning rates, less than 1 after the loss has exploded
-    #: Losses of the first steps, for a comparison in the end; none in runs of version 0.1.
+    #: Losses of photographs in the first steps, for a comparison in the end; none in runs of
+    #: version 0.1.
     untrained: tuple[float, ...] = ()
     warning: str | None = None  #: what is wrong with a fit that has ended; not part of checkpoints
 

@@ -151,7 +151,7 @@ class Watchdog:
                 f"{black:.3g}. Look at the strength of the lights, and the unit of the photographs"
             )
         # With rates that are far too high, the fields are not untrained any more after one step.
-        pairs = [(a, _total(b)) for a, b in zip(before, again, strict=False)]
+        pairs = [(a, b[PHOTOMETRIC]) for a, b in zip(before, again, strict=False)]
         pairs = [(a, b) for a, b in pairs if abs(a) < _FAR * abs(before[0])]
         if not pairs:
             return None
@@ -176,10 +176,13 @@ class Watchdog:
         return median(losses if len(losses) >= _FEWEST_STEPS else self._last_losses)
 
     def _note_untrained(self, readings: Sequence[Reading]) -> None:
-        """Note the losses of the first steps, in which next to nothing has been learned."""
+        """Note the losses of photographs in the first steps, when next to nothing was learned.
+
+        Others are not compared: the prior of L_θ rises as light is learned.
+        """
         noted, first = self._progress.untrained, self._progress.step - len(readings)
         if first == len(noted) < COMPARED and PHOTOMETRIC in readings[0]:
-            losses = [_total(reading) for reading in readings[: COMPARED - len(noted)]]
+            losses = [reading[PHOTOMETRIC] for reading in readings[: COMPARED - len(noted)]]
             if all(map(math.isfinite, losses)):
                 self._progress.untrained = (*noted, *losses)
 
