@@ -14,6 +14,7 @@ import pytest
 
 from unbake import cli
 from unbake.errors import UserError
+from unbake.evaluation import evaluate as evaluation
 from unbake.report.page import write_report
 from unbake.training import saving
 from unbake.training.checkpoint import Progress, newest_progress
@@ -124,32 +125,52 @@ def test_checkpoints_of_another_run_are_not_evaluated(fit, run, unbake, tmp_path
     assert newest_progress(run).step == 3
 
 
-def test_numbers_of_an_interrupted_evaluation_are_not_those_before(fit, run, unbake, monkeypatch):
+def test_an_evaluation_takes_the_place_of_the_one_before_as_a_whole(fit, run, unbake, monkeypatch):
     assert fit("--steps", 1).status == 0
-    assert unbake("evaluate", run.path, "--spp", 1).status == 0
+    evaluate = ("evaluate", run.path, "--max-depth", 2, "--spp")
+    assert unbake(*evaluate, 1, "--train-views", 2).status == 0
+    (run.evaluation / "my notes.txt").touch()
 
-    def stopped(*words):
-        raise KeyboardInterrupt
+    def found():
+        return {p: p.read_bytes() for p in run.evaluation.rglob("*") if p.is_file()}
 
-    with monkeypatch.context() as patch:
-        patch.setattr("unbake.evaluation.evaluate.render_camera", stopped)
-        assert unbake("evaluate", run.path, "--spp", 1).status == 130
-    one_line(unbake("report", run.path, "--out", run.path / "page.html"), "Run `unbake evaluate")
+    before = found()
+    assert sum("train_001" in file.name for file in before) == 6
+    real = evaluation.render_camera
+    for error, status in ((KeyboardInterrupt(), 130), (UserError("no luck"), 2)):
+        count = iter(range(2))
+
+        def ended(*words, error=error, count=count):
+            if next(count, None) is None:  # after two views, whose pictures are written
+                raise error
+            return real(*words)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(evaluation, "render_camera", ended)
+            assert unbake(*evaluate, 2, "--train-views", 2).status == status
+        after = found()
+        assert {p: x for p, x in after.items() if p.name != ".lock"} == {
+            p: x for p, x in before.items() if p.name != ".lock"
+        }
+    assert unbake(*evaluate, 2, "--train-views", 1).status == 0
+    after = found()
+    assert before.keys() - after.keys() == {p for p in before if "train_001" in p.name}
+    assert not after.keys() - before.keys() and run.metrics()["render"]["spp"] == 2
+    picture = run.evaluated.picture("heldout", "heldout_000", "render")
+    assert before[picture] != after[picture]
 
 
 def test_a_run_that_is_deleted_while_it_is_evaluated(fit, run, unbake, monkeypatch):
     """The evaluation ended well, in a new folder without a run."""
-    from unbake.evaluation import evaluate
-
     assert fit("--steps", 1).status == 0
-    real = evaluate._evaluate_view
+    real = evaluation._evaluate_view
 
     def deleted(*words):
         found = real(*words)
         shutil.rmtree(run.path)
         return found
 
-    monkeypatch.setattr(evaluate, "_evaluate_view", deleted)
+    monkeypatch.setattr(evaluation, "_evaluate_view", deleted)
     one_line(unbake("evaluate", run.path, "--spp", 1), "the folder was deleted, moved or replaced")
     assert not run.path.exists()
 

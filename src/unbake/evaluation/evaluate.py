@@ -22,7 +22,7 @@ from ..scene.parse import parse
 from ..training.cameras import Cameras
 from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
-from ..training.run_folder import METRICS_FORMAT, RunFolder
+from ..training.run_folder import METRICS_FORMAT, EvaluationFolder, RunFolder
 from ..training.run_lock import RunLock
 from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys
 from ..transport.objective import has_radiance
@@ -107,14 +107,17 @@ def evaluate(
     if not (recovered.dataset.heldout or settings.train_views):
         what = "no view to evaluate: the data set has no held-out views"
         raise UserError(what, "--train-views", "Give at least 1")
-    with folder.lock_evaluation() as lock:
-        folder.forget_evaluation()
-        return _evaluate(recovered, folder, settings, tell, lock)
+    with folder.lock_evaluation() as lock, folder.new_evaluation() as out:
+        metrics = _evaluate(recovered, folder, out, settings, tell, lock)
+        lock.require_held()
+        folder.replace_evaluation(out, metrics)
+    return metrics
 
 
 def _evaluate(
     recovered: Recovered,
     folder: RunFolder,
+    out: EvaluationFolder,
     settings: EvaluationSettings,
     tell: Callable[[str], None],
     lock: RunLock,
@@ -128,7 +131,7 @@ def _evaluate(
     spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
     views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
     # First, as the true lighting may be damaged, and views take long
-    recovered_lighting = _evaluate_lighting(recovered, folder, tell)
+    recovered_lighting = _evaluate_lighting(recovered, out, tell)
     clip = settings.clip_negative or recovered.clip_negative
     exposure = exposure_of(read_photograph(view, clip) for view in views)
     cameras = Cameras(recovered.problem.camera, dataset.train)
@@ -138,7 +141,7 @@ def _evaluate(
         view = placed_view(recovered, cameras, given, settings)
         placed.append(view)
         row, seen, truth, gain = _evaluate_view(
-            recovered, cameras, view, folder, settings, true_scene, exposure
+            recovered, cameras, view, out, settings, true_scene, exposure
         )
         rows.append(row)
         gains.append(gain)
@@ -154,9 +157,10 @@ def _evaluate(
         heldout = materials[: len(dataset.heldout)]
         measures["yardsticks"] = asdict(find_yardsticks(dataset, recovered.config, heldout))
     found = _evaluate_cameras(recovered, cameras, placed, gains, tell)
-    lacking = evaluate_outliers(recovered, folder, tell)
-    metrics = {"format": METRICS_FORMAT} | description(recovered.config)
-    metrics |= {
+    lacking = evaluate_outliers(recovered, out, tell)
+    return {
+        "format": METRICS_FORMAT,
+        **description(recovered.config),
         "steps": recovered.progress.step,
         # Not what the checkpoint says: version 0.1 counts one of two passes.
         "samples": recovered.progress.samples,
@@ -182,9 +186,6 @@ def _evaluate(
         "render": {"spp": settings.spp, "max_depth": settings.max_depth},
         "evaluation": asdict(settings),
     }
-    lock.require_held()
-    folder.write_metrics(metrics)
-    return metrics
 
 
 def description(config: FitConfig) -> dict:
@@ -234,7 +235,7 @@ def _evaluate_view(
     recovered: Recovered,
     cameras: Cameras,
     view: View,
-    folder: RunFolder,
+    out: EvaluationFolder,
     settings: EvaluationSettings,
     true_scene: SceneView | None,
     exposure: float,
@@ -259,8 +260,8 @@ def _evaluate_view(
             rgb = np.repeat(value, 3 // value.shape[-1], -1)
             pictures[name] = rgb, shown(value, QUANTITIES[name].display)
     for name, (linear, picture) in pictures.items():
-        write_exr(folder.picture(view.split, view.name, name), np.dstack([linear, alpha]))
-        write_png(folder.picture(view.split, view.name, name, ".png"), picture)
+        write_exr(out.picture(view.split, view.name, name), np.dstack([linear, alpha]))
+        write_png(out.picture(view.split, view.name, name, ".png"), picture)
 
     keys = (*METRICS, *psnr_keys(recovered.config.quantities))
     limits = () if true_scene is None else ("true_render_psnr",)
@@ -334,7 +335,7 @@ def _evaluate_cameras(
 
 
 def _evaluate_lighting(
-    recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]
+    recovered: Recovered, out: EvaluationFolder, tell: Callable[[str], None]
 ) -> dict:
     """Scores and images of the lighting; empty if the run did not optimize it."""
     problem, data = recovered.problem, recovered.dataset
@@ -342,9 +343,9 @@ def _evaluate_lighting(
     if problem.environment is not None:
         map_ = problem.environment.to_latlong(ROWS)
         truth = true_environment(data.folder, allow_outside=data.allow_outside)
-        write_exr(folder.environment(), map_)
+        write_exr(out.environment(), map_)
         tiles = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
-        write_png(folder.environment(".png"), montage(tiles))
+        write_png(out.environment(".png"), montage(tiles))
         found["environment"] = None
         if truth is not None:
             found["environment"] = numbers = lighting.compare_environments(map_, truth)

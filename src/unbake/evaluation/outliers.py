@@ -10,7 +10,7 @@ import numpy as np
 from ..dataset.views import read_photograph
 from ..imaging.pictures import tonemap, write_png
 from ..training.recovered import Recovered
-from ..training.run_folder import RunFolder
+from ..training.run_folder import EvaluationFolder
 
 #: Pictures of views with outliers, at most: of those with the largest share.
 _PICTURES = 12
@@ -24,7 +24,7 @@ DEFINITIONS = {
 
 
 def evaluate_outliers(
-    recovered: Recovered, folder: RunFolder, tell: Callable[[str], None]
+    recovered: Recovered, out: EvaluationFolder, tell: Callable[[str], None]
 ) -> dict[str, Any]:
     """Numbers for `metrics.json`, and pictures beside it; empty where all pixels count alike.
 
@@ -42,7 +42,7 @@ def evaluate_outliers(
     for i in shown:
         picture = tonemap(read_photograph(views[i], recovered.clip_negative)[..., :3])
         picture[masks[i]] = (picture[masks[i]] // 2 + _TINT // 2).astype(np.uint8)
-        write_png(folder.picture("train", views[i].name, "outliers", ".png"), picture)
+        write_png(out.picture("train", views[i].name, "outliers", ".png"), picture)
     tell(
         f"outliers: {100 * whole:.1f} % of the pixels, {100 * max(shares):.1f} % of a view at most"
     )

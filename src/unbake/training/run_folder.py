@@ -21,8 +21,8 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
@@ -31,6 +31,7 @@ from ..config import FitConfig, read_toml, to_tables, to_toml
 from ..errors import UserError
 from ..formats import check_format
 from ..io import read_lines, read_object, read_text, require_utf8, write_json, write_text
+from ..signals import cleaned_up
 from . import run_numbers
 from .event_log import EventLog
 from .run_lock import RunLock
@@ -98,6 +99,31 @@ class Origin:
     def radiance_scale(self) -> float:
         """The scale of the radiance field."""
         return self.mean_radiance if self.warm_start is None else self.warm_start.scale
+
+
+@final
+@dataclass(frozen=True)
+class EvaluationFolder:
+    """The pictures of an evaluation.
+
+    Args:
+        path: the folder.
+    """
+
+    path: Path
+
+    def picture(self, split: str, view: str, quantity: str, suffix: str = ".exr") -> Path:
+        """The final picture of a quantity, such as "render" or "albedo", in a view.
+
+        Args:
+            split: of the view: "train" or "heldout".
+            suffix: ".exr" (linear) or ".png" (for display).
+        """
+        return self.path / split / f"{view}_{quantity}{suffix}"
+
+    def environment(self, suffix: str = ".exr") -> Path:
+        """The picture of the recovered environment map; `suffix` as in `picture`."""
+        return self.path / f"environment{suffix}"
 
 
 @final
@@ -378,26 +404,37 @@ class RunFolder:
 
     # -------------------------------------------------------------------------- evaluation
 
-    def picture(self, split: str, view: str, quantity: str, suffix: str = ".exr") -> Path:
-        """The final picture of a quantity, such as "render" or "albedo", in a view.
+    @property
+    def evaluated(self) -> EvaluationFolder:
+        """The pictures of the evaluation."""
+        return EvaluationFolder(self.evaluation)
 
-        Args:
-            split: of the view: "train" or "heldout".
-            suffix: ".exr" (linear) or ".png" (for display).
+    @contextmanager
+    def new_evaluation(self) -> Iterator[EvaluationFolder]:
+        """A folder for the pictures of a further evaluation, which `replace_evaluation` takes.
+
+        The one before stays as it is until then, and where there is no further one. Only with the
+        lock.
         """
-        return self.evaluation / split / f"{view}_{quantity}{suffix}"
+        new = self.evaluation / ".new"
+        # What a killed one left; until version 0.2 that lay beside pictures.
+        _remove(new, *self.evaluation.glob("**/.*.tmp"))
+        with cleaned_up(lambda: _remove(new)):
+            yield EvaluationFolder(new)
 
-    def environment(self, suffix: str = ".exr") -> Path:
-        """The picture of the recovered environment map; `suffix` as in `picture`."""
-        return self.evaluation / f"environment{suffix}"
+    def replace_evaluation(self, new: EvaluationFolder, metrics: Mapping[str, Any]) -> None:
+        """Put another evaluation, pictures and numbers, in the place of the one before.
 
-    def forget_evaluation(self) -> None:
-        """Delete the numbers of an earlier evaluation, whose pictures are now replaced.
-
-        Also what a killed one left unfinished. Only with the lock.
+        Raises:
+            OSError, UserError: a file cannot be written.
         """
-        self.metrics_file.unlink(missing_ok=True)
-        _remove(*self.evaluation.glob("**/.*.tmp"))
+        before = self.evaluated
+        self.metrics_file.unlink(missing_ok=True)  # of no other pictures than its own
+        _remove(*(self.evaluation / split for split in ("train", "heldout")))
+        _remove(*(before.environment(suffix) for suffix in (".exr", ".png")))
+        for path in new.path.glob("*"):
+            path.rename(self.evaluation / path.name)
+        write_json(self.metrics_file, metrics)
 
     def metrics(self) -> dict[str, Any]:
         """The numbers of the evaluation.
@@ -411,10 +448,6 @@ class RunFolder:
         if wrong:
             raise UserError(wrong, self.metrics_file, self.evaluate_again)
         return metrics
-
-    def write_metrics(self, metrics: Mapping[str, Any]) -> None:
-        """Write the numbers of the evaluation."""
-        write_json(self.metrics_file, metrics)
 
     @property
     def evaluate_again(self) -> str:
