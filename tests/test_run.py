@@ -102,7 +102,9 @@ def test_materials_are_those_of_the_surfaces_that_rays_meet(run):
         ([[0, 0, 0]], [[0, 0, 0]], "its direction is zero"),
         ([[0, 0, np.nan]], [[0, 0, 1]], "not finite"),
         ([[0, 0]], [[0, 1]], "have shape"),
-        ([[0, 0, 0]] * 2, [[0, 0, 1]] * 3, "like shapes"),
+        ([[0, 0, 0]] * 2, [[0, 0, 1]] * 3, "2 origins and 3 directions"),
+        ([[0, 0, 0]] * 2, [[0, 0, 1]], "2 origins and 1 directions"),
+        ([[0, 0, 0]] * 2, [0, 1], "like shapes"),
         (["a"], ["b"], "like shapes"),
     ],
 )

@@ -206,8 +206,8 @@ class Run:
         surfaces of the run's own scene: some depend on more than the position.
 
         Args:
-            origins: (n, 3) or (3,), world units.
-            directions: (n, 3) or (3,), of any length.
+            origins: (n, 3), world units; (3,) is one for all directions.
+            directions: (n, 3), of any length; (3,) is one for all origins.
             seed: of the random numbers of cut-outs.
 
         Returns:
@@ -385,8 +385,11 @@ def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.n
     """
     remedy = "Give origins and directions of shape (n, 3)"
     try:
-        o, d = (np.atleast_2d(np.asarray(x, np.float32)) for x in (origins, directions))
-        o, d = np.broadcast_arrays(o, d)
+        o, d = (np.asarray(x, np.float32) for x in (origins, directions))
+        if o.ndim == d.ndim == 2 and len(o) != len(d):
+            what = f"there are {len(o)} origins and {len(d)} directions"
+            raise UserError(what, None, "Give as many of both, or one alone for all, of shape (3,)")
+        o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
     except (ValueError, TypeError):
         raise UserError(
             "origins and directions are not arrays of like shapes", None, remedy

@@ -139,6 +139,7 @@ def test_true_materials_relit_are_a_capture_under_that_light(options, folder, tm
     assert made["mean"]["views"] == 3 and made["mean"]["render_psnr"] > 38
     assert made["mean"]["render_ssim"] > 0.9 and made["mean"]["render_flip"] < 0.1
     assert any("turned off 3 lights" in line for line in lines) is not light.keep_lights
+    assert not any("warning" in line for line in lines)
     before, after = (Dataset.load(folder / d).train[0].image for d in ("data", truth))
     assert np.abs(read_exr(before) - read_exr(after))[..., :3].mean() > 0.02
     if light.lights is not None:
@@ -154,6 +155,22 @@ def test_another_light_than_that_of_the_truth_scores_less(folder, tmp_path):
     )
     assert made["mean"]["render_psnr"] < 25 and made["mean"]["render_flip"] > 0.1
     assert any("--envmap-up +z turns it" in line for line in lines)
+    assert any("data was captured under the scene's own light" in line for line in lines)
+
+
+def test_a_truth_of_other_settings_or_of_another_scene_is_told(folder, cornell, tmp_path):
+    truth, lines = tmp_path / "truth", []
+    more = CaptureSettings(resolution=8, spp=4, max_depth=2)
+    light = LightConfig(envmap=folder / "sky.exr", envmap_rotate=40.0)
+    scene, cameras = folder / "scene.xml", folder / "cameras.json"
+    capture(scene, truth, more, cameras=cameras, light=light, **SILENT)
+    other, settings = replace(light, envmap_rotate=90.0), RenderSettings(spp=4, max_depth=2)
+    relight(folder / "run", tmp_path / "out", other, settings, truth=truth, tell=lines.append)
+    assert any("truth was captured under another light: envmap_rotate 40.0" in x for x in lines)
+    words = (folder / "run", tmp_path / "second", light, settings)
+    with pytest.raises(UserError, match=r"is of another scene than the run: they span .* around"):
+        relight(*words, truth=cornell, **SILENT)
+    assert not (tmp_path / "second").exists()
 
 
 def test_recovered_lights_are_kept_where_that_is_asked(folder, tmp_path):
@@ -275,16 +292,27 @@ def test_what_is_no_environment_map_is_refused(kind, told, tmp_path):
     [
         ((), "no light given. Give --envmap FILE or --lights FILE"),
         (("--envmap", "a.exr", "--lights", "b.xml"), "--lights: cannot be given together"),
-        (("--envmap", "none.exr"), "none.exr: the environment map does not exist"),
-        (("--lights", "none.xml"), "none.xml: no such scene file"),
+        (("--envmap", "none.exr"), "--envmap: there is no file none.exr. Check the path"),
+        (("--lights", "none.xml"), "--lights: there is no file none.xml. Check the path"),
         (("--lights", "dark.xml"), "dark.xml: no light in the file"),
         (("--lights", "dark.xml", "--envmap-scale", 2), "--envmap-scale: needs --envmap"),
         (("--envmap", "a.exr", "--envmap-scale", 0), "--envmap-scale: must be"),
         (("--envmap", "a.exr", "--turntable", 0), "--turntable: must be from 1"),
         (("--envmap", "a.exr", "--turntable", 2, "--cameras", "c"), "--cameras: cannot be given"),
-        (("--envmap", "a.exr", "--truth", "none"), "none"),
+        (
+            ("--envmap", "a.exr", "--truth", "none"),
+            "a.exr. Check the path; --truth: there is no folder none. Check the path",
+        ),
         (("--envmap", "a.exr", "--spp", 0), "--spp: must be 1 or more"),
         (("--envmap", "a.exr", "--height", 0), "--height: must be 1 or more"),
+        (
+            ("--envmap", "a.exr", "--spp", 0, "--width", 0, "--height", -1),
+            "--spp: must be 1 or more, not 0; --width: must be 1 or more, not 0; --height: must be",
+        ),
+        (
+            ("--lights", "none.xml", "--turntable", -1, "--cameras", "c", "--out", "full"),
+            "Give another --out, or empty it; --cameras: cannot be given together with --turntable",
+        ),
         (("--envmap", "a.exr", "--out", "full"), "full: the folder is not empty"),
     ],
 )

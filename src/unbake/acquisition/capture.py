@@ -201,6 +201,7 @@ def _capture(
             "seed": settings.seed,
             "variant": mi.variant(),
             "mitsuba": mi.__version__,
+            "light": None if light is None else light.named(),
         },
         coverage=round(float(seen), 4),
         light_by_depth=shares,

@@ -25,7 +25,8 @@ def change_light(
         UserError: the light cannot be used.
     """
     if not light.keep_lights:
-        tell(f"turned off {relight.turn_off(scene)} lights of the scene")
+        count = relight.turn_off(scene)
+        tell(f"turned off {count} light{'' if count == 1 else 's'} of the scene")
     put_light(scene, light, allow_outside, tell)
 
 

@@ -25,7 +25,7 @@ from .. import backend, experiments, exports, signals
 from ..acquisition.settings import CaptureSettings, DegradeSettings
 from ..config import FitConfig, with_quality
 from ..config.light import LightConfig
-from ..errors import UserError, of_system, printable
+from ..errors import UserError, of_system, printable, raise_together
 from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
@@ -83,8 +83,9 @@ _START = (
 )
 _STATUS = (
     "Exit status: 0; 1 where a part failed or a fit learned nothing; 2 on bad input or a full "
-    "disk; ended early, with what was done saved: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 "
-    "(closed pipe). A second Ctrl-C ends at once."
+    "disk; ended early: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 (closed pipe). What takes "
+    "long, such as a fit, saves what was done; the others leave what there was. A second Ctrl-C "
+    "ends at once."
 )
 
 if TYPE_CHECKING:
@@ -562,7 +563,7 @@ def relight(
 ) -> None:
     """Render the recovered scene under another light, which takes the place of its own.
 
-    Give --envmap, --lights or both. --cameras, --turntable and --truth exclude each other.
+    Give --envmap or --lights. --cameras, --turntable and --truth exclude each other.
 
     Writes NAME.exr (linear radiance) and NAME.png of each camera, and render.json.
 
@@ -607,12 +608,18 @@ def _scores(values: Mapping[str, float | None]) -> str:
 def _render_settings(
     values: dict[str, Any], width: int | None, height: int | None
 ) -> RenderSettings:
-    settings = with_options(RenderSettings(), values)
+    """The settings of pictures with the options that were given; all wrong ones are told."""
+    settings, faults = RenderSettings(), []
+    try:
+        settings = with_options(settings, values)
+    except UserError as error:
+        faults.append(error)
     for name, value in {"width": width, "height": height}.items():
         try:
             settings = dataclasses.replace(settings, **{name: value})
         except UserError as error:
-            raise UserError(error.what, f"--{name}") from None
+            faults.append(UserError(error.what, f"--{name}"))
+    raise_together(faults)
     return settings
 
 

@@ -79,3 +79,8 @@ class LightConfig:
         """All of it as JSON has it."""
         paths = {"envmap": self.envmap, "lights": self.lights}
         return asdict(self) | {k: None if v is None else os.fspath(v) for k, v in paths.items()}
+
+    def named(self) -> dict[str, Any]:
+        """The same, with the names of files instead of their paths."""
+        paths = {"envmap": self.envmap, "lights": self.lights}
+        return asdict(self) | {k: None if v is None else Path(v).name for k, v in paths.items()}

@@ -22,11 +22,14 @@ from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
 from ..dataset.camera import Camera, frame_name, frame_of, read_cameras
 from ..dataset.views import Dataset, View, read_photograph
-from ..errors import UserError
+from ..errors import UserError, printable, raise_together
+from ..fields.domain import Domain
 from ..imaging.metrics import mean_psnr
 from ..imaging.pictures import tonemap, write_exr, write_png
 from ..io import filled_folder, require_new_folder, write_json
 from ..memory import require_memory
+from ..scene.geometry import differing, probe
+from ..scene.parse import parse
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..training.validation import GroundTruth
@@ -43,6 +46,10 @@ from .yardsticks import seen_materials
 _PIXEL_BYTES = 64
 #: Cosine below which an environment map that stands beside the cameras' upward direction is told.
 _UPRIGHT = 0.7
+#: Of scenes that are not the same: how far bounding boxes differ, as a part of their extent.
+_ANOTHER = 0.1
+#: The share of rays that end elsewhere above which one is told of it.
+_CHANGED = 0.02
 
 
 @dataclass(frozen=True)
@@ -137,10 +144,12 @@ def relight(
     Paper: Sec. 6.
     """
     settings = settings or RenderSettings()
-    _require_sound(run, Path(out), settings, cameras, turntable, truth)
+    _require_sound(run, Path(out), settings, cameras, turntable, truth, light)
     true = None if truth is None else Dataset.load(Path(truth), allow_outside=allow_outside)
     change = partial(change_light, light=light, allow_outside=allow_outside, tell=tell)
     recovered = load_run(Path(run), allow_outside=allow_outside, change=change)
+    if true is not None:
+        _require_truth_of(recovered.problem.scene_view.scene, true, light, tell)
     chosen = _Cameras(None if cameras is None else Path(cameras), turntable, true)
     return _render(recovered, Path(run), Path(out), settings, chosen, light, tell)
 
@@ -152,21 +161,76 @@ def _require_sound(
     cameras: Path | str | None,
     turntable: int | None,
     truth: Path | str | None = None,
+    light: LightConfig | None = None,
 ) -> None:
-    """Check what can be checked before anything is read."""
-    RunFolder(Path(run)).require_fitted()
-    require_new_folder(out)
+    """Check what can be checked before anything is read; all that is wrong is told at once."""
+    faults: list[UserError] = []
+    for check in (RunFolder(Path(run)).require_fitted, partial(require_new_folder, out)):
+        try:
+            check()
+        except UserError as error:
+            faults.append(error)
     given = {"--cameras": cameras, "--turntable": turntable, "--truth": truth}
     named = [name for name, value in given.items() if value is not None]
     if len(named) > 1:
-        raise UserError(f"cannot be given together with {named[1]}", named[0], "Give one of them")
+        what = f"cannot be given together with {named[1]}"
+        faults.append(UserError(what, named[0], "Give one of them"))
     if turntable is not None and not 1 <= turntable <= MOST_PICTURES:
-        raise UserError(f"must be from 1 to {MOST_PICTURES}, not {turntable}", "--turntable")
+        what = f"must be from 1 to {MOST_PICTURES}, not {turntable}"
+        faults.append(UserError(what, "--turntable"))
     if truth is not None and not (settings.width is None and settings.height is None):
-        raise UserError("pictures have the size of the truth", "--truth", "Leave out their size")
+        what = "pictures have the size of the truth"
+        faults.append(UserError(what, "--truth", "Leave out their size"))
     if settings.denoise and mi.variant() != CUDA_VARIANT:
         what = f"Mitsuba's denoiser needs an NVIDIA GPU, and {mi.variant()} runs on the CPU"
-        raise UserError(what, "--denoise", "Leave it out, and take a larger --spp")
+        faults.append(UserError(what, "--denoise", "Leave it out, and take a larger --spp"))
+    named_files = {"--cameras": cameras}
+    if light is not None:
+        named_files |= {"--envmap": light.envmap, "--lights": light.lights}
+    for name, file in named_files.items():
+        if file is not None and not Path(file).is_file():
+            what = f"there is no file {printable(file)}"
+            faults.append(UserError(what, name, "Check the path"))
+    if truth is not None and not Path(truth).is_dir():
+        what = f"there is no folder {printable(truth)}"
+        faults.append(UserError(what, "--truth", "Check the path"))
+    raise_together(faults)
+
+
+def _require_truth_of(
+    scene: mi.Scene, truth: Dataset, light: LightConfig, tell: Callable[[str], None]
+) -> None:
+    """Refuse a truth of another scene, and tell of one that may be of another light.
+
+    Args:
+        scene: under the light.
+    """
+    true = parse(truth.scene, truth.root).instantiate()
+    own, other = Domain.of(scene.bbox()), Domain.of(true.bbox())
+    apart = np.linalg.norm(np.subtract(own.centre, other.centre)) + abs(own.extent - other.extent)
+    if apart > _ANOTHER * own.extent:
+        spans = " and ".join(f"{x.extent:.3g} around {_point(x.centre)}" for x in (other, own))
+        what = f"is of another scene than the run: they span {spans}"
+        raise UserError(what, truth.folder, "Give a capture of the same scene under that light")
+    elsewhere = differing(probe(scene), probe(true))
+    if elsewhere > _CHANGED:
+        tell(
+            f"warning: {100 * elsewhere:.0f} % of the rays through the scene end elsewhere than in "
+            f"that of {printable(truth.folder)}: is it the same, under the same light?"
+        )
+    if "light" not in truth.render:  # as of version 0.1, or of photographs
+        return
+    named, wanted = truth.render["light"], light.named()
+    if named is None:
+        tell(f"warning: {printable(truth.folder)} was captured under the scene's own light")
+    elif isinstance(named, dict) and named != wanted:
+        others = ", ".join(f"{k} {named.get(k)}" for k in wanted if named.get(k) != wanted[k])
+        tell(f"warning: {printable(truth.folder)} was captured under another light: {others}")
+
+
+def _point(centre: Sequence[float]) -> str:
+    x, y, z = centre
+    return f"({x:.3g}, {y:.3g}, {z:.3g})"
 
 
 def _render(
