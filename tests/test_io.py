@@ -208,6 +208,10 @@ def test_an_empty_folder_is_filled_and_nothing_is_left_of_a_failure(tmp_path, mo
     with pytest.raises(UserError, match="another program has written"), filled_folder(other):
         write_text(other / "theirs.txt", "")
     assert [path.name for path in other.iterdir()] == ["theirs.txt"]
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ZeroDivisionError), filled_folder(tmp_path / "there" / "a" / "b") as folder:
+        raise ZeroDivisionError
+    assert not list((tmp_path / "there").iterdir())
     with filled_folder(tmp_path / "new" / "folder") as folder:
         write_text(folder / "a.txt", "a")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["folder"]

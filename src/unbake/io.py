@@ -118,7 +118,7 @@ def filled_folder(out: Path) -> Iterator[Path]:
     # Within a folder that there is: it may be the present one, or another file system.
     folder, name = (out, "folder") if out.is_dir() else (out.parent, out.name)
     partial = folder / f".{name[:100]}.{secrets.token_hex(8)}.partial"
-    with cleaned_up(lambda: shutil.rmtree(partial, ignore_errors=True)):
+    with cleaned_up(removed_with_parents(partial)):
         try:
             partial.mkdir(parents=True)
             yield partial
@@ -131,6 +131,19 @@ def filled_folder(out: Path) -> Iterator[Path]:
                 partial.rename(out)
         except OSError as error:
             raise UserError(f"cannot be written ({error.strerror})", where=out) from None
+
+
+def removed_with_parents(folder: Path) -> Callable[[], None]:
+    """What removes a folder that is yet to be made, and parents that do not exist yet, if empty."""
+    missing = [parent for parent in folder.parents if not parent.exists()]
+
+    def remove() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # something is in there
+            for parent in missing:
+                parent.rmdir()
+
+    return remove
 
 
 def _move_up(folder: Path) -> None:

@@ -259,6 +259,7 @@ def test_a_jpeg_has_a_mask_where_the_background_is_hidden(cornell, tmp_path):
     file = data / "images" / "train_000.exr"
     pixels = read_exr(file)
     pixels[:4] = 0
+    pixels[4] *= 0.5  # half covered, and premultiplied
     write_exr(file, pixels)
     out = tmp_path / "out"
     dataset = degrade(data, out, DegradeSettings(format="jpeg"), tell=lambda line: None)
@@ -266,8 +267,33 @@ def test_a_jpeg_has_a_mask_where_the_background_is_hidden(cornell, tmp_path):
     assert not counted[:4].any() and np.array_equal(counted[4:], pixels[4:, :, 3] > 0)
     dataset = degrade(data, tmp_path / "png", DegradeSettings(format="png"), tell=lambda line: None)
     assert all(view.mask is None for view in dataset.views)
-    read = read_masked(next(v for v in dataset.views if v.name == "train_000"))[0]
+    view = next(v for v in dataset.views if v.name == "train_000")
+    read = read_masked(view)[0]
     assert (read[:4] == 0).all()
+    shown = (view.exposure * pixels[4, :, :3]).clip(max=0.5)
+    np.testing.assert_allclose(read[4, :, :3], shown, atol=0.01)
+
+
+@pytest.mark.parametrize("told", [{"clipped": 1.0}, {"noise": {"shot": 0.01, "read": 0.0}}])
+def test_photographs_of_a_camera_are_not_degraded(told, cornell, tmp_path):
+    """What they tell of it would no longer be true."""
+    data = shutil.copytree(cornell, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame |= told
+    (data / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match="of a camera already"):
+        degrade(data, tmp_path / "out", DegradeSettings(), tell=lambda line: None)
+
+
+def test_changed_meshes_are_written_once(cornell, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    dataset = degrade(cornell, "worse", DegradeSettings(displace=0.01), tell=lambda line: None)
+    truth = json.loads((tmp_path / "worse" / "degraded.json").read_text())
+    meshes = {file.name for file in (tmp_path / "worse" / "scene").rglob("changed-*.ply")}
+    assert meshes == set(truth["displaced"]["meshes"]) and meshes
+    text = (tmp_path / dataset.scene).read_text()
+    assert all(name in text for name in meshes)
 
 
 def test_read_noise_needs_electrons():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import re
@@ -24,7 +23,7 @@ from ..dataset.views import Dataset, View
 from ..errors import UserError, printable
 from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
-from ..io import is_locked, locked, require_file, require_utf8
+from ..io import is_locked, locked, removed_with_parents, require_file, require_utf8
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import parse, write
@@ -77,15 +76,7 @@ def capture(
         raise UserError("exists already", where=out, remedy="Give another --out, or remove it")
     # Nobody else has a folder of this name: what is removed in the end is our own.
     partial = out.with_name(f"{_partial_name(out)}{secrets.token_hex(8)}{_PARTIAL}")
-    missing = [folder for folder in out.parents if not folder.exists()]
-
-    def remove() -> None:
-        shutil.rmtree(partial, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            for folder in missing:  # if they are empty: where nothing was written
-                folder.rmdir()
-
-    with cleaned_up(remove):
+    with cleaned_up(removed_with_parents(partial)):
         try:
             _tell_unfinished(out, tell)
             partial.mkdir(parents=True)

@@ -89,7 +89,8 @@ def degrade(
         tell: called with lines of progress.
 
     Raises:
-        UserError: the data set cannot be read, or is degraded already, or `out` is not empty.
+        UserError: the data set cannot be read, is degraded already, or is of a camera, or `out` is
+            not empty.
     """
     out = Path(out)
     require_new_folder(out)
@@ -98,6 +99,9 @@ def degrade(
         what = "the data set is degraded already, and the truth of that would be lost"
         remedy = "Degrade what it was made of, with all options at once"
         raise UserError(what, dataset.folder, remedy)
+    if any(view.clipped is not None or view.noise is not None for view in dataset.views):
+        what = "the photographs are of a camera already: they tell where they clip, or their noise"
+        raise UserError(what, dataset.folder, "Degrade photographs that were rendered")
     cameras, diagonal = [view.camera for view in dataset.views], 0.0
     if settings.pose_jitter or settings.displace:
         scene = parse(dataset.scene, dataset.root).instantiate()
@@ -114,7 +118,7 @@ def degrade(
         folder.scene.mkdir()
         changed = settings.displace or settings.decimate < 1
         displaced = _change_meshes(parsed, folder, settings, diagonal) if changed else []
-        path = write(parsed, folder.scene)
+        path = write(parsed, folder.scene.resolve())
         views = []
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
             pixels, counted = _photograph(view, number, truth, settings)
@@ -247,10 +251,15 @@ def _write_photograph(
     if settings.format == "exr":
         write_exr(file, pixels)
         return
+    if settings.format == "png" and background == "hidden":
+        # Files of codes are not premultiplied.
+        alpha = pixels[..., 3:]
+        straight = to_srgb(pixels[..., :3] / np.where(alpha > 0, alpha, 1))
+        write_png(file, np.dstack([to_bytes(straight), to_bytes(alpha)]))
+        return
     codes = to_bytes(to_srgb(pixels[..., :3]))
     if settings.format == "png":
-        alpha = to_bytes(pixels[..., 3:])
-        write_png(file, np.dstack([codes, alpha]) if background == "hidden" else codes)
+        write_png(file, codes)
         return
     image, subsampling = Image.fromarray(codes), _SUBSAMPLING[settings.chroma]
     quality = settings.quality

@@ -30,7 +30,7 @@ class CaptureSettings:
     views: Annotated[int, Flag("Views to learn from. Cameras are placed automatically")] = 24
     #: Without a camera file.
     held_out: Annotated[int, Flag("Further views that are kept apart, to judge results by")] = 4
-    #: Unless the camera file has its own.
+    #: Of the cameras of a file, too: their horizontal fields of view stay.
     resolution: Annotated[int, Flag("Width and height of the images in pixels")] = 128
     #: Camera samples a pixel, stratified.
     spp: Annotated[int, Flag("Samples per pixel: more mean less noise, and more time")] = 100
