@@ -162,9 +162,11 @@ def test_a_world_that_is_turned_is_told(spoilt):
     assert finding.remedy == "Turn them by 90° about x"
 
 
+@pytest.mark.parametrize("background", ["visible", "hidden"])
 @pytest.mark.parametrize("some", [False, True])
-def test_masks_that_leave_nothing_are_told(some, spoilt, unbake, tmp_path):
+def test_masks_that_leave_nothing_are_told(some, background, spoilt, unbake, tmp_path):
     data = spoilt("cornell")
+    data.content["background"] = background
     size = data.frames[0]["w"], data.frames[0]["h"]
     (data.folder / "masks").mkdir()
     for i, frame in enumerate(data.frames):
@@ -176,6 +178,34 @@ def test_masks_that_leave_nothing_are_told(some, spoilt, unbake, tmp_path):
     assert finding.level == ("warning" if some else "error")
     assert finding.where == ("train_000" if some else None)
     assert unbake("data", "check", data.folder).status == (0 if some else 2)
+
+
+def test_a_bracket_that_clips_has_the_exposures_that_it_tells(spoilt):
+    """Most surfaces of the long photographs are at the limit."""
+    data = spoilt("cornell")
+    for i, frame in enumerate(data.frames):
+        exposure = 8.0 if i % 2 else 0.5
+        data.picture(frame, lambda pixels, e=exposure: np.minimum(e * pixels, [1, 1, 1, 99]))
+        frame |= {"exposure": exposure, "clipped": 1.0}
+    folder = data.save()
+    assert not found(folder, "exposure")
+    dataset = Dataset.load(folder)
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    photographs = Photographs.load(dataset, False)
+    assert not [
+        f for f in quick_findings(scene, dataset.train, photographs) if f.check == "exposure"
+    ]
+
+
+@pytest.mark.parametrize("size", [(6000, 4000), (7008, 4672), (64, 1), (100, 37)])
+def test_small_pictures_are_of_the_pixels_of_their_cameras(size):
+    width, height = size
+    camera = Camera(np.eye(4), 1.0 * width, 1.0 * width, width / 2, height / 2, width, height)
+    across = np.tile((np.arange(width) + 0.5) / width, (height, 1))
+    rgb = np.repeat(across.reshape(-1, 1), 3, 1).astype(np.float32)
+    view = small_view("a", camera, rgb, None)
+    expected = (np.arange(view.camera.width) + 0.5 - view.camera.cx) / view.camera.fl_x + 0.5
+    np.testing.assert_allclose(view.rgb[0, :, 0], expected, atol=1e-4)
 
 
 def test_no_other_poses_are_named_where_nothing_agrees(spoilt):

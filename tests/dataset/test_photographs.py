@@ -10,6 +10,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 from unbake import memory
 from unbake.dataset import decoding
@@ -376,6 +377,18 @@ def test_a_refused_image_leaves_nothing_behind(dataset, on_disk):
 def other_image(made):
     mi.Bitmap(np.full((HEIGHT, WIDTH, 4), 0.5, np.float32)).write(str(made.train[1].image))
     os.utime(made.train[1].image, ns=(1, 1))
+
+
+def test_a_mask_that_moves_to_another_view_counts_there(dataset, on_disk):
+    made = dataset("visible")
+    mask = made.folder / "mask.png"
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(mask)
+    for number in (0, 1):
+        views = [replace(v, mask=mask if v.name == str(number) else None) for v in made.views]
+        found = Photographs.load(replace(made, views=tuple(views)), False)
+        assert found.masked and found.count == 2 * WIDTH * HEIGHT
+        view = found.chosen // (WIDTH * HEIGHT)
+        assert set(view.tolist()) == {0, 1, 2} - {number}
 
 
 def test_a_file_that_a_fit_has_mapped_stays_as_it_is(dataset, on_disk):

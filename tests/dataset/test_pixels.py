@@ -1,5 +1,7 @@
 """Batches: rays go through the right pixels, which come with their own targets, evenly drawn."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -347,6 +349,20 @@ def test_crops_have_no_pixel_that_is_held_aside(large):
         assert len(numbers) == 16 and not held & set(numbers.tolist())
         assert np.array_equal(colours[:, 0], numbers)
         assert not held & set(source.draw_crop(seed, 1).read()[0].tolist())
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.5])
+def test_crops_have_no_pixel_that_is_masked(aside, large):
+    """Background is in crops, as in the paper; what is masked is not."""
+    source = large(True)
+    masked = replace(source, photographs=replace(source.photographs, masked=True))
+    counts = []
+    for made in (source, masked):
+        made = made.holding_aside(aside, seed=1)
+        drawn = np.concatenate([made.draw_crop(seed, 16).read()[0] for seed in range(50)])
+        assert len(drawn) == 50 * 16
+        counts.append((drawn % 3 == 0).sum())
+    assert counts[0] > 100 and counts[1] == 0
 
 
 def test_the_seed_decides_what_is_held_aside(large):

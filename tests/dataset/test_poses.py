@@ -34,16 +34,35 @@ def seen(built_in):
     return make
 
 
-def warnings(scene, cameras, photographs):
+def warnings(scene, cameras, photographs, hidden=None):
+    hidden = photographs.chosen is not None if hidden is None else hidden
     views = [
         View(f"train_{i:03d}", "train", c, Path("none.exr"), {}) for i, c in enumerate(cameras)
     ]
-    return pose_warnings(scene, views, photographs, "data")
+    return pose_warnings(scene, views, photographs, "data", hidden=hidden)
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_good_poses_are_not_doubted(name, seen):
     assert warnings(*seen(name)) == []
+
+
+def test_masks_do_not_hide_the_sky(seen):
+    """Where the background is visible, pixels that count may see it, masks or none."""
+    scene, cameras, _ = seen("still")
+    count = SIZE * SIZE * len(cameras)
+    counted = np.arange(count) % 7 > 0
+    found = Photographs.of(cameras, np.ones((count, 3)), counted, foreground_only=True)
+    assert scene.environment() is not None
+    assert warnings(scene, cameras, found, hidden=False) == []
+    assert "of the pixels to train on see a surface" in warnings(scene, cameras, found)[0]
+
+
+def test_no_pixel_that_counts_says_nothing_of_poses(seen):
+    scene, cameras, _ = seen("still")
+    count = SIZE * SIZE * len(cameras)
+    found = Photographs.of(cameras, np.ones((count, 3)), np.zeros(count), foreground_only=True)
+    assert found.count == 0 and warnings(scene, cameras, found) == []
 
 
 def moved(scale=1.0, turn=None, flip=None):

@@ -59,10 +59,14 @@ def test_decoding_is_the_inverse_of_tone_mapping():
     assert np.array_equal(encode(decode(fine)[..., :1]), fine)
 
 
-def test_pictures_are_not_turned_by_their_exif(tmp_path):
+@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png"])
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_pictures_are_not_turned_by_their_exif(suffix, orientation, tmp_path):
     exif = Image.Exif()
-    exif[0x0112] = 6
-    file = save(tmp_path / "a.jpg", CODES, exif=exif)
+    exif[0x0112] = orientation
+    file = save(tmp_path / f"a{suffix}", CODES, exif=exif)
+    plain = save(tmp_path / f"b{suffix}", CODES)
+    assert np.array_equal(read_picture(file), read_picture(plain))
     assert read_picture(file).shape == (5, 7, 4)
 
 

@@ -20,6 +20,7 @@ from ..dataset.agreement import (
     turning_light,
 )
 from ..dataset.alignment import Alignment, alignment
+from ..dataset.camera import Camera
 from ..dataset.findings import (
     Finding,
     light_that_turns,
@@ -32,7 +33,7 @@ from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
 from ..dataset.noise_at_black import found_noise
 from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
-from ..dataset.small_views import Seen, SmallView, seen_by, small_camera, small_view
+from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
 from ..errors import UserError, printable
 from ..scene import edit, free_space
@@ -211,12 +212,12 @@ def _checked(
         result.warn("hot pixels", told, None, "Remove them where they are no light that is seen")
     alpha = cleaned[:, 3] * counted if hidden else counted
     light = cleaned[:, :3] if view.exposure == 1 else cleaned[:, :3] / np.float32(view.exposure)
-    small = small_view(view.name, camera, light, alpha)
+    small = small_view(view.name, camera, light, alpha, limit=view.limit)
     shape = (camera.height, camera.width)
     hit = np.isfinite(seen.distance)
     facts = picture_facts(
         pixels[:, :3].reshape(*shape, 3),
-        _enlarged((hit & ~seen.emits).reshape(small.alpha.shape), shape),
+        _enlarged((hit & ~seen.emits).reshape(small.alpha.shape), camera),
         counted.reshape(shape),
         view.clipped,
     )
@@ -241,10 +242,10 @@ def _check_masks(result: DataCheck) -> None:
         result.warn("masks", what, named(bare), remedy)
 
 
-def _enlarged(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _enlarged(mask: np.ndarray, camera: Camera) -> np.ndarray:
     """A mask of blocks as one of pixels; a remainder at the edges is False."""
-    block = min(side // small for side, small in zip(shape, mask.shape, strict=True))
-    large = mask.repeat(block, 0).repeat(block, 1)[: shape[0], : shape[1]]
+    shape, block = (camera.height, camera.width), block_of(camera)
+    large = mask.repeat(block, 0).repeat(block, 1)
     return np.pad(large, [(0, s - n) for s, n in zip(shape, large.shape, strict=True)])
 
 
@@ -279,7 +280,7 @@ def _pose_problems(
     alpha = np.concatenate([v.small.alpha.ravel() > 0.5 for v in train])
     cameras = [v.camera for v in views]
     small = Photographs.of(cameras, rgb, alpha, foreground_only=hidden, smoothed=False)
-    return pose_problems(scene, views, small, folder)
+    return pose_problems(scene, views, small, folder, hidden=hidden)
 
 
 def _check_distance(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -> None:

@@ -191,6 +191,7 @@ def _usable(view: SmallView, brightness: np.ndarray, seen: Seen) -> np.ndarray:
         out[:-1] = np.maximum(out[:-1], step)
         out[1:] = np.maximum(out[1:], step)
     whole = (steep < _STEEP) & (view.alpha > 0.999) & (view.rgb.mean(axis=-1) > 0)
+    whole &= view.clipped == 0
     return whole.ravel() & np.isfinite(seen.distance) & ~seen.emits
 
 

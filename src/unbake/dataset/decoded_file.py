@@ -29,14 +29,15 @@ def in_file(plan: Plan) -> Decoded:
     """All views in a file that is made where it is missing, or made from other images."""
     dataset, views = plan.dataset, plan.dataset.train
     data = DataFolder(dataset.folder, dataset.allow_outside)
-    masks = [view.mask for view in views if view.mask is not None]
+    # Which view has which mask counts, too.
+    masks = [[] if view.mask is None else _stamps([view.mask]) for view in views]
     key = {
         "images": _stamps([view.image for view in views]),
         "pixels": sum(plan.sizes),
         "columns": plan.columns,
         "clip_negative": plan.clip_negative,
         "foreground_only": plan.hidden,
-        **({"masks": _stamps(masks)} if masks else {}),
+        **({"masks": masks} if any(masks) else {}),
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }

@@ -53,6 +53,7 @@ class Photographs:
         hot_pixels: pixels that were too bright and are not as in the images, by view, of all views.
         noise: that was clipped at black, found and corrected where nobody tells it; None: none was.
         share: what this process holds; None: all.
+        masked: whether pixels are masked, and not only background.
 
     Paper: Sec. 5.4.
     """
@@ -63,6 +64,7 @@ class Photographs:
     hot_pixels: tuple[HotPixels, ...] = ()
     noise: SensorNoise | None = None
     share: Share | None = None
+    masked: bool = False
 
     @property
     def count(self) -> int:
@@ -183,12 +185,13 @@ class Photographs:
             dataset = replace(dataset, views=tuple(views))
         plan = Plan.of(dataset, clip_negative, WITH_BLURRED if smoothed else COLUMNS, ranks.size)
         found = ranks.together(lambda: _loaded(plan, ranks.rank, ranks.here), math.inf)
+        masked = any(view.mask is not None for view in dataset.train)
         if ranks.size == 1:
-            return _made(found, noise)
+            return replace(_made(found, noise), masked=masked)
         every = [Told(**told) for told in ranks.told(asdict(found.told))]
         counts = np.concatenate([told.counts for told in every])
         share = Share(ranks, plan.first_views, np.array(plan.sizes), counts)
-        return _made(found, noise, every, share)
+        return replace(_made(found, noise, every, share), masked=masked)
 
 
 def _loaded(plan: Plan, rank: int, here: int) -> Decoded:

@@ -329,8 +329,8 @@ class PixelSource:
         """Draw a crop of one random view that this process holds, with all its pixels.
 
         It is a square, or a rectangle along the longer edge of the view; see `crop_edges`. Each
-        view is as likely as any other, and so is each place in it. Pixels that are held aside are
-        replaced by others of the crop, or of all views if these are all held aside. Where the
+        view is as likely as any other, and so is each place in it. Pixels that are masked or held
+        aside are replaced by others of the crop, or of all views if there are no others. Where the
         background is hidden, at least half of the crop are foreground pixels; in a view that has no
         such place, it is one of those with the most of them, and a view without any is never drawn.
 
@@ -354,12 +354,24 @@ class PixelSource:
             place = int(places[rng.integers(len(places))])
         row, column = np.divmod(np.arange(count), columns)
         numbers = first + (place // across + row) * width + place % across + column
+        out = np.zeros(count, bool)
+        if self.photographs.masked:
+            out |= ~self._chosen(numbers)
         if self.held is not None:
-            held = np.isin(numbers, self.photographs.own_numbers(self._own_held))
-            if held.all():
-                return self.draw(seed, count)
-            numbers[held] = rng.choice(numbers[~held], int(held.sum()))
+            out |= np.isin(numbers, self.photographs.own_numbers(self._own_held))
+        if out.all():
+            return self.draw(seed, count)
+        if out.any():
+            numbers[out] = rng.choice(numbers[~out], int(out.sum()))
         return self.of_numbers(numbers)
+
+    def _chosen(self, numbers: np.ndarray) -> np.ndarray:
+        """Whether pixels that this process holds are among those to train on, (n,) bool."""
+        chosen = self.photographs.chosen
+        if chosen is None or not len(chosen):
+            return np.full(len(numbers), chosen is None)
+        places = np.searchsorted(chosen, numbers)
+        return chosen[np.minimum(places, len(chosen) - 1)] == numbers
 
     def place(self, number: int) -> tuple[int, int, int]:
         """The view of a pixel, from 0, and its column and row in it."""

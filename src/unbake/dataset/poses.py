@@ -27,7 +27,7 @@ _CONVINCING = 0.5
 
 
 def pose_warnings(
-    scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path
+    scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path, *, hidden: bool
 ) -> list[str]:
     """One line for each sign that poses do not belong to the scene; arguments as below.
 
@@ -35,14 +35,14 @@ def pose_warnings(
         UserError: no pixel sees a surface of the scene. It names the mistake that explains that, if
             there is one.
     """
-    problems = pose_problems(scene, views, photographs, where)
+    problems = pose_problems(scene, views, photographs, where, hidden=hidden)
     if any(problem.where == str(where) for problem in problems):
         raise problems[0]
     return [str(problem) for problem in problems]
 
 
 def pose_problems(
-    scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path
+    scene: mi.Scene, views: Sequence[View], photographs: Photographs, where: Path, *, hidden: bool
 ) -> list[UserError]:
     """What is wrong where poses do not belong to the scene, with the likely mistake.
 
@@ -51,12 +51,15 @@ def pose_problems(
         views: to train on.
         photographs: of these views.
         where: the data set's folder, which is named where no pixel sees a surface of the scene.
+        hidden: whether the background is, so that all pixels to train on show surfaces.
     """
+    if not photographs.count:
+        return []
     cameras = [view.camera for view in views]
     places = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)
     numbers = photographs.numbers(places)
-    sky = photographs.chosen is None and scene.environment() is not None
-    if photographs.chosen is None and not sky:
+    sky = not hidden and scene.environment() is not None
+    if not hidden and not sky:
         numbers = numbers[(photographs.radiance(numbers) > 0).any(axis=1)]
     seen = _seen(scene, cameras, numbers)
     share = float(seen.mean()) if len(seen) else 1.0

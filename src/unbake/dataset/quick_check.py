@@ -16,8 +16,8 @@ from .views import View
 
 #: Views that are looked at, spread evenly.
 _MOST_VIEWS = 16
-#: Of a small view: linear RGB and coverage.
-_CHANNELS = 4
+#: Of a small view: linear RGB, coverage and clipped share.
+_CHANNELS = 5
 
 
 def quick_findings(
@@ -63,7 +63,7 @@ def _small_views(
         for i in numbers:
             if first[i] in photographs.pixels:
                 view = _small_view(views[i], photographs, int(first[i]), int(first[i + 1]))
-                rows = np.dstack([view.rgb, view.alpha]).reshape(-1, _CHANNELS)
+                rows = np.dstack([view.rgb, view.alpha, view.clipped]).reshape(-1, _CHANNELS)
                 found.append(rows.astype(np.float32))
         return np.concatenate(found)
 
@@ -72,7 +72,8 @@ def _small_views(
         camera = small_camera(views[i].camera)
         count = camera.width * camera.height
         picture = rows[:count].reshape(camera.height, camera.width, _CHANNELS)
-        small.append(SmallView(views[i].name, camera, picture[..., :3], picture[..., 3]))
+        alpha, clipped = picture[..., 3], picture[..., 4]
+        small.append(SmallView(views[i].name, camera, picture[..., :3], alpha, clipped))
         rows = rows[count:]
     return small
 
@@ -89,4 +90,4 @@ def _small_view(view: View, photographs: Photographs, start: int, stop: int) -> 
         alpha = np.zeros(stop - start, np.float32)
         alpha[photographs.chosen[inside].astype(np.int64) - start] = 1
     rgb = np.array(photographs.table[start - first : stop - first, :3])
-    return small_view(view.name, view.camera, rgb, alpha)
+    return small_view(view.name, view.camera, rgb, alpha, limit=view.limit)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -30,12 +31,14 @@ class SmallView:
         camera: of the small picture.
         rgb: mean linear radiance of blocks of pixels, (height, width, 3).
         alpha: mean coverage of the same blocks, (height, width); 1 where the background is visible.
+        clipped: share of the pixels of the same blocks that are clipped, (height, width).
     """
 
     name: str
     camera: Camera
     rgb: np.ndarray
     alpha: np.ndarray
+    clipped: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +69,7 @@ def small_view(
     rgb: np.ndarray,
     alpha: np.ndarray | None,
     longest: int = LONGEST_SIDE,
+    limit: float = math.inf,
 ) -> SmallView:
     """A view averaged over the smallest square blocks that make it fit; a remainder is cut.
 
@@ -74,22 +78,21 @@ def small_view(
         rgb: linear, row by row, (pixels, 3).
         alpha: coverage, (pixels,); None where the background is visible.
         longest: pixels along the longer side, at most.
+        limit: from which on a channel is clipped.
     """
-    small = small_camera(camera, longest)
-    height, width = small.height, small.width
-    shape = (camera.height, camera.width)
-    block = min(shape[0] // height, shape[1] // width)
-    means = block_means(rgb.reshape(*shape, -1)[..., :3], block)
-    covered = np.ones((height, width))
+    small, block = small_camera(camera, longest), block_of(camera, longest)
+    pixels = rgb.reshape(camera.height, camera.width, -1)[..., :3]
+    covered, clipped = np.ones((small.height, small.width)), np.zeros((small.height, small.width))
     if alpha is not None:
-        covered = block_means(alpha.reshape(shape), block)
-    return SmallView(name, small, means, covered)
+        covered = block_means(alpha.reshape(pixels.shape[:2]), block)
+    if math.isfinite(limit):
+        clipped = block_means(np.asarray((pixels >= limit).any(axis=-1), np.float32), block)
+    return SmallView(name, small, block_means(pixels, block), covered, clipped)
 
 
 def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
     """The camera of the small view."""
-    block = -(-max(camera.height, camera.width) // longest)
-    block = min(block, camera.height, camera.width)  # a picture of one line keeps it
+    block = block_of(camera, longest)
     return replace(
         camera,
         fl_x=camera.fl_x / block,
@@ -99,6 +102,12 @@ def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
         width=camera.width // block,
         height=camera.height // block,
     )
+
+
+def block_of(camera: Camera, longest: int = LONGEST_SIDE) -> int:
+    """Pixels along an edge of the blocks that become pixels of a small view."""
+    block = -(-max(camera.height, camera.width) // longest)
+    return min(block, camera.height, camera.width)  # a picture of one line keeps it
 
 
 def pixel_rays(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:

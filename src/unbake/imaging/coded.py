@@ -17,6 +17,8 @@ from .srgb import from_srgb, to_srgb
 
 #: Formats that Pillow may try, by its names: it knows some that start other programs.
 _FORMATS = ("PNG", "JPEG", "TIFF")
+#: The tag of EXIF and of TIFF.
+_ORIENTATION = 0x0112
 #: Pillow's names of colours that become RGB without a profile.
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 
@@ -121,6 +123,8 @@ def _read_by_pillow(path: Path) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of odd tags, and of sizes that were checked
         with Image.open(path, formats=_FORMATS) as image:
+            # Pillow turns TIFF files while it reads them.
+            image.getexif().pop(_ORIENTATION, None)
             if image.mode not in _MODES:
                 raise _Unreadable(f"its colours are {image.mode}, not RGB or grey")
             alpha = "A" in image.mode or "transparency" in image.info

@@ -44,7 +44,9 @@ def data_warnings(
     with dr.suspend_grad():
         inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
         found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
-        found += pose_warnings(scene, dataset.train, pixels.photographs, dataset.folder)
+        hidden = dataset.background == "hidden"
+        words = (scene, dataset.train, pixels.photographs, dataset.folder)
+        found += pose_warnings(*words, hidden=hidden)
         quick = quick_findings(scene, dataset.train, pixels.photographs)
         # Of poses that see little of the scene, nothing else is told but what is surely wrong.
         quick = [finding for finding in quick if finding.level == "error" or not found]
