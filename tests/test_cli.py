@@ -29,6 +29,7 @@ from unbake.config import (
 from unbake.errors import UserError
 from unbake.fields import registry
 from unbake.imaging.pictures import read_exr
+from unbake.solver.settings import SolveSettings
 from unbake.training.monitor import SHORT
 from unbake.transport.methods import METHODS
 from unbake.version import VERSION
@@ -528,6 +529,16 @@ def test_a_registered_representation_is_an_option_like_any_other(monkeypatch):
     assert "wide (wide net)" in str(told.type)
     chosen = with_options(FitConfig(), {"representation": "wide"})
     assert chosen.material_settings["albedo"].width == 64
+
+
+def test_options_are_taken_together():
+    """The order in which they are applied refuses none that suit each other."""
+    chosen = with_options(SolveSettings(), {"batch": 3_000_000, "samples": 1})
+    assert (chosen.batch, chosen.samples) == (3_000_000, 1)
+    with pytest.raises(UserError, match=r"--batch: .* are too many"):
+        with_options(SolveSettings(), {"batch": 3_000_000, "samples": 2})
+    with pytest.raises(UserError, match=r"--spp: must be 1 or more.*; --seed: must be 0 or more"):
+        with_options(SolveSettings(), {"spp": 0, "seed": -1, "batch": 64})
 
 
 def test_usage_shows_where_a_command_writes_to(unbake):

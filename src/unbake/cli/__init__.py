@@ -70,6 +70,8 @@ from .options import (
 
 #: Characters of a line that is printed: more than a path can have.
 _LONGEST = 1 << 14
+#: Between scores of a comparison, unless a file or an option says otherwise.
+_SCORE_SECONDS = 5.0
 
 _DESCRIPTION = (
     "Recovers the materials or the lighting of a scene with known geometry from posed "
@@ -720,7 +722,7 @@ def compare(
     out: Out,
     preset: Preset = None,
     settings: File = None,
-    score_seconds: Annotated[float, arg(metavar="SECONDS")] = 5.0,
+    score_seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
     evaluate_spp: int = 32,
     evaluate_truth: Flag = False,
     clip_negative: Flag = False,
@@ -748,7 +750,8 @@ def compare(
         preset: Settings to start from: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
-        score_seconds: Training time between scores on all held-out views (0: no scores).
+        score_seconds: Training time between scores on all held-out views (default: as the file
+            says, else 5; 0: no scores).
         evaluate_spp: Samples per pixel of the final renderings.
         evaluate_truth: Render captured scenes with their true materials too.
         clip_negative: Take negative pixels as zero instead of refusing them.
@@ -759,6 +762,8 @@ def compare(
     """
     require("evaluate-spp", evaluate_spp, 1)
     chosen = with_length(chosen_settings(preset, settings), given(compare))
+    if score_seconds is None:
+        score_seconds = chosen.score_seconds or _SCORE_SECONDS
     try:
         chosen = dataclasses.replace(chosen, score_seconds=score_seconds)
     except UserError as error:

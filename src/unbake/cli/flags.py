@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, TypeVar
@@ -14,7 +15,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from .. import config
 from ..config import FitConfig, Flag, with_method
-from ..errors import UserError
+from ..errors import UserError, raise_together
 
 Settings = TypeVar("Settings")
 
@@ -160,22 +161,30 @@ def with_options(settings: Settings, values: Mapping[str, Any]) -> Settings:
     known = {option.name: option for option in options(type(settings))}
     problems: list[UserError] = []
     # The method first: whether other options make sense depends on it.
-    for name, value in sorted(values.items(), key=lambda item: item[0] != "method"):
+    if "method" in values and isinstance(settings, FitConfig):
         try:
-            if name == "method" and isinstance(settings, FitConfig):
-                settings = with_method(settings, value)
-                continue
-            settings = _replaced(settings, known[name].path, value)
+            settings = with_method(settings, values["method"])
+        except UserError as error:
+            problems.append(UserError(error.what, "--method", error.remedy))
+        values = {name: value for name, value in values.items() if name != "method"}
+    if not problems:
+        with suppress(UserError):  # at once: what one option asks for may need another
+            return _replaced(settings, {known[name].path: x for name, x in values.items()})
+    for name, value in values.items():
+        try:
+            settings = _replaced(settings, {known[name].path: value})
         except UserError as error:
             problems.append(UserError(error.what, f"--{name}", error.remedy))
-    if len(problems) == 1:
-        raise problems[0]
-    if problems:
-        raise UserError("; ".join(map(str, problems)))
+    raise_together(problems)
     return settings
 
 
-def _replaced(settings: Any, path: tuple[str, ...], value: object) -> Any:
-    key, *rest = path
-    new = _replaced(getattr(settings, key), tuple(rest), value) if rest else value
-    return dataclasses.replace(settings, **{key: new})
+def _replaced(settings: Any, values: Mapping[tuple[str, ...], object]) -> Any:
+    """Settings with other values, by their paths."""
+    if not values:
+        return settings
+    changed: dict[str, Any] = {path[0]: value for path, value in values.items() if len(path) == 1}
+    for key in dict.fromkeys(path[0] for path in values if len(path) > 1):
+        inner = {p[1:]: x for p, x in values.items() if p[0] == key and len(p) > 1}
+        changed[key] = _replaced(getattr(settings, key), inner)
+    return dataclasses.replace(settings, **changed)

@@ -53,7 +53,7 @@ class SolveSettings:
             "--from takes the held-out views instead"
         ),
     ] = 4
-    #: Unless the camera file has its own.
+    #: Of the cameras of a file, too: their horizontal fields of view stay.
     resolution: Annotated[int, Flag("Width and height of the pictures in pixels")] = 64
     spp: Annotated[
         int, Flag("Samples per pixel of both sides, where they are measured on the way")
