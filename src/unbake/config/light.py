@@ -82,5 +82,6 @@ class LightConfig:
 
     def named(self) -> dict[str, Any]:
         """The same, with the names of files instead of their paths."""
-        paths = {"envmap": self.envmap, "lights": self.lights}
-        return asdict(self) | {k: None if v is None else Path(v).name for k, v in paths.items()}
+        told = self.told()
+        files = {key: told[key] for key in ("envmap", "lights") if told[key] is not None}
+        return told | {key: Path(file).name for key, file in files.items()}

@@ -250,8 +250,9 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> list[str]:
     sensor = mi.parser.SceneNode()
     sensor.type = mi.ObjectType.Sensor
     sensor.props.set_plugin_name("perspective")
-    for key in wanted.keys() - {"type", "film", "sampler"}:
-        sensor.props[key] = wanted[key]
+    for key, value in wanted.items():
+        if key not in ("type", "film", "sampler"):
+            sensor.props[key] = value
     sensor.props["film"] = mi.Properties.ResolvedReference(scene.append(film))
     scene.append_to_root("exported sensor", sensor)
     return notes
