@@ -238,7 +238,7 @@ def fits_of_views(tmp_path, monkeypatch):
         fits = []
         for seed, psnr in enumerate(albedo):
             run = RunFolder(tmp_path / f"{seed}")
-            write_exr(run.evaluated.picture("heldout", "a", "render"), np.full((4, 4, 4), 0.9))
+            write_exr(run.picture("heldout", "a", "render"), np.full((4, 4, 4), 0.9))
             metrics = {"albedo_psnr": psnr, "roughness_psnr": None}
             found = {"steps": 4 + seed, "per_view": [metrics], "estimator": "two-pass"}
             fits.append(Fit(seed, run, found | others))
@@ -402,7 +402,7 @@ def test_a_rendering_of_another_size_than_the_photograph_is_named(tmp_path, monk
     run = RunFolder(tmp_path / "ours")
     view = SimpleNamespace(name="a", split="heldout", image=tmp_path / "a.exr")
     write_exr(view.image, np.ones((8, 8, 4)))
-    write_exr(run.evaluated.picture("heldout", "a", "render"), np.ones((4, 8, 4)))
+    write_exr(run.picture("heldout", "a", "render"), np.ones((4, 8, 4)))
     monkeypatch.setattr(SceneFits, "heldout", lambda *_: [view])
     fits = SceneFits(STAIRCASE, ["ours"], None, spp=1)
     with pytest.raises(UserError, match=r"a_render\.exr: the picture has 8 x 4 pixels"):

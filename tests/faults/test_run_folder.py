@@ -156,7 +156,7 @@ def test_an_evaluation_takes_the_place_of_the_one_before_as_a_whole(fit, run, un
     after = found()
     assert before.keys() - after.keys() == {p for p in before if "train_001" in p.name}
     assert not after.keys() - before.keys() and run.metrics()["render"]["spp"] == 2
-    picture = run.evaluated.picture("heldout", "heldout_000", "render")
+    picture = run.picture("heldout", "heldout_000", "render")
     assert before[picture] != after[picture]
 
 

@@ -93,7 +93,7 @@ def test_a_fit_finds_what_was_painted_into_a_photograph(painted, tiny, tmp_path)
     found = evaluate(run, FEW, tell=lambda line: None)["outliers"]
     assert found["images"][0] == {"name": "train_000", "share": first.mean()}
     assert found["share"] == pytest.approx((first.mean() + second.mean()) / 2)
-    picture = read_png(RunFolder(run).evaluated.picture("train", "train_000", "outliers", ".png"))
+    picture = read_png(RunFolder(run).picture("train", "train_000", "outliers", ".png"))
     assert picture.shape[:2] == first.shape and "train_000" in found["shown"]
     assert json.loads(RunFolder(run).metrics_file.read_text())["outliers"] == found
     page = write_report([run], tmp_path / "report.html").read_text()

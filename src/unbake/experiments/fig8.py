@@ -66,8 +66,8 @@ def _picture(context: ExperimentContext, scene_fits: SceneFits) -> np.ndarray:
     """The maps of the first seed, and a view lit by them; the truth on the right."""
     view, folder = scene_fits.heldout(context)[VIEW], scene_fits.runs(context, scene_fits.seeds[0])
     runs = [RunFolder(folder / method) for method in ABLATION.values()]
-    maps = [read_exr(run.evaluated.environment()) for run in runs]
-    renderings = [run.evaluated.picture(view.split, view.name, "render") for run in runs]
+    maps = [read_exr(run.environment()) for run in runs]
+    renderings = [run.picture(view.split, view.name, "render") for run in runs]
     truth = true_environment(scene_fits.scene.data(context))
     photograph = read_exr(view.image)
     images = [

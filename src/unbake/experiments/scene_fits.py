@@ -281,7 +281,7 @@ class SceneFits:
         """
         rows, size = [], context.pick(1, 4, 4)
         for view, metrics in zip(self.heldout(context), fit.found["per_view"], strict=True):
-            file = fit.run.evaluated.picture(view.split, view.name, "render")
+            file = fit.run.picture(view.split, view.name, "render")
             photograph, rendering = read_exr(view.image), read_exr(file)[..., :3]
             require_same_size(rendering, photograph, file)
             scale = exposure(photograph)
@@ -310,7 +310,7 @@ class SceneFits:
             truth = {"render": view.image, **view.truth}
             for quantity in ROWS:
                 runs = (RunFolder(folder / method) for method in self.methods)
-                files = [run.evaluated.picture(view.split, view.name, quantity) for run in runs]
+                files = [run.picture(view.split, view.name, quantity) for run in runs]
                 factor = scale if quantity == "render" else 1.0
                 columns = (*files, truth.get(quantity))
                 sheet.append([_cell(file, quantity, factor, view) for file in columns])

@@ -42,7 +42,7 @@ def _maps(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
     errors: list[np.ndarray | None] = []
     for run in runs:
         optimized = run.optimizes("environment")
-        path = display.evaluated(run, run.folder.evaluated.environment()) if optimized else None
+        path = display.evaluated(run, run.folder.environment()) if optimized else None
         if path is None:
             found.append(None)
             errors.append(None)

@@ -23,9 +23,7 @@ def outlier_section(runs: list[Run]) -> list[dict[str, Any]] | None:
         shares = {row["name"]: row["share"] for row in told["images"]}
         figures = []
         for name in told["shown"]:
-            file = display.evaluated(
-                run, run.folder.evaluated.picture("train", name, "outliers", ".png")
-            )
+            file = display.evaluated(run, run.folder.picture("train", name, "outliers", ".png"))
             picture = pictures.png_data_uri(pictures.read_png(file))
             figures.append({"name": name, "picture": picture, "share": _percent(shares.get(name))})
         found.append({"label": run.label, "share": _percent(told["share"]), "figures": figures})

@@ -201,7 +201,7 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
     """A run's image of a view; None if it was not evaluated or the quantity not optimized."""
     if not run.view(view.name) or not run.optimizes(quantity):
         return None
-    return display.evaluated(run, run.folder.evaluated.picture(view.split, view.name, quantity))
+    return display.evaluated(run, run.folder.picture(view.split, view.name, quantity))
 
 
 def _reference(view: View, quantity: str) -> tuple[np.ndarray, np.ndarray]:

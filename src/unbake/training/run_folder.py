@@ -404,10 +404,13 @@ class RunFolder:
 
     # -------------------------------------------------------------------------- evaluation
 
-    @property
-    def evaluated(self) -> EvaluationFolder:
-        """The pictures of the evaluation."""
-        return EvaluationFolder(self.evaluation)
+    def picture(self, split: str, view: str, quantity: str, suffix: str = ".exr") -> Path:
+        """A picture of the evaluation; see `EvaluationFolder.picture`."""
+        return EvaluationFolder(self.evaluation).picture(split, view, quantity, suffix)
+
+    def environment(self, suffix: str = ".exr") -> Path:
+        """The environment map of the evaluation; see `EvaluationFolder.environment`."""
+        return EvaluationFolder(self.evaluation).environment(suffix)
 
     @contextmanager
     def new_evaluation(self) -> Iterator[EvaluationFolder]:
@@ -428,10 +431,9 @@ class RunFolder:
         Raises:
             OSError, UserError: a file cannot be written.
         """
-        before = self.evaluated
         self.metrics_file.unlink(missing_ok=True)  # of no other pictures than its own
         _remove(*(self.evaluation / split for split in ("train", "heldout")))
-        _remove(*(before.environment(suffix) for suffix in (".exr", ".png")))
+        _remove(*(self.environment(suffix) for suffix in (".exr", ".png")))
         for path in new.path.glob("*"):
             path.rename(self.evaluation / path.name)
         write_json(self.metrics_file, metrics)
