@@ -98,12 +98,13 @@ def test_it_draws_less_often_where_the_bsdf_knows_better():
     assert guide.share(mi.UInt32(7))[0] < before - 0.05
 
 
-def test_samples_without_light_teach_nothing():
+@pytest.mark.parametrize("pdf", [0.0, np.nan, np.inf])
+def test_samples_without_light_teach_nothing(pdf):
     guide = random_guide()
     values = guide.parameters()
     dr.enable_grad(*values.values())
     cell = dr.arange(mi.UInt32, 48)
-    choice = Choice(cell, mi.Vector3f(0, 0, 1), dr.opaque(mi.Float, 0, 48))
+    choice = Choice(cell, mi.Vector3f(0, 0, 1), dr.opaque(mi.Float, pdf, 48))
     loss = guide.loss(choice, dr.opaque(mi.Float, 0, 48))
     dr.backward(loss)
     assert loss[0] == 0

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from support import tiny_fields
 
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.config import read_toml, to_toml
 from unbake.dataset.views import Dataset
 from unbake.fields.settings import GuideConfig
@@ -48,6 +50,29 @@ def test_what_the_guide_has_learned_takes_noise_out_of_steps(fitted):
     print(f"variance {learned:.4g} with the guide, {uniform:.4g} with even directions")
     assert learned < 0.9 * uniform
     assert noise(step, state, pixels) == learned
+
+
+#: A floor, and a card of which nothing is seen, before the sky.
+WITH_HOLES = """<scene version="3.0.0"><emitter type="constant"/>
+  <shape type="rectangle"><bsdf type="principled"/></shape>
+  <shape type="rectangle"><bsdf type="mask"><float name="opacity" value="0"/>
+    <bsdf type="twosided"><bsdf type="principled"/></bsdf></bsdf>
+    <transform name="to_world"><rotate x="1" angle="90"/><translate z="1"/></transform></shape>
+</scene>"""
+
+
+def test_no_step_is_skipped_where_holes_show_the_sky(tmp_path):
+    (tmp_path / "scene.xml").write_text(WITH_HOLES)
+    settings = CaptureSettings(views=2, held_out=0, resolution=8, spp=4, max_depth=4)
+    capture(tmp_path / "scene.xml", tmp_path / "data", settings, tell=lambda line: None)
+    dataset = replace(Dataset.load(tmp_path / "data"), background="visible")
+    config = replace(tiny_fields(), pixels=64, guide=GuideConfig(cells=4, bands=4, sectors=8))
+    pixels = pixels_of(dataset, config, clip_negative=False)
+    problem = problem_of(dataset, config, pixels.photographs.mean)
+    step, state = TrainingStep(problem, pixels, config), initial_state(problem)
+    for number in range(6):
+        terms = step(state, number, learning_rates(config, number, number / 6))
+        assert terms["skipped"][0] == 0, {name: x[0] for name, x in terms.items()}
 
 
 def test_methods_without_a_radiance_field_and_settings_without_cells_have_no_guide(cornell):

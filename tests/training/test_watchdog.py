@@ -301,6 +301,16 @@ def test_only_what_the_batches_tell_is_said_of_a_fit(begun, monkeypatch, before,
     assert learned or "no better than by the untrained fields" in told
 
 
+def test_an_explosion_is_not_lost_in_the_loss_of_the_guide(begun):
+    """That one is a cross-entropy, which is large all the time."""
+    dog, _, progress, _ = watching(begun)
+    told = []
+    for loss in (0.01, 0.01, 0.01, 0.01, 10.0, 10.0):
+        progress.step += 20
+        told += dog.read([reading(loss) | {"guide": 4.3}] * 20, last=False)
+    assert len(told) == 1 and "the loss rose from about 0.01 to 10; back to" in told[0]
+
+
 def test_what_photographs_tell_is_not_lost_in_a_prior_that_rises(begun, monkeypatch):
     dog, state, progress, _ = watching(begun)
     first = [{"photometric": 2.0, "prior": 0.5, "skipped": 0} for _ in range(COMPARED)]

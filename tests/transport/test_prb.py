@@ -32,7 +32,7 @@ from unbake.transport.prb import (
     path_radiance,
     path_replay,
 )
-from unbake.transport.vertex import SceneView
+from unbake.transport.vertex import SceneView, find_vertex
 
 DEPTH = 4
 
@@ -182,10 +182,10 @@ def test_cut_outs_are_those_of_mitsubas_volumetric_path_tracer(tmp_path, instanc
     assert_same_expectation(ours, theirs, 1024)
 
 
-def half_opaque_leaf(*, lamp):
+def leaf(*, lamp=False, opacity=0.5):
     """A leaf before the sky, or before a lamp, and rays that it fills."""
     material = {"type": "principled", "roughness": 0.5}
-    mask = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "bsdf": material}}
+    mask = {"type": "mask", "opacity": opacity, "bsdf": {"type": "twosided", "bsdf": material}}
     content = {
         "type": "scene",
         "sky": {"type": "constant", "radiance": 1.0},
@@ -202,9 +202,19 @@ def half_opaque_leaf(*, lamp):
     return mi.load_dict(content), pixel_rays([camera], 1024, seed=1)
 
 
+@pytest.mark.parametrize("opacity", [0.0, 0.5])
+def test_a_chain_that_ends_nowhere_leaves_numbers(opacity):
+    scene, ray = leaf(opacity=opacity)
+    sampler = seeded(2, dr.width(ray))
+    vertex = find_vertex(SceneView.of(scene, None, 8), ray, mi.Bool(True), sampler)
+    valid, found = np.array(vertex.valid), np.array(vertex.opacity)
+    assert valid.any() == (opacity > 0) and not valid.all()
+    assert (found[~valid] == 1).all() and (found[valid] == opacity).all()
+
+
 @pytest.mark.parametrize("lamp", [False, True], ids=["sky", "lamp"])
 def test_no_method_sees_hidden_lights_through_cut_outs(lamp):
-    scene, ray = half_opaque_leaf(lamp=lamp)
+    scene, ray = leaf(lamp=lamp)
     theirs = stock_path(scene, ray, 3, max_depth=12, integrator="volpath", hide_emitters=True)
     scene_view = SceneView.of(scene, None, 8)
     traced = path_traced(scene_view, ray, 2, max_depth=12, rr_depth=5, hide_emitters=True)
@@ -232,7 +242,7 @@ def test_no_method_sees_hidden_lights_through_thin_panes(material):
 
 
 def test_light_through_holes_passes_gradients_to_the_sky():
-    scene, ray = half_opaque_leaf(lamp=False)
+    scene, ray = leaf()
     parameters = mi.traverse(scene)
     sky = parameters["sky.radiance.value"]
     dr.enable_grad(sky)

@@ -163,7 +163,7 @@ class LightGuide:
         mixed = Mixture(self, cell, self.share(cell)).pdf(choice.pdf, choice.direction)
         index, count = cell * n + self._bin(choice.direction), dr.width(weight)
         own = dr.log(dr.gather(mi.Float, self._weights, index) / self._total(cell))
-        told = -dr.mean(weight * (own + dr.log(mixed)))
+        told = -dr.mean(dr.select(weight > 0, weight * (own + dr.log(mixed)), 0))
         # The logarithm of a density passes gradients to all bins of its cell, which are the same
         # for all samples there: they are summed by cell first.
         logits = _GAIN * self._logits

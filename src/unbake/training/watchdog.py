@@ -10,6 +10,7 @@ from typing import final
 
 from ..errors import UserError
 from ..transport.methods import PHOTOMETRIC
+from ..transport.samplers import GUIDE
 from .checkpoint import Progress
 from .diagnosis import diagnose
 from .state import Snapshot, State
@@ -238,4 +239,5 @@ class Watchdog:
 
 
 def _total(reading: Reading) -> float:
-    return sum(value for term, value in reading.items() if term != "skipped")
+    """The loss of a step, without that of the guide: a cross-entropy, large or below zero."""
+    return sum(value for term, value in reading.items() if term not in ("skipped", GUIDE))

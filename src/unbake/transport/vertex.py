@@ -143,6 +143,8 @@ def find_vertex(
             pi, ray, β, passed, opacity, specular, moved = chain
             direct_view &= ~specular
             valid = valid & pi.is_valid()
+            # Of a chain that ends nowhere it is that of the last hole, which may be 0.
+            opacity = dr.select(valid, opacity, 1)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid | moved)
 
     # The light that is met passes gradients: lighting may be unknown.
