@@ -89,7 +89,11 @@ def main() -> None:
 def smaller(source: Path, project: Path, edge: int) -> None:
     """The project with photographs that are `edge` pixels wide, as PNG with their EXIF."""
     lines = (source / "sparse" / "cameras.txt").read_text(encoding="utf-8").splitlines()
-    (camera,) = (line.split() for line in lines if not line.startswith("#"))
+    cameras = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    if len(cameras) != 1 or cameras[0][1] not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        told = ", ".join(camera[1] for camera in cameras)
+        raise SystemExit(f"{source} has the cameras {told or 'none'}, not a single pinhole")
+    (camera,) = cameras
     width, height = int(camera[2]), int(camera[3])
     factor = width // edge
     if factor * edge != width:

@@ -33,7 +33,7 @@ from unbake import backend  # noqa: E402
 backend.activate()
 
 import numpy as np  # noqa: E402
-from relight_demo import LAMPS  # noqa: E402
+from relight_demo import LAMPS, lamps  # noqa: E402
 
 from unbake.acquisition.new_light import change_light  # noqa: E402
 from unbake.config import preset  # noqa: E402
@@ -100,7 +100,7 @@ def main() -> None:
         last = row["scores"][-1]
         told = ", ".join(f"{k} {v:.2f}" for k, v in last.items() if k.endswith("psnr"))
         print(f"{start}: {told}, {row['cpu_seconds']:.0f} CPU s", flush=True)
-    write_text(args.work / "lamps.xml", LAMPS)
+    write_text(args.work / "lamps.xml", lamps(LAMPS))
     light = LightConfig(lights=args.work / "lamps.xml")
     run = args.work / "run-cold"
     found["tuned"] = kept(args.work / "tuned.json", lambda: tuned(run, light, args))

@@ -171,8 +171,33 @@ def test_names_that_no_terminal_shows_become_ones_that_do(captured, nerfstudio, 
     image = nerfstudio / "images" / f"{name}.png"
     image.rename(image.with_name("a\x07b.png"))
     change(nerfstudio, set_frame("file_path", "images/a\x07b.png"))
+    change(nerfstudio, set_top("train_filenames", None))
+    change(nerfstudio, set_top("test_filenames", None))
     import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
     assert {view.name for view in Dataset.load(tmp_path / "data").views} > {"a_b"}
+
+
+@pytest.mark.parametrize("frames", ["without images", "none"])
+def test_cameras_of_blender_without_pictures_are_left_out(frames, captured, meshes, tmp_path):
+    """As the add-on writes them for tests, and all names as it writes them on Windows."""
+    source = tmp_path / "blender"
+    write_blender(captured, source)
+    for file in source.glob("transforms_*.json"):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            frame["file_path"] = frame["file_path"].removeprefix("./").replace("/", "\\") + ".png"
+        if file.name != "transforms_train.json" and frames == "none":
+            content["frames"] = []
+        file.write_text(json.dumps(content))
+    shutil.rmtree(source / "test")
+    shutil.rmtree(source / "val")
+    told = []
+    settings = ImportSettings(holdout=2)
+    import_data(source, tmp_path / "data", meshes, settings, tell=told.append)
+    assert sum("is left out: its cameras have no pictures" in line for line in told) == 2
+    found = Dataset.load(tmp_path / "data")
+    # What is held out is chosen as where nothing is said of it
+    assert (len(found.train), len(found.heldout)) == (1, 1)
 
 
 def test_names_in_two_folders_are_kept_apart(captured, meshes, tmp_path):
@@ -358,8 +383,9 @@ def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
         {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.0, "k4": 0.0},
         {"is_fisheye": True, "k1": 0.02, "k2": -0.01},
         {"camera_model": "PINHOLE", "fl_y": 90.0},
+        {"camera_model": "PINHOLE", "k1": -0.2, "k2": 0.05},
     ],
-    ids=["opencv", "fisheye", "instant-ngp", "oblong pixels"],
+    ids=["opencv", "fisheye", "instant-ngp", "oblong pixels", "pinhole by name alone"],
 )
 @pytest.mark.parametrize("suffix", [".png", ".exr"])
 def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
@@ -563,6 +589,26 @@ def test_a_split_of_a_frame_decides_what_is_held_out(split, nerfstudio, meshes, 
                          ["frames"][1]["file_path"]).stem]  # fmt: skip
 
 
+def test_frames_in_no_list_of_splits_are_left_out(captured, nerfstudio, meshes, tmp_path):
+    """As nerfstudio does, and only where a list of those to train on names any."""
+    names = [f"images/{view.name}.png" for view in captured.views]
+    lists = {"train_filenames": names[:1], "test_filenames": names[1:2]}
+    change(nerfstudio, lambda content: content.update(lists))
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    assert [view.name for view in Dataset.load(tmp_path / "data").views] == [
+        view.name for view in captured.views[:2]
+    ]
+    assert any(
+        f"1 frames are in no list of splits, and are left out: {names[2]}" in x for x in told
+    )
+    # Where images are of another format by now, names match without their suffix
+    lists = {"train_filenames": [name.replace(".png", ".jpg") for name in names]}
+    change(nerfstudio, lambda content: content.update(lists | {"test_filenames": []}))
+    import_data(nerfstudio, tmp_path / "other", meshes, tell=quiet)
+    assert len(Dataset.load(tmp_path / "other").train) == 3
+
+
 def test_names_in_lists_of_splits_that_are_of_no_frame_are_told(nerfstudio, meshes, tmp_path):
     change(nerfstudio, set_top("test_filenames", ["images/none.png", "images/train_000.png"]))
     told = []
@@ -598,6 +644,14 @@ def test_an_angle_of_a_frame_stands_before_a_focal_length_at_the_top(
     change(nerfstudio, angles)
     import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
     same_as_captured(captured, tmp_path / "data")
+
+
+def test_a_file_that_cannot_be_read_does_not_hide_other_faults(nerfstudio, tmp_path):
+    (nerfstudio / "transforms.json").write_text("{")
+    with pytest.raises(ImportFaults) as caught:
+        import_data(nerfstudio, tmp_path / "data", [tmp_path / "none.ply"], tell=quiet)
+    told = "; ".join(caught.value.faults)
+    assert "transforms.json" in told and "none.ply" in told and len(caught.value.faults) == 2
 
 
 def test_a_source_that_is_none_is_told_what_there_could_be(meshes, tmp_path):

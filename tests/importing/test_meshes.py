@@ -82,6 +82,56 @@ def test_parts_of_obj_files_are_as_written(normals, textured, tmp_path):
         assert len(part.positions) <= 24, "no part has the vertices of others"
 
 
+#: Two triangles, one after the other, that count their corners backwards.
+BACKWARDS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "v 0 0 5\nv 1 0 5\nv 0 1 5\nf -3 -2 -1\n"
+
+
+def test_numbers_that_count_backwards_are_refused_where_they_would_be_misread(tmp_path):
+    file = tmp_path / "mesh.obj"
+    file.write_text("".join(BACKWARDS))
+    with pytest.raises(ImportFaults, match="count vertices backwards"):
+        parts_of(file)
+    file.write_text(BACKWARDS[0])
+    (part,) = parts_of(file)
+    assert part.positions[part.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+def test_a_vertex_without_a_normal_takes_that_of_its_triangles(tmp_path):
+    """And a vertex that no triangle has does not count."""
+    mesh = trimesh.creation.box()
+    normals = np.array(mesh.vertices) / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    normals[3] = 0
+    lines = [f"v {x} {y} {z}" for x, y, z in [*mesh.vertices, (9, 9, 9)]]
+    lines += [f"vn {x} {y} {z}" for x, y, z in [*normals, (0, 0, 0)]]
+    lines += ["f " + " ".join(f"{i + 1}//{i + 1}" for i in face) for face in mesh.faces]
+    file = tmp_path / "box.obj"
+    file.write_text("\n".join(lines) + "\n")
+    (part,) = parts_of(file)
+    assert part.normals is not None and len(part.positions) == 8
+    expected = part.positions / np.linalg.norm(part.positions, axis=1, keepdims=True)
+    cosine = (part.normals * expected).sum(1)
+    assert (np.sort(cosine)[1:] > 0.999).all() and cosine.min() > 0.5
+
+
+def test_normals_of_ply_files_stay_where_corners_have_textures(tmp_path):
+    """Quads, and texture coordinates of corners, are read by trimesh."""
+    head = ["ply", "format ascii 1.0", "element vertex 4"]
+    head += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    head += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    slope = "0.6 0 0.8"
+    corners = [f"{x} {y} 0 {slope}" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    file = tmp_path / "quad.ply"
+    file.write_text("\n".join([*head, *corners, "4 0 1 2 3"]) + "\n")
+    (part,) = parts_of(file)
+    assert len(part.faces) == 2 and np.allclose(part.normals, (0.6, 0, 0.8))
+    head[-1:] = ["property list uchar float texcoord", "end_header"]
+    head[-4] = "element face 2"
+    faces = ["3 0 1 2 6 0 0 1 0 1 1", "3 0 2 3 6 0.5 0 0.7 1 0 1"]
+    file.write_text("\n".join([*head, *corners, *faces]) + "\n")
+    (part,) = parts_of(file)
+    assert len(part.faces) == 2 and np.allclose(part.normals, (0.6, 0, 0.8)) and part.uv is None
+
+
 def test_materials_of_obj_files_part_a_mesh(tmp_path):
     file = tmp_path / "one.obj"
     file.write_text(cubes(("cube",), materials=True))

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layouts import codes, quiet, write_photographed_room, write_rendered_room
+from PIL import Image
 
 from unbake.dataset.views import Dataset, read_photograph
+from unbake.errors import UserError
 from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.settings import ImportSettings
@@ -56,6 +58,17 @@ def test_other_images_of_a_room_hold_code_values(captured, photographed, tmp_pat
     assert {view.encoding for view in found.views} == {"srgb"}
     for mine, known in zip(found.views, captured.views, strict=True):
         assert np.abs(codes(mine).astype(int) - codes(known)).max() <= 1
+
+
+def test_images_of_a_room_have_the_size_that_its_cameras_are_for(photographed, tmp_path):
+    for file in (photographed / "ldr").glob("*.png"):
+        with Image.open(file) as image:
+            smaller = image.resize((image.width // 2, image.height // 2))
+        smaller.save(file)
+    with pytest.raises(
+        UserError, match="the image has 8 x 8 pixels, and the cameras are for 16 x 16"
+    ):
+        import_data(photographed, tmp_path / "data", images=photographed / "ldr", tell=quiet)
 
 
 def test_exposures_of_a_room_are_those_that_it_tells(photographed, tmp_path):

@@ -48,7 +48,11 @@ def read_colmap(model: Path, images: Path | None, allow_outside: bool, faults: F
     if found is None or not found.is_dir():
         faults.add("there is no folder of images (name it with --images)", found)
         found = None
-    reconstruction, shots, lenses = _reconstruction(model), [], {}
+    reconstruction, shots, lenses = None, [], {}
+    with faults.collected():
+        reconstruction = _reconstruction(model)
+    if reconstruction is None:
+        return Source("COLMAP", ())
     for image in reconstruction.images.values():
         if not image.has_pose or found is None:
             continue

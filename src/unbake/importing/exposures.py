@@ -86,8 +86,8 @@ def read_table(file: Path, shots: Sequence[Shot], faults: Faults) -> tuple[dict[
         value = _positive(row[1]) if len(row) == 2 else None
         if value is None:
             faults.add("a line of the table is no name and positive number", f"line {number}")
-        else:
-            table[row[0].strip()] = value
+        elif table.setdefault(row[0].strip(), value) != value:
+            faults.add("the table has two exposures of a photograph", row[0].strip())
     found = {shot.name: _looked_up(shot, table) for shot in shots}
     for name, value in found.items():
         if value is None:

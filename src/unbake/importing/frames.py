@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -53,7 +54,11 @@ def read_one_file(
         allow_outside: read images that lie outside of the folder.
         faults: all that is wrong is added to it.
     """
-    top = read_object(file)
+    top = None
+    with faults.collected():
+        top = read_object(file)
+    if top is None:
+        return Source("nerfstudio", ())
     if "scene" in top:
         faults.add(f"the folder is a data set already: {file.name} names a 'scene'")
         return Source("data set", ())
@@ -71,7 +76,31 @@ def read_one_file(
         )
         for shot in shots
     ]
-    return Source("nerfstudio", tuple(placed), (*notes, *_unknown_names(top, splits)))
+    kept, left_out = _of_lists(placed, splits)
+    return Source("nerfstudio", kept, (*notes, *_unknown_names(top, splits), *left_out))
+
+
+def _of_lists(
+    shots: Sequence[Shot], splits: Mapping[PurePosixPath, str]
+) -> tuple[tuple[Shot, ...], tuple[str, ...]]:
+    """The frames that a list of splits names, and a note of the others.
+
+    Where there is a list of those to train on, nerfstudio leaves the others out; all are kept where
+    it names no frame.
+    """
+    if "train" not in splits.values() or all(shot.split is None for shot in shots):
+        return tuple(shots), ()
+    others = [shot.name for shot in shots if shot.split is None]
+    if not others:
+        return tuple(shots), ()
+    note = f"{len(others)} frames are in no list of splits, and are left out: {_few(others)}"
+    return tuple(shot for shot in shots if shot.split is not None), (note,)
+
+
+def _few(names: Sequence[object]) -> str:
+    """Some names of many."""
+    more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+    return ", ".join(printable(name) for name in names[:_TOLD]) + more
 
 
 def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> tuple[str, ...]:
@@ -84,9 +113,7 @@ def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> 
     unknown = [str(name) for name in splits if name.name not in ends and name.stem not in ends]
     if not unknown:
         return ()
-    more = f" and {len(unknown) - _TOLD} more" if len(unknown) > _TOLD else ""
-    told = ", ".join(printable(name) for name in unknown[:_TOLD])
-    return (f"lists of splits name images that no frame has: {told}{more}",)
+    return (f"lists of splits name images that no frame has: {_few(unknown)}",)
 
 
 def read_split_files(
@@ -95,22 +122,51 @@ def read_split_files(
     """A folder with `transforms_train.json` and its like; arguments as in `read_one_file`.
 
     The views of `transforms_test.json` are held out; those of `transforms_val.json` where there is
-    no other file, and are left out where there is.
+    no other file, and are left out where there is. A file of cameras without pictures, as
+    Blender-NeRF writes it for tests, is left out, too. Nothing is held out by what is left then.
     """
     found = {name: folder / name for name in SPLIT_FILES if (folder / name).is_file()}
     notes = []
+    for name in [name for name, split in SPLIT_FILES.items() if split == "heldout"]:
+        if name in found and _without_pictures(found[name], images, allow_outside):
+            del found[name]
+            notes.append(f"{name} is left out: its cameras have no pictures")
     if {"transforms_test.json", "transforms_val.json"} <= found.keys():
         del found["transforms_val.json"]
         notes.append("transforms_val.json is left out: transforms_test.json has held-out views")
-    shots = []
+    shots, alone = [], len(found) == 1
     for name, file in found.items():
+        split = None if alone else SPLIT_FILES[name]
         with faults.collected():
-            shots += _read_frames(
-                file, read_object(file), images, SPLIT_FILES[name], allow_outside, faults
-            )
+            shots += _read_frames(file, read_object(file), images, split, allow_outside, faults)
     if "transforms_train.json" not in found:
         faults.add("there is no transforms_train.json")
     return Source("Blender", tuple(shots), tuple(notes))
+
+
+def _without_pictures(file: Path, images: Path | None, allow_outside: bool) -> bool:
+    """Whether a file is one of cameras alone: without frames, or without the image of any frame."""
+    frames = None
+    with suppress(UserError):
+        frames = read_object(file).get("frames")
+    if not isinstance(frames, list):
+        return False  # which is told when it is read
+    names = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
+    if len(names) < len(frames) or not all(isinstance(name, str) for name in names):
+        return False
+
+    def has_image(name: str) -> bool:
+        try:
+            return _image(file.parent, _slashed(name), images, allow_outside).is_file()
+        except UserError:  # which is told, too
+            return True
+
+    return not any(has_image(name) for name in names)
+
+
+def _slashed(name: str) -> str:
+    """The name of a file as it is here, where Windows wrote it."""
+    return name if "/" in name else name.replace("\\", "/")
 
 
 def _read_frames(
@@ -145,7 +201,7 @@ def _shot(
     faults: Faults,
 ) -> Shot | None:
     """A frame; None where its image, pose or lens is faulty, each of which is told."""
-    name = text(frame, "file_path", file.name)
+    name = _slashed(text(frame, "file_path", file.name))
     image = mask = pose = lens = None
     with faults.collected(name):
         image = _image(file.parent, name, images, allow_outside)
@@ -230,7 +286,7 @@ def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
     project = None
     if model == _FISHEYE:
         project = fisheye(focal, centre, np.array([k1, k2, k3, k4]))
-    elif any(values.values()) and model not in _PINHOLES:
+    elif any(values.values()):  # whatever the model is called, as nerfstudio does
         if k4 or k5 or k6:
             raise UserError("the lens has k4, k5 or k6, which programs use differently", where)
         project = opencv(focal, centre, np.array([k1, k2, k3]), p1, p2)
@@ -297,9 +353,12 @@ def _listed(name: str, splits: Mapping[PurePosixPath, str]) -> str | None:
     if path in splits:
         return splits[path]
 
-    def same(listed: PurePosixPath) -> bool:
+    def same(listed: PurePosixPath, path: PurePosixPath) -> bool:
         count = min(len(listed.parts), len(path.parts))
         return count > 0 and listed.parts[-count:] == path.parts[-count:]
 
-    found = {split for listed, split in splits.items() if same(listed)}
+    found = {split for listed, split in splits.items() if same(listed, path)}
+    if not found:  # images may be of another format by now
+        short = path.with_suffix("")
+        found = {x for listed, x in splits.items() if same(listed.with_suffix(""), short)}
     return found.pop() if len(found) == 1 else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import mmap
 import re
 import warnings
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from ..errors import UserError, printable
 from ..io import require_file
 from ..scene.meshes import HEADER, check_mesh
-from ..scene.triangles import write_mesh
+from ..scene.triangles import normal_sums, unit, write_mesh
 from .faults import Faults
 
 #: Suffixes of the meshes that are read.
@@ -153,15 +154,34 @@ def _read_ply(file: Path) -> Part | None:
     def table(name: str, columns: int) -> np.ndarray:
         return np.array(params[name], np.float64).reshape(-1, columns)
 
-    with file.open("rb") as opened:
-        smooth = re.search(rb"\n\s*property \w+ nx\s", opened.read(HEADER)) is not None
     return Part(
         file.stem,
         table("vertex_positions", 3),
         np.array(params["faces"], np.int64).reshape(-1, 3),
-        table("vertex_normals", 3) if smooth else None,
+        table("vertex_normals", 3) if _has_normals(file) else None,
         table("vertex_texcoords", 2) if mesh.has_vertex_texcoords() else None,
     )
+
+
+def _has_normals(file: Path) -> bool:
+    """Whether a PLY file has normals."""
+    with file.open("rb") as opened:
+        return re.search(rb"\n\s*property \w+ nx\s", opened.read(HEADER)) is not None
+
+
+def _require_absolute(file: Path) -> None:
+    """Refuse an OBJ file whose faces count corners backwards from where they stand.
+
+    trimesh 5.2 counts from the end of the file, which is the same where all corners come first.
+    """
+    if not file.stat().st_size:
+        return
+    with file.open("rb") as opened, mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as all_:
+        first = re.search(rb"(?m)^[ \t]*f[ \t][^\r\n#]*?[ \t/]-[0-9]", all_)
+        if first and re.compile(rb"(?m)^[ \t]*v[tn]?[ \t]").search(all_, first.end()):
+            what = "faces count vertices backwards (negative numbers), in parts of the file"
+            remedy = "Export it with numbers from the start of the file, or as GLB or PLY"
+            raise UserError(what, file, remedy)
 
 
 def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
@@ -182,6 +202,9 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
         # Not maintain_order: with it, trimesh 5.2 gives vertices the normals and texture
         # coordinates of others.
         options |= {"split_objects": True, "split_groups": True}
+        _require_absolute(file)
+    if suffix == ".ply" and _has_normals(file):
+        options["fix_texture"] = False  # it would forget normals
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of textures that are not there
@@ -214,23 +237,33 @@ def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
         raise UserError("the mesh has vertices that are not finite", file)
     if faces.min() < 0 or faces.max() >= len(positions):
         raise UserError("the mesh has triangles of vertices that it does not have", file)
-    normals = None
-    # Where the file has none, trimesh 5.2 makes them up at this very access, and keeps them there.
-    if "vertex_normals" in mesh._cache and np.shape(mesh.vertex_normals) == positions.shape:
-        normals = np.array(mesh.vertex_normals, np.float64) @ np.linalg.inv(linear)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = normals / np.maximum(length, 1e-12) if (length > 0).all() else None
-    uv = getattr(mesh.visual, "uv", None)
-    known = uv is not None and np.shape(uv) == (len(positions), 2) and np.isfinite(uv).all()
     # Parts of an OBJ file share its vertices
     used, places = np.unique(faces, return_inverse=True)
+    faces, normals = places.reshape(faces.shape), None
+    # Where the file has none, trimesh 5.2 makes them up at this very access, and keeps them there.
+    if "vertex_normals" in mesh._cache and np.shape(mesh.vertex_normals) == positions.shape:
+        found = np.array(mesh.vertex_normals, np.float64)[used] @ np.linalg.inv(linear)
+        normals = _repaired(found, positions[used], faces)
+    uv = getattr(mesh.visual, "uv", None)
+    known = uv is not None and np.shape(uv) == (len(positions), 2) and np.isfinite(uv).all()
+    # Corners of a PLY file's triangles may differ in their texture, but not in their normals.
+    known = known and (normals is None or file.suffix.lower() != ".ply")
     return Part(
-        name,
-        positions[used],
-        places.reshape(faces.shape),
-        None if normals is None else normals[used],
-        np.array(uv, np.float64)[used] if known else None,
+        name, positions[used], faces, normals, np.array(uv, np.float64)[used] if known else None
     )
+
+
+def _repaired(normals: np.ndarray, positions: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """Normals of length 1, (n, 3), with those of triangles in the place of what is none.
+
+    None where no vertex has one.
+    """
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    known = np.isfinite(length) & (length > 0)
+    if not known.any():
+        return None
+    around = normals if known.all() else unit(normal_sums(positions, faces))
+    return np.where(known, normals / np.where(known, length, 1), around)
 
 
 def _ids(name: str) -> tuple[str, str, str]:

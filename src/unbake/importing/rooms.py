@@ -91,10 +91,22 @@ def _photographed(folder: Path, root: Path, allow_outside: bool, faults: Faults)
         with faults.collected(name):
             image = _image(root, name, allow_outside)
             header = image_header(image)
+            _require_size_of(folder / _IMAGES / f"{name}.exr", image)
             lens = _pinhole(rows, header.width, header.height)
             told = None if exposures is None else exposures[index]
             shots.append(Shot(image.name, None, image, lens, _looking(*pose), exposure=told))
     return shots
+
+
+def _require_size_of(own: Path, image: Path) -> None:
+    """Refuse an image of another size than the room's own, which the lenses of rooms are for."""
+    if not own.is_file():
+        return
+    there, here = (image_header(file) for file in (own, image))
+    if (there.width, there.height) != (here.width, here.height):
+        what = f"the image has {here.width} x {here.height} pixels, and the cameras are for "
+        remedy = "Give images of the size of the room's own"
+        raise UserError(f"{what}{there.width} x {there.height}", image, remedy)
 
 
 def _exposures(root: Path, count: int) -> list[float] | None:
