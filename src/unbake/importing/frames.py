@@ -151,8 +151,9 @@ def _without_pictures(file: Path, images: Path | None, allow_outside: bool) -> b
         frames = read_object(file).get("frames")
     if not isinstance(frames, list):
         return False  # which is told when it is read
-    names = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
-    if len(names) < len(frames) or not all(isinstance(name, str) for name in names):
+    given = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
+    names = [name for name in given if isinstance(name, str)]
+    if len(names) < len(frames):
         return False
 
     def has_image(name: str) -> bool:

@@ -24,6 +24,7 @@ from ..fields.guide import LightGuide
 from ..fields.materials import Material, carry, carrying
 from ..fields.pieces import Piece
 from ..fields.radiance import RadianceField
+from .emitter_sampling import sample_emitter
 from .operator import attach_albedo, mixture_at
 from .path_sample import reflected_radiance
 from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
@@ -268,7 +269,7 @@ def _lights(
             found = mixture.pdf(found, x.si.to_world(wo))
         return found + bsdf.pdf(ctx, sharp, wo, active) * solid
 
-    ds, light = scene.sample_emitter_direction(own, sampler.next_2d(), True, active)
+    ds, light = sample_emitter(scene, own, sampler.next_2d(), active, scene_view.pierced)
     towards, lit = x.si.to_local(ds.d), active & (ds.pdf != 0)
     weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, density(towards)))
     found = [_Light(towards, lit, dr.select(lit, light * weight * solid, 0))]

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .emitter_sampling import lights_pierce, sample_emitter
 from .vertex import behind_area_emitters, mis_weight
 
 
@@ -49,7 +50,8 @@ def light_by_depth(
         pi = scene.ray_intersect_preliminary(ray, True, True)
         if hide_emitters:
             pi, ray = behind_area_emitters(scene, pi, ray, mi.Bool(True))
-        sums = _follow(scene, pi, ray, sampler, group, groups, max_depth, rr_depth, hide_emitters)
+        limits = max_depth, rr_depth, hide_emitters, lights_pierce(scene)
+        sums = _follow(scene, pi, ray, sampler, group, groups, *limits)
     light = np.array(sums, np.float64).reshape(max_depth, groups)
     total = light.sum(0)
     lit = light[:, (total > 0) & np.isfinite(total)]
@@ -87,6 +89,7 @@ def _follow(
     max_depth: int,
     rr_depth: int,
     hide_emitters: bool,
+    pierced: bool,
 ) -> mi.Float:
     """Sums of radiance by depth and group, in one kernel: Mitsuba's `path`, its light sorted."""
     ctx = mi.BSDFContext()
@@ -113,7 +116,7 @@ def _follow(
 
         active &= si.is_valid() & (depth + 1 < max_depth)
         lit = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
+        ds, weight = sample_emitter(scene, si, sampler.next_2d(), lit, pierced)
         lit &= ds.pdf != 0
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), lit)
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..fields.guide import Choice, LightGuide, Mixture
 from ..fields.materials import carry, carrying, with_joint_gradients
+from .emitter_sampling import sample_emitter
 from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
 
 
@@ -81,7 +82,7 @@ def bounce(
 
     # -------------------------------- Emitter sampling --------------------------------
 
-    ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
+    ds, em_weight = sample_emitter(scene, si, sampler.next_2d(), active, scene_view.pierced)
     active_em = active & (ds.pdf != 0)
     bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
     pdf_em = bsdf_pdf_em * solid

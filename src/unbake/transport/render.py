@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.materials import carrying, read_carried
-from ..fields.shapes import met_shapes
+from .emitter_sampling import has_cut_outs
 from .operator import attach_material
 from .path_tracer import path_traced
 from .vertex import SceneView, find_vertex
@@ -101,9 +101,7 @@ def path_integrator(scene: mi.Scene) -> str:
     Where a cut-out's opacity is a fraction, `path` of Mitsuba 3.9.1 multiplies the light of emitter
     sampling by it twice: a leaf of opacity 0.5 is half as bright as it should be.
     """
-    found = [int(shape.bsdf().flags()) for shape in met_shapes(scene) if shape.bsdf() is not None]
-    cut_out = int(mi.BSDFFlags.Null)
-    return "volpath" if any(f & cut_out and f & int(mi.BSDFFlags.Smooth) for f in found) else "path"
+    return "volpath" if has_cut_outs(scene) else "path"
 
 
 def parts_of(

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from ..fields.materials import Materials, carrying
 from ..fields.shapes import met_shapes, registry_number
+from .emitter_sampling import lights_pierce
 from .optimized import optimized_shapes
 
 
@@ -27,6 +28,7 @@ class SceneView:
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
         has_holes: whether any lets rays pass as they are: cut-outs, thin panes (found by `of`).
         has_area_emitters: whether any surface of the scene emits light (found by `of`).
+        pierced: whether lights without size shine through cut-outs (found by `of`).
         optimized: numbers of the shapes whose material is optimized (found by `of`).
     """
 
@@ -36,6 +38,7 @@ class SceneView:
     has_chains: bool
     has_holes: bool
     has_area_emitters: bool
+    pierced: bool
     optimized: frozenset[int]
 
     @staticmethod
@@ -46,8 +49,8 @@ class SceneView:
         holes = any(f & int(mi.BSDFFlags.Null) for f in flags)
         chains = holes or any(not f & int(mi.BSDFFlags.Smooth) for f in flags)
         area_emitters = any(shape.emitter() is not None for shape in shapes)
-        optimized = optimized_shapes(scene)
-        return SceneView(scene, materials, max_specular, chains, holes, area_emitters, optimized)
+        found = chains, holes, area_emitters, lights_pierce(scene)
+        return SceneView(scene, materials, max_specular, *found, optimized_shapes(scene))
 
     def with_scene(self, scene: mi.Scene) -> SceneView:
         """The same around this handle of the scene (frozen functions bring their own)."""

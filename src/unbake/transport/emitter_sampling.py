@@ -1,0 +1,70 @@
+"""Light of a sampled emitter, and what cut-outs let pass of it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..fields.shapes import met_shapes
+
+#: Surfaces that a shadow ray passes; it ends in black at the next one.
+_MOST_PASSED = 64
+
+
+def has_cut_outs(scene: mi.Scene) -> bool:
+    """Whether any surface scatters and lets rays pass as they are."""
+    wanted = int(mi.BSDFFlags.Null), int(mi.BSDFFlags.Smooth)
+    flags = [int(shape.bsdf().flags()) for shape in met_shapes(scene) if shape.bsdf() is not None]
+    return any(all(f & one for one in wanted) for f in flags)
+
+
+def lights_pierce(scene: mi.Scene) -> bool:
+    """Whether there are both cut-outs and lights without size: points, spots, directions."""
+    delta = int(mi.EmitterFlags.Delta)
+    return has_cut_outs(scene) and any(int(e.flags()) & delta for e in scene.emitters())
+
+
+def sample_emitter(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool, pierced: bool
+) -> tuple[mi.DirectionSample3f, mi.Color3f]:
+    """An emitter in sight of a point, as `mi.Scene.sample_emitter_direction` samples it.
+
+    Mitsuba takes a cut-out for opaque then. Light of areas and of the environment that passes it is
+    met by rays that do. No ray meets a light without size: its light is multiplied by what
+    surfaces on the way let pass, as in `volpath`.
+
+    Args:
+        sample: uniform in [0, 1)².
+        pierced: of the scene, by `lights_pierce`.
+
+    Returns:
+        Direction and density, and radiance over the density, linear RGB; 0 where it is hidden.
+    """
+    if not pierced:
+        return scene.sample_emitter_direction(si, sample, True, active)
+    ds, weight = scene.sample_emitter_direction(si, sample, False, active)
+    lit = active & (ds.pdf != 0)
+    hidden = scene.ray_test(si.spawn_ray_to(ds.p), lit & ~ds.delta)
+    with dr.suspend_grad():
+        passed = _passed(scene, si, ds.p, lit & ds.delta)
+    return ds, dr.select(ds.delta, passed, dr.select(hidden, 0.0, 1.0)) * weight
+
+
+@dr.syntax
+def _passed(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool
+) -> mi.Color3f:
+    """The share of light that surfaces between two points let pass as it is, linear RGB."""
+    ray, active = si.spawn_ray_to(target), mi.Bool(active)
+    share, count = mi.Color3f(1), mi.UInt32(0)
+    while dr.hint(active, label="light through cut-outs"):
+        hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        met = active & hit.is_valid()
+        bsdf = hit.bsdf()
+        passes = met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (count < _MOST_PASSED)
+        through = dr.select(passes, bsdf.eval_null_transmission(hit, passes), 0)
+        share = dr.select(met, share * through, share)
+        ray = dr.select(passes, hit.spawn_ray_to(target), ray)
+        count += 1
+        active = passes & (dr.max(share) > 0)
+    return share

@@ -1,0 +1,83 @@
+"""Light of emitters: what cut-outs let pass is that of Mitsuba's volumetric path tracer."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import assert_same_expectation, pixel_rays, stock_path
+
+from unbake.dataset.camera import Camera
+from unbake.transport.emitter_sampling import has_cut_outs, lights_pierce
+from unbake.transport.light_by_depth import light_by_depth
+from unbake.transport.path_tracer import path_traced
+from unbake.transport.render import path_integrator
+from unbake.transport.vertex import SceneView
+
+POINT = {
+    "type": "point",
+    "position": [0.2, 0.1, 2],
+    "intensity": {"type": "rgb", "value": [4, 3, 2]},
+}
+LIGHTS = {
+    "point": POINT,
+    "spot": {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0.2, 2], [0, 0, 0], [0, 1, 0]),
+        "intensity": 6.0,
+        "cutoff_angle": 50.0,
+    },
+    "directional": {"type": "directional", "direction": [0.2, 0.1, -1], "irradiance": 2.0},
+    "sky": {"type": "constant", "radiance": 0.5},
+    "lamp": {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]).scale(0.4),
+        "emitter": {"type": "area", "radiance": 5.0},
+    },
+}
+
+
+def scene_of(*lights, opacity=0.3, count=2):
+    """A floor under some cut-outs and lights, and rays of a camera beside them."""
+    material = {"type": "twosided", "bsdf": {"type": "principled", "roughness": 0.5}}
+    leaf = {"type": "mask", "opacity": opacity, "bsdf": material} if opacity < 1 else material
+    content = {"type": "scene", "floor": {"type": "rectangle", "bsdf": material}}
+    for number in range(count):
+        place = mi.ScalarTransform4f().translate([0.1, 0, 0.5 + 0.3 * number]).scale(0.5)
+        content[f"leaf {number}"] = {"type": "rectangle", "to_world": place, "bsdf": leaf}
+    scene = mi.load_dict(content | {name: LIGHTS[name] for name in lights})
+    camera = Camera.look_at((2.5, 0, 0.4), (0, 0, 0), (0, 0, 1), 40.0, 8, 8)
+    return scene, pixel_rays([camera], 1024, seed=1)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.3])
+@pytest.mark.parametrize(
+    "lights", [["point"], ["spot"], ["directional"], ["point", "sky", "lamp"]], ids=" ".join
+)
+def test_lights_shine_through_cut_outs(lights, opacity):
+    scene, ray = scene_of(*lights, opacity=opacity)
+    assert lights_pierce(scene) and path_integrator(scene) == "volpath"
+    theirs = stock_path(scene, ray, 3, max_depth=8, integrator="volpath")
+    view = SceneView.of(scene, None, 8)
+    ours = path_traced(view, ray, 2, max_depth=8, rr_depth=5, hide_emitters=False)
+    assert_same_expectation(ours, theirs, 1024)
+
+
+def test_what_is_opaque_hides_them():
+    """And where nothing is cut out, Mitsuba decides what is in sight."""
+    scene, ray = scene_of("point", opacity=1.0)
+    assert not has_cut_outs(scene) and not lights_pierce(scene)
+    theirs = stock_path(scene, ray, 3, max_depth=4)
+    view = SceneView.of(scene, None, 8)
+    ours = path_traced(view, ray, 2, max_depth=4, rr_depth=5, hide_emitters=False)
+    assert_same_expectation(ours, theirs, 1024)
+    assert has_cut_outs(scene_of("lamp")[0]) and not lights_pierce(scene_of("lamp")[0])
+
+
+def test_the_depth_of_light_counts_what_passes():
+    """The floor has next to no other light than what passes the leaves."""
+    scene, ray = scene_of("point", opacity=0.1, count=1)
+    shares = light_by_depth(scene, ray, 2, max_depth=4, rr_depth=5, hide_emitters=False)
+    direct, all_ = (
+        np.array(stock_path(scene, ray, 3, max_depth=d, integrator="volpath")).mean()
+        for d in (2, 4)
+    )
+    assert shares[1] == pytest.approx(direct / all_, abs=0.02)
