@@ -301,6 +301,23 @@ def test_only_what_the_batches_tell_is_said_of_a_fit(begun, monkeypatch, before,
     assert learned or "no better than by the untrained fields" in told
 
 
+def test_an_explosion_does_not_take_back_what_a_search_has_found(begun):
+    dog, state, _, read = watching(begun)
+    for _ in range(4):
+        read(0.5)
+    key = next(iter(state.phi))
+    searched = mi.TensorXf if dr.is_tensor_v(state.phi[key]) else mi.Float
+    state.phi[key] = searched(dr.detach(state.phi[key]) + 1)
+    found = numbers(state)
+    dog.keep()
+    read(0.5 * EXPLOSION * 1.1)
+    state.phi[key] = searched(dr.detach(state.phi[key]) + 1)
+    (line,) = read(0.5 * EXPLOSION * 2)
+    assert "back to the state of step 80," in line
+    for a, b in zip(found, numbers(state), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_an_explosion_is_not_lost_in_the_loss_of_the_guide(begun):
     """That one is a cross-entropy, which is large all the time."""
     dog, _, progress, _ = watching(begun)

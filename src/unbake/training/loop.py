@@ -403,7 +403,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
             now = _done(config, progress) / total
-            _search(search, (before, now), saving, state, progress, clock, ranks)
+            _search(search, watchdog, (before, now), saving, state, progress, clock, ranks)
             before, last = now, last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
             if not (full or last or due or save or tell):
@@ -460,6 +460,7 @@ def _open(
 
 def _search(
     search: RoughnessSearch,
+    watchdog: Watchdog,
     between: tuple[float, float],
     saving: Saving,
     state: State,
@@ -471,6 +472,7 @@ def _search(
 
     Args:
         search: what searches.
+        watchdog: goes back no further than to what is found.
         between: fractions of the fit that were done before the present step, and are now.
         saving: saves the state where there is no memory for the search.
         state: where what is found is left.
@@ -490,6 +492,7 @@ def _search(
         dr.sync_thread()
         progress.samples += samples
         progress.seconds = ranks.of_first(time.perf_counter() - clock)
+        watchdog.keep()
 
 
 def _watch(

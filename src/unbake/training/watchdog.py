@@ -125,6 +125,15 @@ class Watchdog:
             self._good.append((self._progress.step, self._state.snapshot()))
         return told
 
+    def keep(self) -> None:
+        """Go back no further than to the present state, as one that a search has found.
+
+        A search is not made again, and steps leave alone what it has found.
+        """
+        if self.trusts:
+            self._good.clear()
+            self._good.append((self._progress.step, self._state.snapshot()))
+
     def verdict(self, rates: Mapping[str, float]) -> str | None:
         """What is wrong with a fit that has ended; None if it has learned something.
 
