@@ -438,7 +438,7 @@ backend.activate()
 from dataclasses import replace
 from searches import SEARCH, SMALL, made_up
 from unbake.training.roughness_curves import Curves
-from unbake.training.roughness_search import searched
+from unbake.training.roughness_search import descend, searched
 from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
 from unbake.ranks import Ranks
@@ -455,6 +455,20 @@ for ranks in (Ranks(), Ranks.of_environment()):
     field.assign(before | searched(field, curves, SEARCH, 0.02, ranks))
     found.append(np.array(field.evaluate(every.point)[0]))
 assert ranks.size == 2 and found[0].std() > 0.1
+assert np.abs(found[0] - found[1]).max() < 1e-3, np.abs(found[0] - found[1]).max()
+
+# What is expected of pieces that one of the ranks has alone counts once, too.
+rows, found = made_up(noise=0.02), []
+rows["piece"] = 2 * (np.arange(400) // 20) + np.arange(400) % 2
+rows["weight"] = 100
+whole = Curves.of(rows, 1, 6, True)
+for ranks in (Ranks(), Ranks.of_environment()):
+    field = Network(varied, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+    before = dict(field.parameters())
+    curves = Curves.of(rows, 1, 6, True, ranks)
+    field.assign(before | descend(field, curves, SEARCH, 0.02, ranks))
+    found.append(np.array(field.evaluate(whole.point)[0]))
+assert found[0].std() > 0.05
 assert np.abs(found[0] - found[1]).max() < 1e-3, np.abs(found[0] - found[1]).max()
 """
 

@@ -41,6 +41,7 @@ class Curves:
         nodes: their logarithms.
         total: how many pixels all ranks have.
         pieces: of surface that any pixels of all ranks show, in the order of their numbers.
+        known: those of the pixels that have a curve, of all ranks.
         shown: what any pixels of all ranks show, whether they have a curve or not.
     """
 
@@ -50,6 +51,7 @@ class Curves:
     nodes: mi.Float
     total: int
     pieces: Piece
+    known: Piece
     shown: SurfacePoint
 
     @staticmethod
@@ -75,13 +77,13 @@ class Curves:
         # A squared error is not below zero. What is far below has few samples of a sharp lobe.
         losses = np.maximum(losses_by_roughness(rows, groups(rows, cells, colours)), _LEAST)
         piece = np.unique(rows["piece"], return_inverse=True)[1]
-        pieces = pieces_of(rows, every)
+        pieces, known = pieces_of(rows, every), pieces_of(rows)
         slopes = _slopes(losses, piece.ravel())
         here = slice(ranks.rank, None, ranks.size)
         rows, losses, slopes = rows[here], losses[here], slopes[here]
         flat = [from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, np.log(NODES))]
         of_every = points(every, albedo)
-        return Curves(points(rows, albedo), flat[0], flat[1], flat[2], total, pieces, of_every)
+        return Curves(points(rows, albedo), *flat, total, pieces, known, of_every)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""

@@ -28,6 +28,7 @@ does to it differs within a piece, and a search starts from there.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -251,6 +252,8 @@ def descend(
     optimizer = mi.ad.Adam(rate, {key: first[key] for key in field.shared()})
     beside = dr.detach(field.beside_shared(curves.point))
     dr.eval(beside)
+    # What is expected of numbers counts once, however pixels are dealt to ranks.
+    known = replace(curves.point, piece=curves.known)
     # Both are logarithms of probabilities, times -2. Errors of a pixel are a mean over channels,
     # because most of their noise is the same. The mean over ranks is that over all pixels.
     spreads = {
@@ -267,7 +270,7 @@ def descend(
         field.assign(first | dict(optimizer.items()))
         roughness = in_range(field.with_shared(beside, curves.point))
         loss = weights["pixels"] * dr.mean(curves.at(roughness))
-        for key, values in field.deviations(curves.point).items():
+        for key, values in field.deviations(known).items():
             loss += weights[key] * dr.sum(dr.square(values))
         dr.backward(loss)
         if ranks.size > 1:
