@@ -83,7 +83,8 @@ class Curves:
         rows, losses, slopes = rows[here], losses[here], slopes[here]
         flat = [from_numpy(mi.Float, x.astype(np.float32)) for x in (losses, slopes, np.log(NODES))]
         of_every = points(every, albedo)
-        return Curves(points(rows, albedo), *flat, total, pieces, known, of_every)
+        at = points(rows, albedo)
+        return Curves(at, flat[0], flat[1], flat[2], total, pieces, known, of_every)
 
     def at(self, roughness: mi.Float) -> mi.Float:
         """The loss of each pixel at its roughness; beyond the nodes it stays as it is."""
