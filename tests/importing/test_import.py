@@ -599,9 +599,7 @@ def test_frames_in_no_list_of_splits_are_left_out(captured, nerfstudio, meshes, 
     assert [view.name for view in Dataset.load(tmp_path / "data").views] == [
         view.name for view in captured.views[:2]
     ]
-    assert any(
-        f"1 frames are in no list of splits, and are left out: {names[2]}" in x for x in told
-    )
+    assert f"frames in no list of splits are left out: {names[2]}" in told
     # Where images are of another format by now, names match without their suffix
     lists = {"train_filenames": [name.replace(".png", ".jpg") for name in names]}
     change(nerfstudio, lambda content: content.update(lists | {"test_filenames": []}))

@@ -12,13 +12,12 @@ from unbake.transport.path_tracer import path_traced
 from unbake.transport.render import path_integrator
 from unbake.transport.vertex import SceneView
 
-POINT = {
-    "type": "point",
-    "position": [0.2, 0.1, 2],
-    "intensity": {"type": "rgb", "value": [4, 3, 2]},
-}
 LIGHTS = {
-    "point": POINT,
+    "point": {
+        "type": "point",
+        "position": [0.2, 0.1, 2],
+        "intensity": {"type": "rgb", "value": [4, 3, 2]},
+    },
     "spot": {
         "type": "spot",
         "to_world": mi.ScalarTransform4f().look_at([0, 0.2, 2], [0, 0, 0], [0, 1, 0]),

@@ -93,7 +93,7 @@ def _of_lists(
     others = [shot.name for shot in shots if shot.split is None]
     if not others:
         return tuple(shots), ()
-    note = f"{len(others)} frames are in no list of splits, and are left out: {_few(others)}"
+    note = f"frames in no list of splits are left out: {_few(others)}"
     return tuple(shot for shot in shots if shot.split is not None), (note,)
 
 
