@@ -539,6 +539,10 @@ def test_options_are_taken_together():
         with_options(SolveSettings(), {"batch": 3_000_000, "samples": 2})
     with pytest.raises(UserError, match=r"--spp: must be 1 or more.*; --seed: must be 0 or more"):
         with_options(SolveSettings(), {"spp": 0, "seed": -1, "batch": 64})
+    wrong = {"spp": 0, "seed": -1, "batch": 0, "samples": 0, "resolution": 0}
+    with pytest.raises(UserError) as caught:
+        with_options(SolveSettings(), wrong)
+    assert all(f"--{name}: must be" in str(caught.value) for name in wrong)
 
 
 def test_usage_shows_where_a_command_writes_to(unbake):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 #: Characters that are shown of a name, and of each part of a message.
 _LONGEST_NAME, _LONGEST_PART = 80, 1000
@@ -39,18 +40,32 @@ class UserError(Exception):
         return text if self.remedy is None else f"{text}. {_one_line(self.remedy)}"
 
 
-def raise_together(faults: Sequence[UserError], others: str = "") -> None:
+@contextmanager
+def collected(faults: list[UserError]) -> Iterator[None]:
+    """Append an error of the block, or of the system in it, to others; the block ends there."""
+    try:
+        yield
+    except UserError as error:
+        faults.append(error)
+    except OSError as error:
+        faults.append(UserError(of_system(error)))
+
+
+def raise_together(
+    faults: Sequence[UserError], others: str = "", *, most: int | None = _TOLD
+) -> None:
     """Raise one error for all that is wrong, or none; of much that is wrong it tells some.
 
     Args:
         faults: what is wrong, one after the other.
         others: how to learn of those that it does not tell, such as ", which the log has".
+        most: how many it tells; None: all, as of options, which are few.
     """
     if len(faults) == 1:
         raise faults[0]
     if faults:
-        told = "; ".join(map(str, faults[:_TOLD]))
-        more = len(faults) - _TOLD
+        told = "; ".join(map(str, faults[:most]))
+        more = 0 if most is None else len(faults) - most
         raise UserError(f"{told}; and {more} more{others}" if more > 0 else told)
 
 

@@ -25,7 +25,7 @@ from .. import backend, experiments, exports, signals
 from ..acquisition.settings import CaptureSettings, DegradeSettings
 from ..config import FitConfig, with_quality
 from ..config.light import LightConfig
-from ..errors import UserError, of_system, printable, raise_together
+from ..errors import UserError, collected, of_system, printable, raise_together
 from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
@@ -612,16 +612,14 @@ def _render_settings(
 ) -> RenderSettings:
     """The settings of pictures with the options that were given; all wrong ones are told."""
     settings, faults = RenderSettings(), []
-    try:
+    with collected(faults):
         settings = with_options(settings, values)
-    except UserError as error:
-        faults.append(error)
     for name, value in {"width": width, "height": height}.items():
         try:
             settings = dataclasses.replace(settings, **{name: value})
         except UserError as error:
             faults.append(UserError(error.what, f"--{name}"))
-    raise_together(faults)
+    raise_together(faults, most=None)
     return settings
 
 

@@ -175,7 +175,7 @@ def with_options(settings: Settings, values: Mapping[str, Any]) -> Settings:
             settings = _replaced(settings, {known[name].path: value})
         except UserError as error:
             problems.append(UserError(error.what, f"--{name}", error.remedy))
-    raise_together(problems)
+    raise_together(problems, most=None)
     return settings
 
 

@@ -53,7 +53,7 @@ class Finding:
 
 
 def named(names: Sequence[str]) -> str:
-    """Names of views, of which the first are told."""
+    """Names of views or files, of which the first are told."""
     more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
     return ", ".join(printable(name) for name in names[:_TOLD]) + more
 

@@ -22,13 +22,13 @@ from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
 from ..dataset.camera import Camera, frame_name, frame_of, read_cameras
 from ..dataset.views import Dataset, View, read_photograph
-from ..errors import UserError, printable, raise_together
+from ..errors import UserError, collected, printable, raise_together
 from ..fields.domain import Domain
 from ..imaging.metrics import mean_psnr
 from ..imaging.pictures import tonemap, write_exr, write_png
 from ..io import filled_folder, require_new_folder, write_json
 from ..memory import require_memory
-from ..scene.geometry import differing, probe
+from ..scene.geometry import CHANGED, differing, probe
 from ..scene.parse import parse
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
@@ -48,8 +48,6 @@ _PIXEL_BYTES = 64
 _UPRIGHT = 0.7
 #: Of scenes that are not the same: how far bounding boxes differ, as a part of their extent.
 _ANOTHER = 0.1
-#: The share of rays that end elsewhere above which one is told of it.
-_CHANGED = 0.02
 
 
 @dataclass(frozen=True)
@@ -165,11 +163,10 @@ def _require_sound(
 ) -> None:
     """Check what can be checked before anything is read; all that is wrong is told at once."""
     faults: list[UserError] = []
-    for check in (RunFolder(Path(run)).require_fitted, partial(require_new_folder, out)):
-        try:
-            check()
-        except UserError as error:
-            faults.append(error)
+    with collected(faults):
+        RunFolder(Path(run)).require_fitted()
+    with collected(faults):
+        require_new_folder(out)
     given = {"--cameras": cameras, "--turntable": turntable, "--truth": truth}
     named = [name for name, value in given.items() if value is not None]
     if len(named) > 1:
@@ -194,7 +191,7 @@ def _require_sound(
     if truth is not None and not Path(truth).is_dir():
         what = f"there is no folder {printable(truth)}"
         faults.append(UserError(what, "--truth", "Check the path"))
-    raise_together(faults)
+    raise_together(faults, most=None)
 
 
 def _require_truth_of(
@@ -209,11 +206,10 @@ def _require_truth_of(
     own, other = Domain.of(scene.bbox()), Domain.of(true.bbox())
     apart = np.linalg.norm(np.subtract(own.centre, other.centre)) + abs(own.extent - other.extent)
     if apart > _ANOTHER * own.extent:
-        spans = " and ".join(f"{x.extent:.3g} around {_point(x.centre)}" for x in (other, own))
-        what = f"is of another scene than the run: they span {spans}"
+        what = f"is of another scene than the run: they span {other.told()} and {own.told()}"
         raise UserError(what, truth.folder, "Give a capture of the same scene under that light")
     elsewhere = differing(probe(scene), probe(true))
-    if elsewhere > _CHANGED:
+    if elsewhere > CHANGED:
         tell(
             f"warning: {100 * elsewhere:.0f} % of the rays through the scene end elsewhere than in "
             f"that of {printable(truth.folder)}: is it the same, under the same light?"
@@ -226,11 +222,6 @@ def _require_truth_of(
     elif isinstance(named, dict) and named != wanted:
         others = ", ".join(f"{k} {named.get(k)}" for k in wanted if named.get(k) != wanted[k])
         tell(f"warning: {printable(truth.folder)} was captured under another light: {others}")
-
-
-def _point(centre: Sequence[float]) -> str:
-    x, y, z = centre
-    return f"({x:.3g}, {y:.3g}, {z:.3g})"
 
 
 def _render(

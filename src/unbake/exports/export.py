@@ -11,7 +11,6 @@ DIR/
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..dataset.views import Dataset
-from ..errors import UserError
+from ..errors import UserError, collected, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
@@ -121,34 +120,23 @@ def _require_sound(
     run: Path, out: Path, formats: Collection[str], texels: float | None
 ) -> tuple[Format, ...]:
     """Check all that can be checked before anything is read; tells all mistakes at once."""
-    wrong: list[str] = []
-    with _collected(wrong):
+    wrong: list[UserError] = []
+    with collected(wrong):
         RunFolder(run).require_fitted()
-    with _collected(wrong):
+    with collected(wrong):
         require_new_folder(out)
     unknown = [str(name) for name in formats if name not in FORMATS]
     if unknown or not formats:
         what = f"no format named {', '.join(map(repr, unknown))}" if unknown else "no format given"
-        wrong.append(str(UserError(what, "--format", f"There are {', '.join(FORMATS)}")))
+        wrong.append(UserError(what, "--format", f"There are {', '.join(FORMATS)}"))
     if "usd" in formats:
-        with _collected(wrong):
+        with collected(wrong):
             require_usd()
     if texels is not None and not 0 < texels < 1e9:
         what = f"must be a positive number below 1e9, not {texels:g}"
-        wrong.append(str(UserError(what, "--texels")))
-    if wrong:
-        raise UserError("; ".join(wrong))
+        wrong.append(UserError(what, "--texels"))
+    raise_together(wrong, most=None)
     return tuple(name for name in FORMATS if name in formats)
-
-
-@contextlib.contextmanager
-def _collected(wrong: list[str]):
-    try:
-        yield
-    except UserError as error:
-        wrong.append(str(error))
-    except OSError as error:
-        wrong.append(f"{error.filename}: {error.strerror}")
 
 
 def _export(

@@ -46,6 +46,11 @@ class Domain:
         centre = tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
         return Domain(centre, 1.01 * max(b - a for a, b in zip(lower, upper, strict=True)))
 
+    def told(self) -> str:
+        """Its extent and its centre in a few words."""
+        x, y, z = self.centre
+        return f"{self.extent:.4g} around ({x:.3g}, {y:.3g}, {z:.3g})"
+
     def to_unit(self, p: mi.Point3f, valid: mi.Bool) -> mi.Point3f:
         """World positions to [0,1]³; lanes that are not valid get the centre.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..dataset.camera import Camera, camera_from_frame, with_top
 from ..dataset.data_folder import TRANSFORMS
+from ..dataset.findings import named
 from ..errors import UserError, printable
 from ..io import array, inside, number, read_object, text
 from .faults import Faults
@@ -34,8 +35,6 @@ _SPLITS = {
     "validation": "heldout",
     "eval": "heldout",
 }
-#: Names of images that a note tells.
-_TOLD = 3
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _LENSES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
@@ -93,14 +92,8 @@ def _of_lists(
     others = [shot.name for shot in shots if shot.split is None]
     if not others:
         return tuple(shots), ()
-    note = f"frames in no list of splits are left out: {_few(others)}"
+    note = f"frames in no list of splits are left out: {named(others)}"
     return tuple(shot for shot in shots if shot.split is not None), (note,)
-
-
-def _few(names: Sequence[object]) -> str:
-    """Some names of many."""
-    more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
-    return ", ".join(printable(name) for name in names[:_TOLD]) + more
 
 
 def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> tuple[str, ...]:
@@ -113,7 +106,7 @@ def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> 
     unknown = [str(name) for name in splits if name.name not in ends and name.stem not in ends]
     if not unknown:
         return ()
-    return (f"lists of splits name images that no frame has: {_few(unknown)}",)
+    return (f"lists of splits name images that no frame has: {named(unknown)}",)
 
 
 def read_split_files(

@@ -18,7 +18,8 @@ import numpy as np
 from ..errors import UserError, printable
 from ..io import require_file
 from ..scene.meshes import HEADER, check_mesh
-from ..scene.triangles import normal_sums, unit, write_mesh
+from ..scene.normals import repaired
+from ..scene.triangles import write_mesh
 from .faults import Faults
 
 #: Suffixes of the meshes that are read.
@@ -243,7 +244,7 @@ def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     # Where the file has none, trimesh 5.2 makes them up at this very access, and keeps them there.
     if "vertex_normals" in mesh._cache and np.shape(mesh.vertex_normals) == positions.shape:
         found = np.array(mesh.vertex_normals, np.float64)[used] @ np.linalg.inv(linear)
-        normals = _repaired(found, positions[used], faces)
+        normals = _of_length_one(found, positions[used], faces)
     uv = getattr(mesh.visual, "uv", None)
     known = uv is not None and np.shape(uv) == (len(positions), 2) and np.isfinite(uv).all()
     # Corners of a PLY file's triangles may differ in their texture, but not in their normals.
@@ -253,17 +254,16 @@ def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     )
 
 
-def _repaired(normals: np.ndarray, positions: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """Normals of length 1, (n, 3), with those of triangles in the place of what is none.
-
-    None where no vertex has one.
-    """
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    known = np.isfinite(length) & (length > 0)
-    if not known.any():
+def _of_length_one(
+    normals: np.ndarray, positions: np.ndarray, faces: np.ndarray
+) -> np.ndarray | None:
+    """Normals of length 1, (n, 3), what is none repaired; None where no vertex has one."""
+    length = np.linalg.norm(normals, axis=1)
+    broken = ~(np.isfinite(length) & (length > 0))
+    if broken.all():
         return None
-    around = normals if known.all() else unit(normal_sums(positions, faces))
-    return np.where(known, normals / np.where(known, length, 1), around)
+    found = normals / np.where(broken, 1, length)[:, None]
+    return repaired(found, broken, positions, faces) if broken.any() else found
 
 
 def _ids(name: str) -> tuple[str, str, str]:

@@ -204,17 +204,17 @@ def _recovered(run: Run, view: View, quantity: str) -> Path | None:
     return display.evaluated(run, run.folder.picture(view.split, view.name, quantity))
 
 
-def _reference(view: View, quantity: str) -> tuple[np.ndarray, np.ndarray]:
-    """The truth of a quantity, (H, W, 3), and the pixels whose errors count, (H, W) bool.
+def _references(view: View) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The truth of each quantity, (H, W, 3), and the pixels whose errors count, (H, W) bool.
 
     Those of renderings are not masked, and show what is unknown where the data set tells that.
     """
-    image, counted = display.rgb(view.truth[quantity])
-    if quantity == "render":
-        counted = read_photograph(view.source, clip_negative=True)[..., 3] >= 0.5
-        for path in view.source.truth.values():
-            counted &= read_view(path, view.source)[..., 3] >= 0.5
-    return image, counted
+    photograph = read_photograph(view.source, clip_negative=True)
+    maps = {name: read_view(path, view.source) for name, path in view.source.truth.items()}
+    known = {name: pixels[..., 3] >= 0.5 for name, pixels in maps.items()}
+    counted = np.logical_and.reduce([photograph[..., 3] >= 0.5, *known.values()])
+    found = {name: (pixels[..., :3], known[name]) for name, pixels in maps.items()}
+    return {"render": (photograph[..., :3], counted)} | found
 
 
 def _scales(runs: list[Run], views: list[View]) -> Scales:
@@ -222,8 +222,7 @@ def _scales(runs: list[Run], views: list[View]) -> Scales:
     radiance: list[np.ndarray] = []
     errors: dict[str, list[list[np.ndarray]]] = {q: [[] for _ in runs] for q in NAMES}
     for view in views:
-        for quantity in view.truth:
-            reference, mask = _reference(view, quantity)
+        for quantity, (reference, mask) in _references(view).items():
             if quantity == "render":
                 radiance.append(pictures.sample(reference.mean(axis=2)[mask]))
             for run, parts in zip(runs, errors[quantity], strict=True):
@@ -237,13 +236,20 @@ def _scales(runs: list[Run], views: list[View]) -> Scales:
 
 def _view_block(view: View, runs: list[Run], scales: Scales) -> dict[str, Any]:
     """A view's images for the template: a column a quantity with truth and runs."""
-    height, width = display.rgb(view.truth["render"])[0].shape[:2]
+    references = _references(view)
+    height, width = references["render"][0].shape[:2]
     quantities = [q for q in NAMES if any(run.optimizes(q) for run in runs)]
-    columns = [_column(view, runs, quantity, scales) for quantity in quantities]
+    columns = [_column(view, runs, q, references.get(q), scales) for q in quantities]
     return {"name": view.name, "width": width, "height": height, "columns": columns}
 
 
-def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[str, Any]:
+def _column(
+    view: View,
+    runs: list[Run],
+    quantity: str,
+    truth: tuple[np.ndarray, np.ndarray] | None,
+    scales: Scales,
+) -> dict[str, Any]:
     def paint(linear: np.ndarray) -> str:
         if quantity in QUANTITIES and QUANTITIES[quantity].display == "data":
             small = pictures.shrink(linear, display.LONGEST_SIDE)
@@ -252,7 +258,7 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
 
     values = [display.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
     scale = scales.error[quantity]
-    reference, mask = _reference(view, quantity) if quantity in view.truth else (None, None)
+    reference, mask = truth or (None, None)
     cells = []
     for run, psnr in zip(runs, display.marked(values, display.decibels), strict=True):
         path = _recovered(run, view, quantity)
@@ -267,8 +273,8 @@ def _column(view: View, runs: list[Run], quantity: str, scales: Scales) -> dict[
         unit = "" if psnr["text"] == display.DASH else " dB"
         more = display.similar(run.view(view.name)) if quantity == "render" else ""
         cells.append(cell | {"number": psnr["text"] + unit, "best": psnr["best"], "more": more})
-    truth = None if reference is None else paint(reference)
-    return {"quantity": quantity, "truth": truth, "scale": scale, "cells": cells}
+    shown = None if reference is None else paint(reference)
+    return {"quantity": quantity, "truth": shown, "scale": scale, "cells": cells}
 
 
 # ------------------------------------------------------------------------------------------ numbers

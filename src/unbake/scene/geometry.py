@@ -16,6 +16,8 @@ RAYS = 256
 _NOTHING = -1.0
 #: Distances that count as equal, as a fraction of the extent.
 _SAME = 1e-3
+#: Share of rays that end elsewhere above which one is told that scenes may not be the same.
+CHANGED = 0.02
 
 
 def probe(scene: mi.Scene) -> list[float]:

@@ -31,17 +31,31 @@ def repair_normals(scene: mi.Scene) -> int:
         if not shape.is_mesh() or not shape.has_vertex_normals():
             continue
         normals = np.array(shape.vertex_normals_buffer(), np.float32).reshape(-1, 3)
-        broken = ~np.isfinite(normals).all(1)
+        broken = np.asarray(~np.isfinite(normals).all(1))
         if not broken.any():
             continue
         positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
         faces = np.array(shape.faces_buffer()).reshape(-1, 3)
-        sums = normal_sums(positions, faces)
-        # Meshes may be turned inside out, their normals with them.
-        inward = (sums[~broken] * normals[~broken]).sum() < 0
-        normals[broken] = unit(-sums[broken] if inward else sums[broken])
         params = mi.traverse(shape)
-        params["vertex_normals"] = normals.ravel()
+        params["vertex_normals"] = repaired(normals, broken, positions, faces).ravel()
         params.update()
         count += int(broken.sum())
     return count
+
+
+def repaired(
+    normals: np.ndarray, broken: np.ndarray, positions: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
+    """Normals with those of the triangles around vertices in the place of broken ones, (n, 3).
+
+    Args:
+        normals: (n, 3), of length 1 but for broken ones.
+        broken: which are none, (n,) bool.
+        positions: of the vertices, (n, 3).
+        faces: (m, 3) indices.
+    """
+    sums, found = normal_sums(positions, faces), normals.copy()
+    # Meshes may be turned inside out, their normals with them.
+    inward = (sums[~broken] * normals[~broken]).sum() < 0
+    found[broken] = unit(-sums[broken] if inward else sums[broken])
+    return found

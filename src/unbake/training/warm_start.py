@@ -11,7 +11,7 @@ from ..config.tables import flattened
 from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.settings import FieldSettings
-from ..scene.geometry import differing, probe
+from ..scene.geometry import CHANGED, differing, probe
 from ..transport.objective import has_radiance
 from .problem import Problem
 from .run_folder import WarmStart
@@ -19,9 +19,8 @@ from .solved import Solved
 
 #: Of the options, for messages.
 OPTION = "--radiance-from"
-#: Share of rays that end elsewhere from which on the scenes are not the same, and above which one
-#: is told of it.
-_ANOTHER, _CHANGED = 0.2, 0.02
+#: Share of rays that end elsewhere from which on the scenes are not the same.
+_ANOTHER = 0.2
 #: Differences of domains that count as none, as a fraction of their extent.
 _SAME_DOMAIN = 1e-3
 #: Settings that say nothing about θ: a rate, and what sizes were chosen by.
@@ -82,14 +81,14 @@ def start_radiance(problem: Problem, solved: Solved) -> list[str]:
     elsewhere = differing(probe(problem.scene_view.scene), solved.geometry)
     if not _same_domain(domain, other) or elsewhere > _ANOTHER:
         what = (
-            f"was solved in another scene ({solved.scene}): that one spans {_told(other)}, this "
-            f"one {_told(domain)}, and {100 * elsewhere:.0f} % of the rays through them end "
+            f"was solved in another scene ({solved.scene}): that one spans {other.told()}, this "
+            f"one {domain.told()}, and {100 * elsewhere:.0f} % of the rays through them end "
             "elsewhere"
         )
         remedy = "Solve the scene of the data set, with any materials and light"
         raise UserError(what, solved.folder, remedy)
     field.assign(solved.radiance.parameters())
-    if elsewhere <= _CHANGED:
+    if elsewhere <= CHANGED:
         return []
     return [
         f"{100 * elsewhere:.0f} % of the rays through the scene end elsewhere than in the one that "
@@ -118,11 +117,6 @@ def _same_domain(first: Domain, second: Domain) -> bool:
     near = _SAME_DOMAIN * max(first.extent, second.extent)
     pairs = [*zip(first.centre, second.centre, strict=True), (first.extent, second.extent)]
     return all(abs(a - b) <= near for a, b in pairs)
-
-
-def _told(domain: Domain) -> str:
-    x, y, z = domain.centre
-    return f"{domain.extent:.4g} around ({x:.3g}, {y:.3g}, {z:.3g})"
 
 
 def _leaves(settings: FieldSettings) -> Iterator[tuple[str, Any]]:

@@ -21,7 +21,7 @@ def has_cut_outs(scene: mi.Scene) -> bool:
 def lights_pierce(scene: mi.Scene) -> bool:
     """Whether there are both cut-outs and lights without size: points, spots, directions."""
     delta = int(mi.EmitterFlags.Delta)
-    return has_cut_outs(scene) and any(int(e.flags()) & delta for e in scene.emitters())
+    return any(int(e.flags()) & delta for e in scene.emitters()) and has_cut_outs(scene)
 
 
 def sample_emitter(
