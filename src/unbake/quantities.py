@@ -29,7 +29,6 @@ class Quantity:
         initial: value of an untrained field, strictly between the bounds.
         default: what `principled` takes where a scene does not say.
         display: how pictures show it: a colour through the sRGB curve, or data without one.
-        gltf: where it goes in a glTF 2.0 material: texture and channels.
         comes_back: whether a least slope in gradients brings it back from far beyond a bound
             (`FitConfig.least_slope`). Not for what searches move: they seek the most probable
             numbers, for which they need the true slope.
@@ -46,7 +45,6 @@ class Quantity:
     initial: float
     default: float
     display: Literal["colour", "data"]
-    gltf: str
     comes_back: bool = False
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -66,7 +64,6 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 initial=0.5,
                 default=0.5,
                 display="colour",
-                gltf="baseColorTexture.rgb",
                 comes_back=True,
                 settings={
                     "neural": {
@@ -97,7 +94,6 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 initial=0.51,
                 default=0.5,
                 display="data",
-                gltf="metallicRoughnessTexture.g",
                 settings={
                     "neural": {
                         "grid": {"footprints": 8.0},
@@ -122,7 +118,6 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                 initial=0.1,
                 default=0.0,
                 display="data",
-                gltf="metallicRoughnessTexture.b",
                 settings={
                     "neural": {
                         "grid": {"footprints": 8.0},

@@ -25,6 +25,7 @@ from unbake.errors import UserError
 from unbake.exports import export as exporting
 from unbake.exports import gltf
 from unbake.exports.bake import WANTED
+from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
 from unbake.exports.mitsuba import write_scene
 from unbake.exports.observed import Views, filled
@@ -421,9 +422,83 @@ def test_a_browser_says_what_it_cannot_show(judges, tmp_path):
         judges["shown"](tmp_path / "broken.glb", camera)
 
 
+def document_of(file):
+    data = file.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+#: Materials beside whose textures there is more.
+CONSTANTS = """<scene version="3.0.0">
+  <bsdf type="principled" id="shiny"><float name="specular" value="1"/>
+    <float name="clearcoat" value="0.8"/><float name="clearcoat_gloss" value="1"/></bsdf>
+  <bsdf type="principled" id="velvet"><float name="eta" value="1.3"/>
+    <float name="sheen" value="0.3"/></bsdf>
+  <bsdf type="plastic" id="plastic"><rgb name="diffuse_reflectance" value="0.1 0.2 0.4"/>
+    <float name="int_ior" value="1.6"/></bsdf>
+  <bsdf type="diffuse" id="spectral">
+    <spectrum name="reflectance" value="400:0.3, 700:0.6"/></bsdf>
+  <shape type="rectangle" id="a"><ref id="shiny"/></shape>
+  <shape type="rectangle" id="b"><ref id="velvet"/></shape>
+  <shape type="rectangle" id="c"><ref id="plastic"/></shape>
+  <shape type="rectangle" id="d"><ref id="spectral"/></shape>
+  <emitter type="constant"/></scene>"""
+
+
+def test_materials_keep_what_they_have_beside_textures(tmp_path):
+    (tmp_path / "scene.xml").write_text(CONSTANTS)
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    parts = {part.name: part for part in found.parts}
+    shiny, velvet, spectral = (
+        material_constants(found.scene, parts[name].materials) for name in "abd"
+    )
+    assert shiny.ior == pytest.approx(2 / (1 - 0.08**0.5) - 1) and velvet.ior == pytest.approx(1.3)
+    assert spectral == Constants(pytest.approx(1.5), 0.0, pytest.approx(0.1**0.5), ())
+    assert (shiny.clearcoat, velvet.clearcoat) == (pytest.approx(0.2), 0)
+    assert shiny.clearcoat_roughness == pytest.approx(0.001**0.5)
+    assert (shiny.left_out, velvet.left_out) == ((), ("sheen",))
+    document = Document()
+    plastic = gltf.plain_material(document, found.scene, parts["c"], None)
+    factors = plastic["pbrMetallicRoughness"]
+    assert factors["baseColorFactor"] == pytest.approx([0.1, 0.2, 0.4, 1])
+    assert factors["roughnessFactor"] == 0
+    assert plastic["extensions"] == {"KHR_materials_ior": {"ior": pytest.approx(1.6)}}
+
+
+def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
+    from pxr import Usd, UsdShade
+
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "scene.xml").write_text(CONSTANTS)
+    data = grey_data(scene / "scene.xml", tmp_path / "data")
+    config = replace(tiny_fields("grid"), method="direct", steps=0)
+    fit(data, tmp_path / "run", replace(config, quantities=("roughness",)))
+    options = {"texels": 2.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["gltf", "usd"], **options)
+    assert "glTF and usd have no sheen: left out of velvet" in manifest["notes"]
+    made = document_of(tmp_path / "out" / "scene.glb")["materials"]
+    shiny = next(m for m in made if m["name"] == "shiny")["extensions"]
+    assert shiny["KHR_materials_ior"]["ior"] == pytest.approx(1.789, abs=1e-3)
+    assert shiny["KHR_materials_clearcoat"]["clearcoatFactor"] == pytest.approx(0.2)
+    stage = Usd.Stage.Open(str(tmp_path / "out" / "usd" / "scene.usdc"))
+    materials = {p.GetDisplayName(): p for p in stage.Traverse() if p.IsA(UsdShade.Material)}
+    surface = UsdShade.Material(materials["shiny"]).ComputeSurfaceSource()[0]
+    assert surface.GetInput("ior").Get() == pytest.approx(1.789, abs=1e-3)
+    assert surface.GetInput("clearcoat").Get() == pytest.approx(0.2)
+    assert {row["name"] for row in manifest["materials"]} == {"shiny", "velvet", "spectral"}
+
+
+@pytest.mark.parametrize("kind", ["usd", "mitsuba"])
+def test_masks_of_what_no_view_saw_come_with_all_formats(kind, exported, tmp_path, monkeypatch):
+    exported.use(monkeypatch)
+    options = {"texels": 2.0, "tell": lambda line: None}
+    manifest = exporting.export(exported.run, tmp_path / "out", [kind], **options)
+    for row in manifest["materials"]:
+        assert (tmp_path / "out" / row["unobserved"]).is_file()
+
+
 def test_gltf_has_the_lights(exported):
-    data = (exported.folder / "scene.glb").read_bytes()
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    document = document_of(exported.folder / "scene.glb")
     used = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_transmission"}
     assert used <= set(document["extensionsUsed"])
     (light,) = document["extensions"]["KHR_lights_punctual"]["lights"]

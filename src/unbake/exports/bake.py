@@ -16,7 +16,7 @@ from ..fields.pieces import ATTRIBUTE, Piece, decoded
 from ..imaging.pictures import encoded
 from ..memory import free_bytes, require_memory
 from ..quantities import QUANTITIES
-from ..scene.parse import ParsedScene, is_reference, reason
+from ..scene.parse import ParsedScene, is_reference, is_spectrum, reason
 from .observed import Views, filled
 from .unwrap import LARGEST, Atlas, Placed, joined, parameterized, surface_points
 
@@ -346,6 +346,8 @@ def own_textures(scene: ParsedScene, without: Sequence[str]) -> OwnTextures:
             value = props.get(quantity.slot, quantity.default)
             if is_reference(value):
                 found[number][name] = make_texture(scene, value.index())
+            elif is_spectrum(value):
+                found[number][name] = props.get_texture(quantity.slot, quantity.default)
             else:
                 rgb = [float(x) for x in np.ravel(np.array(value, np.float64))]
                 rgb = rgb * 3 if len(rgb) == 1 else rgb

@@ -4,7 +4,7 @@ DIR/
   export.json             what is there, how it was made, and its conventions
   textures/               of each material: OpenEXR, PNG, and a mask of what no view saw
   scene.glb               the scene as binary glTF
-  unobserved/             masks of what no view saw, beside scene.glb where no textures are written
+  unobserved/             masks of what no view saw, where no textures are written
   mitsuba/scene.xml       the scene for Mitsuba, with its own meshes and textures
   usd/scene.usdc          the scene as OpenUSD, with its own textures
 """
@@ -21,17 +21,20 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ..dataset.findings import named
 from ..dataset.views import Dataset
 from ..errors import UserError, collected, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
+from ..scene.parse import ParsedScene
 from ..training.grid_sizes import surface_seen
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..version import VERSION
 from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
 from .bake import WANTED, Baked, Baker, own_textures
+from .constants import TEXTURED, material_constants
 from .gltf import write_glb
 from .lights import Light, environment_picture, read_lights
 from .mitsuba import write_scene
@@ -202,7 +205,11 @@ def _export(
         "environment": None if environment is None else _ENVIRONMENT,
         "colour_spaces": COLOUR_SPACES,
         "conventions": _CONVENTIONS,
-        "notes": [*_notes(found, baked, lights, _COARSE[texels is None]), *written.notes],
+        "notes": [
+            *_notes(found, baked, lights, _COARSE[texels is None]),
+            *_without_place(found.scene, baked, formats, learned),
+            *written.notes,
+        ],
     }
     _report(manifest, tell)
     return manifest
@@ -238,7 +245,7 @@ def _write(
         if "textures" in formats:
             files[one.atlas.name] = write_textures(out / "textures", stem, one)
             masks[one.atlas.name] = f"textures/{stem}_unobserved.png"
-        elif "gltf" in formats:
+        else:
             masks[one.atlas.name] = f"unobserved/{write_mask(out / 'unobserved', stem, one)}"
     if environment is not None:
         write_exr(out / _ENVIRONMENT, environment)
@@ -347,6 +354,19 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
     if not any(one.learned for one in baked):
         notes.append("the run learned no materials: all textures are the scene's own")
     return notes
+
+
+def _without_place(
+    scene: ParsedScene, baked: Sequence[Baked], formats: Sequence[Format], learned: Sequence[str]
+) -> list[str]:
+    """What materials have and glTF and OpenUSD have not."""
+    if not {"gltf", "usd"} & set(formats):
+        return []
+    lost = {name: ["all materials"] for name in learned if name not in TEXTURED}
+    for one in filter(lambda each: each.atlas.is_optimized, baked):
+        for name in material_constants(scene, one.atlas.materials).left_out:
+            lost.setdefault(name, []).append(one.atlas.name)
+    return [f"glTF and usd have no {name}: left out of {named(of)}" for name, of in lost.items()]
 
 
 def _report(manifest: dict[str, Any], tell: Callable[[str], None]) -> None:

@@ -4,7 +4,7 @@ Texture coordinates are the same in Mitsuba and in glTF: (0, 0) is the corner of
 the first row. Axes and units stay those of the scene; glTF takes +y as up and metres.
 
 Source: Khronos, glTF 2.0 specification; KHR_lights_punctual, KHR_materials_emissive_strength,
-KHR_materials_transmission, KHR_materials_ior.
+KHR_materials_transmission, KHR_materials_ior, KHR_materials_clearcoat.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from ..version import VERSION
 from .bake import Baked
+from .constants import Constants, material_constants
 from .lights import Light
 from .parts import Part
 from .tessellate import Triangles
@@ -36,6 +37,7 @@ _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 #: A mesh that lights pass through, and its index of refraction where a scene says none.
 _GLASS = ("dielectric", "thindielectric", "roughdielectric")
 _CONDUCTORS = ("conductor", "roughconductor")
+_PLASTIC = "plastic"
 _SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
 
 #: Bytes that the header of a file can tell.
@@ -165,7 +167,8 @@ def write_glb(
         if part.is_optimized:
             triangles, one = placed[id(part)]
             if id(one) not in textures:
-                textures[id(one)] = _textured(document, one)
+                constants = material_constants(scene, one.atlas.materials)
+                textures[id(one)] = _textured(document, one, constants)
             material = {"name": one.atlas.name, **textures[id(one)]}
         else:
             triangles = part.triangles
@@ -196,8 +199,14 @@ def _add_part(document: Document, name: str, triangles: Triangles, material: int
     document.json["scenes"][0]["nodes"].append(node)
 
 
-def _textured(document: Document, baked: Baked) -> dict[str, Any]:
+def _textured(document: Document, baked: Baked, constants: Constants) -> dict[str, Any]:
     """A material of textures: roughness is the green channel and metallic the blue one."""
+    extensions: dict[str, Any] = {document.use("KHR_materials_ior"): {"ior": constants.ior}}
+    if constants.clearcoat > 0:
+        extensions[document.use("KHR_materials_clearcoat")] = {
+            "clearcoatFactor": constants.clearcoat,
+            "clearcoatRoughnessFactor": constants.clearcoat_roughness,
+        }
     name, values = baked.atlas.name, baked.values
     roughness, metallic = (picture(k, values[k]) for k in ("roughness", "metallic"))
     both = np.stack([np.full_like(roughness, 255), roughness, metallic], -1)
@@ -206,7 +215,8 @@ def _textured(document: Document, baked: Baked) -> dict[str, Any]:
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": colour},
             "metallicRoughnessTexture": {"index": document.image(f"{name} roughness", both)},
-        }
+        },
+        "extensions": extensions,
     }
 
 
@@ -235,20 +245,29 @@ def plain_material(
             material |= _emissive(document, strength)
     elif glass := next((props[k] for k in _GLASS if k in props), None):
         factors["roughnessFactor"] = _roughness(glass, "roughdielectric")
-        ior = glass.get("int_ior", 1.5046)
-        material["extensions"] = {
-            document.use("KHR_materials_transmission"): {"transmissionFactor": 1.0}
-        }
-        if isinstance(ior, float) and ior >= 1:
-            material["extensions"][document.use("KHR_materials_ior")] = {"ior": ior}
+        transmission = document.use("KHR_materials_transmission")
+        material["extensions"] = {transmission: {"transmissionFactor": 1.0}}
+        material["extensions"] |= _refraction(document, glass, 1.5046)
     elif metal := next((props[k] for k in _CONDUCTORS if k in props), None):
         factors["metallicFactor"] = 1.0
         factors["roughnessFactor"] = _roughness(metal, "roughconductor")
         factors["baseColorFactor"] = [*_colour(metal.get("specular_reflectance", None)), 1.0]
+    elif plastic := props.get(_PLASTIC):
+        factors["roughnessFactor"] = 0.0
+        colour = _colour(plastic.get("diffuse_reflectance", 0.5), default=0.5)
+        factors["baseColorFactor"] = [*colour, 1.0]
+        material["extensions"] = _refraction(document, plastic, 1.49)
     else:
         factors["baseColorFactor"] = [0.5, 0.5, 0.5, 1.0]
     material["pbrMetallicRoughness"] = factors
     return material
+
+
+def _refraction(document: Document, props: Any, default: float) -> dict[str, Any]:
+    """The index of refraction of a known BSDF, if it is a number."""
+    ior = props.get("int_ior", default)
+    known = isinstance(ior, float) and ior >= 1
+    return {document.use("KHR_materials_ior"): {"ior": ior}} if known else {}
 
 
 def _roughness(props: Any, rough: str) -> float:
@@ -259,14 +278,14 @@ def _roughness(props: Any, rough: str) -> float:
     return math.sqrt(min(max(alpha, 0.0), 1.0))
 
 
-def _colour(value: Any) -> list[float]:
-    """A colour of the scene, linear RGB in [0, 1]; that of a mirror where it is no number."""
+def _colour(value: Any, default: float = 0.9) -> list[float]:
+    """A colour of the scene, linear RGB in [0, 1]; grey where it is no number."""
     try:
         rgb = np.ravel(np.array(value, np.float64))
     except (TypeError, ValueError, RuntimeError):
         rgb = np.array([])
     if rgb.size not in (1, 3) or not np.isfinite(rgb).all():
-        return [0.9, 0.9, 0.9]
+        return [default] * 3
     return np.broadcast_to(rgb.clip(0, 1), 3).tolist()
 
 

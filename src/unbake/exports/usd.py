@@ -26,6 +26,7 @@ from ..imaging.pictures import write_png
 from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from .bake import Baked
+from .constants import Constants, material_constants
 from .gltf import Document, plain_material
 from .lights import Light
 from .parts import Part
@@ -82,7 +83,8 @@ def write_usd(
     stems = file_names([one.atlas.name for one in baked])
     placed, textured = {}, {}
     for stem, one in zip(stems, baked, strict=True):
-        textured[id(one)] = writer.textured(folder, stem, one)
+        constants = material_constants(scene, one.atlas.materials)
+        textured[id(one)] = writer.textured(folder, stem, one, constants)
         placed |= {id(p.part): (p.triangles, textured[id(one)]) for p in one.atlas.placed}
     glow = {light.node: light.strength for light in lights}
     for part in parts:
@@ -156,12 +158,17 @@ class _Writer:
             made.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(st, np.float32)))
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
 
-    def textured(self, folder: Path, stem: str, baked: Baked) -> Any:
+    def textured(self, folder: Path, stem: str, baked: Baked, constants: Constants) -> Any:
         """Add a material of textures, and write those."""
         from pxr import Sdf, UsdShade
 
         kinds = Sdf.ValueTypeNames
         material, surface = self._material(baked.atlas.name)
+        surface.CreateInput("ior", kinds.Float).Set(constants.ior)
+        if constants.clearcoat > 0:
+            surface.CreateInput("clearcoat", kinds.Float).Set(constants.clearcoat)
+            coat = surface.CreateInput("clearcoatRoughness", kinds.Float)
+            coat.Set(constants.clearcoat_roughness)
         root = material.GetPath()
         reader = UsdShade.Shader.Define(self._stage, root.AppendChild("st"))
         reader.CreateIdAttr("UsdPrimvarReader_float2")

@@ -298,8 +298,13 @@ def _require_needed(scene: ParsedScene) -> None:
             raise UserError(f"the {plugin} has no {needed!r}", where, "Add it")
 
 
+def is_spectrum(value: object) -> bool:
+    """Whether the value of a property is a spectrum, whose class has no name of its own."""
+    return hasattr(value, "wavelengths")
+
+
 def _is_finite(value: Any) -> bool:
-    if hasattr(value, "wavelengths"):  # a spectrum: its class has no name of its own
+    if is_spectrum(value):
         value = value.values
     elif dr.is_array_v(value):
         value = np.array(value)
