@@ -128,10 +128,10 @@ def test_a_run_shows_what_was_recovered_and_its_error(run):
 def test_the_end_of_a_log_is_told():
     line = {"step": 5, "seconds": 2.0, "samples_per_second": 1000.0, "lhs": 0.25}
     score = {"step": 5, "seconds": 2.0, "validation": {"split": "heldout", "albedo_psnr": 20.0}}
-    told = log_tail([line, line | {"lhs": 0.125}, score])
+    told = log_tail([line | {"skipped": 2}, line | {"skipped": 3}, line | {"lhs": 0.125}, score])
     assert told == {
-        "step": "5", "seconds": "2", "samples / s": "1,000", "loss: lhs": "0.1250",
-        "validation: albedo": "20.00 dB",
+        "step": "5", "seconds": "2", "samples / s": "1,000", "skipped steps": "5",
+        "loss: lhs": "0.1250", "validation: albedo": "20.00 dB",
     }  # fmt: skip
     assert log_tail([]) == {}
 
@@ -212,6 +212,19 @@ def test_the_page_follows_a_run_and_changes_nothing_in_it(viewer, run):
     assert page._pictures.content != pictures and page._surface.glb_data != first
     page.close()
     assert digest(run) == before
+
+
+def test_clicks_that_come_quickly_end_at_the_last_one(viewer):
+    page, count = viewer._page, len(viewer._views)
+    for _ in range(2):
+        page._tell("step", 1)
+    viewer.step(0)
+    assert viewer._number == 2 % count and page._chosen == viewer._number
+    # What the page changed itself is no click
+    assert page.events.empty()
+    for value in page._views.options:  # such as a visitor's
+        page._views.value = value
+    assert page.events.empty()
 
 
 def test_what_is_wrong_with_a_checkpoint_stays_on_the_page(viewer, run, monkeypatch):

@@ -222,9 +222,7 @@ class Page:
             kinds = ("held-out", "training")
             names = [f"{n} ({kinds[t]})" for n, t in zip(self._names, self._train, strict=True)]
             self._views = gui.add_dropdown("View", tuple(names))
-            self._views.on_update(
-                lambda event: self._tell("view", names.index(event.target.value), event.client)
-            )
+            self._views.on_update(self._picked)
             steps = gui.add_button_group("Camera", _STEPS)
             steps.on_click(self._stepped)
             self._note, self._pictures = gui.add_html(""), gui.add_html("")
@@ -236,6 +234,10 @@ class Page:
                 self._checkpoint = gui.add_html("")
             with gui.add_folder("Log"):
                 self._log = gui.add_html("")
+
+    def _picked(self, event: Any) -> None:
+        if event.client is not None:  # else it is `choose` that changed it
+            self._tell("view", event.target.options.index(event.target.value), event.client)
 
     def _slid(self, event: Any) -> None:
         if event.client is not None:  # else it is `show_checkpoints` that moved it

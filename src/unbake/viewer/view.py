@@ -125,10 +125,11 @@ class Viewer:
             self._look()
             self._looked = time.monotonic()
         self._refresh()
+        events = self._page.events
         try:
-            self._handle(self._page.events.get(timeout=seconds))
-            while True:
-                self._handle(self._page.events.get_nowait())
+            self._handle(events.get(timeout=seconds))
+            for _ in range(events.qsize()):  # those that come meanwhile wait
+                self._handle(events.get_nowait())
         except queue.Empty:
             pass
 

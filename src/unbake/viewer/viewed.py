@@ -85,7 +85,7 @@ class ViewedData:
         self._numbers = sorted({p.materials[0] for p in parts if p.is_optimized})
         self._own = self._own_textures()
         #: Whether the scene's own materials are those that the photographs were rendered with.
-        self.has_true_materials = bool(dataset.render) and self._own is not None
+        self.has_true_materials = dataset.has_true_materials and self._own is not None
 
     def _own_textures(self) -> OwnTextures | None:
         parsed = parsed_principled(self.dataset.scene, self.dataset.root)
@@ -406,8 +406,8 @@ def log_tail(lines: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         newest = losses[-1]
         if newest.get("samples_per_second"):
             told["samples / s"] = f"{newest['samples_per_second']:,.0f}"
-        if newest.get("skipped"):
-            told["skipped steps"] = f"{newest['skipped']:.0f}"
+        if skipped := sum(line.get("skipped", 0) for line in losses):
+            told["skipped steps"] = f"{skipped:.0f}"
         for name, value in newest.items():
             if name not in _NO_TERMS and isinstance(value, float):
                 told[f"loss: {name}"] = f"{value:.4f}"
