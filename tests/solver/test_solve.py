@@ -1,7 +1,9 @@
 """The forward problem: the radiance of known scenes, from the residual alone."""
 
 import json
+import os
 import shutil
+import signal
 from dataclasses import replace
 
 import drjit as dr
@@ -9,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
+from safetensors.numpy import load_file, save_file
 from support import TINY, assert_only_replayed, seeded
 
 from unbake.config import FitConfig, read_toml
@@ -21,17 +24,19 @@ from unbake.fields.settings import GridConfig, NetworkConfig
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.io import read_object
 from unbake.scene.geometry import differing, probe
+from unbake.solver import learn
 from unbake.solver.lit import matching_scale
 from unbake.solver.pictures import debiased_relative_mse, relative_mse
 from unbake.solver.points import SurfacePoints
 from unbake.solver.settings import SolveSettings
 from unbake.solver.solve import fine_tune, solve
 from unbake.solver.step import SolverStep
+from unbake.training import loop
 from unbake.training.loop import fit
 from unbake.training.recovered import load_run
 from unbake.training.run_folder import RunFolder
 from unbake.training.solved import load_radiance, read_solved
-from unbake.training.warm_start import with_solved_field
+from unbake.training.warm_start import start_radiance, with_solved_field
 from unbake.transport.vertex import SceneView, find_vertex
 
 SMALL = NetworkConfig(
@@ -215,12 +220,39 @@ def test_the_command_writes_the_folder_and_fits_eighty_columns(unbake, tmp_path,
     assert again.status == 2 and "not empty" in again.err
 
 
+def test_a_solve_that_is_stopped_keeps_all_that_was_learned(tmp_path, monkeypatch):
+    """A signal comes while the clock waits for the steps, far from a measurement."""
+    taken, sent = [], []
+    step, sync = SolverStep.__call__, dr.sync_thread
+
+    def counted(self, *args):
+        taken.append(1)
+        return step(self, *args)
+
+    def interrupted():
+        if len(taken) > 30 and not sent:
+            sent.append(os.kill(os.getpid(), signal.SIGINT))
+        sync()
+
+    monkeypatch.setattr(SolverStep, "__call__", counted)
+    monkeypatch.setattr(learn.dr, "sync_thread", interrupted)
+    settings = SolveSettings(steps=400, batch=64, views=1, resolution=8, spp=4, final_spp=4,
+                             reference_spp=0, radiance=SMALL)  # fmt: skip
+    made = solve("furnace", tmp_path / "out", settings)
+    *_, last = made["measurements"]
+    assert sent and 30 < len(taken) < 60 and last["step"] == len(taken)
+    assert made["finished"] is False
+    assert read_object(tmp_path / "out" / "solve.json")["measurements"][-1] == last
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["--attach-rhs", "--samples", "3"], "even number of samples"),
         (["--reference-spp", "5"], "even"),
         (["--steps", "0"], "--steps"),
+        (["--keep-lights"], "--keep-lights: needs --envmap or --lights"),
+        (["--cameras", "c.json", "--views", "2"], "--views: cannot be given together"),
         (["--batch", "4194304"], "too many"),
     ],
 )
@@ -294,6 +326,32 @@ def test_a_fit_starts_with_a_solved_field(tuned, unbake, cornell, tiny, tmp_path
         np.testing.assert_array_equal(np.array(value), np.array(started.parameters()[key]))
     refused = unbake(*words, "--resume", "--steps", 2, "--radiance-from", tuned)
     assert refused.status == 2 and "--resume" in refused.err
+
+
+def test_a_fit_without_a_checkpoint_begins_again_with_the_solved_field(
+    tuned, unbake, cornell, tiny, tmp_path
+):
+    copy = shutil.copytree(tuned, tmp_path / "solved")
+    words = ("fit", cornell, "--out", tmp_path / "warm")
+    done = unbake(*words, "--settings", tiny, "--steps", 1, "--radiance-from", copy)
+    assert done.status == 0, done.err
+    shutil.rmtree(tmp_path / "warm" / "checkpoints")  # as if it was killed before the first one
+    started = []
+
+    def seen(problem, solved):
+        started.append(solved.sha256)
+        return start_radiance(problem, solved)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "start_radiance", seen)
+        done = unbake(*words, "--resume", "--steps", 2)
+    assert done.status == 0 and "it begins again" in done.out
+    assert started == [RunFolder(tmp_path / "warm").origin().warm_start.sha256]
+    shutil.rmtree(tmp_path / "warm" / "checkpoints")
+    values = load_file(copy / "radiance.safetensors")
+    save_file({key: x + 1 for key, x in values.items()}, copy / "radiance.safetensors")
+    done = unbake(*words, "--resume", "--steps", 2)
+    assert done.status == 2 and "not the solved field any more" in done.err
 
 
 @pytest.mark.slow

@@ -193,10 +193,12 @@ class _Learning:
             self._measure(optimizer, _entry(0, 0.0, 0.0, 0, settings.spp), monitor.say)
             due.pop(0)
             clock, cpu_clock = time.perf_counter(), time.process_time()
-            while done() < 1 and not stop:
+            last = done() >= 1 or bool(stop)
+            while not last:
                 now = rate * settings.final_learning_rate ** min(done(), 1.0)
                 recent.append(step(optimizer, number, now, self.recovered))
                 number += 1
+                # A signal is looked for in one place, so that all that was learned is measured.
                 last = done() >= 1 or bool(stop)
                 if not (last or number % _TIMED == 0):
                     continue
@@ -217,7 +219,7 @@ class _Learning:
                     clock, cpu_clock = time.perf_counter() - seconds, time.process_time() - cpu
             for failure in monitor.failures:
                 raise failure
-        self.manifest["finished"] = not stop
+        self.manifest["finished"] = done() >= 1
         self._write()
 
     def write_pictures(self) -> None:

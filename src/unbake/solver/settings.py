@@ -8,7 +8,7 @@ from typing import Annotated
 from ..config.fit import DEEPEST
 from ..config.flag import Flag
 from ..errors import UserError, require_ranges
-from ..fields.settings import LEAK, GridConfig, NetworkConfig
+from ..fields.settings import LEAK, GridConfig, NetworkConfig, require_no_pieces
 
 #: Samples of a pixel are all in flight at once; see `transport/render.py`.
 MOST_SAMPLES = 1 << 20
@@ -94,6 +94,7 @@ class SolveSettings:
                 "final_learning_rate": (1e-6, 1),
             },
         )
+        require_no_pieces(self.radiance, "radiance")
         if self.batch * self.samples > MOST_BOUNCES:
             what = f"{self.batch} points of {self.samples} samples are too many for a step"
             raise UserError(what, "--batch", f"Their product is at most {MOST_BOUNCES}")
