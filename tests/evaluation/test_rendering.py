@@ -146,6 +146,16 @@ def test_true_materials_relit_are_a_capture_under_that_light(options, folder, tm
         assert any("left out 1 shapes that emit no light" in line for line in lines)
 
 
+def test_scores_do_not_depend_on_the_exposure_of_the_png_files(folder, tmp_path):
+    light, found = LightConfig(envmap=folder / "sky.exr"), []
+    for exposure in (0.0, 3.0):
+        settings = RenderSettings(spp=4, max_depth=3, exposure=exposure)
+        out = tmp_path / f"out-{exposure}"
+        made = relight(folder / "run", out, light, settings, truth=folder / "data", **SILENT)
+        found.append((made["mean"], made["display_exposure"]))
+    assert found[0] == found[1]
+
+
 def test_another_light_than_that_of_the_truth_scores_less(folder, tmp_path):
     settings = RenderSettings(spp=64, max_depth=8)
     light = LightConfig(envmap=folder / "sky.exr")
@@ -296,6 +306,10 @@ def test_what_is_no_environment_map_is_refused(kind, told, tmp_path):
         (("--lights", "none.xml"), "--lights: there is no file none.xml. Check the path"),
         (("--lights", "dark.xml"), "dark.xml: no light in the file"),
         (("--lights", "dark.xml", "--envmap-scale", 2), "--envmap-scale: needs --envmap"),
+        (
+            ("--lights", "dark.xml", "--views", "all", "--turntable", 3),
+            "--views: cannot be given together with --turntable",
+        ),
         (("--envmap", "a.exr", "--envmap-scale", 0), "--envmap-scale: must be"),
         (("--envmap", "a.exr", "--turntable", 0), "--turntable: must be from 1"),
         (("--envmap", "a.exr", "--turntable", 2, "--cameras", "c"), "--cameras: cannot be given"),

@@ -160,7 +160,7 @@ def test_a_quantity_without_true_maps_has_no_ceiling(data, tiny, tmp_path, short
     assert all(found[kind]["roughness_psnr"] is None for kind in found)
     lines = told_yardsticks({"albedo_psnr": 20.0, "roughness_psnr": None}, found)
     assert len(lines) == 1 and lines[0].startswith("albedo ")
-    # A constant that is exact has no PSNR.
+    # Where the constant was not told
     found = {"ceiling": {"metallic_psnr": 40.0}, "constant": {"metallic_psnr": None}}
     found["untrained"] = {"metallic_psnr": 20.0}
     (line,) = told_yardsticks({"metallic_psnr": 42.5}, found)

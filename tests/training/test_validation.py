@@ -14,6 +14,7 @@ from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import _true_scene, evaluate
 from unbake.evaluation.settings import EvaluationSettings
+from unbake.imaging.metrics import HIGHEST
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training.loop import TIME_EVERY, fit
 from unbake.training.recovered import load_run
@@ -53,7 +54,7 @@ def test_a_score_is_what_an_evaluation_says(scored):
     assert score.measure() == pytest.approx(logged, abs=1e-3)
     for key in ("albedo_psnr", "roughness_psnr"):
         # One held-out view: with the same samples and seed, the same picture.
-        same = score.measure(spp=FEW.material_spp, seed=1)
+        same = score.measure(spp=FEW.material_spp, seed=2)
         assert same[key] == pytest.approx(said["heldout"][key], abs=1e-5)
         assert logged[key] == pytest.approx(said["heldout"][key], abs=0.5)
 
@@ -105,8 +106,7 @@ def test_what_cannot_be_compared_has_no_number(scored):
     nothing = dataclasses.replace(truth, known=np.zeros_like(truth.known))
     assert seen.psnr(nothing) == {"albedo_psnr": None, "roughness_psnr": None}
     equal = dataclasses.replace(truth, values={**truth.values, "albedo": seen.values["albedo"]})
-    assert seen.psnr(equal)["albedo_psnr"] is None
-    assert seen.psnr(equal)["roughness_psnr"] is not None
+    assert seen.psnr(equal)["albedo_psnr"] == HIGHEST > seen.psnr(equal)["roughness_psnr"]
 
 
 def test_a_quantity_whose_truth_is_not_known_has_no_number(scored):

@@ -14,7 +14,7 @@ from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
-from ..imaging.metrics import mean_psnr, psnr
+from ..imaging.metrics import HIGHEST, mean_psnr, psnr
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
 from ..quantities import QUANTITIES
 from ..scene import edit
@@ -24,7 +24,7 @@ from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, EvaluationFolder, RunFolder
 from ..training.run_lock import RunLock
-from ..training.validation import GroundTruth, MaterialBuffers, finite, psnr_keys
+from ..training.validation import GroundTruth, MaterialBuffers, psnr_keys
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from . import lighting, outliers, renderings, yardsticks
@@ -42,11 +42,12 @@ from .settings import EvaluationSettings
 from .yardsticks import find_yardsticks, seen_materials
 
 DEFINITIONS = {
-    "psnr": "10 log10(1 / MSE), peak 1; MSE over unmasked pixels and channels of a view; the "
-    "value of a split is the mean over its views. Renderings: both pictures clipped to [0,1], "
-    "because one caustic pixel of a photograph would decide all; render_psnr_unclamped does not. "
-    "Quantities of materials are not clipped. Renderings are compared as photographs show them: "
-    "times the exposure of the view, and no brighter than the value at which it is clipped",
+    "psnr": f"10 log10(1 / MSE), peak 1, {HIGHEST:g} at most; MSE over unmasked pixels and "
+    "channels of a view; the value of a split is the mean over its views. Renderings: both "
+    "pictures clipped to [0,1], because one caustic pixel of a photograph would decide all; "
+    "render_psnr_unclamped does not. Quantities of materials are not clipped. Renderings are "
+    "compared as photographs show them: times the exposure of the view, and no brighter than the "
+    "value at which it is clipped",
     "true_render_psnr": "render_psnr of the scene with its true materials and lights, with as many "
     "samples: the limit that the noise of renderings and photographs sets",
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
@@ -54,7 +55,8 @@ DEFINITIONS = {
     "one number for all views, which brings it nearest to the truth in the least squares sense",
     "convergence": "of the photometric error on training pixels that no step drew, relative: its "
     "change over the last part of the fit (share), and the standard error of that (noise)",
-    "samples": "camera samples traced in training; of an estimator with two passes, both count",
+    "samples": "camera samples traced in training, those of searches of roughness included; of an "
+    "estimator with two passes, both count",
     "data_changed": "parts of the data set that differ from those that the run was fit to",
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
     "and background are left out; without truth images every foreground pixel counts",
@@ -216,7 +218,7 @@ def require_true_materials(dataset: Dataset) -> None:
     Raises:
         UserError: they are not known.
     """
-    if not dataset.render:
+    if not dataset.has_true_materials:
         known = "unbake capture SCENE --out DATA makes one that does"
         raise UserError("the data set does not hold its true materials", dataset.folder, known)
 
@@ -385,7 +387,7 @@ def _align_albedo(
     for row, view in zip(rows, known, strict=True):
         if view is not None and view[2].any():
             seen, truth, mask = view
-            row["albedo_psnr_aligned"] = finite(psnr(seen * scale, truth, mask))
+            row["albedo_psnr_aligned"] = psnr(seen * scale, truth, mask)
     return [float(x) for x in scale]
 
 

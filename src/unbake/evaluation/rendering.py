@@ -36,7 +36,7 @@ from ..training.validation import GroundTruth
 from ..version import VERSION
 from . import renderings
 from .evaluate import DEFINITIONS, description
-from .renderings import METRICS, counted_pixels, render_camera, render_scores
+from .renderings import METRICS, counted_pixels, exposure_of, render_camera, render_scores
 from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
 from .turntable import axis_of, up_of
 from .turntable import turntable as make_turntable
@@ -241,6 +241,10 @@ def _render(
     hide = recovered.problem.hide_emitters
     if cameras.truth is not None:
         hide = cameras.truth.background == "hidden"
+    compared = [shot.truth for shot in shots if shot.truth is not None]
+    exposure = 0.0
+    if compared:
+        exposure = exposure_of(read_photograph(v, recovered.clip_negative) for v in compared)
     frames, brightest = [], 0.0
     with filled_folder(out) as folder:
         for number, shot in enumerate(shots):
@@ -248,7 +252,7 @@ def _render(
             brightest = max(brightest, float(radiance.max()))
             write_exr(folder / f"{shot.name}.exr", radiance)
             write_png(folder / f"{shot.name}.png", tonemap(radiance, settings.exposure))
-            frames.append(_frame(shot) | _scores(recovered, shot, radiance, settings))
+            frames.append(_frame(shot) | _scores(recovered, shot, radiance, settings, exposure))
             _tell_progress(number, len(shots), frames[-1], tell)
         notes = []
         if brightest == 0:
@@ -268,13 +272,13 @@ def _render(
             "settings": asdict(settings),
             "variant": mi.variant(),
             "truth": None if cameras.truth is None else os.fspath(cameras.truth.folder),
-            "mean": _means(frames) if cameras.truth is not None else None,
+            "mean": _means(frames) if compared else None,
+            "display_exposure": exposure if compared else None,
             "frames": frames,
             "definitions": {
                 key: DEFINITIONS[key] for key in ("psnr", "colour_space", "mask")
             }
             | renderings.DEFINITIONS
-            | {"display_exposure": "stops, as the settings say"}
             | {"files": "OpenEXR: linear RGB radiance; PNG: the same times 2^exposure as sRGB"},
             "notes": notes,
         }  # fmt: skip
@@ -350,9 +354,17 @@ def _picture(
 
 
 def _scores(
-    recovered: Recovered, shot: _Shot, radiance: np.ndarray, settings: RenderSettings
+    recovered: Recovered,
+    shot: _Shot,
+    radiance: np.ndarray,
+    settings: RenderSettings,
+    exposure: float,
 ) -> dict[str, float | None]:
-    """Scores of a picture against the truth, counted as in an evaluation; empty without truth."""
+    """Scores of a picture against the truth, counted as in an evaluation; empty without truth.
+
+    Args:
+        exposure: stops, of SSIM and FLIP.
+    """
     if shot.truth is None:
         return {}
     photograph = read_photograph(shot.truth, recovered.clip_negative)
@@ -364,7 +376,7 @@ def _scores(
     if not mask.any():
         return dict.fromkeys(METRICS)
     shown, compared = shot.truth.photographed(radiance), shot.truth.readable(photograph[..., :3])
-    return render_scores(shown, compared, mask, settings.exposure)
+    return render_scores(shown, compared, mask, exposure)
 
 
 def _frame(shot: _Shot) -> dict[str, Any]:

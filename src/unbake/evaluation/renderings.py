@@ -11,7 +11,7 @@ from ..dataset.pixels import CameraRays
 from ..imaging import perceptual
 from ..imaging.metrics import psnr
 from ..imaging.pictures import encoded, fitting_exposure, sample
-from ..training.validation import GroundTruth, MaterialBuffers, finite
+from ..training.validation import GroundTruth, MaterialBuffers
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
 from .settings import EvaluationSettings, RenderSettings
@@ -85,15 +85,15 @@ def render_scores(
     image, reference = (encoded(x, exposure) for x in (radiance, photograph))
     return {
         "render_psnr": render_psnr(radiance, photograph, mask),
-        "render_psnr_unclamped": finite(psnr(radiance, photograph, mask)),
+        "render_psnr_unclamped": psnr(radiance, photograph, mask),
         "render_ssim": float(perceptual.ssim(image, reference)[mask].mean()),
         "render_flip": float(perceptual.flip(image, reference)[mask].mean()),
     }
 
 
-def render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> float | None:
+def render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> float:
     """The score `render_psnr` alone; arguments as of `render_scores`."""
-    return finite(psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask))
+    return psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)
 
 
 def exposure_of(photographs: Iterable[np.ndarray]) -> float:

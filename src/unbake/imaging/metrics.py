@@ -9,6 +9,9 @@ import numpy as np
 
 from unbake.errors import UserError
 
+#: dB of equal pictures, and the most that there is: JSON has no infinity.
+HIGHEST = 120.0
+
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio of a picture in dB, with peak 1, on linear and unclamped values.
@@ -22,7 +25,7 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
         mask: (H, W) bool; None: all pixels.
 
     Returns:
-        dB; `inf` if the two are equal.
+        dB, `HIGHEST` at most, which two equal pictures have.
 
     Raises:
         UserError: a pixel inside the mask is not finite, as after a fit that diverged.
@@ -41,7 +44,7 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
         bad = int(np.count_nonzero(~finite))
         raise UserError(f"{bad} of {finite.size} compared values are not finite")
     mse = float(np.mean(np.square(image.astype(np.float64) - reference.astype(np.float64))))
-    return math.inf if mse == 0 else -10 * math.log10(mse)
+    return HIGHEST if mse == 0 else min(-10 * math.log10(mse), HIGHEST)
 
 
 def require_alike(image: np.ndarray, reference: np.ndarray) -> None:
@@ -65,7 +68,7 @@ def mean_psnr(values: Iterable[float | None]) -> float | None:
 
     Returns:
         The arithmetic mean of the dB values (not the PSNR of the pooled error), or None where no
-        view has a value. An infinite value makes the mean infinite.
+        view has a value.
     """
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None

@@ -35,8 +35,7 @@ def decibels(value: float | None) -> str:
     """A PSNR with two digits, and a dash for None."""
     if value is None:
         return DASH
-    text = "∞" if math.isinf(value) else f"{abs(value):.2f}"
-    return f"−{text}" if value < 0 else text
+    return f"−{-value:.2f}" if value < 0 else f"{value:.2f}"
 
 
 def similar(scores: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -76,8 +75,7 @@ class MaterialBuffers:
     def psnr(self, truth: GroundTruth) -> dict[str, float | None]:
         """PSNR in dB, linear and not clipped; keys such as `albedo_psnr`.
 
-        None where no pixel counts, where the truth is not known, and where two pictures are equal:
-        JSON has no infinity.
+        None where no pixel counts, and where the truth is not known.
 
         Raises:
             UserError: a value is not finite.
@@ -88,7 +86,7 @@ class MaterialBuffers:
         scores = dict.fromkeys(psnr_keys(self.values))
         for name, value in self.values.items():
             if name in truth.values and mask.any():
-                scores[f"{name}_psnr"] = finite(psnr(value, truth.values[name], mask))
+                scores[f"{name}_psnr"] = psnr(value, truth.values[name], mask)
         return scores
 
 
@@ -120,8 +118,3 @@ class Score:
         keys = psnr_keys(self._problem.materials or ())
         means = {key: mean_psnr(row[key] for row in rows) for key in keys}
         return {"views": len(rows)} | means
-
-
-def finite(value: float) -> float | None:
-    """The value, or None in place of infinity and not-a-number, which JSON lacks."""
-    return value if math.isfinite(value) else None
