@@ -6,11 +6,13 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -565,14 +567,16 @@ def test_ssim_and_flip_stand_beside_psnr(made, tmp_path: Path):
     assert text.count("<small>SSIM 0.951, FLIP 0.100</small>") == views
 
 
-def _relit(folder: Path, run: Path, truth: Path | None = None, name: str = "sky.exr") -> Path:
+def _relit(
+    folder: Path, run: Path, truth: Path | None = None, name: str = "sky.exr", **light: Any
+) -> Path:
     """Pictures of a run, as `unbake relight` leaves them."""
     frames = [{"name": f"train_{i:03d}", "render_psnr": 30.0 + i} for i in range(TRAINING)]
     for number, frame in enumerate(frames):
         _save(folder / f"{frame['name']}.exr", 0.9 * _truth(number)["render"])
     found = {
         "format": 1, "run": {"folder": str(run.resolve())}, "settings": {"exposure": 1.0},
-        "light": {"envmap": f"lights/{name}", "lights": None}, "frames": frames,
+        "light": {"envmap": f"lights/{name}", "lights": None} | light, "frames": frames,
         "truth": None if truth is None else str(truth),
         "mean": {"views": TRAINING, "render_psnr": 32.5, "render_ssim": 0.9, "render_flip": 0.05},
     }  # fmt: skip
@@ -600,6 +604,33 @@ def test_pictures_under_another_light_are_strips(made, tmp_path: Path):
     assert truth in sky
     other = section.replace(sky, "")
     assert len(_Page(other).images()) == 6 and "ground truth, view" not in other
+
+
+def test_each_light_has_a_strip_of_its_own(made, tmp_path: Path):
+    _, runs = made
+    turned = {"envmap_rotate": 90.0, "envmap_scale": 2.0, "envmap_up": "+z", "keep_lights": True}
+    folders = [_relit(tmp_path / "plain", runs[0]), _relit(tmp_path / "turned", runs[0], **turned)]
+    page = write_report(runs, tmp_path / "report.html", relit=folders).read_text()
+    section = _section(page, "relit")
+    words = "turned by 90°, times 2, its first row at +z, with the scene&#39;s own lights"
+    assert section.count('class="strip"') == 2
+    for title in ("sky.exr", f"sky.exr, {words}"):
+        assert f"<h3>Environment map: {title}</h3>" in section
+
+
+def test_the_truth_of_another_light_is_as_bright_as_its_radiance(made, tmp_path: Path):
+    data, runs = made
+    bright = shutil.copytree(data, tmp_path / "bright")
+    described = json.loads((bright / "transforms.json").read_text())
+    for frame in described["frames"]:
+        frame["exposure"] = 4.0
+        image = bright / frame["file_path"]
+        pictures.write_exr(image, 4 * pictures.read_exr(image))
+    (bright / "transforms.json").write_text(json.dumps(described))
+    folder = _relit(tmp_path / "relit", runs[0], bright)
+    page = write_report(runs, tmp_path / "report.html", relit=[folder]).read_text()
+    truth = pictures.png_data_uri(pictures.tonemap(_truth(0)["render"].astype(np.float32), 1.0))
+    assert truth in _section(page, "relit")
 
 
 def _exported(folder: Path, run: Path, count: int = 2, formats: tuple[str, ...] = ("textures",)):

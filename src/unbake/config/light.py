@@ -76,9 +76,10 @@ class LightConfig:
         return Path(Path(self.lights).resolve().anchor)
 
     def told(self) -> dict[str, Any]:
-        """All of it as JSON has it."""
+        """All of it as JSON has it, with absolute paths."""
         paths = {"envmap": self.envmap, "lights": self.lights}
-        return asdict(self) | {k: None if v is None else os.fspath(v) for k, v in paths.items()}
+        files = {k: None if v is None else os.path.abspath(v) for k, v in paths.items()}
+        return asdict(self) | files
 
     def named(self) -> dict[str, Any]:
         """The same, with the names of files instead of their paths."""

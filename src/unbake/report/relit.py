@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unbake.dataset.views import Dataset
+from unbake.config.light import LightConfig
+from unbake.dataset.views import Dataset, read_photograph
 from unbake.errors import UserError
 from unbake.evaluation.settings import RENDER_FORMAT
 from unbake.formats import check_format
@@ -19,6 +21,13 @@ from unbake.report.runs import Run, made_of
 
 #: Pictures of a folder that are shown, evenly spaced, and pixels along their longer side.
 MOST, LONGEST = 6, 320
+#: What settings of a light are told by, where they are not the usual ones.
+_WORDS = {
+    "envmap_rotate": "turned by {:g}°",
+    "envmap_scale": "times {:g}",
+    "envmap_up": "its first row at {}",
+    "keep_lights": "with the scene's own lights",
+}
 
 
 def relit_sections(
@@ -43,10 +52,11 @@ def relit_sections(
         try:
             names = [str(frame["name"]) for frame in manifest["frames"]]
             exposure = float(manifest["settings"]["exposure"])
-            light, truth = _light(manifest.get("light")), manifest.get("truth")
+            told, truth = manifest.get("light"), manifest.get("truth")
             if not names or any(Path(name).name != name for name in names):
                 raise ValueError
-            key = (light, truth, exposure, *names)
+            light = _light(told)
+            key = (light, json.dumps(told, sort_keys=True), truth, exposure, *names)
             if key not in strips:
                 strips[key] = _strip(light, truth, exposure, names, allow_outside)
             strips[key]["rows"].append(_row(folder, manifest, number, strips[key]))
@@ -60,8 +70,12 @@ def _light(told: dict[str, Any] | None) -> str:
     if told is None:
         return "The scene's own light, as it was recovered"
     file = Path(str(told.get("envmap") or told.get("lights") or "another light")).name
-    kind = "Environment map" if told.get("envmap") else "Lights"
-    return f"{kind}: {file}" + (", with its own" if told.get("keep_lights") else "")
+    parts = [f"{'Environment map' if told.get('envmap') else 'Lights'}: {file}"]
+    for key, words in _WORDS.items():
+        usual = getattr(LightConfig, key)
+        if told.get(key, usual) != usual:
+            parts.append(words.format(told[key]))
+    return ", ".join(parts)
 
 
 def _strip(
@@ -73,7 +87,8 @@ def _strip(
     if truth is not None and Path(truth).is_dir():
         views = {v.name: v for v in Dataset.load(Path(truth), allow_outside=allow_outside).views}
         if all(name in views for name in shown):
-            images = [display.rgb(views[name].image)[0] for name in shown]
+            chosen = [views[name] for name in shown]
+            images = [read_photograph(v, True)[..., :3] / v.exposure for v in chosen]
             true = [_picture(image, exposure) for image in images]
     return {
         "light": light,
