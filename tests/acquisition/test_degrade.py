@@ -1,6 +1,7 @@
 """What cameras do to photographs is done as told, the same for the same seed, with its truth."""
 
 import json
+import re
 import shutil
 from typing import get_args
 
@@ -13,6 +14,7 @@ from unbake.acquisition.degrade import degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings, Response
 from unbake.dataset.views import Dataset, SensorNoise, read_masked
 from unbake.errors import UserError
+from unbake.evaluation.evaluate import require_true_materials
 from unbake.evaluation.placing import told_of_place
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.imaging.srgb import from_srgb, to_srgb
@@ -189,6 +191,27 @@ def test_large_meshes_lose_triangles(cornell, degraded, monkeypatch):
     # Two boxes of ten triangles, beside walls
     assert counts[0] - counts[1] == pytest.approx(10, abs=3)
     assert truth["triangles"] == 0.5 and len(truth["displaced"]["meshes"]) == 6
+    assert dataset.has_true_materials, "nothing in this room has a texture"
+
+
+def test_textures_are_lost_with_the_coordinates_of_decimated_meshes(cornell, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap", reason="fewer triangles need pycolmap")
+    monkeypatch.setattr("unbake.acquisition.degrade.FEWEST", 10)
+    data = shutil.copytree(cornell, tmp_path / "data")
+    write_exr(Dataset.load(data).scene.parent / "paint.exr", np.full((4, 4, 3), 0.5, np.float32))
+    scene = Dataset.load(data).scene
+    text, said = scene.read_text(), []
+    colour = text.index("<rgb", text.index("principled"))
+    end = text.index("/>", colour) + 2
+    name = re.search(r'name="(\w+)"', text[colour:end])[1]
+    texture = f"""<texture type="bitmap" name="{name}">
+      <string name="filename" value="paint.exr"/></texture>"""
+    scene.write_text(text[:colour] + texture + text[end:])
+    assert Dataset.load(data).has_true_materials
+    few = degrade(data, tmp_path / "few", DegradeSettings(decimate=0.5), tell=said.append)
+    assert not few.has_true_materials and "no longer has its true materials" in " ".join(said)
+    with pytest.raises(UserError, match="does not hold its true materials"):
+        require_true_materials(few)
 
 
 def test_noise_that_is_told_is_that_of_photographs(degraded):
@@ -205,6 +228,12 @@ def test_noise_that_is_told_is_that_of_photographs(degraded):
     for settings in ({}, {"electrons": 200.0, "response": "gamma"}):
         with pytest.raises(UserError, match="tell_noise"):
             DegradeSettings(tell_noise=True, **settings)
+
+
+def test_options_of_another_format_are_refused(cornell, unbake, tmp_path):
+    outcome = unbake("degrade", cornell, "-o", tmp_path / "out", "--format", "png", "--quality", 50)
+    assert outcome.status == 2 and "--quality: needs --format jpeg" in outcome.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_says_where_it_wrote(cornell, unbake, tmp_path):

@@ -26,7 +26,7 @@ from PIL import Image
 from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
-from ..dataset.views import Dataset, SensorNoise, View, read_masked
+from ..dataset.views import TRUE_MATERIALS, Dataset, SensorNoise, View, read_masked
 from ..errors import UserError
 from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..imaging.srgb import from_srgb, to_srgb
@@ -117,7 +117,10 @@ def degrade(
         folder = DataFolder(partial)
         folder.scene.mkdir()
         changed = settings.displace or settings.decimate < 1
-        displaced = _change_meshes(parsed, folder, settings, diagonal) if changed else []
+        displaced, bare = [], False
+        if changed:
+            displaced, bare = _change_meshes(parsed, folder, settings, diagonal)
+        render = dataset.render | ({TRUE_MATERIALS: False} if bare else {})
         path = write(parsed, folder.scene.resolve())
         views = []
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
@@ -138,13 +141,18 @@ def degrade(
             _copy_truth(view, folder)
             views.append(degraded)
         _copy_lighting(DataFolder(dataset.folder, allow_outside), folder)
-        replace(dataset, scene=path, views=tuple(views)).save(partial)
+        replace(dataset, scene=path, views=tuple(views), render=render).save(partial)
         write_json(
             folder.degraded_file,
             _truth(dataset, truths, gain, settings, displaced, diagonal),
             allow_nan=False,
         )
     tell(f"degraded {len(truths)} photographs; the truth of it is in degraded.json")
+    if bare:
+        tell(
+            "note: meshes lost their texture coordinates, so that the scene no longer has its true "
+            "materials: nothing can be compared with renderings of them, nor its light be fitted"
+        )
     return Dataset.load(out)
 
 
@@ -306,9 +314,14 @@ def _moved(scene: mi.Scene, cameras: list[Camera], settings: DegradeSettings) ->
 
 def _change_meshes(
     parsed: ParsedScene, folder: DataFolder, settings: DegradeSettings, diagonal: float
-) -> list[str]:
-    """Move the vertices of all meshes by smooth noise, and leave out some; the files it wrote."""
-    files = []
+) -> tuple[list[str], bool]:
+    """Move the vertices of all meshes by smooth noise, and leave out some.
+
+    Returns:
+        The files it wrote, and whether meshes have lost the coordinates of textures in the scene.
+    """
+    files, bare = [], False
+    textured = any(node.props.plugin_name() == "bitmap" for node in parsed.state.nodes)
     for number, node in enumerate(parsed.state.nodes):
         plugin = node.props.plugin_name()
         if node.type != mi.ObjectType.Shape or plugin not in _MESHES:
@@ -322,6 +335,7 @@ def _change_meshes(
             positions += displacement(positions, settings, diagonal)
         faces = np.array(params["faces"]).reshape(-1, 3)
         if settings.decimate < 1 and len(faces) >= FEWEST:
+            bare |= textured and mesh.has_vertex_texcoords()
             mesh = decimated(positions, faces, settings.decimate)
         else:
             params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
@@ -335,7 +349,7 @@ def _change_meshes(
         node.props.set_plugin_name("ply")
         node.props["filename"] = str(file.resolve())
         files.append(file.name)
-    return files
+    return files, bare
 
 
 def displacement(positions: np.ndarray, settings: DegradeSettings, diagonal: float) -> np.ndarray:

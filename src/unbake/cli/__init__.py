@@ -61,9 +61,11 @@ from .options import (
     Scenes,
     Source,
     any_light,
+    changed,
     chosen_light,
     chosen_settings,
     exclude,
+    exclude_changed,
     require,
     with_length,
 )
@@ -85,9 +87,9 @@ _START = (
 )
 _STATUS = (
     "Exit status: 0; 1 where a part failed or a fit learned nothing; 2 on bad input or a full "
-    "disk; ended early: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 (closed pipe). What takes "
-    "long, such as a fit, saves what was done; the others leave what there was. A second Ctrl-C "
-    "ends at once."
+    "disk; ended early: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP), 141 (closed pipe). Long "
+    "commands, such as a fit, save their progress; others leave existing files untouched. A second "
+    "Ctrl-C ends at once."
 )
 
 if TYPE_CHECKING:
@@ -171,6 +173,8 @@ def capture(
         light: How the other light is put into the scene.
     """
     settings = with_options(CaptureSettings(), given(capture))
+    if cameras is not None:
+        exclude_changed("cameras", CaptureSettings, given(capture), "views", "held-out")
     other = any_light(envmap, lights, given(light))
     backend.activate()
     from ..acquisition.capture import capture as run
@@ -306,6 +310,9 @@ def degrade(
         degrade: What is done to photographs, poses and meshes.
     """
     settings = with_options(DegradeSettings(), given(degrade))
+    if settings.format != "jpeg":
+        for name in changed(DegradeSettings, given(degrade), "quality", "chroma"):
+            raise UserError("needs --format jpeg", f"--{name}", "Give it, or leave this out")
     backend.activate()
     from ..acquisition.degrade import degrade as run
 
@@ -539,6 +546,7 @@ def render(
         render: How pictures are rendered.
     """
     settings = _render_settings(given(render), width, height)
+    _exclude_views(cameras, turntable, given(render))
     backend.activate()
     from ..evaluation.rendering import render as go
 
@@ -586,6 +594,7 @@ def relight(
         render: How pictures are rendered.
     """
     settings = _render_settings(given(render), width, height)
+    _exclude_views(cameras, turntable, given(render))
     chosen = chosen_light(envmap, lights, given(light))
     backend.activate()
     from ..evaluation.rendering import relight as go
@@ -621,6 +630,13 @@ def _render_settings(
             faults.append(UserError(error.what, f"--{name}"))
     raise_together(faults, most=None)
     return settings
+
+
+def _exclude_views(cameras: Path | None, turntable: int | None, values: dict[str, Any]) -> None:
+    """Refuse --views where pictures are of other cameras."""
+    for option, value in {"cameras": cameras, "turntable": turntable}.items():
+        if value is not None:
+            exclude_changed(option, RenderSettings, values, "views")
 
 
 def view(
@@ -691,12 +707,13 @@ def solve(
         light: How the other light is put into the scene.
     """
     settings = with_options(SolveSettings(), given(solve))
+    if cameras is not None:
+        exclude_changed("cameras", SolveSettings, given(solve), "views")
     other = any_light(envmap, lights, given(light))
     if (scene is None) == (from_ is None):
         raise UserError("give a scene, or a run with --from, and not both", "solve")
     if from_ is not None:
-        usual = {name: getattr(SolveSettings, name) for name in ("views", "resolution")}
-        exclude("from", {k: v for k, v in given(solve).items() if usual.get(k, v) != v})
+        exclude_changed("from", SolveSettings, given(solve), "views", "resolution")
     backend.activate()
     from ..solver.solve import fine_tune
     from ..solver.solve import solve as run
@@ -731,8 +748,9 @@ def compare(
 ) -> int:
     """Fit several methods to the same photographs, and compare their quality over time.
 
-    Fields, batches, seed and length are the same for all. Learning rates, estimator and warm-up are
-    each method's own, unless the settings give them.
+    Fields, batches, seed and length are the same for all. Learning rates, estimator, warm-up and
+    Adam's beta2 are each method's own, unless the settings give them. Methods with a radiance field
+    also search for roughness.
 
     Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. OUT/untrained has
     the fields before the first step: a method is worth what it adds to these. Where the data set

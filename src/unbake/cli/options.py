@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -72,6 +73,9 @@ def any_light(
     """The same; None where neither option was given."""
     if envmap is None and lights is None:
         _require_envmap(envmap, values)
+        if values.get("keep-lights"):
+            remedy = "Give one, or leave this out"
+            raise UserError("needs --envmap or --lights", "--keep-lights", remedy)
         return None
     return chosen_light(envmap, lights, values)
 
@@ -99,6 +103,23 @@ def exclude(option: str, others: dict[str, object]) -> None:
     for name, value in others.items():
         if value is not None:
             raise UserError(f"cannot be given together with --{option}", where=f"--{name}")
+
+
+def exclude_changed(option: str, settings: type, values: Mapping[str, object], *names: str) -> None:
+    """Refuse options that are not as usual, beside another one that makes them senseless.
+
+    Args:
+        settings: whose options they are.
+        values: of the options.
+        names: of those that are refused.
+    """
+    exclude(option, changed(settings, values, *names))
+
+
+def changed(settings: type, values: Mapping[str, object], *names: str) -> dict[str, object]:
+    """Those of some options that are not as usual; arguments as of `exclude_changed`."""
+    usual = {name: getattr(settings, name.replace("-", "_")) for name in names}
+    return {name: values[name] for name in names if values.get(name, usual[name]) != usual[name]}
 
 
 def require(name: str, value: int, least: int) -> None:

@@ -27,6 +27,8 @@ from unbake.transport.light_by_depth import depth_of_light, light_of_depth
 BACKGROUNDS = ("visible", "hidden")
 #: What is known of the light of the scene: all, or nothing, and a placeholder stands for it.
 LIGHTS = ("known", "unknown")
+#: A key of `render`: false where the scene has lost the materials that it was rendered with.
+TRUE_MATERIALS = "true_materials"
 #: How photographs hold radiance: as it is, or as code values of the sRGB curve.
 ENCODINGS = ("linear", "srgb")
 
@@ -194,6 +196,11 @@ class Dataset:
     def kind(self) -> SceneKind:
         """The kind of scene."""
         return scene_kind(self.background)
+
+    @property
+    def has_true_materials(self) -> bool:
+        """Whether the scene has the materials that its photographs were rendered with."""
+        return bool(self.render) and self.render.get(TRUE_MATERIALS) is not False
 
     @property
     def train(self) -> tuple[View, ...]:

@@ -1,4 +1,4 @@
-"""`demo`: a warm room, 4 x 3 x 2.6 m, whose lamps are hidden: nearly all its light is indirect.
+"""`demo`: a warm room, 4 x 3 x 2.8 m, whose lamps are hidden: nearly all its light is indirect.
 
 The lamp lies in a bowl that hangs above the table and shines upwards. Only the ceiling and the tops
 of the walls see it; all else is lit by what those reflect.
