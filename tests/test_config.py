@@ -356,8 +356,17 @@ def test_settings_of_format_1_mean_the_same_today(number):
     assert from_toml(to_toml(old)) == old
 
 
+def test_keys_that_are_absent_today_are_those_of_the_preset():
+    assert from_toml("format = 3\n") == preset("cpu") != from_toml("format = 2\n")
+
+
+def test_the_radiance_field_has_no_pieces():
+    with pytest.raises(UserError, match=r"radiance\.neural\.pieces\.most.*materials alone"):
+        from_toml("[radiance.neural.pieces]\nmost = 64\n")
+
+
 def test_fields_of_earlier_runs_do_not_leak():
-    text = to_toml(preset("cpu"))
+    text = to_toml(preset("cpu")).replace("format = 3", "format = 2")
     lines = [line for line in text.splitlines() if not line.startswith("leak = ")]
     found = [from_toml(x).radiance["neural"].leak for x in (text, "\n".join(lines))]
     assert found == [LEAK, 0]
@@ -366,7 +375,7 @@ def test_fields_of_earlier_runs_do_not_leak():
 
 
 def test_a_setting_that_is_no_more_is_passed_over_in_runs_alone():
-    text = to_toml(preset("cpu"))
+    text = to_toml(preset("cpu")).replace("format = 3", "format = 2")
     assert "\n[camera]\n" in text
     old = text.replace("\n[camera]\n", "\n[camera]\nsmoothness = 0.25\n")
     assert from_toml(old) == from_toml(text)
@@ -385,8 +394,8 @@ def test_a_file_without_a_format_may_have_keys_of_today():
     ("text", "message"),
     [
         (
-            "format = 3",
-            r"format: was written by a newer unbake \(format 3; .* up to 2\). Update unbake",
+            "format = 4",
+            r"format: was written by a newer unbake \(format 4; .* up to 3\). Update unbake",
         ),
         ("format = true", "format: 'format' is True, not a positive whole number"),
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),

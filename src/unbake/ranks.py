@@ -383,12 +383,17 @@ class Ranks:
         stop = threading.Event()
         thread = threading.Thread(target=self._watch, args=(stop,), daemon=True)
         thread.start()
+        together = True
         try:
             yield
+        except BaseException as error:
+            together = isinstance(error, Agreed)  # which all ranks raise
+            raise
         finally:
             stop.set()
             thread.join(_LAST_RESORT)
-        self._receive_rest(_APART)
+            if together:
+                self._receive_rest(_APART)
 
     def _watch(self, stop: threading.Event) -> None:
         """End all where one rank is not heard of any more."""
@@ -543,6 +548,7 @@ class Ranks:
             yield
         except Agreed:
             if self.leads:
+                self.leave()
                 raise
             sys.exit(2)
         except BaseException as error:

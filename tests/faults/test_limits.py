@@ -102,6 +102,13 @@ def test_a_field_that_does_not_fit_is_refused_with_the_size_that_would(
         require_room(sized(config, form, setting, int(told[1]) + 1), materials=3)
 
 
+def test_a_guide_that_does_not_fit_is_named(monkeypatch):
+    monkeypatch.setattr(memory, "free_bytes", lambda: GB)
+    config = update(preset("cpu"), {"guide": {"cells": 64}})
+    with pytest.raises(UserError, match=r"guide\.cells: .* Lower guide\.cells from 64"):
+        require_room(config, materials=3)
+
+
 def test_a_fit_without_room_for_its_grid_makes_no_run(limited, cornell, tiny, tmp_path):
     """A limit of the process, under which such a grid crashed in native code."""
     file = tmp_path / "large.toml"

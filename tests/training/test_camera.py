@@ -605,6 +605,20 @@ def test_a_response_that_photographs_do_not_tell_is_doubted_and_stays(cornell, t
     np.testing.assert_allclose(problem.camera.curves(), [np.linspace(0, 1, 17)] * 3, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "unknown", [{"exposure": "per-image"}, {"white_balance": "per-image"}, {"response": "monotone"}]
+)
+def test_one_photograph_tells_nothing_of_its_camera(unknown, cornell, tiny):
+    config = replace(read_toml(tiny), camera=CameraConfig(**unknown))
+    dataset = Dataset.load(cornell)
+    dataset = replace(dataset, views=(dataset.train[0], *dataset.heldout))
+    pixels = pixels_of(dataset, config, clip_negative=False)
+    problem = problem_of(dataset, config, pixels.photographs.mean)
+    line = begin_cameras(problem, dataset, pixels)
+    assert (line is not None) == ("response" in unknown)
+    np.testing.assert_allclose(problem.camera.gains(), np.ones((1, 3)))
+
+
 def test_green_tells_the_response_where_each_photograph_has_a_white_balance(monkeypatch):
     """Red and blue alone would be explained by no response at all, with other balances."""
     rng, views = np.random.default_rng(0), 12

@@ -5,8 +5,10 @@ import io
 import json
 import shutil
 import signal
+from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
@@ -22,6 +24,7 @@ from unbake.training.fresh_fit import begin_fit
 from unbake.training.held_aside import HeldAside, HeldOutPhotographs, convergence
 from unbake.training.loop import fit
 from unbake.training.monitor import Monitor
+from unbake.training.poses import PoseModel
 from unbake.training.run_folder import RunFolder
 from unbake.training.step import TrainingStep
 
@@ -192,6 +195,42 @@ def test_photographs_of_held_out_views_are_compared_in_full(cornell, config):
         "split": "heldout",
         "render_psnr": pytest.approx(-10 * np.log10(error), abs=1e-4),
     }
+
+
+def test_pixels_without_an_estimate_do_not_lose_the_others(cornell, config):
+    dataset = Dataset.load(cornell)
+    rays = CameraRays.of([v.camera for v in (*dataset.train, *dataset.heldout)])
+
+    def measured(broken):
+        step = Halves(lambda n: np.where(np.arange(len(n)) < broken, np.nan, 0.25),
+                      lambda n: np.full(len(n), 0.5))  # fmt: skip
+        probe = HeldOutPhotographs(step, rays, dataset, config, clip_negative=False)
+        return probe.measure(None)
+
+    assert measured(3)["render_psnr"] == pytest.approx(measured(0)["render_psnr"], abs=1.0)
+    assert measured(10**6) is None
+
+
+def test_photographs_of_held_out_views_are_compared_with_refined_intrinsics(cornell, config):
+    dataset = Dataset.load(cornell)
+    cameras, (view,) = [v.camera for v in dataset.train], dataset.heldout
+    rays, shot = CameraRays.of([*cameras, view.camera]), []
+
+    class Watched(Halves):
+        def probe(self, state, rays, pixels, seed):
+            shot.append(np.array(rays.lens).reshape(-1, 4))
+            return super().probe(state, rays, pixels, seed)
+
+    step = Watched(lambda n: np.full(len(n), 0.25), lambda n: np.full(len(n), 0.5))
+    poses = PoseModel(cameras, np.ones(len(cameras)), 100.0, poses=False, intrinsics=True)
+    probe = HeldOutPhotographs(step, rays, dataset, config, clip_negative=False, poses=poses)
+    moves = [2.0, 1.0, -1.0]  # half the width is 2 pixels longer; the principal point moves
+    probe.measure(SimpleNamespace(phi={"intrinsics.moves": mi.Float(moves)}))
+    longer = 1 + 2 / (view.camera.width / 2)
+    c = view.camera
+    expected = [c.fl_x * longer, c.fl_y * longer, c.cx + 1, c.cy - 1]
+    np.testing.assert_allclose(shot[0][-1], expected, rtol=1e-5)
+    np.testing.assert_allclose(shot[0][:-1], np.array(rays.lens).reshape(-1, 4)[:-1])
 
 
 @pytest.mark.parametrize("heldout", [True, False])

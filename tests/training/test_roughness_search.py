@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -22,7 +23,7 @@ from unbake.fields.field import FieldSpec
 from unbake.fields.network import Network
 from unbake.quantities import QUANTITIES
 from unbake.ranks import Ranks
-from unbake.training import loop, roughness_search
+from unbake.training import loop, roughness_search, search_samples
 from unbake.training.piece_variation import expected_albedo
 from unbake.training.problem import make_problem
 from unbake.training.roughness_curves import (
@@ -122,6 +123,23 @@ def test_pixels_are_drawn_that_show_one_piece(built_in, monkeypatch):
     monkeypatch.setattr(samples, "_of_one_piece", lambda _, seed, count: pixels.draw(seed, count))
     drawn = len(samples.by_roughness(state, (1, 2), 256, 16, NODES))
     assert drawn < 0.8 * chosen and chosen > 0.85 * 256
+
+
+def test_a_search_without_a_pixel_of_use_finds_nothing(built_in, monkeypatch):
+    problem, _, step, state = started(built_in)
+
+    found = search_samples.by_roughness
+
+    def none(*args, **options):
+        chosen, rows = found(*args, **options)
+        return chosen[:0], rows[:0]
+
+    monkeypatch.setattr(search_samples, "by_roughness", none)
+    assert len(SearchSamples(problem, step).by_roughness(state, (3, 0), 64, 4, (0.4,))) == 0
+    before = {key: np.array(x.array) for key, x in state.phi.items()}
+    search = RoughnessSearch(problem, SETTINGS, step, Ranks())
+    assert search.search_if_due(0.5, state, 4) and search.made == 1
+    assert all((np.array(x.array) == before[key]).all() for key, x in state.phi.items())
 
 
 def test_nothing_is_compiled_for_another_draw_of_pixels(built_in):
@@ -296,27 +314,66 @@ def test_errors_have_the_variance_1_however_bright_pixels_are():
 def test_searches_come_at_their_places_and_steps_hardly_move_roughness(built_in):
     problem, _, step, state = started(built_in)
     search = RoughnessSearch(problem, SETTINGS, step, Ranks())
-    assert not search.due(0.0, 0.39) and search.rates({}, 0, 0.0) == {}
-    assert search.due(0.39, 0.4) and not search.due(0.4, 0.45)
-    assert search.due(0.7, 0.8) and not search.due(0.8, 1.0)
+    assert not search.due(0.39) and search.rates({}, 0, 0.0) == {}
+    assert search.due(0.4) and search.due(1.0)
     rates = {"albedo": 1.0, "roughness": 1.0}
     before = rates | {"roughness": SETTINGS.roughness_search.rate_before}
     assert 0 < before["roughness"] < 1
     assert search.rates(rates, 39, 0.39) == before
     none = replace(SETTINGS, roughness_search=replace(SETTINGS.roughness_search, times=0))
     assert RoughnessSearch(problem, none, step, Ranks()).rates(rates, 39, 0.39) == rates
-    assert search.rates(rates, 40, 0.4) == {"albedo": 1.0, "roughness": 0.0}
+    assert search.rates(rates, 40, 0.4) == before, "no search was made yet"
     before = {key: np.array(x.array) for key, x in state.phi.items()}
-    assert search.search_between(0.1, 0.2, state, 4) == 0
-    samples = search.search_between(0.3, 0.5, state, 4)
+    assert search.search_if_due(0.2, state, 4) == 0
+    samples = search.search_if_due(0.5, state, 4)
+    assert search.made == 1 and not search.due(0.74) and search.due(0.75)
+    assert search.rates(rates, 50, 0.5) == {"albedo": 1.0, "roughness": 0.0}
     assert samples == pytest.approx(SHARE * 4 / 0.5 * SETTINGS.samples_per_step, rel=0.01)
     moved = {k for k, x in state.phi.items() if (np.array(x.array) != before[k]).any()}
     assert moved == {"roughness.pieces.0", "roughness.colours"}
 
 
+def test_a_shorter_fit_makes_up_for_the_searches_that_it_missed(built_in):
+    problem, _, step, state = started(built_in)
+    search = RoughnessSearch(problem, SETTINGS, step, Ranks())
+    assert search.search_if_due(0.8, state, 4), "both places were passed, and no search was made"
+    assert search.made == 2 and not search.due(1.0)
+
+
+def test_a_fit_that_goes_on_makes_the_searches_of_its_new_length(cornell, tmp_path, unbake):
+    settings = tmp_path / "settings.toml"
+    settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20)))
+    made, search, step = [], RoughnessSearch._search, TrainingStep.__call__
+
+    def counted(self, state, number, *args):
+        made.append(number)
+        return search(self, state, number, *args)
+
+    def stopped(self, state, number, rates):
+        if number == 6:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, state, number, rates)
+
+    def fitted(name, *words):
+        made.clear()
+        return unbake("fit", cornell, "--out", tmp_path / name, *words).status, list(made)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RoughnessSearch, "_search", counted)
+        assert fitted("longer", "--settings", settings) == (0, [8, 15])
+        assert fitted("longer", "--resume", "--steps", 40) == (0, [30]), "the first is at 16"
+        with patch.context() as other:
+            other.setattr(TrainingStep, "__call__", stopped)
+            assert fitted("shorter", "--settings", settings) == (130, [])
+        assert fitted("shorter", "--resume", "--steps", 8) == (0, [8]), "both were due before"
+    manifests = sorted((tmp_path / "shorter" / "checkpoints").glob("step-*/manifest.json"))
+    assert [json.loads(x.read_text())["searches"] for x in manifests] == [0, 2]
+
+
 def test_steps_of_older_runs_move_roughness_as_before():
     text = to_toml(FitConfig())
-    kept = "\n".join(x for x in text.splitlines() if not x.startswith("rate_before"))
+    old = text.replace("format = 3", "format = 2")
+    kept = "\n".join(x for x in old.splitlines() if not x.startswith("rate_before"))
     found = [from_toml(x).roughness_search.rate_before for x in (text, kept)]
     assert found == [FitConfig().roughness_search.rate_before, 1]
 
@@ -332,7 +389,7 @@ def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):
     def factors(name):
         return np.unique(np.array(state.phi[f"{name}.variation"]))
 
-    assert search.search_between(0.3, 0.5, state, 4)
+    assert search.search_if_due(0.5, state, 4)
     assert factors("albedo").tolist() == [1]
     assert factors("roughness").min() < 1
     shown = []
@@ -342,7 +399,7 @@ def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):
         return expected_albedo(*args)
 
     monkeypatch.setattr(roughness_search, "expected_albedo", seen)
-    assert search.search_between(0.7, 0.8, state, 8)
+    assert search.search_if_due(0.8, state, 8)
     assert 0.1 < factors("albedo").min() < 1
     # As many as the pixels of the search, of which fewer show one piece alone.
     pixels = SHARE * SETTINGS.samples_per_step * 8 / 0.8 / SETTINGS.roughness_search.spp
@@ -354,7 +411,7 @@ def test_fits_of_few_samples_do_not_search(built_in):
     problem, _, step, state = started(built_in, config)
     search = RoughnessSearch(problem, config, step, Ranks())
     rates = {"albedo": 1.0, "roughness": 1.0}
-    assert search.search_between(0.3, 0.5, state, 4) == 0
+    assert search.search_if_due(0.5, state, 4) == 0
     assert search.rates(rates, 4, 0.5) == rates
 
 
@@ -367,7 +424,7 @@ def test_nothing_is_searched_where_there_is_nothing_to_search_with(built_in, cha
     config = replace(SETTINGS, **change)
     problem, _, step, _ = started(built_in, config)
     search = RoughnessSearch(problem, config, step, Ranks())
-    assert not search.due(0.0, 1.0)
+    assert not search.due(1.0)
     rates = {"albedo": 1.0, "roughness": 1.0}
     assert search.rates(rates, 90, 0.9) == rates
 
@@ -492,5 +549,5 @@ def test_older_runs_and_the_papers_settings_do_not_search(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text(text)
     assert read_toml(file).roughness_search == SEARCH
-    file.write_text(text.replace(table, ""))
+    file.write_text(text.replace(table, "").replace("format = 3", "format = 2"))
     assert read_toml(file).roughness_search.times == 0

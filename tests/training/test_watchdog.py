@@ -361,6 +361,26 @@ def notes(run):
     return [line["note"] for line in run.log() if "note" in line]
 
 
+def test_a_method_without_images_has_no_verdict_on_them(begun, monkeypatch):
+    step, state = begun()
+    dog = Watchdog(state, step, Progress(step=LONG_ENOUGH), ["view"])
+    monkeypatch.setattr(type(state), "moved", lambda self: True)
+    monkeypatch.setattr(Watchdog, "_looked_at_again", lambda *_: [{"prior": 0.1, "skipped": 0.0}])
+    assert dog.verdict({"albedo": 0.01, "roughness": 0.01}) is None
+
+
+def test_batches_of_other_processes_are_not_compared(begun, monkeypatch):
+    step, state = begun()
+    now = [{"photometric": 1.0, "skipped": 0.0}] * 8
+    monkeypatch.setattr(type(state), "moved", lambda self: True)
+    monkeypatch.setattr(Watchdog, "_looked_at_again", lambda *_: now)
+    monkeypatch.setattr(type(step), "loss_of_black", lambda self: 1.0)
+    for processes, told in ((1, True), (2, False)):
+        progress = Progress(step=LONG_ENOUGH, untrained=(1.0,) * 8, processes=processes)
+        dog = Watchdog(state, step, progress, ["view"])
+        assert (dog.verdict({"albedo": 0.01, "roughness": 0.01}) is not None) == told
+
+
 def test_a_fit_that_learns_ends_well(fit):
     outcome, run = fit()
     assert outcome.status == 0 and not notes(run), outcome

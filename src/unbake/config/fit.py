@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from ..errors import POSITIVE, UserError, require, require_name, require_ranges
 from ..fields.grid_sizes import USUAL, sized
 from ..fields.registry import representation, representations
-from ..fields.settings import RATES, FieldSettings, GuideConfig
+from ..fields.settings import RATES, FieldSettings, GuideConfig, require_no_pieces
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES, in_order, quantity
 from ..transport.methods import KEPT_PATHS, METHODS, PATH_REPLAY, Method
 from .camera import CameraConfig
@@ -436,6 +436,8 @@ class FitConfig:
         factors = {name: factors.get(name) for name in UNKNOWNS}
         of_radiance = {form: representation(form).radiance for form in representations()}
         radiance = _completed(self.radiance, {f: s for f, s in of_radiance.items() if s})
+        for form, settings in radiance.items():
+            require_no_pieces(settings, f"radiance.{form}")
         # Frozen: the completed settings take the place of what was given.
         for key, value in (
             ("quantities", chosen),

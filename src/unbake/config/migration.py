@@ -9,8 +9,8 @@ from ..errors import UserError
 from ..fields.settings import GridConfig
 from ..formats import check_format
 
-#: Version of the settings file.
-FORMAT = 2
+#: Version of the settings file. Until 2, keys that are absent have the values of `_AS_BEFORE`.
+FORMAT = 3
 
 #: Where keys of format 1, which knew albedo and roughness alone, are now.
 _MOVED = {
@@ -85,8 +85,8 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
         check_format(table, FORMAT, "format")
         del table["format"]
     # Where unbake wrote the file, all settings are in it but those of later versions.
-    written = version is not None or _OF_RUN <= table.keys()
-    found = table if version == FORMAT else _moved(table, version)
+    written = version in (1, 2) or (version is None and _OF_RUN <= table.keys())
+    found = _moved(table, version) if version in (None, 1) else table
     for outer, settings in _AS_BEFORE.items() if written else ():
         if outer and not _has(found, outer):
             continue

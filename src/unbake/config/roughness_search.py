@@ -46,7 +46,7 @@ class RoughnessSearchConfig:
     rate_between: float = 0.0
 
     def __post_init__(self) -> None:
-        ranges = {"times": (0, 1000), "first": (0, 1), "last": (0, 1)}
+        ranges = {"times": (0, 1000), "first": (POSITIVE, 1), "last": (POSITIVE, 1)}
         ranges |= {"share": (POSITIVE, 1000), "pixels": (1, 1 << 24), "spp": (2, 1 << 14)}
         ranges |= {"cells": (1, 1024), "colours": (1, 64), "steps": (0, 10**6)}
         ranges |= {"rate": (POSITIVE, 1e4), "rate_before": (0, 1e4), "rate_between": (0, 1e4)}

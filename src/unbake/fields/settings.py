@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from ..errors import POSITIVE, require, require_ranges
+from ..errors import POSITIVE, UserError, require, require_ranges
 
 #: log2 of the most cells along an axis.
 FINEST = 24
@@ -133,6 +133,21 @@ class NetworkConfig:
         inputs = self.grid.levels * self.grid.features + extra
         layers = _of_layers(inputs, self.width, self.hidden, outputs)
         return self.grid.numbers() + layers + self.pieces.numbers(outputs)
+
+
+def require_no_pieces(settings: object, key: str) -> None:
+    """Refuse values of pieces in the settings of L_θ, which is asked at points without their piece.
+
+    Args:
+        settings: of any representation.
+        key: their dotted key.
+
+    Raises:
+        UserError: there are such values.
+    """
+    if isinstance(settings, NetworkConfig) and settings.pieces.most:
+        what = "must be 0: pieces of surface are of materials alone"
+        raise UserError(what, f"{key}.pieces.most")
 
 
 @dataclass(frozen=True)

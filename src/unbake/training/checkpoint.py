@@ -50,6 +50,9 @@ class Progress:
     #: Losses of photographs in the first steps, for a comparison in the end; none in runs of
     #: version 0.1.
     untrained: tuple[float, ...] = ()
+    processes: int = 1  #: that took these first steps together
+    #: For how many of its places roughness was searched; None: nobody wrote that down.
+    searches: int | None = 0
     warning: str | None = None  #: what is wrong with a fit that has ended; not part of checkpoints
 
     def counted(self) -> dict[str, Any]:
@@ -83,6 +86,8 @@ def save_checkpoint(
         "skipped": progress.skipped,
         "rate": progress.rate,
         "untrained": list(progress.untrained),
+        "processes": progress.processes,
+        "searches": progress.searches,
         **(about or {}),
         "files": {STATE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
     }
@@ -185,6 +190,8 @@ def _good(path: Path, most: int) -> tuple[dict[str, np.ndarray], Progress, dict[
             int(manifest.get("skipped", 0)),
             float(manifest.get("rate", 1.0)),
             tuple(map(float, manifest.get("untrained", ()))),
+            int(manifest.get("processes", 1)),
+            None if manifest.get("searches") is None else int(manifest["searches"]),
         )
         if not all(np.isfinite(array).all() for array in arrays.values()):
             raise _Damaged("a number is not finite")

@@ -173,6 +173,8 @@ def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> st
     solves = Cameras(camera, views).solves
     if camera is None or not (solves or camera.has_response):
         return None
+    if len(views) == 1:  # there is no other photograph of its points
+        return _UNTOLD if camera.has_response else None
     shared = shared_points(problem.scene_view.scene, views, pixels)
     gains = np.log(first_gains(shared)) if solves else np.zeros((len(views), 3))
     if not camera.has_response:

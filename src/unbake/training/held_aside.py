@@ -18,6 +18,7 @@ from ..fields.arrays import from_numpy
 from ..fields.camera import CameraModel
 from .cameras import Cameras
 from .checkpoint import Progress
+from .poses import PoseModel, refined_view
 from .state import State
 from .step import TrainingStep
 
@@ -56,7 +57,7 @@ class _Probe:
         colours: np.ndarray,
         config: FitConfig,
     ) -> None:
-        self._step, self._rays = step, rays
+        self._step, self.rays = step, rays
         self.target = colours[:, :3].astype(np.float64)
         # Passes have as many pixels as a step: they take no more memory, and are compiled once.
         passes, size = math.ceil(len(numbers) / config.pixels), config.pixels
@@ -68,7 +69,7 @@ class _Probe:
     def halves(self, state: State) -> np.ndarray:
         """Two independent estimates of each pixel, linear RGB, shape (n, 2, 3)."""
         found = [
-            self._step.probe(state, self._rays, pixels, seed)
+            self._step.probe(state, self.rays, pixels, seed)
             for pixels, seed in zip(self._passes, self._seeds, strict=True)
         ]
         return np.concatenate(found)[: len(self.target)].astype(np.float64)
@@ -224,6 +225,7 @@ class HeldOutPhotographs:
         config: of the fit.
         clip_negative: take negative pixels of the photographs as zero.
         camera: what is fitted of the cameras.
+        poses: what is fitted of where they stood; held-out views have refined intrinsics.
 
     Raises:
         UserError: a photograph cannot be read.
@@ -238,8 +240,10 @@ class HeldOutPhotographs:
         *,
         clip_negative: bool,
         camera: CameraModel | None = None,
+        poses: PoseModel | None = None,
     ) -> None:
         self._camera, self._cameras = camera, Cameras(camera, dataset.train)
+        self._poses, self._train = poses, dataset.train
         self._views: list[tuple[View, np.ndarray]] = []  # with the numbers of pixels in it
         start = sum(view.camera.width * view.camera.height for view in dataset.train)
         each = max(MOST_HELD // len(dataset.heldout), 1)
@@ -259,22 +263,31 @@ class HeldOutPhotographs:
     def measure(self, state: State) -> dict[str, Any] | None:
         """The PSNR of their pictures in dB, clipped to [0,1]; None where no pixel is in the scene.
 
+        Pixels without a finite estimate are left out, as steps skip them.
         Pictures are as photographs show them, times their exposure and clipped where these are.
         Pictures are as a step sees them, with L_θ after the first bounces, without their noise.
         """
         if self._probe is None:
             return None
+        views = [view for view, _ in self._views]
+        if self._poses is not None:
+            self._poses.assign(dict(state.phi.items()))
+            views = [refined_view(self._poses, self._train, view) for view in views]
+            # Steps correct the cameras of training views themselves
+            self._probe.rays = CameraRays.of([v.camera for v in (*self._train, *views)])
         halves, target = self._probe.halves(state), self._probe.target
         if self._camera is not None:
             self._camera.assign(dict(state.phi.items()))
         errors, start = [], 0
-        for view, numbers in self._views:
+        for view, (_, numbers) in zip(views, self._views, strict=True):
             part = slice(start, start + len(numbers))
             start = part.stop
             shown = self._shown(view, numbers, halves[part], target[part]).clip(max=1)
             compared = view.readable(target[part]).clip(max=1)
             errors.append(_squared_errors(shown, compared))
-        error = float(np.concatenate(errors).mean())
+        found = np.concatenate(errors)
+        known = np.isfinite(found)
+        error = float(found.mean(where=known)) if known.any() else 0.0
         if not 0 < error < math.inf:
             return None
         return {"split": "heldout", "render_psnr": -10 * math.log10(error)}

@@ -73,14 +73,19 @@ def require_room(config: FitConfig, materials: int) -> None:
     """
     fields = _fields(config)
     needs = {field.key: field.bytes(materials) for field in fields}
-    total = sum(needs.values())
+    guide = 0
+    if has_radiance(config.chosen_method):
+        guide = BYTES_A_NUMBER * config.guide.numbers()
+    total = sum(needs.values()) + guide
     if not total:
         return
+    told = "the fields of this fit, with gradients and Adam's moments, need"
+    if guide >= max(needs.values(), default=0):
+        lower = f"Lower guide.cells from {config.guide.cells}"
+        require_memory(_reserved(total), told, lambda free: lower, "guide.cells")
+        return
     worst = max(fields, key=lambda field: needs[field.key])
-    if has_radiance(config.chosen_method):
-        total += BYTES_A_NUMBER * config.guide.numbers()
     others = total - needs[worst.key]
-    factor, always = (_RESERVED, _RESERVED_ALWAYS) if reserved_counts() else (1.0, 0.0)
 
     def remedy(free: int) -> str:
         if worst.form.size is None:
@@ -88,9 +93,7 @@ def require_room(config: FitConfig, materials: int) -> None:
 
         def fits(size: int) -> bool:
             resized = worst.resized(size)
-            return resized is None or (
-                factor * (others + resized.bytes(materials)) + always <= free
-            )
+            return resized is None or _reserved(others + resized.bytes(materials)) <= free
 
         most = largest(fits, worst.size)
         name = f"{worst.key}.{worst.form.size}"
@@ -98,8 +101,12 @@ def require_room(config: FitConfig, materials: int) -> None:
             return f"Lower {name} from {worst.size} to {most} or less"
         return f"Lower {name} and those of the other fields"
 
-    told = "the fields of this fit, with gradients and Adam's moments, need"
-    require_memory(factor * total + always, told, remedy, worst.key)
+    require_memory(_reserved(total), told, remedy, worst.key)
+
+
+def _reserved(need: float) -> float:
+    """Bytes that are taken where so many are used."""
+    return _RESERVED * need + _RESERVED_ALWAYS if reserved_counts() else need
 
 
 def _fields(config: FitConfig) -> list[_Field]:

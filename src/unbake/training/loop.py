@@ -26,7 +26,7 @@ from ..dataset.photographs import MOST_PIXELS
 from ..dataset.pixels import CameraRays, PixelSource
 from ..dataset.views import Dataset
 from ..errors import UserError
-from ..fields.camera import CameraModel
+from ..machine import machine
 from ..ranks import Ranks
 from ..signals import deferred
 from ..version import VERSION
@@ -49,9 +49,16 @@ from .schedule import learning_rates
 from .sharing import kept_whole
 from .solved import Solved, read_solved
 from .state import State, initial_state
-from .step import TrainingStep
+from .step import TrainingStep, with_share
 from .validation import Score
-from .warm_start import OPTION, start_radiance, told_start, warm_start, with_solved_field
+from .warm_start import (
+    OPTION,
+    solved_again,
+    start_radiance,
+    told_start,
+    warm_start,
+    with_solved_field,
+)
 from .watchdog import Watchdog
 
 #: Steps between looks at the clock, where time is the limit or decides when to score. Looking waits
@@ -217,7 +224,8 @@ def _begin(
     )
     if before is not None:
         _require_same_data(folder, before, origin)
-        origin = dataclasses.replace(origin, warm_start=before.warm_start)
+        kept = {"warm_start": before.warm_start, "machines": before.machines}
+        origin = dataclasses.replace(origin, **kept)
     problem = problem_of(dataset, config, origin.mean_radiance)
     untold = begin_cameras(problem, dataset, pixels)
     if problem.radiance is not None:
@@ -234,24 +242,42 @@ def _begin(
         console.print(told_start(solved, config), highlight=False, soft_wrap=True)
     if config.follows_paths:
         console.print(told_depth(config, dataset), highlight=False, soft_wrap=True)
-    state = initial_state(problem)
-    # A resumed fit plans with the first state, too, and so goes on as if it had not stopped.
     step = TrainingStep(problem, pixels, config, ranks)
-    step.plan(state)
-    restored = load_checkpoint(folder, state) if resume else None
-    if resume and restored is None:
-        console.print("the run has no checkpoint yet: it begins again", highlight=False)
+    state, restored = _state(problem, step, folder if resume else None, origin, console)
     preview = Preview(problem, dataset, folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
-    aside, photographs = _probes(
-        dataset, pixels, step, config, preview, clip_negative, problem.camera
-    )
+    of_rank = with_share(config, ranks.size)
+    aside, photographs = _probes(problem, dataset, pixels, step, of_rank, preview, clip_negative)
     step.require_memory(state)
     names = [view.name for view in dataset.train]
     return _Begun(
         config, origin, problem, step, state, restored, preview, score, aside, photographs, names
     )
+
+
+def _state(
+    problem: Problem,
+    step: TrainingStep,
+    folder: RunFolder | None,
+    origin: Origin,
+    console: Console,
+) -> tuple[State, Progress | None]:
+    """The state that a fit begins with, and its progress if that is one of a checkpoint.
+
+    Args:
+        folder: of a run that goes on; None: it is new.
+    """
+    state = initial_state(problem)
+    # A resumed fit plans with the first state, too, and so goes on as if it had not stopped.
+    step.plan(state)
+    restored = None if folder is None else load_checkpoint(folder, state)
+    if folder is not None and restored is None:
+        console.print("the run has no checkpoint yet: it begins again", highlight=False)
+        if origin.warm_start is not None:
+            start_radiance(problem, solved_again(origin.warm_start))
+            state = initial_state(problem)
+    return state, restored
 
 
 def what_ranks_share(settings: str, files: Mapping[str, Any]) -> dict[str, str]:
@@ -302,13 +328,13 @@ def _require_same_state(state: State, ranks: Ranks) -> None:
 
 
 def _probes(
+    problem: Problem,
     dataset: Dataset,
     pixels: PixelSource,
     step: TrainingStep,
     config: FitConfig,
     preview: Preview | None,
     clip_negative: bool,
-    camera: CameraModel | None,
 ) -> tuple[HeldAside | None, HeldOutPhotographs | None]:
     """What is measured beside the training, from photographs alone.
 
@@ -323,11 +349,19 @@ def _probes(
     held = pixels.held_aside()
     aside = None
     if held is not None:
-        aside = HeldAside(step, rays, held, config, camera=camera, exposures=pixels.exposures)
+        aside = HeldAside(
+            step, rays, held, config, camera=problem.camera, exposures=pixels.exposures
+        )
     photographs = None
     if compared:
         photographs = HeldOutPhotographs(
-            step, rays, dataset, config, clip_negative=clip_negative, camera=camera
+            step,
+            rays,
+            dataset,
+            config,
+            clip_negative=clip_negative,
+            camera=problem.camera,
+            poses=problem.poses,
         )
     return aside, photographs
 
@@ -354,12 +388,13 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     """
     config, problem, state, score = begun.config, begun.problem, begun.state, begun.score
     progress = begun.restored or Progress()
+    over = _done(config, progress) >= (config.seconds or config.steps)
     if begun.restored is not None:
-        over = _done(config, progress) >= (config.seconds or config.steps)
         more = f"going on after step {progress.step}"
         none = f"the run has {progress.step} steps already, and is to have no more"
         console.print(none if over else more, highlight=False)
-    log, events = _open(begun, folder, lock, progress, tensorboard)
+    origin = begun.origin if over else begun.origin.on(machine())
+    log, events = _open(begun, origin, folder, lock, progress, tensorboard)
     errors = ErrorCurve(begun.aside, config, _measured_before(folder), progress)
 
     unknown = next(iter(state.phi)).partition(".")[0]  # the first one, whose rate is logged
@@ -370,7 +405,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
     shown_at = scored_at = progress.seconds
     recent: list[dict[str, mi.Float]] = []
     watchdog = Watchdog(state, begun.step, progress, begun.views)
-    search = RoughnessSearch(problem, config, begun.step, ranks)
+    search = _searches(begun, progress, ranks)
     failures: list[UserError] = []  # to write what was due last
     stopped = False
     with Monitor(log, console, total, events) as monitor:
@@ -378,8 +413,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             monitor.record(0.0, _log_entry([], progress, 0.0) | {"score": score.measure()})
         clock = time.perf_counter() - progress.seconds
         # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
-        last = _done(config, progress) >= total
-        before = 1.0 if last else _done(config, progress) / total
+        last = over
         if last and begun.restored is None:  # nothing to learn: the untrained fields are the result
             failures = [*saving.save(state, progress), *_show(begun, monitor, progress, lock)]
         while not last:
@@ -403,8 +437,8 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
             now = _done(config, progress) / total
-            _search(search, watchdog, (before, now), saving, state, progress, clock, ranks)
-            before, last = now, last or _done(config, progress) >= total
+            _search(search, watchdog, now, saving, state, progress, clock, ranks)
+            last = last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
             if not (full or last or due or save or tell):
                 continue
@@ -442,7 +476,12 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
 
 
 def _open(
-    begun: _Begun, folder: RunFolder, lock: RunLock | None, progress: Progress, tensorboard: bool
+    begun: _Begun,
+    origin: Origin,
+    folder: RunFolder,
+    lock: RunLock | None,
+    progress: Progress,
+    tensorboard: bool,
 ) -> tuple[Path, EventLog | None]:
     """Make the folder that of the run, without what is of steps that will be taken again.
 
@@ -453,15 +492,25 @@ def _open(
         return Path(os.devnull), None
     folder.sweep()
     folder.forget_after(progress.step)
-    folder.write_origin(begun.origin)
+    folder.write_origin(origin)
     folder.write_settings(begun.config)  # from here on there is a run, which can be resumed
     return folder.log_file, folder.events(progress.step + 1) if tensorboard else None
+
+
+def _searches(begun: _Begun, progress: Progress, ranks: Ranks) -> RoughnessSearch:
+    """The searches of a fit, some of which may have been made before."""
+    config = begun.config
+    search = RoughnessSearch(begun.problem, config, begun.step, ranks)
+    # In a longer fit than before, places lie later. Older versions made all in their places.
+    passed = search.passed(_done(config, progress) / (config.seconds or config.steps or 1))
+    search.made = passed if progress.searches is None else min(progress.searches, passed)
+    return search
 
 
 def _search(
     search: RoughnessSearch,
     watchdog: Watchdog,
-    between: tuple[float, float],
+    done: float,
     saving: Saving,
     state: State,
     progress: Progress,
@@ -473,7 +522,7 @@ def _search(
     Args:
         search: what searches.
         watchdog: goes back no further than to what is found.
-        between: fractions of the fit that were done before the present step, and are now.
+        done: fraction of the fit.
         saving: saves the state where there is no memory for the search.
         state: where what is found is left.
         progress: of the fit.
@@ -484,13 +533,14 @@ def _search(
         UserError: there is no memory for it.
     """
     try:
-        samples = search.search_between(*between, state, progress.step)
+        samples = search.search_if_due(done, state, progress.step)
     except UserError:  # the state is that of before: a search leaves what it finds at its end
         saving.save(state, progress)
         raise
     if samples:  # on all ranks
         dr.sync_thread()
         progress.samples += samples
+        progress.searches = search.made
         progress.seconds = ranks.of_first(time.perf_counter() - clock)
         watchdog.keep()
 

@@ -72,7 +72,11 @@ class RoughnessSearch:
     """
 
     def __init__(
-        self, problem: Problem, config: FitConfig, step: TrainingStep, ranks: Ranks
+        self,
+        problem: Problem,
+        config: FitConfig,
+        step: TrainingStep,
+        ranks: Ranks,
     ) -> None:
         self._problem, self._config, self._step, self._ranks = problem, config, step, ranks
         self._samples = SearchSamples(problem, step)
@@ -84,20 +88,25 @@ class RoughnessSearch:
         # A single search is the last one; there is none where there is nothing to search.
         times = 0 if self._field is None else search.times
         self._places = np.sort(np.linspace(search.last, search.first, times))
+        self.made = 0  # for how many of the places roughness was searched
 
-    def due(self, before: float, now: float) -> bool:
-        """Whether a search lies between two fractions of a fit that are done, the second included.
+    def passed(self, done: float) -> int:
+        """How many places of searches lie before a fraction of the fit, or at it."""
+        return int((self._places <= done).sum())
 
-        A fit that goes on does so after its last step, whose searches were done.
+    def due(self, done: float) -> bool:
+        """Whether a search is to be made after a fraction of the fit.
+
+        Those that were missed, as a fit was made shorter, are made up for by one.
         """
-        return bool(((before < self._places) & (self._places <= now)).any())
+        return self.made < self.passed(done)
 
     def rates(self, rates: dict[str, float], step: int, done: float) -> dict[str, float]:
         """The learning rates of a step, after a fraction of the fit."""
         if not len(self._places) or not self._pixels(step, done):
             return rates
-        search, after = self._config.roughness_search, (self._places <= done).any()
-        factor = search.rate_between if after else search.rate_before
+        search = self._config.roughness_search
+        factor = search.rate_between if self.made else search.rate_before
         return rates | {"roughness": rates["roughness"] * factor}
 
     def _pixels(self, step: int, done: float) -> int:
@@ -108,12 +117,11 @@ class RoughnessSearch:
         pixels = round(search.share * step / done * of_steps / search.spp)
         return min(pixels, search.pixels) if pixels >= _FEWEST else 0
 
-    def search_between(self, before: float, now: float, state: State, number: int) -> int:
+    def search_if_due(self, done: float, state: State, number: int) -> int:
         """Search, if that is due, and leave in the state what was found.
 
         Args:
-            before: fraction of the fit that was done before the present step.
-            now: the same after it.
+            done: fraction of the fit.
             number: of the step; with the settings' seed it decides all random numbers.
 
         Returns:
@@ -122,16 +130,19 @@ class RoughnessSearch:
         Raises:
             UserError: there is no memory for it.
         """
-        pixels = self._pixels(number, now) if self.due(before, now) else 0
+        pixels = self._pixels(number, done) if self.due(done) else 0
         if not pixels:
             return 0
         try:
             with without_garbage_collection():
-                # The first ones are of an L_θ that is not there yet.
-                part = 1 / max(1, int((self._places <= now).sum()) - 1)
-                last = bool((self._places <= now).all())
+                passed = self.passed(done)
+                # The first one is of an L_θ that is not there yet.
+                part = 1 / max(1, passed - 1) if self.made else 1.0
+                last = passed == len(self._places)
                 each = -(-pixels // self._ranks.size)
-                return self._search(state, number, each, part, last)
+                samples = self._search(state, number, each, part, last)
+                self.made = passed
+                return samples
         except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
                 raise

@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
+from .. import json_checks
 from ..config import FitConfig, read_toml, to_tables, to_toml
 from ..errors import UserError
 from ..formats import check_format
@@ -47,6 +48,7 @@ STATE, MANIFEST = "state.safetensors", "manifest.json"
 SUFFIX_OF_VERSION_0_1 = ".safetensors"
 _CHECKPOINT = re.compile(r"step-(\d{1,18})(\.safetensors)?", re.ASCII)
 _GIVE_RUN = "Give the folder of a run"
+_MACHINES = json_checks.list_of(json_checks.any_object)
 
 
 @final
@@ -94,6 +96,13 @@ class Origin:
     #: Of the data set (`dataset/fingerprint.py`); empty: begun by version 0.1.
     fingerprint: Mapping[str, str] = field(default_factory=dict)
     warm_start: WarmStart | None = None  #: None: the radiance field started untrained
+    #: That took steps, in their order (`machine.machine`); empty: none did, or nobody wrote it.
+    machines: tuple[Mapping[str, Any], ...] = ()
+
+    def on(self, machine: Mapping[str, Any]) -> Origin:
+        """The same of a run whose next steps are taken on a machine."""
+        known = machine in self.machines
+        return self if known else replace(self, machines=(*self.machines, machine))
 
     @property
     def radiance_scale(self) -> float:
@@ -292,11 +301,15 @@ class RunFolder:
                 "clip_negative": bool(clip),
             } if data and "\0" not in data and 0 < radiance < math.inf:
                 run, fingerprint = facts.get("run"), facts.get("fingerprint", {})
+                machines = facts.get("machines", [])
                 texts = fingerprint.values() if isinstance(fingerprint, dict) else (None,)
-                if isinstance(run, str | None) and all(isinstance(x, str) for x in texts):
+                good = isinstance(run, str | None) and all(isinstance(x, str) for x in texts)
+                if good and _MACHINES(machines):
                     with suppress(ValueError):
                         start = WarmStart.read(facts.get("warm_start"))
-                        return Origin(data, radiance, clip, run, fingerprint, start)
+                        return Origin(
+                            data, radiance, clip, run, fingerprint, start, tuple(machines)
+                        )
         raise UserError("cannot be read", self.origin_file, again)
 
     def write_origin(self, origin: Origin) -> None:

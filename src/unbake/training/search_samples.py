@@ -81,7 +81,8 @@ class SearchSamples:
             rows["target"] = np.array(target).T[chosen]
             rows["weight"] = self._weight * np.array(weight).T[chosen]
             rows["gain"] = 1 if loss.gain is None else np.array(loss.gain).T[chosen]
-        return rows[np.isfinite(rows.view(np.float32).reshape(len(rows), -1)).all(1)]
+        numbers = rows.view(np.float32).reshape(len(rows), rows.dtype.itemsize // 4)
+        return rows[np.isfinite(numbers).all(1)]
 
     @carrying()
     def places(self, state: State, seeds: Sequence[int], count: int) -> np.ndarray:

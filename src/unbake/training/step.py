@@ -262,6 +262,11 @@ class TrainingStep:
         return told
 
     @property
+    def processes(self) -> int:
+        """How many take the steps together."""
+        return self._ranks.size
+
+    @property
     def rate_names(self) -> tuple[str, ...]:
         """The names of learning rates that a step takes."""
         config = self._config

@@ -15,7 +15,7 @@ from ..scene.geometry import CHANGED, differing, probe
 from ..transport.objective import has_radiance
 from .problem import Problem
 from .run_folder import WarmStart
-from .solved import Solved
+from .solved import Solved, read_solved
 
 #: Of the options, for messages.
 OPTION = "--radiance-from"
@@ -100,6 +100,19 @@ def warm_start(solved: Solved) -> WarmStart:
     """What the origin of a run tells of the field that it started with."""
     folder = str(solved.folder.resolve())
     return WarmStart(folder, solved.scene, solved.steps, solved.sha256, solved.radiance.scale)
+
+
+def solved_again(start: WarmStart) -> Solved:
+    """The field that a run started with, for one that begins again.
+
+    Raises:
+        UserError: it cannot be read, or is another one by now.
+    """
+    solved = read_solved(start.folder)
+    if solved.sha256 != start.sha256:
+        what = "is not the solved field any more that the run was to start with"
+        raise UserError(what, solved.folder, f"Start another run with {OPTION}")
+    return solved
 
 
 def told_start(solved: Solved, config: FitConfig) -> str:

@@ -154,6 +154,8 @@ class Watchdog:
             what = f"{progress.step} steps move the unknowns by {path:.1g} at most"
             return f"nothing was learned: {what}. Raise the learning rates"
         again = self._looked_at_again(len(before) or 1)
+        if PHOTOMETRIC not in again[0]:  # a method without images
+            return None
         end, black = median(r[PHOTOMETRIC] for r in again), self._step.loss_of_black()
         if end > _WORSE_THAN_BLACK * black:
             return (
@@ -162,6 +164,8 @@ class Watchdog:
             )
         # With rates that are far too high, the fields are not untrained any more after one step.
         pairs = [(a, b[PHOTOMETRIC]) for a, b in zip(before, again, strict=False)]
+        if progress.processes != self._step.processes:  # their batches are others
+            pairs.clear()
         pairs = [(a, b) for a, b in pairs if abs(a) < _FAR * abs(before[0])]
         if not pairs:
             return None
@@ -195,6 +199,7 @@ class Watchdog:
             losses = [reading[PHOTOMETRIC] for reading in readings[: COMPARED - len(noted)]]
             if all(map(math.isfinite, losses)):
                 self._progress.untrained = (*noted, *losses)
+                self._progress.processes = self._step.processes
 
     def _count_skipped(self, readings: Sequence[Reading], last: bool) -> list[str]:
         progress, told = self._progress, []
@@ -242,7 +247,7 @@ class Watchdog:
         readings = []
         for number in range(count):
             terms = self._step(self._state, number, rates)
-            readings.append({term: float(value[0]) for term, value in terms.items()})
+            readings += self._step.read([terms])
             self._state.restore(now)
         return readings
 
