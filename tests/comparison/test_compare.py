@@ -23,8 +23,10 @@ from unbake.evaluation import yardsticks
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.pictures import read_exr, write_exr
+from unbake.machine import machine
 from unbake.ranks import Ranks
 from unbake.training import loop
+from unbake.training.run_folder import RunFolder
 
 
 @pytest.fixture(autouse=True)
@@ -398,15 +400,39 @@ def test_data_that_is_not_there_is_named(compare, tmp_path):
 def test_runs_of_other_settings_or_data_are_not_mixed_in(compare, cornell, tmp_path):
     assert compare("direct", steps=2).status == 0
     before = contents(tmp_path / "out")
+    brighter = shutil.copytree(cornell, tmp_path / "other")
+    photograph = next((brighter / "images").glob("*.exr"))
+    write_exr(photograph, 2 * read_exr(photograph))
     for outcome in (
         compare("direct", steps=3),
         compare("ours", "direct", steps=2, extra=("--seed", 5, "--batch", 16)),
-        compare("direct", steps=2, data=shutil.copytree(cornell, tmp_path / "other")),
+        compare("direct", steps=2, data=brighter),
     ):
         assert outcome.status == 2 and outcome.err.count("\n") == 1
         assert "direct: the run in this folder" in outcome.err
         assert contents(tmp_path / "out") == before
     assert "has other data. Give another --out" in outcome.err
+
+
+def test_a_data_set_that_has_moved_is_the_same(compare, cornell, tmp_path):
+    assert compare("direct", steps=2).status == 0
+    moved = shutil.copytree(cornell, tmp_path / "moved")
+    outcome = compare("direct", "ours", steps=2, data=moved)
+    assert outcome.status == 0, outcome.err
+    assert RunFolder(tmp_path / "out" / "direct").origin().data == str(moved.resolve())
+
+
+def test_runs_of_several_machines_are_told(compare, tmp_path, monkeypatch):
+    outcome = compare("direct", steps=2)
+    assert outcome.status == 0 and "several machines" not in outcome.out
+    own = machine()
+    assert result(tmp_path)["methods"]["direct"]["machines"] == [own]
+    other = own | {"processor": "another one"}
+    monkeypatch.setattr(loop, "machine", lambda: other)
+    outcome = compare("direct", "ours", steps=2)
+    assert outcome.status == 0 and "runs are of several machines" in outcome.out
+    rows = result(tmp_path)["methods"]
+    assert [rows[name]["machines"] for name in ("direct", "ours")] == [[own], [other]]
 
 
 def test_no_run_is_written_through_a_link(compare, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from rich.console import Console
 
 from .. import backend, signals
 from ..config import FitConfig, to_toml
-from ..dataset.fingerprint import fingerprint
+from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..evaluation.convergence import (
@@ -49,6 +49,7 @@ DEFINITIONS = {
     "samples_per_second": "camera samples of a step over that median",
     "memory_mb": "resident memory of the process, which fits all methods one after the other: the "
     "most that a line of the log tells",
+    "machines": "that took the steps of a run; empty: of a version that did not write them",
     "skipped": "steps whose loss was not finite",
     "notes": "what was noted of the fit: a state to which it went back, or that it learned nothing",
     "untrained": "the fields that all methods start from, with the shared representation and seed",
@@ -196,7 +197,16 @@ def compare(
     failed = {name: str(error) for name, error in errors.items()}
     write_report(good, out / "report.html", failed, allow_outside=allow_outside)
     print_comparison(result, console)
+    if len(machines_of(rows.values())) > 1:
+        what = "runs are of several machines: their times and steps cannot be compared"
+        console.print(f"warning: {what}", style="yellow", soft_wrap=True)
     return result
+
+
+def machines_of(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The different machines that rows of a comparison are of, as far as these tell."""
+    found = [machine for row in rows for machine in row.get("machines", ())]
+    return list({json.dumps(machine, sort_keys=True): machine for machine in found}.values())
 
 
 def _checked(
@@ -219,6 +229,9 @@ def _checked(
     if UNTRAINED in names:
         raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
     dataset = Dataset.load(data, allow_outside=allow_outside)
+    files = (
+        fingerprint(dataset) if any(RunFolder(out / n).exists for n in (*names, UNTRAINED)) else {}
+    )
     if evaluation.truth:
         require_true_materials(dataset)
     config = with_data_defaults(config, dataset)
@@ -227,7 +240,7 @@ def _checked(
     untrained = replace(untrained, steps=0, seconds=0.0, score_seconds=0.0)
     fits = {UNTRAINED: untrained, **chosen}
     for name, settings in {**chosen, **fits}.items():
-        _check_kept(RunFolder(out / name), settings, data)
+        _check_kept(RunFolder(out / name), settings, data, files)
     return dataset, config, fits
 
 
@@ -242,12 +255,18 @@ def _of_all(
     return found, {name: UserError(*error) for name, error in failed.items()}
 
 
-def _check_kept(run: RunFolder, settings: FitConfig, data: Path) -> None:
-    """Refuse a link in the run's place, and a run that has other settings or data."""
+def _check_kept(run: RunFolder, settings: FitConfig, data: Path, files: Mapping[str, str]) -> None:
+    """Refuse a link in the run's place, and a run that has other settings or data.
+
+    Args:
+        files: the data set's fingerprint, where there are runs; its folder may have moved.
+    """
     require_no_link(run.path)
     if not run.exists:
         return
-    if run.data(run.origin().data).resolve() != data.resolve():
+    origin = run.origin()
+    elsewhere = run.data(origin.data).resolve() != data.resolve()
+    if changed(origin.fingerprint, files) if origin.fingerprint else elsewhere:
         raise UserError("the run in this folder has other data", run.path, "Give another --out")
     stored = vars(run.settings())
     other = ", ".join(key for key, value in vars(settings).items() if stored[key] != value)
@@ -322,6 +341,7 @@ def _evaluated(
         metrics = run.metrics()
         same = metrics.get("steps") == progress.step
         same = same and metrics.get("evaluation") == asdict(settings)
+        same = same and run.data(metrics["data"]).resolve() == dataset.folder.resolve()
         # Version 0.1 had no yardsticks; runs of known materials have none.
         same = same and (YARDSTICKS in metrics or not metrics.get("quantities"))
         if same and YARDSTICKS in metrics and metrics[YARDSTICKS]["ceiling"] is None:
@@ -347,6 +367,7 @@ def _numbers(run: RunFolder, metrics: dict[str, Any], config: FitConfig) -> dict
         "samples_per_second": None if each is None else 1e3 * config.samples_per_step / each,
         "milliseconds_per_step": each,
         "start_up_seconds": None if each is None else max(0.0, seconds - steps * each / 1e3),
+        "machines": list(run.origin().machines),
         "memory_mb": max((r["memory_mb"] for r in log if "memory_mb" in r), default=None),
         "heldout": metrics["heldout"],
         "train": metrics["train"],

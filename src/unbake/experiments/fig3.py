@@ -45,10 +45,9 @@ def _jobs(context: ExperimentContext) -> list[Job]:
     jobs = []
     for scene in scenes_at(context):
         scene.require(context)
-        # The step time does not depend on the noise of the photographs.
-        shots = dataclasses.replace(
-            scene.capture_settings(context), resolution=context.pick(16, 64, 128), spp=1
-        )
+        # The step time does not depend on the noise of the photographs, but on their resolution,
+        # which fields are as fine as.
+        shots = dataclasses.replace(scene.capture_settings(context), spp=1)
         config = scene.settings(context)
         jobs.append(
             Job(

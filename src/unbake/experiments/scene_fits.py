@@ -133,7 +133,9 @@ class SceneFits:
             seconds = context.pick(2.0 * count, beside, None)
             waits = count * self.config.seconds
             group = self.scene.folder
-            jobs.append(Job(self._job(seed), settings, work, seconds, waits, group=group))
+            # Pictures and metrics of the runs are read again.
+            files = [RunFolder(self.runs(context, seed) / m).metrics_file for m in self.methods]
+            jobs.append(Job(self._job(seed), settings, work, seconds, waits, files, group))
         return jobs
 
     def jobs_at_equal_samples(

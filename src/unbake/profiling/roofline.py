@@ -89,6 +89,9 @@ def _work(problem: Problem, state: State, config: FitConfig) -> Work:
     arrays = [a for _, adam in state.optimizers() for a in adam.values()]
     adam = Work(0, 0, 4 * _ADAM_FLOATS * sum(dr.width(a) for a in arrays))
     work = adam + _of_the_image(problem, needs).times(config.samples_per_pass)
+    if config.two_passes:  # the first one is of values alone
+        first = _of_the_image(problem, needs, gradient=False)
+        work += first.times(config.samples_per_pass)
     if not needs.radiance:
         return work
     each = config.radiance_samples
@@ -96,14 +99,15 @@ def _work(problem: Problem, state: State, config: FitConfig) -> Work:
     return work + learning.times(config.pixels * each)
 
 
-def _of_the_image(problem: Problem, needs: Requirements) -> Work:
+def _of_the_image(problem: Problem, needs: Requirements, *, gradient: bool = True) -> Work:
     """Work of one camera sample, if every vertex is on a surface."""
     # A camera ray, then at each vertex a shadow ray and a BSDF sample.
     work = Work(1 + 2 * needs.bounces, 0, 0)
     for _ in range(needs.bounces):
-        work += _materials(problem, gradient=True)
+        work += _materials(problem, gradient=gradient)
     if needs.radiance:
-        work += _albedo(problem) + _radiance(problem, gradient=needs.image_attached)
+        attached = gradient and needs.image_attached
+        work += _albedo(problem) + _radiance(problem, gradient=attached)
     return work
 
 
