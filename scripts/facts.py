@@ -213,6 +213,25 @@ class Facts:
         searches = self.result("rates")["searches"] if self.has("rates") else []
         return any(search["method"] == method for search in searches)
 
+    def schedules(self) -> str:
+        """What searches found of warm-up and decay, as sentences; empty where they did not look."""
+        searches = self.result("rates")["searches"] if self.has("rates") else []
+        looked = [search for search in searches if "warm_up" in search["trials"][0]]
+        told = []
+        for search in looked:
+            key, own = "final_learning_rate", search["trials"][0]
+            found = (search["best"] or own)[key]
+            if found != own[key]:
+                told.append(
+                    f"In {search['kind']}s the rates of `{search['method']}` fall to {found:.2g} "
+                    f"of their start instead of {own[key]:.2g}."
+                )
+        names = list(dict.fromkeys(search["method"] for search in searches))
+        missed = [f"`{n}`" for n in names if n not in {search["method"] for search in looked}]
+        if looked and missed:
+            told.append(f"For {', '.join(missed)} neither was searched yet.")
+        return " ".join(["", *told])
+
     def search_gain(self, method: str, kind: str) -> str:
         """What a search found better than the fields' own rates, in dB."""
         for search in self.result("rates")["searches"]:
@@ -233,13 +252,17 @@ class Facts:
             fits = sum(len(trial["per_seed"]) for trial in search["trials"])
             own = search["trials"][0]  # a search begins with the fields' rates
             scores = [f"{row['score']:.1f}" for row in (search["untrained"], own, best)]
-            rows.append([f"`{search['method']}`", *scene, factors, chosen, *scores, fits])
+            schedule = [_told(best.get(key)) for key in ("final_learning_rate", "warm_up")]
+            row = [f"`{search['method']}`", *scene, factors, *schedule, chosen, *scores, fits]
+            rows.append(row)
         titles = [
             "method",
             "for",
             "unknown",
             "found on",
             "factors of the rates",
+            "fall to",
+            "warm-up",
             "estimator",
             "untrained",
             "own rates",
@@ -458,6 +481,11 @@ def require_same(found: Mapping[str, Row], keys: Sequence[str]) -> None:
 def cores_of(machine: Row) -> str:
     """The number of cores of a machine, in words."""
     return {1: "one core", 2: "two cores"}.get(machine["cores"], f"{machine['cores']} cores")
+
+
+def _told(value: float | None) -> str:
+    """A number that was searched for; empty where it was not."""
+    return "" if value is None else f"{value:.3g}"
 
 
 def number_or_text(text: str) -> float | str | None:

@@ -70,7 +70,8 @@ def test_the_first_estimator_is_taken_unless_the_other_is_better():
 def test_what_is_better_is_so_by_more_than_the_seeds_differ():
     assert beats([21.0, 21.2], [20.0, 20.2])
     assert not beats([20.0, 20.2], [21.0, 21.2])
-    assert not beats([21.0, 23.0], [20.0, 22.0]), "the seeds differ by more"
+    assert beats([21.0, 25.0], [20.0, 24.0]), "it is better with each seed"
+    assert not beats([21.0, 25.0], [22.0, 20.0]), "the gains differ by more"
     assert not beats([20.1, 20.1], [20.0, 20.0]), "less than the margin"
     assert beats([21.0], [20.0]) and not beats([20.0], [20.0])
 

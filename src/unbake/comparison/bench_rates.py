@@ -70,7 +70,7 @@ DEFINITIONS = {
     f"{STEP} for as long as the score grows by {MARGIN} dB or more; then the other estimator "
     "needs as much; and once again if anything moved. Of the trial that is found, the estimator "
     "and then the rates are taken if they are better than the published estimator and the fields' "
-    "own rates by more than the standard deviation of the difference over seeds",
+    "own rates by more than the standard deviation over seeds of the difference, seed by seed",
     "final_learning_rate": "factor that all rates reach at the end, where it is searched too",
     "warm_up": "steps over which the unknowns' rates rise, where they are searched too",
     "seconds": "of the steps, whose kernels were compiled before",
@@ -253,14 +253,21 @@ def settled(trials: Sequence[Row], best: Row) -> Row:
     """
     wanted = {key: best[key] for key in TRIED if key in best} | {"estimator": PUBLISHED}
     published = next((row for row in trials if wanted.items() <= row.items()), best)
-    chosen = best if beats(_per_seed(best), _per_seed(published)) else published
-    return chosen if beats(_per_seed(chosen), _per_seed(trials[0])) else trials[0]
+    chosen = best if _is_better(best, published) else published
+    return chosen if _is_better(chosen, trials[0]) else trials[0]
 
 
-def _per_seed(trial: Row) -> list[float]:
-    """Scores of a trial, one for each seed."""
-    scores = [fit["score"] for fit in trial["per_seed"]]
-    return [LEAST if score is None else score for score in scores]
+def _is_better(trial: Row, other: Row) -> bool:
+    """Whether a trial beats another one, seed by seed."""
+    first, second = _per_seed(trial), _per_seed(other)
+    shared = sorted(first.keys() & second.keys())
+    return bool(shared) and beats([first[s] for s in shared], [second[s] for s in shared])
+
+
+def _per_seed(trial: Row) -> dict[int, float]:
+    """Scores of a trial, by seed."""
+    scores = {fit["seed"]: fit["score"] for fit in trial["per_seed"]}
+    return {seed: LEAST if score is None else score for seed, score in scores.items()}
 
 
 @final
@@ -305,8 +312,10 @@ class _Search:
         found = self._row(best)
         if "error" in found:
             raise UserError(found["error"], self._name)
+        own = self._row(Trial(tuple(searched), (0,) * len(searched), estimators[0]))
         # A file of an earlier version may have trials with another estimator.
-        taken = settled([t for t in record["trials"] if t["estimator"] in estimators], found)
+        known = [t for t in record["trials"] if t["estimator"] in estimators and t is not own]
+        taken = settled([own, *known], found)
         record["best"] = {key: taken[key] for key in (*TRIED, "score") if key in taken}
         self._write()
 
@@ -481,6 +490,7 @@ def _search(
     schedule: bool,
 ) -> Row:
     """The search of a method on a data set in the record; a new one if there is none."""
+    estimators = _estimators(config)
     config = with_defaults(config, dataset)
     settings = tomllib.loads(to_toml(config))
     for key in ("rate_factors", "estimator", "seed", *(SCHEDULE if schedule else ())):
@@ -488,18 +498,21 @@ def _search(
     camera = dataset.train[0].camera
     described: Row = {
         "method": name,
-        "data": dataset.folder.name,
+        "data": dataset.folder.resolve().name,
         "kind": dataset.kind,
         "unknown": config.unknown,
         "views": len(dataset.train),
         "heldout": len(dataset.heldout),
         "resolution": [camera.width, camera.height],
         "follows_paths": config.follows_paths,
+        "estimators": list(estimators),
+        "files": fingerprint(dataset),
         "settings": settings,
     }
     for search in result["searches"]:
         if _key(search) == _key(described):
-            other = [key for key, value in described.items() if search.get(key) != value]
+            # Records of earlier versions lack some keys.
+            other = [k for k, value in described.items() if search.get(k, value) != value]
             if "settings" in other:
                 both = settings.keys() | search["settings"].keys()
                 other += sorted(k for k in both if search["settings"].get(k) != settings.get(k))

@@ -5,7 +5,6 @@ It knows no fits: whoever calls it scores the trials.
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -81,13 +80,15 @@ def best_trial(
 def beats(first: Sequence[float], second: Sequence[float]) -> bool:
     """Whether scores are better than others by `MARGIN`, and by more than seeds differ.
 
+    Fits of one seed begin alike, so that the difference is taken seed by seed.
+
     Args:
         first: in dB, one for each seed.
-        second: those of other settings.
+        second: those of other settings, with the same seeds.
     """
-    difference = statistics.fmean(first) - statistics.fmean(second)
-    several = [scores for scores in (first, second) if len(scores) > 1]
-    return difference >= max(MARGIN, math.hypot(*map(statistics.stdev, several)))
+    gains = [a - b for a, b in zip(first, second, strict=True)]
+    spread = statistics.stdev(gains) if len(gains) > 1 else 0.0
+    return statistics.fmean(gains) >= max(MARGIN, spread)
 
 
 def _along(unknown: str, start: Trial, score: Callable[[Trial], float]) -> Trial:

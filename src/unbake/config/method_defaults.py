@@ -38,8 +38,8 @@ class MethodDefaults:
 #: search found better ones for rooms.
 METHOD_DEFAULTS: Mapping[str, Mapping[SceneKind, MethodDefaults]] = {
     "prb": {
-        "room": MethodDefaults({"roughness": 2.5, "albedo": 1.0}, "two-pass"),
-        "object": MethodDefaults({"roughness": 1.0, "albedo": 1.0}, "two-pass"),
+        "room": MethodDefaults({"roughness": 1.0, "albedo": 2.5}, "two-pass", 0.3125, 0),
+        "object": MethodDefaults({"roughness": 1.0, "albedo": 1.0}, "two-pass", 0.05, 0),
     },
     "no-prior": {
         "room": MethodDefaults({"roughness": 1.0, "albedo": 1.0}),
