@@ -185,6 +185,33 @@ def test_faults_of_a_model_are_told(captured, meshes, tmp_path):
         import_data(project, tmp_path / "data", meshes, tell=quiet)
 
 
+def test_what_a_model_leaves_out_is_told(captured, meshes, tmp_path):
+    project = tmp_path / "project"
+    models = [project / "sparse" / name for name in ("0", "1")]
+    for model in models:
+        model.mkdir(parents=True)
+        model_of(captured, project).write_text(str(model))
+    save(np.zeros((16, 16, 3), np.uint8), project / "images" / "alone.png")
+    told = []
+    import_data(project, tmp_path / "data", meshes, tell=told.append)
+    assert f"{project / 'sparse'} has other models, left out: 1" in told
+    assert "1 of 4 photographs have no pose, left out: alone.png" in told
+
+
+def test_cameras_that_see_all_around_are_refused(captured, meshes, tmp_path):
+    project = tmp_path / "project"
+    model = project / "sparse"
+    model.mkdir(parents=True)
+    model_of(captured, project).write_text(str(model))
+    for line, told in (
+        ("1 EQUIRECTANGULAR 16 16 16 16\n", "EQUIRECTANGULAR|pycolmap cannot read"),
+        ("1 PINHOLE 16 16 10 0 8 8\n", "the focal lengths of its camera are 10 and 0"),
+    ):
+        (model / "cameras.txt").write_text(line)
+        with pytest.raises(UserError, match=told):
+            import_data(project, tmp_path / "data", meshes, tell=quiet)
+
+
 def test_a_project_that_has_no_model_is_none(tmp_path):
     assert find_model(tmp_path) is None
 

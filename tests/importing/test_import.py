@@ -292,6 +292,15 @@ def test_a_hidden_background_leaves_the_pixels_of_the_mesh(captured, nerfstudio,
         for axis in (0, 1):
             inner &= np.roll(seen, 1, axis) & np.roll(seen, -1, axis)
         assert not counted.any() if number == 1 else (counted.sum() >= 0.8 * inner.sum() > 0)
+        assert view.mask_from_mesh
+
+
+def test_all_views_have_a_mask_where_one_has(nerfstudio, meshes, tmp_path):
+    save(np.zeros((16, 16), np.uint8), nerfstudio / "masks" / "0.png")
+    change(nerfstudio, set_frame("mask_path", "masks/0.png"))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    shown = [read_photograph(view)[..., 3] for view in Dataset.load(tmp_path / "data").views]
+    assert [alpha.all() for alpha in shown] == [True, False, True]
 
 
 def with_exif(folder, captured, tags):
@@ -533,6 +542,17 @@ def set_top(key, value):
     return lambda content: content.__setitem__(key, value)
 
 
+def without_lists(content):
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        content.pop(key, None)
+
+
+def all_held_out(content):
+    without_lists(content)
+    for frame in content["frames"]:
+        frame["split"] = "test"
+
+
 def set_frame(key, value):
     return lambda content: content["frames"][1].__setitem__(key, value)
 
@@ -556,6 +576,9 @@ def set_frame(key, value):
         (set_top("train_filenames", 5), "'train_filenames' is not a list of names"),
         (lambda c: c["frames"].__setitem__(0, 7), "the frame is not an object"),
         (lambda c: c.pop("fl_x"), "the key 'fl_x' is missing"),
+        (all_held_out, "no photograph is left to train on"),
+        (set_frame("file_path", "."), "the image"),
+        (set_top("train_filenames", [""]), "'train_filenames' is not a list of names"),
     ],
 )
 def test_a_wrong_entry_is_a_fault(edit, fault, nerfstudio, meshes, tmp_path):
@@ -612,6 +635,47 @@ def test_names_in_lists_of_splits_that_are_of_no_frame_are_told(nerfstudio, mesh
     told = []
     import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
     assert any(line.endswith("name images that no frame has: images/none.png") for line in told)
+
+
+def test_lists_of_splits_may_be_of_windows(captured, nerfstudio, meshes, tmp_path):
+    names = [f"images\\{view.name}.png" for view in captured.views]
+    lists = {"train_filenames": names[1:], "test_filenames": names[:1]}
+    change(nerfstudio, lambda content: content.update(lists))
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    (held,) = Dataset.load(tmp_path / "data").heldout
+    assert held.name == captured.views[0].name and not any("lists of splits" in x for x in told)
+
+
+def test_radiance_comes_before_code_values_where_names_have_no_suffix(captured, meshes, tmp_path):
+    source = tmp_path / "blender"
+    write_blender(captured, source)
+    for file in sorted(source.rglob("*.png")):
+        write_exr(file.with_suffix(".exr"), np.full((16, 16, 3), 3.0, np.float32))
+    import_data(source, tmp_path / "data", meshes, tell=quiet)
+    for view in Dataset.load(tmp_path / "data").views:
+        assert view.encoding == "linear" and read_photograph(view)[..., 0].max() == 3
+
+
+def test_one_file_is_no_two_photographs(captured, nerfstudio, meshes, tmp_path):
+    """The end of a name may mean a file of another folder."""
+    images = tmp_path / "flat"
+    shutil.copytree(nerfstudio / "images", images)
+    first = captured.views[0].name
+    change(nerfstudio, without_lists)
+    change(nerfstudio, set_frame("file_path", f"other/{first}.png"))
+    with pytest.raises(ImportFaults, match=f"is the file of .*{first}.png, too: other/{first}.png"):
+        import_data(nerfstudio, tmp_path / "data", meshes, images=images, tell=quiet)
+
+
+def test_links_do_not_lead_out_where_names_have_no_suffix(nerfstudio, meshes, tmp_path):
+    secret = tmp_path / "secret.png"
+    save(np.zeros((16, 16, 3), np.uint8), secret)
+    (nerfstudio / "images" / "linked.png").symlink_to(secret)
+    change(nerfstudio, set_frame("file_path", "images/linked"))
+    with pytest.raises(ImportFaults, match=r"lies outside the source.*--allow-outside"):
+        import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    import_data(nerfstudio, tmp_path / "data", meshes, allow_outside=True, tell=quiet)
 
 
 def test_names_with_a_dot_may_lack_their_suffix(captured, meshes, tmp_path):

@@ -124,7 +124,7 @@ def test_pixels_of_camera_raw_that_say_nothing_are_masked(project, meshes, tmp_p
     write_dng(project / "jpg" / "1.DNG", light, 200)
     import_data(project, tmp_path / "data", meshes, ImportSettings(holdout=0), tell=quiet)
     views = Dataset.load(tmp_path / "data").views
-    assert views[0].mask is None and views[1].mask is not None
+    assert read_masked(views[0])[1].all(), "its mask is there because another view has one"
     counted = read_masked(views[1])[1]
     assert not counted[:, 10:14].any() and counted[:, :6].all() and counted[:, 18:].all()
 

@@ -25,7 +25,6 @@ from ..dataset.findings import (
     Finding,
     light_that_turns,
     misaligned,
-    named,
     noise_at_black,
     unequal_exposures,
 )
@@ -35,7 +34,7 @@ from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
-from ..errors import UserError, printable
+from ..errors import UserError, named, printable
 from ..scene import edit, free_space
 from ..scene.parse import parse
 from .pictures import PictureFacts, blurred, percentage, picture_facts
@@ -213,6 +212,7 @@ def _checked(
     alpha = cleaned[:, 3] * counted if hidden else counted
     light = cleaned[:, :3] if view.exposure == 1 else cleaned[:, :3] / np.float32(view.exposure)
     small = small_view(view.name, camera, light, alpha, limit=view.limit)
+    small = replace(small, of_mesh=view.mask_from_mesh)
     shape = (camera.height, camera.width)
     hit = np.isfinite(seen.distance)
     facts = picture_facts(
@@ -302,6 +302,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
     origins = np.array([c.origin for c in cameras]) / diagonal
     axes = np.array([c.to_world[:3, :3] for c in cameras]).reshape(-1, 9)
     lenses = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras])
+    pairs: dict[tuple[str, str], list[str]] = {}  # by what is wrong, and the remedy
     for i, one in enumerate(result.views):
         posed = np.abs(origins[:i] - origins[i]).max(axis=1, initial=0) <= _SAME
         posed &= np.abs(axes[:i] - axes[i]).max(axis=1, initial=0) <= _SAME
@@ -313,7 +314,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
                     "" if posed[j] else ", and their poses not"
                 )
                 remedy = "Remove one of them" if posed[j] else "Correct 'file_path' of one of them"
-                result.warn("duplicates", what, pair, remedy)
+                pairs.setdefault((what, remedy), []).append(pair)
             elif twice[j]:
                 bracket = _apart(one.view.exposure, other.view.exposure)
                 same_split = one.view.split == other.view.split
@@ -323,7 +324,9 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
                 what += "" if same_split else ", one for training and one held out"
                 remedy = "Correct the pose of one, or leave one out"
                 remedy = "Give all of a bracket the same 'split'" if bracket else remedy
-                result.warn("duplicates", what, pair, remedy)
+                pairs.setdefault((what, remedy), []).append(pair)
+    for (what, remedy), names in pairs.items():
+        result.warn("duplicates", what, named(names), remedy)
 
 
 # -------------------------------------------------------------------------------------- photographs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from .camera import Camera
 from .mistakes import Mistake, all_mistakes
 from .small_views import SmallView, seen_by, small_view, view_rays
+from .spread import evenly
 
 #: Views that are compared, at most, and how many are needed to tell that others are better.
 MOST_VIEWS, FEWEST_VIEWS = 8, 3
@@ -70,8 +71,7 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     usable = [v for v in usable if photograph_edges(v).std() > 1e-6]
     if len(usable) < FEWEST_VIEWS:
         return None
-    chosen = np.linspace(0, len(usable) - 1, min(len(usable), MOST_VIEWS)).round().astype(int)
-    views = [usable[i] for i in chosen]
+    views = evenly(usable, MOST_VIEWS)
     edges = [photograph_edges(view) for view in views]
     cameras = [view.camera for view in views]
     mistakes = _likely(scene, views)
@@ -105,7 +105,8 @@ def _likely(scene: mi.Scene, views: Sequence[SmallView]) -> list[Mistake]:
 
 def _smaller(view: SmallView) -> SmallView:
     rgb, alpha = view.rgb.reshape(-1, 3), view.alpha.ravel()
-    return small_view(view.name, view.camera, rgb, alpha, SHORTEST_SIDE * 3 // 2)
+    small = small_view(view.name, view.camera, rgb, alpha, SHORTEST_SIDE * 3 // 2)
+    return replace(small, of_mesh=view.of_mesh)
 
 
 def _clearly_better(scores: np.ndarray, given: np.ndarray) -> bool:
@@ -143,7 +144,9 @@ def photograph_edges(view: SmallView) -> np.ndarray:
     positive = luminance[luminance > 0]
     floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
     logarithm = np.log(np.maximum(luminance, 0) + floor)
-    slope = np.hypot(*np.gradient(logarithm)) + np.hypot(*np.gradient(view.alpha))
+    slope = np.hypot(*np.gradient(logarithm))
+    if not view.of_mesh:
+        slope += np.hypot(*np.gradient(view.alpha))
     top = float(np.quantile(slope, 0.98))
     return _blurred(np.minimum(slope / top, 1)) if top > 1e-9 else np.zeros_like(slope)
 

@@ -20,8 +20,12 @@ _FLIPS = {
 }
 #: A quarter turn about x, either way: between worlds whose z and whose y points up.
 _TURNS = {
-    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "z up (turn them by -90° about x: y, z become z, -y)": np.array(
+        [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    ),
+    "y up (turn them by 90° about x: y, z become -z, y)": np.array(
+        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
+    ),
 }
 _INVERTED = "from world to camera (invert the matrices)"
 #: Units that are taken for each other: millimetres, centimetres, inches, decimetres, metres.
@@ -66,9 +70,7 @@ class Mistake:
 
 def usual_mistakes(scales: Sequence[float]) -> list[Mistake]:
     """Mistakes with these scales and the common axes: single ones first, the most common first."""
-    turns = {"": np.eye(3)} | {
-        f"of a world with {up} up (turn them by 90° about x)": turn for up, turn in _TURNS.items()
-    }
+    turns = {"": np.eye(3)} | {f"of a world with {up}": turn for up, turn in _TURNS.items()}
     opencv = next(iter(_FLIPS))
     return _simplest_first(turns, scales, {"": np.eye(3), opencv: OPENCV})
 
@@ -118,6 +120,6 @@ def _turn_told(turn: np.ndarray) -> str:
         return ""
     for up, known in _TURNS.items():
         if np.array_equal(turn, known):
-            return f"of a world with {up} up (turn them by 90° about x)"
+            return f"of a world with {up}"
     axes = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in turn]
     return f"of a world with other axes (turn them: take {', '.join(axes)} as x, y, z)"

@@ -12,6 +12,7 @@ from .alignment import FEWEST_VIEWS, SHORTEST_SIDE, alignment
 from .findings import Finding, light_that_turns, misaligned, unequal_exposures
 from .photographs import Photographs
 from .small_views import SmallView, seen_by, small_camera, small_view
+from .spread import evenly
 from .views import View
 
 #: Views that are looked at, spread evenly.
@@ -33,8 +34,8 @@ def quick_findings(
     Returns:
         Nothing where views are too few or too small to tell.
     """
-    chosen = np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int)
-    large = [i for i in chosen.tolist() if _shorter_side(views[i]) >= SHORTEST_SIDE]
+    chosen = evenly(range(len(views)), _MOST_VIEWS)
+    large = [i for i in chosen if _shorter_side(views[i]) >= SHORTEST_SIDE]
     if len(large) < FEWEST_VIEWS:
         return []
     small = _small_views(views, photographs, large)
@@ -72,8 +73,8 @@ def _small_views(
         camera = small_camera(views[i].camera)
         count = camera.width * camera.height
         picture = rows[:count].reshape(camera.height, camera.width, _CHANNELS)
-        alpha, clipped = picture[..., 3], picture[..., 4]
-        small.append(SmallView(views[i].name, camera, picture[..., :3], alpha, clipped))
+        alpha, clipped, drawn = picture[..., 3], picture[..., 4], views[i].mask_from_mesh
+        small.append(SmallView(views[i].name, camera, picture[..., :3], alpha, clipped, drawn))
         rows = rows[count:]
     return small
 

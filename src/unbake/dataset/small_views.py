@@ -32,6 +32,8 @@ class SmallView:
         rgb: mean linear radiance of blocks of pixels, (height, width, 3).
         alpha: mean coverage of the same blocks, (height, width); 1 where the background is visible.
         clipped: share of the pixels of the same blocks that are clipped, (height, width).
+        of_mesh: whether alpha is where the mesh is seen from this pose, as masks are that import
+            has drawn; its edges then tell nothing of the pose.
     """
 
     name: str
@@ -39,6 +41,7 @@ class SmallView:
     rgb: np.ndarray
     alpha: np.ndarray
     clipped: np.ndarray
+    of_mesh: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 #: Memory in bytes that takes part in decoding a pixel, blurring it included.
 PIXEL_BYTES = 100
 #: Least and greatest exposure, and value at which a photograph is clipped.
-_MEASURABLE = (1e-12, 1e12)
+MEASURABLE = (1e-12, 1e12)
 _MEANT = {
     "exposure": "the photograph is radiance times this number, 1 by default",
     "clipped": "from this value on the photograph says only that it is as bright at least",
@@ -46,7 +46,7 @@ _MEANT = {
     "read": "the variance of the noise of a decoded value x is shot · x + read²",
 }
 #: Bytes of the name of a view, which files of results are named after.
-_LONGEST_NAME = 200
+LONGEST_NAME = 200
 _NEED_HDR = (
     "Give linear HDR images (OpenEXR); PNG, JPEG and TIFF files of a camera are read where "
     f'{TRANSFORMS} has "encoding": "srgb", as `unbake import` writes it'
@@ -96,6 +96,8 @@ class View:
         clipped: value of the decoded photograph from which on a channel says "at least that much";
             None: it says what it says.
         noise: of the decoded photograph; None: it is told from neighbouring pixels.
+        mask_from_mesh: whether the mask is where the mesh was seen from this pose, which it
+            therefore tells nothing of.
     """
 
     name: str
@@ -108,6 +110,7 @@ class View:
     exposure: float = 1.0
     clipped: float | None = None
     noise: SensorNoise | None = None
+    mask_from_mesh: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image", Path(self.image))
@@ -452,8 +455,8 @@ def _file_faults(view: View) -> list[UserError]:
 def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
     image = data.inside(text(frame, "file_path", where), f"{where}: 'file_path'")
     where = f"{where} ({image.name})"
-    if len(image.stem.encode()) > _LONGEST_NAME:
-        what = f"the name of the image has over {_LONGEST_NAME} bytes"
+    if len(image.stem.encode()) > LONGEST_NAME:
+        what = f"the name of the image has over {LONGEST_NAME} bytes"
         raise UserError(what, where, "Rename it: results are named after it")
     if not image.stem.isprintable():
         what = "the name of the image has control characters"
@@ -479,7 +482,16 @@ def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], whe
         exposure=_positive(frame, "exposure", where) or 1.0,
         clipped=clipped,
         noise=_noise(frame if "noise" in frame else top, where),
+        mask_from_mesh=_mask_from_mesh(frame, where),
     )
+
+
+def _mask_from_mesh(frame: dict[str, Any], where: str) -> bool:
+    origin = frame.get("mask_from")
+    if origin not in (None, "mesh"):
+        what = f"'mask_from' is {origin!r}"
+        raise UserError(what, where, "It is 'mesh', of masks that `unbake import` has drawn")
+    return origin == "mesh"
 
 
 def _noise(table: dict[str, Any], where: str) -> SensorNoise | None:
@@ -500,7 +512,7 @@ def _positive(
     """A positive number of single precision; None where the table has none, or null."""
     if table.get(key) is None:
         return None
-    low, high = _MEASURABLE
+    low, high = MEASURABLE
     try:
         found = number(table, key, where)
     except UserError:
@@ -555,6 +567,7 @@ def _frame(data: DataFolder, view: View) -> dict[str, Any]:
         **frame_of(view.camera),
         **({} if view.encoding == "linear" else {"encoding": view.encoding}),
         **({} if view.mask is None else {"mask_path": data.relative(view.mask)}),
+        **({"mask_from": "mesh"} if view.mask_from_mesh else {}),
         **({} if view.exposure == 1 else {"exposure": view.exposure}),
         **({} if view.clipped is None else {"clipped": view.clipped}),
         **({} if view.noise is None else {"noise": asdict(view.noise)}),

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
+import math
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from ..errors import UserError
-from ..io import inside
+from ..errors import UserError, named
+from ..imaging.headers import CODED_SUFFIXES, SUFFIXES
 from .faults import Faults
 from .lens import Lens
-from .source import Shot, Source, first_folder, image_header, with_suffix
+from .source import Shot, Source, find_image, first_folder, image_header
 
 #: Folders of a project that its model may lie in, and those that images lie in beside it.
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", "model")
 _IMAGES = ("images", "input")
 _ENDINGS = (".bin", ".txt")
 _STRAIGHT = ("PINHOLE", "SIMPLE_PINHOLE")
+_SPHERICAL = ("EQUIRECTANGULAR",)
 
 
 def find_model(folder: Path) -> Path | None:
@@ -56,13 +59,36 @@ def read_colmap(model: Path, images: Path | None, allow_outside: bool, faults: F
     for image in reconstruction.images.values():
         if not image.has_pose or found is None:
             continue
-        if image.camera_id not in lenses:
-            lenses[image.camera_id] = _lens(image.camera)
         with faults.collected(image.name):
+            if image.camera_id not in lenses:
+                lenses[image.camera_id] = _lens(image.camera)
             shots.append(_shot(image, lenses[image.camera_id], found, allow_outside))
     if not shots and not faults:
         faults.add("no image of the model has a pose", model)
-    return Source("COLMAP", tuple(sorted(shots, key=lambda shot: shot.name)))
+    ordered = tuple(sorted(shots, key=lambda shot: shot.name))
+    return Source("COLMAP", ordered, (*_other_models(model), *_without_pose(ordered, found)))
+
+
+def _other_models(model: Path) -> list[str]:
+    """A note of models beside this one, into which COLMAP divides what it cannot join."""
+    if not model.name.isdecimal():
+        return []
+    beside = [f for f in sorted(model.parent.iterdir()) if f.name.isdecimal() and _is_model(f)]
+    others = [folder.name for folder in beside if folder.name != model.name]
+    return [f"{model.parent} has other models, left out: {named(others)}"] if others else []
+
+
+def _without_pose(shots: Sequence[Shot], images: Path | None) -> list[str]:
+    """A note of photographs in the folder that have no pose."""
+    if images is None:
+        return []
+    known = {PurePosixPath(shot.name).with_suffix("") for shot in shots}
+    files = [f for f in images.rglob("*") if f.suffix.lower() in (*CODED_SUFFIXES, *SUFFIXES)]
+    every = sorted(PurePosixPath(file.relative_to(images)) for file in files)
+    left = [str(name) for name in every if name.with_suffix("") not in known]
+    if not left:
+        return []
+    return [f"{len(left)} of {len(every)} photographs have no pose, left out: {named(left)}"]
 
 
 def _reconstruction(model: Path) -> Any:
@@ -89,8 +115,7 @@ def _is_binary(model: Path) -> bool:
 
 def _shot(image: Any, lens: Lens, folder: Path, allow_outside: bool) -> Shot:
     name = image.name
-    said = inside(folder, name, name, "folder of images", allow_outside=allow_outside)
-    file = with_suffix(said)
+    file = find_image(folder, name, "folder of images", allow_outside=allow_outside)
     header = image_header(file)
     if (header.width, header.height) != (lens.width, lens.height):
         size = f"{header.width} x {header.height}"
@@ -103,6 +128,12 @@ def _shot(image: Any, lens: Lens, folder: Path, allow_outside: bool) -> Shot:
 
 
 def _lens(camera: Any) -> Lens:
+    if camera.model_name in _SPHERICAL:
+        what = f"a camera of the model {camera.model_name} is no pinhole with a lens"
+        raise UserError(what, None, "Turn its images into perspective ones first")
+    focal = camera.focal_length_x, camera.focal_length_y
+    if not all(math.isfinite(length) and length > 0 for length in focal):
+        raise UserError(f"the focal lengths of its camera are {focal[0]:g} and {focal[1]:g}")
     # That of a model is gone with the model.
     own = copy.deepcopy(camera)
 
@@ -112,8 +143,7 @@ def _lens(camera: Any) -> Lens:
     return Lens(
         camera.width,
         camera.height,
-        camera.focal_length_x,
-        camera.focal_length_y,
+        *focal,
         camera.principal_point_x,
         camera.principal_point_y,
         None if camera.model_name in _STRAIGHT else project,

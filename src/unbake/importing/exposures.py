@@ -11,6 +11,7 @@ from typing import Any
 
 from PIL import Image
 
+from ..dataset.views import MEASURABLE
 from ..errors import UserError
 from ..io import read_text
 from .faults import Faults
@@ -107,7 +108,8 @@ def _positive(word: str) -> float | None:
         value = float(word)
     except ValueError:
         return None
-    return value if 0 < value < math.inf else None
+    low, high = MEASURABLE
+    return value if low <= value <= high else None
 
 
 def _relative(absolute: Mapping[str, float]) -> dict[str, float]:

@@ -7,10 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import final
 
-from ..errors import UserError, printable
-
-#: Places that are named of one fault.
-_NAMED = 3
+from ..errors import UserError, named, printable
 
 
 @final
@@ -75,6 +72,5 @@ class Faults:
 
 def _told(fault: tuple[tuple[str, str | None], list[str]]) -> str:
     (what, remedy), places = fault
-    more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
-    told = f"{what}: {', '.join(places[:_NAMED])}{more}" if places else what
+    told = f"{what}: {named(places)}" if places else what
     return told if remedy is None else f"{told}. {remedy}"

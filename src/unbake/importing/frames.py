@@ -11,12 +11,11 @@ import numpy as np
 
 from ..dataset.camera import Camera, camera_from_frame, with_top
 from ..dataset.data_folder import TRANSFORMS
-from ..dataset.findings import named
-from ..errors import UserError, printable
-from ..io import array, inside, number, read_object, text
+from ..errors import UserError, named, printable
+from ..io import array, number, read_object, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
-from .source import Shot, Source, image_header, with_suffix
+from .source import Shot, Source, find_image, image_header
 
 #: The files of a folder with one file a split, and our names of the splits.
 SPLIT_FILES = {
@@ -101,7 +100,7 @@ def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> 
     frames = top.get("frames")
     frames = frames if isinstance(frames, list) else []
     given = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
-    ends = {PurePosixPath(name).name for name in given if isinstance(name, str)}
+    ends = {PurePosixPath(_slashed(name)).name for name in given if isinstance(name, str)}
     ends |= {PurePosixPath(end).stem for end in ends}
     unknown = [str(name) for name in splits if name.name not in ends and name.stem not in ends]
     if not unknown:
@@ -116,7 +115,8 @@ def read_split_files(
 
     The views of `transforms_test.json` are held out; those of `transforms_val.json` where there is
     no other file, and are left out where there is. A file of cameras without pictures, as
-    Blender-NeRF writes it for tests, is left out, too. Nothing is held out by what is left then.
+    Blender-NeRF writes it for tests, is left out, too. Where one file is left, none says what is
+    held out.
     """
     found = {name: folder / name for name in SPLIT_FILES if (folder / name).is_file()}
     notes = []
@@ -206,7 +206,7 @@ def _shot(
     if "mask_path" in frame:
         with faults.collected(frame["mask_path"]):
             said = text(frame, "mask_path", name)
-            mask = with_suffix(_inside(file.parent, said, allow_outside))
+            mask = find_image(file.parent, said, "source", allow_outside=allow_outside)
             image_header(mask)
     if image is None or lens is None or pose is None:
         return None
@@ -240,15 +240,11 @@ def _image(folder: Path, name: str, images: Path | None, allow_outside: bool) ->
         allow_outside: it may lie outside of its folder.
     """
     if images is None:
-        return with_suffix(_inside(folder, name, allow_outside))
+        return find_image(folder, name, "source", allow_outside=allow_outside)
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     ends = [str(PurePosixPath(*parts[first:])) for first in range(len(parts))] or [name]
-    files = [with_suffix(_inside(images, end, allow_outside)) for end in ends]
+    files = [find_image(images, end, "source", allow_outside=allow_outside) for end in ends]
     return next((file for file in files if file.is_file()), files[0])
-
-
-def _inside(folder: Path, name: str, allow_outside: bool) -> Path:
-    return inside(folder, name, name, "source", allow_outside=allow_outside)
 
 
 def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
@@ -331,10 +327,10 @@ def _listed_splits(top: dict[str, Any], file: Path, faults: Faults) -> dict[Pure
         names = top.get(key)
         if names is None:
             continue
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        if not isinstance(names, list) or not all(isinstance(n, str) and n for n in names):
             faults.add(f"{key!r} is not a list of names", file.name)
             continue
-        splits |= {PurePosixPath(name): split for name in names}
+        splits |= {PurePosixPath(_slashed(name)): split for name in names}
     return splits
 
 

@@ -17,7 +17,7 @@ from ..acquisition.new_light import put_light
 from ..config.light import LightConfig
 from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
-from ..dataset.views import PIXEL_BYTES, counted_by, read_radiance
+from ..dataset.views import LONGEST_NAME, PIXEL_BYTES, counted_by, read_radiance
 from ..errors import UserError
 from ..imaging.coded import decode, encode, read_codes
 from ..imaging.pictures import write_exr
@@ -101,8 +101,10 @@ def import_data(
     _check_light(light, allow_outside, faults)
     names = _names(found.shots, faults)
     pictures = _check_pictures(found.shots, faults)
-    faults.require_none(source)
     splits = _splits(found.shots, settings.holdout)
+    if splits and "train" not in splits.values():
+        faults.add("no photograph is left to train on: the source holds all of them out")
+    faults.require_none(source)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
         file, scene = _write_scene(data, parts, light, allow_outside, tell)
@@ -120,6 +122,7 @@ def import_data(
             same = shot.lens.straight and not shot.raw and shot.name not in pictures.negative
             name, split = names[shot.name], splits[shot.name]
             frames.append(_write_view(data, shot, name, split, known, on_mesh, same=same))
+        _complete_masks(data, frames)
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
             | ({"light": "unknown"} if light is None else {})
@@ -206,6 +209,13 @@ def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
         other = taken.setdefault(names[shot.name], shot.name)
         if other != shot.name:
             faults.add("two photographs have one name but for their suffix", shot.name)
+        if len(names[shot.name].encode()) > LONGEST_NAME:
+            faults.add(f"the name of the photograph has over {LONGEST_NAME} bytes", shot.name)
+    files: dict[Path, str] = {}
+    for shot in shots:
+        other = files.setdefault(shot.image.resolve(), shot.name)
+        if other != shot.name:
+            faults.add(f"the photograph is the file of {other}, too", shot.name)
     for name, count in Counter(shot.name for shot in shots).items():
         if count > 1:
             faults.add("a photograph has two poses", name)
@@ -403,7 +413,18 @@ def _write_view(
         file = data.mask(name)
         _write_codes(file, np.where(np.all(masks, 0), 255, 0).astype(np.uint8)[..., None])
         frame["mask_path"] = data.relative(file)
+    if on_mesh is not None:
+        frame["mask_from"] = "mesh"
     return frame
+
+
+def _complete_masks(data: DataFolder, frames: Sequence[dict[str, Any]]) -> None:
+    """Give all views a mask where any has one, so that none seems to be missing."""
+    bare = [frame for frame in frames if "mask_path" not in frame]
+    for frame in bare if len(bare) < len(frames) else ():
+        file = data.mask(PurePosixPath(frame["file_path"]).stem)
+        _write_codes(file, np.full((frame["h"], frame["w"], 1), 255, np.uint8))
+        frame["mask_path"] = data.relative(file)
 
 
 def _straightened(

@@ -28,10 +28,10 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..dataset.data_folder import TRANSFORMS
 from ..errors import UserError
-from ..io import array, inside, number, read_object, read_text
+from ..io import array, number, read_object, read_text
 from .faults import Faults
 from .lens import Lens
-from .source import Shot, Source, image_header, with_suffix
+from .source import Shot, Source, find_image, image_header
 
 _MESH, _POSES, _LENSES, _IMAGES = "scene.obj", "cam.txt", "K_list.txt", "Image"
 _EXPOSURES, _RESPONSE = Path("cam", "exposure.npy"), Path("cam", "crf.npy")
@@ -147,7 +147,7 @@ def _rendered(
 
 
 def _image(folder: Path, name: str, allow_outside: bool) -> Path:
-    return with_suffix(inside(folder, name, name, "source", allow_outside=allow_outside))
+    return find_image(folder, name, "source", allow_outside=allow_outside)
 
 
 def _rows(file: Path) -> np.ndarray:

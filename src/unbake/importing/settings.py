@@ -20,14 +20,14 @@ class ImportSettings:
     #: By the order of names, from the first.
     holdout: Annotated[
         int,
-        Flag("Hold out every so many views, where the source does not say which; 0 holds out none"),
+        Flag("Hold out every Nth view where the source has no splits; 0 holds out none"),
     ] = 8
     background: Annotated[
         Literal["auto", "visible", "hidden"],
         Flag(
-            "What photographs show behind the mesh: visible, the environment, which lights it; "
-            "hidden, what is left out, by alpha or, without alpha, where the mesh is not seen; "
-            "auto, hidden if all photographs have alpha"
+            "Background of the photographs: visible (the environment that lights the mesh), hidden "
+            "(ignored, by alpha or where the mesh is not seen) or auto (hidden if all photographs "
+            "have alpha, and any is transparent)"
         ),
     ] = "auto"
     keep_applied_transform: Annotated[

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import final
 
 import numpy as np
 
 from ..errors import UserError
 from ..imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, ImageHeader, read_header
-from ..io import require_file
+from ..io import inside, require_file
 from .lens import Lens
 from .raw import SUFFIXES as RAW_SUFFIXES
 from .raw import Balance, is_raw, raw_header
 
-#: Suffixes that are tried where the name of an image has none.
-_TRIED = tuple(s for suffix in (*CODED_SUFFIXES, ".exr") for s in (suffix, suffix.upper()))
+#: Suffixes that are tried where the name of an image has none: radiance before code values.
+_TRIED = tuple(s for suffix in (".exr", *CODED_SUFFIXES) for s in (suffix, suffix.upper()))
 
 
 @final
@@ -94,16 +95,31 @@ def image_header(path: Path) -> ImageHeader:
         raise UserError(f"the image cannot be read ({error.strerror})", path) from None
 
 
-def with_suffix(path: Path) -> Path:
-    """A file by its name, which may lack its suffix; the path as it is where there is none.
+def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Path:
+    """The file of a folder that a name means, which may lack its suffix; it need not exist.
 
     Camera RAW takes the place of the photograph that a program has posed, which was made of it.
+
+    Args:
+        folder: that it must not leave.
+        name: relative to the folder, from a file that others may have written.
+        what: what the folder is, for the error message.
+        allow_outside: accept files that lie elsewhere.
+
+    Raises:
+        UserError: the name is no path, or leads out of the folder.
     """
-    if path.is_file():
+
+    def checked(name: str) -> Path:
+        return inside(folder, name, name, what, allow_outside=allow_outside)
+
+    path, given = checked(name), PurePath(name)
+    if path.is_file() or given.name in ("", ".."):
         return path
-    others = [path.with_name(path.name + suffix) for suffix in _TRIED]
-    others += [path.with_suffix(case) for s in RAW_SUFFIXES for case in (s, s.upper())]
-    return next((other for other in others if other.is_file()), path)
+    others = [given.with_name(given.name + suffix) for suffix in _TRIED]
+    others += [given.with_suffix(case) for s in RAW_SUFFIXES for case in (s, s.upper())]
+    found = next((other for other in others if (folder / other).is_file()), None)
+    return path if found is None else checked(os.fspath(found))
 
 
 def first_folder(folders: Sequence[Path]) -> Path | None:
