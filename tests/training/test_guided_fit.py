@@ -6,17 +6,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import tiny_fields
+from support import seeded, tiny_fields
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config import read_toml, to_toml
 from unbake.dataset.views import Dataset
+from unbake.fields.domain import Domain
+from unbake.fields.guide import LightGuide
 from unbake.fields.settings import GuideConfig
 from unbake.training.problem import pixels_of, problem_of
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
+from unbake.transport.operator import mixture_at
+from unbake.transport.vertex import SceneView, find_vertex
 
 STEPS, GUIDE = 150, "guide.directions"
 
@@ -50,6 +54,27 @@ def test_what_the_guide_has_learned_takes_noise_out_of_steps(fitted):
     print(f"variance {learned:.4g} with the guide, {uniform:.4g} with even directions")
     assert learned < 0.9 * uniform
     assert noise(step, state, pixels) == learned
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "guided"),
+    [
+        ({"type": "principled"}, True),
+        ({"type": "mask", "opacity": 0.6, "bsdf": {"type": "principled"}}, True),
+        ({"type": "plastic"}, False),  # its coating reflects in one direction
+    ],
+    ids=["principled", "cut-out", "plastic"],
+)
+def test_the_guide_draws_where_all_directions_have_a_density(bsdf, guided):
+    pane = {"type": "rectangle", "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "pane": pane, "sky": {"type": "constant"}})
+    guide = LightGuide(GuideConfig(cells=2), Domain.of(scene.bbox()))
+    guide.prepare()
+    ray = mi.Ray3f(mi.Point3f(dr.linspace(mi.Float, -0.5, 0.5, 64), 0, 2), mi.Vector3f(0, 0, -1))
+    vertex = find_vertex(SceneView.of(scene, None, 4), ray, mi.Bool(True), seeded(1, 64))
+    met = np.array(vertex.valid)
+    share = np.array(mixture_at(guide, vertex).share)
+    assert met.any() and (share[met] > 0).all() == guided and (share[~met] == 0).all()
 
 
 #: A floor, and a card of which nothing is seen, before the sky.

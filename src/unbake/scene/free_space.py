@@ -40,6 +40,7 @@ class Hits:
     distance: np.ndarray  #: (n,) world units, infinite where nothing was hit
     back: np.ndarray  #: (n,) bool: a back face, by the geometric normal
     black: np.ndarray  #: (n,) bool: a back face of a one-sided BSDF, which reflects nothing
+    shape: np.ndarray  #: (n,) number of the shape in Dr.Jit's registry; 0 where nothing was hit
 
 
 @final
@@ -290,19 +291,23 @@ def _trace_spheres(scene: mi.Scene, positions: np.ndarray, directions: np.ndarra
     origins = np.repeat(positions, len(directions), axis=0)
     hits = trace(scene, origins, np.tile(directions, (len(positions), 1)))
     shape = (len(positions), len(directions))
-    return Hits(*(a.reshape(shape) for a in (hits.distance, hits.back, hits.black)))
+    found = (hits.distance, hits.back, hits.black, hits.shape)
+    return Hits(*(values.reshape(shape) for values in found))
 
 
 def _trace(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, ...]:
     ray = as_ray(origins, directions)
     hit = scene.ray_intersect(ray)
     valid = hit.is_valid()
     back = valid & (dr.dot(hit.n, ray.d) > 0)
     two_sided = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.BackSide)
     distance = dr.select(valid, hit.t, dr.inf)
-    return np.array(distance, dtype=np.float64), np.array(back), np.array(back & ~two_sided)
+    shape = dr.select(valid, dr.reinterpret_array(mi.UInt32, hit.shape), 0)
+    dr.eval(distance, back, two_sided, shape)
+    black = np.array(back & ~two_sided)
+    return np.array(distance, dtype=np.float64), np.array(back), black, np.array(shape)
 
 
 def as_ray(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:

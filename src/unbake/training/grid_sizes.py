@@ -16,7 +16,9 @@ from ..dataset.views import Dataset
 from ..fields.domain import Domain
 from ..fields.grid_sizes import SurfaceSeen, is_open, sized
 from ..scene import free_space
+from ..scene.edit import to_principled
 from ..scene.parse import parse
+from ..transport.optimized import optimized_shapes
 
 #: Rays that are traced, in all training views together; a ray a view at least.
 RAYS = 4096
@@ -48,7 +50,9 @@ def with_grid_sizes(config: FitConfig, dataset: Dataset) -> FitConfig:
     if not near and not any(map(is_open, fields)):
         return config
     if dataset not in _SEEN:
-        scene = parse(dataset.scene, dataset.root).instantiate()
+        parsed = parse(dataset.scene, dataset.root)
+        to_principled(parsed)
+        scene = parsed.instantiate()
         _SEEN[dataset] = surface_seen(scene, [view.camera for view in dataset.train])
     seen = _SEEN[dataset]
     if seen is None:  # the fit warns of poses that see nothing, and has the usual sizes
@@ -76,20 +80,24 @@ def surface_seen(scene: mi.Scene, cameras: Sequence[Camera]) -> SurfaceSeen | No
 
     Returns:
         Extent of the fields' domain, median footprint and area, in world units; None where no ray
-        hits anything. The area is that of faces of boxes that have hits in them: exact to a
-        factor of two.
+        hits anything. The footprint is on surfaces whose material is optimized, if any is seen: a
+        lamp or a known backdrop may be far larger. The area, which the radiance field has to cover,
+        is of all: that of faces of boxes that have hits in them, exact to a factor of two.
     """
     along = math.ceil(math.sqrt(RAYS / len(cameras)))
     origins, directions = spread_rays(cameras, along)
     focal = np.repeat([math.sqrt(camera.fl_x * camera.fl_y) for camera in cameras], along**2)
-    distance = free_space.trace(scene, origins, directions).distance
+    hits = free_space.trace(scene, origins, directions)
+    distance = hits.distance
     hit = np.isfinite(distance) & (distance > 0)
     if not hit.any():
         return None
     points = origins[hit] + distance[hit, None] * directions[hit]
     domain = Domain.of(scene.bbox())
     unit = (points - np.array(domain.centre)) / domain.extent + 0.5
-    footprint = float(np.median(distance[hit] / focal[hit]))
+    wanted = hit & np.isin(hits.shape, list(optimized_shapes(scene)))
+    wanted = wanted if wanted.any() else hit
+    footprint = float(np.median(distance[wanted] / focal[wanted]))
     return SurfaceSeen(domain.extent, footprint, domain.extent**2 * _area(unit))
 
 

@@ -260,10 +260,10 @@ def refined_view(model: PoseModel | None, train: Sequence[View], view: View) -> 
 
 
 def _distances(scene: mi.Scene, cameras: Sequence[Camera]) -> np.ndarray:
-    """Median distances that cameras see, world units; the scene's diagonal where there is none."""
+    """Median distances that cameras see, lamps left out, world units; for none the diagonal."""
     found = []
     for seen in seen_by(scene, [small_camera(camera) for camera in cameras]):
-        known = seen.distance[np.isfinite(seen.distance)]
+        known = seen.distance[np.isfinite(seen.distance) & ~seen.emits]
         found.append(float(np.median(known)) if len(known) else bounds(scene)[2])
     return np.array(found)
 

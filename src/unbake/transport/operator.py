@@ -131,7 +131,11 @@ def bounce(
 
 def mixture_at(guide: LightGuide, vertex: Vertex) -> Mixture:
     """The guide and the BSDF; it alone where it has directions without a density (a coating)."""
-    dense = vertex.valid & ~mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Delta)
+    # A cut-out's way through is no direction of a bounce: what is met here was stopped by it.
+    flags = vertex.bsdf.flags()
+    single = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
+    single |= mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+    dense = vertex.valid & ~single
     return guide.mixture(guide.cell(vertex.si.p, vertex.n, vertex.valid), dense)
 
 
