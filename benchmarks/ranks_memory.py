@@ -192,11 +192,11 @@ def peaks(data: Path, work: Path, name: str) -> None:
     ranks = Ranks.of_environment()
     config = dataclasses.replace(preset(name), pixels=BATCH * ranks.size, steps=STEPS)
     with TemporaryDirectory(dir=work) as folder:
-        out = ranks.told(folder)[0]
+        out = ranks.gather(folder)[0]
         console = Console(quiet=True)
         fit(data, Path(out) / "run", config, console=console, ranks=ranks)
         peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        every = ranks.told(peak)
+        every = ranks.gather(peak)
     if ranks.leads:
         print(json.dumps(every))
 

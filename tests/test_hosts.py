@@ -81,7 +81,7 @@ with ranks.guarded(print), ranks.apart():
     print("begun\\n", end="", flush=True)
     if ranks.leads:
         time.sleep(60)
-    ranks.told(None)
+    ranks.gather(None)
 """
 
 

@@ -104,7 +104,7 @@ def test_one_process_tells_itself_what_it_knows(monkeypatch):
     alone, numbers = Ranks.of_environment(), np.ones(3, np.float32)
     assert (alone.rank, alone.size, alone.here, alone.leads) == (0, 1, 1, True)
     assert alone.mean(numbers) is numbers and alone.of_first(2.5) == 2.5
-    assert alone.joined(lambda: numbers) is numbers and alone.told("it") == ["it"]
+    assert alone.joined(lambda: numbers) is numbers and alone.gather("it") == ["it"]
     assert alone.any(True, False) == (True, False)
     alone.require_same({"seed": "0"})
     with pytest.raises(UserError, match="bad"):
@@ -390,7 +390,7 @@ ranks._patience = 0.7
 with ranks.apart():
     if not ranks.leads:
         time.sleep(1.2)
-    sys.stdout.write(f"{ranks.told(ranks.rank)}\\n")  # a line of two processes in one piece
+    sys.stdout.write(f"{ranks.gather(ranks.rank)}\\n")  # a line of two processes in one piece
 """
 
 
@@ -501,8 +501,8 @@ def test_what_each_rank_tells_is_known_to_all_and_may_take_its_time():
     longest = len('{"a": [1, null, "\\u00fc"]}')
     lengths, padded = np.int64([len(text)]), np.frombuffer(text.ljust(longest, b"\0"), np.uint8)
     ranks = Ranks(Two(others=[lengths, padded], looks=200), patience=1e-9)
-    assert ranks.told(own) == [own, other]
-    assert Ranks().told(own) == [own]
+    assert ranks.gather(own) == [own, other]
+    assert Ranks().gather(own) == [own]
 
 
 def test_a_process_that_ranks_start_is_none_of_them(monkeypatch):

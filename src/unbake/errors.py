@@ -34,6 +34,11 @@ class UserError(Exception):
         self.remedy = remedy
         super().__init__(str(self))
 
+    @property
+    def parts(self) -> tuple[str, str | None, str | None]:
+        """What is wrong, where, and the remedy, from which another process makes the same error."""
+        return self.what, self.where, self.remedy
+
     def __str__(self) -> str:
         what = _one_line(self.what)
         text = what if self.where is None else f"{_one_line(self.where)}: {what}"
@@ -93,6 +98,12 @@ def printable(name: object, longest: int = _LONGEST_NAME) -> str:
         return text
     head = longest // 2
     return f"{text[:head]}…{text[head + 1 - longest :]}"
+
+
+def named(names: Sequence[object], most: int = _TOLD) -> str:
+    """Names of views, files and the like, printable; of many the first ones."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(printable, names[:most])) + more
 
 
 def _escaped(character: str) -> str:

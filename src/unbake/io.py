@@ -12,7 +12,7 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +100,7 @@ def require_new_folder(out: Path) -> None:
     """Raise a `UserError` unless there is nothing at a path, or an empty folder."""
     require_utf8(out, "folder")
     if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise UserError("is no folder", out, "Give another --out")
+        raise UserError("is not a folder", out, "Give another --out")
     if out.is_dir() and any(out.iterdir()):
         raise UserError("the folder is not empty", out, "Give another --out, or empty it")
 
@@ -203,6 +203,17 @@ def take_lock(number: int, *, wait: bool) -> bool | None:
 def write_text(path: Path, content: str, *, durable: bool = False) -> None:
     """Write a UTF-8 text file, complete or not at all; arguments as in `write_atomically`."""
     write_atomically(path, lambda p: p.write_text(content, encoding="utf-8"), durable=durable)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays to an .npz file, complete or not at all; errors as of `write_atomically`."""
+    import numpy as np
+
+    def write(target: Path) -> None:
+        with open(target, "wb") as file:  # np.savez appends .npz to names
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+    write_atomically(path, write)
 
 
 def write_json(path: Path, content: Any, *, allow_nan: bool = True, durable: bool = False) -> None:
@@ -401,9 +412,9 @@ def number(keys: dict[str, Any], key: str, where: str) -> float:
     try:
         result = float(value)
     except OverflowError:
-        raise UserError(f"{key!r} is too large", where, "Correct it") from None
+        raise UserError(f"{key!r} is too large", where, "Write a smaller number") from None
     if not math.isfinite(result):
-        raise UserError(f"{key!r} is {result}, not a finite number", where, "Correct it")
+        raise UserError(f"{key!r} is {result}, not a finite number", where, "Write a number")
     return result
 
 
@@ -411,7 +422,7 @@ def integer(keys: dict[str, Any], key: str, where: str) -> int:
     """The whole number at a key; floats such as 512.0 count, which some converters write."""
     value = number(keys, key, where)
     if not value.is_integer():
-        raise UserError(f"{key!r} is {value:g}, not a whole number", where, "Correct it")
+        raise UserError(f"{key!r} is {value:g}, not a whole number", where, "Write a whole one")
     return int(value)
 
 
@@ -428,7 +439,7 @@ def array(keys: dict[str, Any], key: str, shape: tuple[int, ...], where: str) ->
         result, numeric = np.empty(0), False
     if result.shape != shape or not numeric:
         size = " x ".join(str(n) for n in shape)
-        raise UserError(f"{key!r} is not an array of {size} numbers", where, "Correct it")
+        raise UserError(f"{key!r} is not an array of {size} numbers", where, "Write a list of them")
     return result.astype(np.float64)
 
 
@@ -436,7 +447,7 @@ def text(keys: dict[str, Any], key: str, where: str) -> str:
     """The text at a key, not empty."""
     value = _value(keys, key, where)
     if not isinstance(value, str) or not value:
-        raise UserError(f"{key!r} is not a text", where, "Correct it")
+        raise UserError(f"{key!r} is not a text", where, "Put it in quotes")
     return value
 
 

@@ -136,7 +136,7 @@ class Communicator(Protocol):
 
 
 class Agreed(UserError):
-    """An error that all ranks know of: rank 0 tells it, and each ends by itself."""
+    """An error that is raised on every rank; only rank 0 prints it."""
 
     @staticmethod
     def of(error: UserError, rank: int | None = None) -> Agreed:
@@ -146,7 +146,7 @@ class Agreed(UserError):
 
 
 class Ranks:
-    """The ranks of a fit; without a communicator there is one.
+    """Cooperating processes of MPI; without a communicator there is one.
 
     Args:
         communicator: of mpi4py; None: this process is alone.
@@ -247,8 +247,8 @@ class Ranks:
         """The jobs of this rank, of a list that all have: every so many, dealt like cards."""
         return jobs[self.rank :: self.size]
 
-    def told(self, own: object) -> list[Any]:
-        """What each rank tells, in their order, on all; it waits for as long as that takes.
+    def gather(self, own: object) -> list[Any]:
+        """What each rank gives, in their order, on all; it waits for as long as that takes.
 
         Args:
             own: serializable as JSON.
@@ -319,7 +319,7 @@ class Ranks:
         failures = np.flatnonzero(self._gathered(failed, patience)[:, 0])
         if not len(failures):
             return result  # pyright: ignore[reportReturnType]
-        parts = [] if error is None else [error.what, error.where or "", error.remedy or ""]
+        parts = [] if error is None else [part or "" for part in error.parts]
         text = "\0".join(parts).encode()[:_LONGEST].ljust(_LONGEST, b"\0")
         texts = self._gathered(np.frombuffer(text, np.uint8))
         what, where, remedy = (*_text(texts[failures[0]]).split("\0"), "", "")[:3]
@@ -375,7 +375,7 @@ class Ranks:
         """A block in which each rank works by itself, as long as it likes, until all meet.
 
         A thread of each tells rank 0 that it lives, and hears so of it. It ends all where nothing
-        is heard any more: a rank that waits in `told` would not notice.
+        is heard any more: a rank that waits in `gather` would not notice.
         """
         if self._communicator is None or not self._beats:
             yield

@@ -16,7 +16,7 @@ from .config import FitConfig
 from .config.light import LightConfig
 from .dataset.camera import Camera
 from .dataset.views import Dataset, View
-from .errors import UserError, printable
+from .errors import UserError, named, printable
 from .evaluation import evaluate, rendering, renderings
 from .evaluation.settings import EvaluationSettings, RenderSettings
 from .exports.bake import Baker
@@ -31,6 +31,8 @@ from .training.recovered import Recovered, load_run
 from .training.run_folder import RunFolder
 from .transport.render import render_materials
 
+#: Names that a message lists.
+_NAMED = 6
 #: What scores are of, by their key in `metrics.json`.
 _ROWS = {"heldout": "held-out views", "train": "training views"}
 #: What held-out scores are measured by; see `evaluation/yardsticks.py`.
@@ -180,9 +182,8 @@ class Run:
         at = _coordinates(uv)
         parts = self._parts
         if mesh not in parts:
-            names = ", ".join(list(parts)[:6]) + (", …" if len(parts) > 6 else "")
             what = f"no mesh named {printable(mesh)!r}"
-            raise UserError(what, self.dataset.scene, f"There are {names}")
+            raise UserError(what, self.dataset.scene, f"There are {named(list(parts), _NAMED)}")
         part = parts[mesh]
         if not part.is_optimized:
             what = f"the material of {printable(mesh)!r} was known, and is not recovered"
@@ -353,9 +354,8 @@ class Run:
             return self.recovered.camera(camera)
         by_name: Mapping[str, View] = {view.name: view for view in self.dataset.views}
         if camera not in by_name:
-            names = ", ".join(list(by_name)[:6]) + (", …" if len(by_name) > 6 else "")
             what = f"no view named {printable(camera)!r}"
-            raise UserError(what, self.dataset.folder, f"There are {names}")
+            raise UserError(what, self.dataset.folder, f"There are {named(list(by_name), _NAMED)}")
         return self.recovered.camera(by_name[camera])
 
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, frame_name, read_cameras
+from ..dataset.camera import Camera, named_by_split, read_cameras
 from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
@@ -161,13 +161,11 @@ def _capture(
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
     shares = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
-    views, first, number = [], 0, {"train": 0, "heldout": 0}
-    for split, camera in posed:
+    views, first = [], 0
+    for view_name, split, camera in named_by_split(posed):
         shape = (camera.height, camera.width)
         part = slice(first, first + camera.width * camera.height)
         first = part.stop
-        view_name = frame_name(split, number[split])
-        number[split] += 1
         view = View(
             name=view_name,
             split=split,

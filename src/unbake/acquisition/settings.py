@@ -73,47 +73,46 @@ class DegradeSettings:
     """
 
     exposure: Annotated[
-        float, Flag("Exposures differ by up to so many stops either way; the first view's does not")
+        float, Flag("Largest random change of exposure, in stops; the first view is unchanged")
     ] = 0.0
-    white_balance: Annotated[
-        float, Flag("Red differs from blue by up to so many stops either way")
-    ] = 0.0
+    white_balance: Annotated[float, Flag("Largest random change of red against blue, in stops")] = (
+        0.0
+    )
     #: Cameras give code values, which programs decode by the sRGB curve.
     response: Annotated[
         Response,
         Flag(
-            "Response of the camera: srgb, which is decoded without an error; gamma, a power of "
-            "1/2.2; contrast, an S-shaped curve as of phones; lifted, brighter in the middle than "
-            "srgb"
+            "Response of the camera: srgb (decoded without error), gamma (a power of 1/2.2), "
+            "contrast (an S-shaped curve, as phones have) or lifted (midtones brighter than srgb)"
         ),
     ] = "srgb"
     vignetting: Annotated[float, Flag("Share of the light that is lost in the corners")] = 0.0
     electrons: Annotated[
-        float, Flag("Electrons that white counts, which makes shot noise; 0: none")
+        float, Flag("Electrons per pixel at white, which adds shot noise; 0: no noise")
     ] = 0.0
-    read_noise: Annotated[float, Flag("Read noise in electrons; only with --electrons given")] = 0.0
+    read_noise: Annotated[float, Flag("Read noise in electrons; needs --electrons")] = 0.0
     clip: Annotated[
         float | None,
         Flag(
-            "Share of the pixels of an exposure without jitter that is brighter than white and "
-            "clipped (default: 0.01 where a response, noise or 8 bits need a white, else nothing "
-            "is clipped)",
+            "Share of the pixels, before exposures change, that is brighter than white and clipped "
+            "(default: 0.01 with a response, noise or 8-bit files, which need a white; otherwise "
+            "nothing is clipped)",
             metavar="NUMBER",
             tell_default=False,
         ),
     ] = None
     pose_jitter: Annotated[
         float,
-        Flag("Poses are off: what pixels see moves by so many of them, root mean square of all"),
+        Flag("Random pose errors: by how many pixels they move the image, root mean square"),
     ] = 0.0
     displace: Annotated[
-        float, Flag("Meshes are off by so much, as a share of the scene's diagonal")
+        float, Flag("Random displacement of meshes, as a fraction of the scene's diagonal")
     ] = 0.0
     #: Small meshes stay as they are: see `acquisition/decimate.py`.
     decimate: Annotated[
         float,
         Flag(
-            "Share of the triangles that meshes keep; those of less than 64 keep all of them",
+            "Share of their triangles that meshes keep; those of fewer than 64 keep all",
             metavar="SHARE",
         ),
     ] = 1.0
@@ -127,14 +126,14 @@ class DegradeSettings:
     chroma: Annotated[
         Chroma,
         Flag(
-            "Resolution of colour in JPEG files: half of that of brightness along both edges, as "
-            "most cameras write it (4:2:0), or full (4:4:4)"
+            "Resolution of colour in JPEG files: half along both edges (4:2:0), as most cameras "
+            "write it, or full (4:4:4)"
         ),
     ] = "half"
     tell_exposures: Annotated[
-        bool, Flag("Write the true exposures to the frames, as EXIF would tell them")
+        bool, Flag("Write the true exposures into transforms.json, as EXIF would have them")
     ] = False
-    tell_noise: Annotated[bool, Flag("Write the noise of the sensor to the frames")] = False
+    tell_noise: Annotated[bool, Flag("Write the noise of the sensor into transforms.json")] = False
     seed: Annotated[int, Flag("Seed of all random numbers")] = 0
 
     def __post_init__(self) -> None:

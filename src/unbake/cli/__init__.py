@@ -297,7 +297,7 @@ def degrade(
     *,
     degrade: OmitArgPrefixes[DegradeFlags],
 ) -> None:
-    """Turn a rendered data set into what cameras deliver, to know what a fit can bear.
+    """Add the faults of cameras and meshes to a rendered data set, to test how robust a fit is.
 
     Faults are drawn at random, the same for the same --seed. Their truth is kept in
     OUT/degraded.json: exposures, white balances and poses by view, the response as a table.
@@ -307,7 +307,7 @@ def degrade(
         data: Folder of the data set, with its transforms.json.
         out: Folder to write, new or empty.
         allow_outside: Read files that the data set or its scene names outside of its folder.
-        degrade: What is done to photographs, poses and meshes.
+        degrade: Faults of photographs, poses and meshes.
     """
     settings = with_options(DegradeSettings(), given(degrade))
     if settings.format != "jpeg":
@@ -1113,7 +1113,7 @@ def _overview() -> str:
 
 
 def _word(path: Path) -> str:
-    """A path as a word of a command that a shell reads."""
+    """A path, quoted for a shell."""
     text = str(path)
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
 

@@ -169,8 +169,8 @@ def bench_rates(
                 with lack_told():
                     _Search(dataset, config, record, part, file, console, schedule).run()
             except UserError as error:
-                errors.append([number, error.what, error.where, error.remedy])
-        every = ranks.told({"records": own, "errors": errors})
+                errors.append([number, *error.parts])
+        every = ranks.gather({"records": own, "errors": errors})
     for number, record in (row for one in every for row in one["records"]):
         planned[number][2].update(record)
     failed = [UserError(*parts) for _, *parts in sorted(e for one in every for e in one["errors"])]
@@ -203,7 +203,7 @@ def _planned(
     if not datasets:
         raise UserError("no data set given", "--data", "Give --data FOLDER [FOLDER ...]")
     if not seeds or len(set(seeds)) < len(seeds):
-        raise UserError("give each seed once", "--seeds", "Such as: 0 1 2")
+        raise UserError("a seed is given twice", "--seeds", "Give each once, such as: 0 1 2")
     if len({dataset.folder.resolve().name for dataset in datasets}) < len(datasets):
         raise UserError("two data sets have the same name", "--data", "Rename the folder of one")
     if not shared.seconds:

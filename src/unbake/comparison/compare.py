@@ -146,7 +146,7 @@ def compare(
     with ranks.apart():
         if ceiling and ranks.leads:
             _measure_ceilings(dataset, list(chosen.values()), console)
-        ranks.told(None)  # the others find it in the data set
+        ranks.gather(None)  # the others find it in the data set
         rows: dict[str, dict[str, Any]] = {}
         errors: dict[str, UserError] = {}
         for name in ranks.mine(list(fits)):
@@ -248,8 +248,8 @@ def _of_all(
     ranks: Ranks, rows: Mapping[str, Any], errors: Mapping[str, UserError]
 ) -> tuple[dict[str, Any], dict[str, UserError]]:
     """The rows and the errors of all ranks."""
-    parts = {name: [e.what, e.where, e.remedy] for name, e in errors.items()}
-    every = ranks.told({"rows": dict(rows), "errors": parts})
+    parts = {name: error.parts for name, error in errors.items()}
+    every = ranks.gather({"rows": dict(rows), "errors": parts})
     failed = {name: error for one in every for name, error in one["errors"].items()}
     found = {name: row for one in every for name, row in one["rows"].items()}
     return found, {name: UserError(*error) for name, error in failed.items()}

@@ -451,8 +451,8 @@ class FitConfig:
         """What is added to the denominator of the relative L2 loss (ours).
 
         Where photographs are darker than `DIM`, it falls with the square of their mean, so that
-        errors stay relative and no fit depends on the unit of light. The presets of the paper and
-        of its authors add the same to all.
+        errors stay relative, and such a fit does not depend on the unit of light. The presets of
+        the paper and of its authors add the same to all.
 
         Args:
             mean: radiance of the photographs, linear RGB, mean over channels and pixels.

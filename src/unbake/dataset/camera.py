@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import mitsuba as mi
 import numpy as np
@@ -17,6 +17,7 @@ from unbake.errors import UserError, raise_together
 from unbake.io import array, integer, number, read_json, write_text
 
 SPLITS = ("train", "heldout")
+Placed = TypeVar("Placed")
 
 # OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
 _FLIP = np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -341,20 +342,32 @@ def frame_name(split: str, index: int) -> str:
     return f"{split}_{index:03d}"
 
 
+def named_by_split(posed: Iterable[tuple[str, Placed]]) -> list[tuple[str, str, Placed]]:
+    """Cameras or placements with their splits, and the names that views of these have.
+
+    Returns:
+        Name, split and camera, in the order given.
+    """
+    counts: dict[str, int] = {}
+    found = []
+    for split, camera in posed:
+        counts[split] = counts.get(split, -1) + 1
+        found.append((frame_name(split, counts[split]), split, camera))
+    return found
+
+
 def write_camera_file(path: Path, cameras: Sequence[tuple[str, LookAt]]) -> None:
     """Write (split, placement) pairs as a camera file: JSON, one camera a line, world units."""
-    counts: dict[str, int] = dict.fromkeys(SPLITS, 0)
     lines = []
-    for split, placed in cameras:
+    for name, split, placed in named_by_split(cameras):
         entry = {
-            "name": frame_name(split, counts[split]),
+            "name": name,
             "split": split,
             "origin": _rounded(placed.origin),
             "target": _rounded(placed.target),
             "up": _rounded(placed.up),
             "fov": placed.fov,
         }
-        counts[split] += 1
         lines.append("  " + json.dumps(entry))
     write_text(path, '{"cameras": [\n' + ",\n".join(lines) + "\n]}\n")
 

@@ -22,7 +22,7 @@ from ..io import locked, read_object, remove_unfinished, temporary_beside, write
 from .clipped_noise import BRIGHT
 from .clipped_noise import RADIUS as BLACK_RADIUS
 from .data_folder import DataFolder
-from .decoding import PEAK, RADIUS, WITH_BLURRED, Decoded, Plan, Told
+from .decoding import PEAK, RADIUS, WITH_BLURRED, Decoded, Plan, Totals
 
 
 def in_file(plan: Plan) -> Decoded:
@@ -99,9 +99,9 @@ def _open_cache(data: DataFolder, key: dict[str, Any]) -> Decoded | None:
             chosen = _mapped(data.cached_foreground, stored["foreground"], np.uint32, shape)
             if chosen.max(initial=0) >= len(table):
                 return None
-        told = Told(stored["sums"], stored["counts"], stored["hot_pixels"])
-        found = Decoded(table, chosen, told)
-        if len(table if chosen is None else chosen) != sum(told.counts):
+        totals = Totals(stored["sums"], stored["counts"], stored["hot_pixels"])
+        found = Decoded(table, chosen, totals)
+        if len(table if chosen is None else chosen) != sum(totals.counts):
             return None
     except (UserError, OSError, ValueError, KeyError, TypeError):
         return None
@@ -152,7 +152,7 @@ def _write_cache(data: DataFolder, plan: Plan, key: dict[str, Any], *, sweep: bo
         # A mapping that was written to stays in memory as a whole, and others look at a part.
         made = replace(made, table=np.load(table_file, mmap_mode="r"))
         del table
-        stored = {"key": key, **asdict(made.told), "table": _stamp(table_file)}
+        stored = {"key": key, **asdict(made.totals), "table": _stamp(table_file)}
         if made.chosen is not None:
             with foreground_file.open("xb") as file:
                 np.save(file, made.chosen)

@@ -32,8 +32,8 @@ Image = tuple[Camera, np.ndarray, np.ndarray, SensorNoise | None]
 
 @final
 @dataclass(frozen=True)
-class Told:
-    """What processes tell each other of their views; serializable.
+class Totals:
+    """Sums over the pixels of views, which processes exchange; serializable.
 
     Args:
         sums: of the pixels to train on and their channels, by view.
@@ -54,21 +54,21 @@ class Decoded:
     Args:
         table: as in `Photographs`.
         chosen: the same.
-        told: what all processes come to know of them.
+        totals: of the views.
     """
 
     table: np.ndarray
     chosen: np.ndarray | None
-    told: Told
+    totals: Totals
 
     def part(self, views: slice, pixels: slice, names: Collection[str]) -> Decoded:
         """Some of these views, with these pixels and names."""
-        chosen, told = self.chosen, self.told
+        chosen, totals = self.chosen, self.totals
         if chosen is not None:
             chosen = chosen[slice(*np.searchsorted(chosen, (pixels.start, pixels.stop)))]
-        hot_pixels = [found for found in told.hot_pixels if found["view"] in names]
-        told = Told(told.sums[views], told.counts[views], hot_pixels)
-        return Decoded(self.table[pixels], chosen, told)
+        hot_pixels = [found for found in totals.hot_pixels if found["view"] in names]
+        totals = Totals(totals.sums[views], totals.counts[views], hot_pixels)
+        return Decoded(self.table[pixels], chosen, totals)
 
 
 @final
@@ -128,7 +128,7 @@ class Plan:
                 yield camera, rgb, counted, noise
 
         made = fill(table, images(), self.chooses, first)
-        return replace(made, told=replace(made.told, hot_pixels=hot_pixels))
+        return replace(made, totals=replace(made.totals, hot_pixels=hot_pixels))
 
 
 def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
@@ -174,7 +174,7 @@ def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0)
             seen.append(first + start + np.flatnonzero(counted))
         start = stop
     chosen = np.concatenate(seen).astype(np.uint32) if some else None
-    return Decoded(table, chosen, Told(sums, counts, []))
+    return Decoded(table, chosen, Totals(sums, counts, []))
 
 
 def _reference(

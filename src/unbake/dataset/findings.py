@@ -26,8 +26,6 @@ SPREAD = 0.5
 #: Light turns with the cameras if it explains such a share of what differs between views, and so
 #: many stops of it.
 TURNING, TURNING_STOPS = 0.35, 0.15
-#: Names that are told; of more there is the number.
-_TOLD = 3
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,6 @@ class Finding:
 
     def __str__(self) -> str:
         return str(UserError(self.what, self.where, self.remedy))
-
-
-def named(names: Sequence[str]) -> str:
-    """Names of views or files, of which the first are told."""
-    more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
-    return ", ".join(printable(name) for name in names[:_TOLD]) + more
 
 
 def misaligned(found: Alignment | None) -> Finding | None:

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import UserError
 from .clipped_noise import clipped_mean
 from .data_folder import DataFolder
+from .spread import evenly
 from .views import Dataset, SensorNoise, fitted, read_masked
 
 #: Edge of a block, in pixels.
@@ -140,11 +141,11 @@ def found_noise(dataset: Dataset, clip_negative: bool = False) -> SensorNoise | 
     if not views or (dataset.render and not degraded):
         return None
     size = max(1, views[0].camera.width * views[0].camera.height)
-    count = min(max(_PIXELS // size, _FEWEST_VIEWS), _MOST_VIEWS, len(views))
+    most = min(max(_PIXELS // size, _FEWEST_VIEWS), _MOST_VIEWS)
     rows = []
-    for i in np.linspace(0, len(views) - 1, count).round().astype(int).tolist():
+    for view in evenly(views, most):
         try:
-            pixels, mask = read_masked(views[i], clip_negative)
+            pixels, mask = read_masked(view, clip_negative)
         except UserError:
             return None
         rows.append(blocks(pixels[..., :3], fitted(pixels, mask, dataset.background)))

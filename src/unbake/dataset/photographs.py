@@ -20,7 +20,7 @@ from ..memory import require_memory
 from ..ranks import Ranks
 from .camera import Camera
 from .decoded_file import in_file
-from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Told, fill
+from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Totals, fill
 from .hot_pixels import HotPixels
 from .noise_at_black import found_noise
 from .shares import Share
@@ -178,7 +178,7 @@ class Photographs:
             lambda: found_noise(dataset, clip_negative) if first else None, math.inf
         )
         # All read photographs alike: by what the first one found.
-        known = ranks.told(None if noise is None else asdict(noise))[0]
+        known = ranks.gather(None if noise is None else asdict(noise))[0]
         if known is not None:
             noise = SensorNoise(**known)
             views = [replace(v, noise=v.noise or noise) for v in dataset.views]
@@ -188,8 +188,8 @@ class Photographs:
         masked = any(view.mask is not None for view in dataset.train)
         if ranks.size == 1:
             return replace(_made(found, noise), masked=masked)
-        every = [Told(**told) for told in ranks.told(asdict(found.told))]
-        counts = np.concatenate([told.counts for told in every])
+        every = [Totals(**own) for own in ranks.gather(asdict(found.totals))]
+        counts = np.concatenate([totals.counts for totals in every])
         share = Share(ranks, plan.first_views, np.array(plan.sizes), counts)
         return replace(_made(found, noise, every, share), masked=masked)
 
@@ -223,21 +223,21 @@ def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
 def _made(
     decoded: Decoded,
     noise: SensorNoise | None = None,
-    every: Sequence[Told] | None = None,
+    every: Sequence[Totals] | None = None,
     share: Share | None = None,
 ) -> Photographs:
     """Decoded photographs: all of them, or a share.
 
     Args:
         noise: that was found.
-        every: what is known of the views of each process; None: this one holds all.
+        every: totals of the views of each process; None: this one holds all.
         share: what it holds.
     """
-    every = every or [decoded.told]
+    every = every or [decoded.totals]
     # One after the other, so that the mean is the same however views are dealt
-    total = reduce(add, (value for told in every for value in told.sums), 0.0)
-    count = sum(sum(told.counts) for told in every)
-    hot_pixels = tuple(HotPixels(**found) for told in every for found in told.hot_pixels)
+    total = reduce(add, (value for totals in every for value in totals.sums), 0.0)
+    count = sum(sum(totals.counts) for totals in every)
+    hot_pixels = tuple(HotPixels(**found) for totals in every for found in totals.hot_pixels)
     mean = total / max(3 * count, 1)
     return Photographs(decoded.table, decoded.chosen, mean, hot_pixels, noise, share)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UserError, printable
+from ..errors import UserError, named
 from ..scene import free_space
 from .camera import Camera
 from .mistakes import usual_mistakes
@@ -72,15 +72,12 @@ def pose_problems(
     view = _views_of(cameras, numbers)
     count = np.bincount(view, minlength=len(views))
     hits = np.bincount(view, seen, len(views))
-    blind = [
-        printable(views[i].name) for i in np.flatnonzero((count >= _BLIND) & (hits == 0)).tolist()
-    ]
+    blind = [views[i].name for i in np.flatnonzero((count >= _BLIND) & (hits == 0)).tolist()]
     if not blind:
         return []
-    more = f" and {len(blind) - 3} more" if len(blind) > 3 else ""
     remedy = _likely(scene, cameras, numbers, share)
     what = "the view sees no surface of the scene"
-    return [UserError(what, f"{', '.join(blind[:3])}{more}", remedy)]
+    return [UserError(what, named(blind), remedy)]
 
 
 def _likely(scene: mi.Scene, cameras: Sequence[Camera], numbers: np.ndarray, share: float) -> str:

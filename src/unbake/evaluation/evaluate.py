@@ -12,6 +12,7 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.lighting import ROWS, true_environment
+from ..dataset.spread import evenly
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
 from ..imaging.metrics import HIGHEST, mean_psnr, psnr
@@ -130,8 +131,7 @@ def _evaluate(
     if data_changed:
         tell(f"warning: other {', '.join(data_changed)} than the run was fit to")
     true_scene = _true_scene(recovered) if settings.truth else None
-    spread = np.linspace(0, len(dataset.train) - 1, min(settings.train_views, len(dataset.train)))
-    views = [*dataset.heldout, *(dataset.train[i] for i in sorted({round(x) for x in spread}))]
+    views = [*dataset.heldout, *evenly(dataset.train, settings.train_views)]
     # First, as the true lighting may be damaged, and views take long
     recovered_lighting = _evaluate_lighting(recovered, out, tell)
     clip = settings.clip_negative or recovered.clip_negative

@@ -20,7 +20,7 @@ import numpy as np
 from ..acquisition.new_light import change_light
 from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, frame_name, frame_of, read_cameras
+from ..dataset.camera import Camera, frame_name, frame_of, named_by_split, read_cameras
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError, collected, printable, raise_together
 from ..fields.domain import Domain
@@ -300,12 +300,10 @@ def _shots(
     width, height = picture_size(first, settings)
     if cameras.file is not None:
         found = read_cameras(cameras.file, first.width, first.height, keep_size=True)
-        counts: dict[str, int] = {}
-        shots = []
-        for split, camera in found:
-            counts[split] = counts.get(split, -1) + 1
-            name = frame_name(split, counts[split])
-            shots.append(_Shot(name, camera.rescaled(*picture_size(camera, settings)), split))
+        shots = [
+            _Shot(name, camera.rescaled(*picture_size(camera, settings)), split)
+            for name, split, camera in named_by_split(found)
+        ]
         return shots, {"kind": "file", "file": os.fspath(cameras.file)}
     if cameras.turntable is not None:
         scene, count = recovered.problem.scene_view.scene, cameras.turntable

@@ -31,9 +31,7 @@ class EvaluationSettings:
     max_depth: Annotated[int, Flag("Longest light path")] = 48
     rr_depth: int = 5  #: bounces before Russian roulette
     #: All held-out views are rendered.
-    train_views: Annotated[
-        int, Flag("How many of the views learned from to render, beside all held-out ones")
-    ] = 4
+    train_views: Annotated[int, Flag("Training views to render, besides all held-out ones")] = 4
     material_spp: int = 16  #: camera samples a pixel of the pictures of materials
     #: As always if the fit did.
     clip_negative: Annotated[
@@ -42,7 +40,7 @@ class EvaluationSettings:
     ] = False
     truth: Annotated[
         bool,
-        Flag("Render captured scenes with their true materials too: what noise alone leaves"),
+        Flag("Also render the true materials of a captured scene, whose errors are noise alone"),
     ] = False
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from ..dataset.pixels import CameraRays
 from ..errors import UserError
 from ..fields.radiance import RadianceField
 from ..imaging.pictures import block_means, false_colour, montage, shrink, tonemap, write_png
-from ..io import write_atomically
+from ..io import write_arrays
 from ..scene.parse import ParsedScene, parse, referenced
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
@@ -234,7 +234,7 @@ def _at(context: ExperimentContext, value: float, shrunk: int, spp: int) -> Find
     wood = Wood.of(STAIRCASE.unpacked(context), shrunk)
     radiance, loss = _trained(context, wood, value, _settings(context))
     arrays = arrays_at(wood, value, spp, radiance=radiance)
-    save(_arrays(context, value), arrays)
+    write_arrays(_arrays(context, value), arrays)
     return {"height": wood.camera.height, "width": wood.camera.width, "residual": loss}
 
 
@@ -278,16 +278,6 @@ def arrays_at(
             arrays[f"{name} {method} image"] = image.astype(np.float32)
             arrays[f"{name} {method} derivative"] = derivative.astype(np.float32)
     return arrays
-
-
-def save(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to an .npz file, complete or not at all."""
-
-    def write(path: Path) -> None:
-        with open(path, "wb") as opened:  # np.savez appends .npz to names
-            np.savez(opened, **arrays)  # pyright: ignore[reportArgumentType]
-
-    write_atomically(file, write)
 
 
 def _methods(e: Estimates) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -190,7 +190,7 @@ class JobRunner:
 
     def _mine(self, jobs: Sequence[Job]) -> list[Job]:
         """The jobs of this rank, of those that rank 0 finds not done."""
-        left = self.ranks.told([job.name for job in self.left(jobs)])[0]
+        left = self.ranks.gather([job.name for job in self.left(jobs)])[0]
         every = [job for job in jobs if job.name in left]
         groups = self.ranks.mine(list(dict.fromkeys(job.group for job in every)))
         return [job for job in every if job.group in groups]
@@ -199,9 +199,9 @@ class JobRunner:
         self, mine: Sequence[Job], records: Mapping[str, Record], failed: dict[str, UserError]
     ) -> dict[str, Record]:
         """The records of the jobs that all ranks ran; their errors go to `failed`."""
-        parts = {name: [e.what, e.where, e.remedy] for name, e in failed.items()}
+        parts = {name: error.parts for name, error in failed.items()}
         own = {"records": {job.name: records[job.name] for job in mine}, "failed": parts}
-        every = self.ranks.told(own)
+        every = self.ranks.gather(own)
         others = {name: UserError(*e) for one in every for name, e in one["failed"].items()}
         for name in others.keys() - failed.keys():
             line = f"{name}: error: {others[name]}"

@@ -12,10 +12,10 @@ import numpy as np
 
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays
-from ..fields.arrays import from_numpy
+from ..fields.arrays import from_numpy, shaped_like
 from ..fields.domain import Domain
 from ..fields.radiance import RadianceField, make_radiance
-from ..io import write_atomically
+from ..io import write_arrays
 from ..training.step import without_garbage_collection
 from ..transport.loss import RelativeL2
 from ..transport.methods import EXTRA, PRIOR, Attached
@@ -129,12 +129,7 @@ def train(
 def save_radiance(file: Path, radiance: RadianceField) -> None:
     """Write the parameters of L_θ, complete or not at all."""
     arrays = {key: value.numpy() for key, value in radiance.parameters().items()}
-
-    def write(path: Path) -> None:
-        with open(path, "wb") as opened:  # np.savez appends .npz to names
-            np.savez(opened, scale=radiance.scale, **arrays)  # pyright: ignore[reportArgumentType]
-
-    write_atomically(file, write)
+    write_arrays(file, {"scale": np.array(radiance.scale), **arrays})
 
 
 def load_radiance(file: Path, scene_view: SceneView, config: FitConfig) -> RadianceField:
@@ -148,10 +143,10 @@ def load_radiance(file: Path, scene_view: SceneView, config: FitConfig) -> Radia
             seed=0,
             half=config.half_precision,
         )
-        parameters = {}
-        for key, value in radiance.parameters().items():
-            flat = from_numpy(mi.Float, arrays[key])
-            parameters[key] = mi.TensorXf(flat, value.shape) if dr.is_tensor_v(value) else flat
+        parameters = {
+            key: shaped_like(from_numpy(mi.Float, arrays[key]), value)
+            for key, value in radiance.parameters().items()
+        }
     radiance.assign(parameters)
     return radiance
 

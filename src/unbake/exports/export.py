@@ -21,9 +21,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ..dataset.findings import named
 from ..dataset.views import Dataset
-from ..errors import UserError, collected, raise_together
+from ..errors import UserError, collected, named, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
@@ -48,8 +47,8 @@ from .usd import require_usd, write_usd
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
-#: Materials that are told one by one, and that are named in a note.
-_TOLD, _NAMED = 12, 4
+#: Materials that are told one by one.
+_TOLD = 12
 #: What to do where textures are coarser than what was recovered: if --texels was given, else.
 _COARSE = "without --texels, textures are as dense as it takes", "a larger --texels keeps more"
 
@@ -343,10 +342,9 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
             notes.append(f"{atlas.name}: no training view saw it, its textures are the defaults")
     far = [one.atlas.name for one in baked if one.atlas.is_optimized and not one.is_near]
     if far:
-        named = ", ".join(far[:_NAMED]) + (" …" if len(far) > _NAMED else "")
         notes.append(
             f"less than {100 * WANTED:.0f} % of the surface is within 2/255 of the fields in "
-            f"{len(far)} of {len(baked)} materials ({named}); {remedy}"
+            f"{len(far)} of {len(baked)} materials ({named(far)}); {remedy}"
         )
     varying = [light.name for light in lights if light.strength is None]
     if varying:

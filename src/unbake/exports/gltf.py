@@ -320,11 +320,9 @@ def _add_light(document: Document, light: Light) -> None:
     extension = document.use("KHR_lights_punctual")
     known = document.json.setdefault("extensions", {}).setdefault(extension, {"lights": []})
     known["lights"].append(entry)
-    matrix = light.to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
     node = {
         "name": light.name,
-        "matrix": matrix.T.ravel().tolist(),
+        "matrix": light.pose.T.ravel().tolist(),
         "extensions": {extension: {"light": len(known["lights"]) - 1}},
     }
     document.json["scenes"][0]["nodes"].append(document.add("nodes", node))

@@ -27,6 +27,13 @@ class Light:
     to_world: np.ndarray  #: (4, 4); lights look along +z
     angles: tuple[float, float]  #: of the cone of a spot, to its full and to no light, radians
 
+    @property
+    def pose(self) -> np.ndarray:
+        """Where it stands without its scale, as glTF and OpenUSD say: it looks along -z, (4, 4)."""
+        matrix = self.to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
+        matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
+        return matrix
+
 
 def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
     """The lights of a scene, without an environment where one was recovered.

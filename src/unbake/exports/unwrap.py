@@ -142,7 +142,8 @@ def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
             break
     if not found:
         why = " ".join("; ".join(failures).split())[:200]
-        raise UserError(f"the material {name!r} cannot be unwrapped ({why})", None, "Unwrap it")
+        what = f"the material {name!r} cannot be unwrapped ({why})"
+        raise UserError(what, None, "Give its meshes texture coordinates in a modelling program")
     return max(found, key=lambda atlas: atlas.unique)
 
 

@@ -241,9 +241,7 @@ class _Writer:
             shaping.CreateShapingConeAngleAttr(math.degrees(outer))
             shaping.CreateShapingConeSoftnessAttr(1 - min(inner / max(outer, 1e-9), 1.0))
         made.GetPrim().SetDisplayName(light.name)
-        matrix = light.to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
-        matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
-        UsdGeom.Xformable(made).AddTransformOp().Set(Gf.Matrix4d(matrix.T.tolist()))
+        UsdGeom.Xformable(made).AddTransformOp().Set(Gf.Matrix4d(light.pose.T.tolist()))
 
     def _material(self, name: str) -> tuple[Any, Any]:
         """A material and its surface shader."""

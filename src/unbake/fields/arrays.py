@@ -14,6 +14,11 @@ from .field import FieldSpec
 _FAR = 6.0
 
 
+def shaped_like(flat: mi.Float, like: mi.Float | mi.TensorXf) -> mi.Float | mi.TensorXf:
+    """Numbers, one after the other, as an array of the kind and shape of another one."""
+    return mi.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
+
+
 def sigmoid(x: mi.Float, least_slope: float = 0.0) -> mi.Float:
     """1 / (1 + exp(−x)).
 

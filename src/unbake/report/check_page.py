@@ -15,6 +15,7 @@ from ..checks.told import told_rows
 from ..dataset.alignment import geometry_edges
 from ..dataset.camera import Camera
 from ..dataset.small_views import seen_by, small_view
+from ..dataset.spread import evenly
 from ..dataset.views import read_masked
 from ..imaging import pictures
 from ..io import write_text
@@ -82,8 +83,7 @@ def _overlays(result: DataCheck, clip_negative: bool) -> list[dict[str, Any]]:
     """Photographs with the edges of the geometry, as posed and as posed better."""
     if result.scene is None or not result.views:
         return []
-    chosen = np.linspace(0, len(result.views) - 1, min(len(result.views), _MOST))
-    views = [result.views[i] for i in dict.fromkeys(chosen.round().astype(int).tolist())]
+    views = evenly(result.views, _MOST)
     exposure = pictures.fitting_exposure([pictures.sample(v.small.rgb.mean(axis=2)) for v in views])
     mistake = result.alignment.mistake if result.alignment is not None else None
     return [_overlay(result.scene, view, exposure, mistake, clip_negative) for view in views]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unbake.config.light import LightConfig
+from unbake.dataset.spread import evenly
 from unbake.dataset.views import Dataset, read_photograph
 from unbake.errors import UserError
 from unbake.evaluation.settings import RENDER_FORMAT
@@ -81,8 +82,7 @@ def _light(told: dict[str, Any] | None) -> str:
 def _strip(
     light: str, truth: str | None, exposure: float, names: list[str], allow_outside: bool
 ) -> dict[str, Any]:
-    at = np.unique(np.linspace(0, len(names) - 1, min(MOST, len(names))).round().astype(int))
-    shown = [names[i] for i in at]
+    shown = evenly(names, MOST)
     true = None
     if truth is not None and Path(truth).is_dir():
         views = {v.name: v for v in Dataset.load(Path(truth), allow_outside=allow_outside).views}

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-
 from unbake.config.tables import flattened
 from unbake.dataset import views
+from unbake.dataset.spread import evenly
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError, printable
 from unbake.quantities import DEFAULT_QUANTITIES
@@ -170,10 +169,7 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
         )
     heldout = [_view(view) for view in dataset.heldout if view.name in evaluated]
     training = [_view(view) for view in dataset.train if view.name in evaluated]
-    if len(training) > TRAINING_VIEWS:
-        chosen = np.linspace(0, len(training) - 1, TRAINING_VIEWS).round().astype(int)
-        training = [training[i] for i in chosen]
-    return heldout + training
+    return heldout + evenly(training, TRAINING_VIEWS)
 
 
 def _view(view: views.View) -> View:

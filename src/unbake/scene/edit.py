@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import UserError
+from ..errors import UserError, named
 from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
@@ -224,9 +224,8 @@ def require_unwrapped(scene: mi.Scene, path: Path) -> None:
     """Raise a `UserError` if a mesh with unknown materials has no texture coordinates."""
     names = painted_meshes_without_uv(scene)
     if names:
-        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
         raise UserError(
-            f"meshes without texture coordinates cannot have bitmaps: {shown}",
+            f"meshes without texture coordinates cannot have bitmaps: {named(names)}",
             path,
             "Use --representation neural or grid, or unwrap the mesh",
         )

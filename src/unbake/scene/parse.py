@@ -250,7 +250,9 @@ def _require_own_plugins(scene: ParsedScene) -> None:
         if not named:
             node = next(n for n in scene.state.nodes if n.props.plugin_name() == name)
             where = mi.parser.file_location(scene.state, node)
-            raise UserError(f"the type {name[:80]!r} is no plugin of Mitsuba", where, "Correct it")
+            raise UserError(
+                f"the type {name[:80]!r} is no plugin of Mitsuba", where, "Correct its name"
+            )
 
 
 def _resolve_files(scene: ParsedScene, folders: list[Path]) -> None:
@@ -285,7 +287,7 @@ def _require_finite(scene: ParsedScene) -> None:
                 raise UserError(
                     f"{node.props.plugin_name()}.{key} has a number that is not finite",
                     mi.parser.file_location(scene.state, node),
-                    "Correct it",
+                    "Write a finite number",
                 )
 
 

@@ -90,7 +90,9 @@ def put_lights(scene: ParsedScene, file: Path, root: Path | None = None) -> list
     new = [_referenced(other, key) for key in found]
     environments = [n for n in new if other.state.nodes[n].props.plugin_name() in ENVIRONMENTS]
     if len(environments) > 1:
-        raise UserError("more than one environment in the file", file, "Leave one")
+        raise UserError(
+            "more than one environment in the file", file, "Keep one of them in the file"
+        )
     for i in (i for n in environments for i in other.reachable(n)):
         if other.state.nodes[i].props.plugin_name() == "envmap":
             check_environment(Path(other.state.nodes[i].props["filename"]))

@@ -36,9 +36,9 @@ class SolveSettings:
         float, Flag("Length in seconds of training; with it, --steps does not count")
     ] = 0.0
     #: N of Eq. 4.
-    batch: Annotated[int, Flag("Points on surfaces a step")] = 8192
+    batch: Annotated[int, Flag("Surface points per step")] = 8192
     #: M. Their mean is the right-hand side.
-    samples: Annotated[int, Flag("Samples of the right-hand side for each point")] = 2
+    samples: Annotated[int, Flag("Samples of the right-hand side per point")] = 2
     #: The square is then the product of two residuals, each of half of the samples: its
     #: expectation is free of their variance.
     attach_rhs: Annotated[
@@ -49,8 +49,8 @@ class SolveSettings:
     views: Annotated[
         int,
         Flag(
-            "Pictures: cameras are placed automatically, or are those of the built-in scene; "
-            "--from takes the held-out views instead"
+            "Pictures to render. Cameras are placed automatically, or are those of the built-in "
+            "scene; --from takes the held-out views instead"
         ),
     ] = 4
     #: Of the cameras of a file, too: their horizontal fields of view stay.

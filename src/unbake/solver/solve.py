@@ -18,7 +18,7 @@ from ..acquisition.new_light import change_light
 from ..acquisition.placement import is_room
 from ..acquisition.settings import CaptureSettings
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, frame_name, read_cameras
+from ..dataset.camera import Camera, named_by_split, read_cameras
 from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.grid_sizes import USUAL, sized
@@ -194,9 +194,4 @@ def _views(recovered: Recovered, cameras: Path | str | None) -> dict[str, Camera
 
 def _named(posed: list[tuple[str, Camera]]) -> dict[str, Camera]:
     """Cameras by the names of their pictures."""
-    counts: dict[str, int] = {}
-    named = {}
-    for split, camera in posed:
-        counts[split] = counts.get(split, -1) + 1
-        named[frame_name(split, counts[split])] = camera
-    return named
+    return {name: camera for name, _, camera in named_by_split(posed)}

@@ -63,7 +63,7 @@ class SeenPoints:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Told:
+class CameraEstimate:
     """What photographs of the same points tell of their camera.
 
     Args:
@@ -77,7 +77,7 @@ class Told:
     falloff: np.ndarray | None = None
 
 
-def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -> Told:
+def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -> CameraEstimate:
     """The response that explains photographs of the same points best, and their gains.
 
     With f(u^2.2) = v^2.2, the code value u of a point of radiance L in a photograph of gain g is
@@ -99,7 +99,9 @@ def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -
         views: how many there are, each with an unknown gain; 0: gains are known.
         vignetting: whether it is unknown.
     """
-    nothing = Told(None, np.zeros(views) if views else None, np.zeros(3) if vignetting else None)
+    nothing = CameraEstimate(
+        None, np.zeros(views) if views else None, np.zeros(3) if vignetting else None
+    )
     seen = seen.some(_comparable(seen, clipped=views > 0))
     # Points are in the order of views.
     order = np.random.default_rng(0).permutation(seen.point.max(initial=-1) + 1)
@@ -109,7 +111,7 @@ def first_response(seen: SeenPoints, views: int = 0, vignetting: bool = False) -
     found = _Fit(seen, views, vignetting).solved()
     falloff = found[len(found) - _TERMS :] * GAMMA if vignetting else None
     gains = (found[_ENDS:][:views] - found[_ENDS]) * GAMMA if views else None
-    return Told(_curve(found[:_ENDS]), gains, falloff)
+    return CameraEstimate(_curve(found[:_ENDS]), gains, falloff)
 
 
 class _Fit:
@@ -215,5 +217,5 @@ def _comparable(seen: SeenPoints, *, clipped: bool) -> np.ndarray:
 
 
 def log_falloff(terms: np.ndarray, radius2: np.ndarray) -> np.ndarray:
-    """Log vignetting at squared radii, by its terms as `Told` has them."""
+    """Log vignetting at squared radii, by its terms as `CameraEstimate` has them."""
     return radius2 * (terms[0] + radius2 * (terms[1] + radius2 * terms[2]))

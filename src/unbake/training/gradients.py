@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..fields.arrays import shaped_like
+
 
 def flat_gradients(optimizer: mi.ad.Optimizer) -> list[mi.Float]:
     """The gradients of all parameters, in their order."""
@@ -24,8 +26,6 @@ def set_gradients(optimizer: mi.ad.Optimizer, flat: mi.Float, first: int = 0) ->
     for value in optimizer.values():
         count = dr.width(value.array)
         gradient = dr.gather(mi.Float, flat, first + dr.arange(mi.UInt32, count))
-        dr.set_grad(
-            value, mi.TensorXf(gradient, value.shape) if dr.is_tensor_v(value) else gradient
-        )
+        dr.set_grad(value, shaped_like(gradient, value))
         first += count
     return first

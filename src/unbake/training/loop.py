@@ -427,12 +427,12 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             # This clock does not wait for the machine, so that slow steps are saved in time, too.
             save = saving.due(time.perf_counter() - clock)
             # What depends on a clock is the same on all ranks from here on: as rank 0 says.
-            tell = ranks.leads and errors.due(progress)
-            stopped, save, tell = ranks.any(bool(stop), save, tell)
+            measure = ranks.leads and errors.due(progress)
+            stopped, save, measure = ranks.any(bool(stop), save, measure)
             last = _done(config, progress) >= total or stopped
             full = len(recent) >= READ_EVERY
             timed = config.seconds or score is not None
-            if full or last or save or tell or (timed and progress.step % TIME_EVERY == 0):
+            if full or last or save or measure or (timed and progress.step % TIME_EVERY == 0):
                 dr.sync_thread()
                 progress.seconds = ranks.of_first(time.perf_counter() - clock)
                 last = last or _done(config, progress) >= total
@@ -440,7 +440,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
             _search(search, watchdog, now, saving, state, progress, clock, ranks)
             last = last or _done(config, progress) >= total
             due = score is not None and progress.seconds - scored_at >= config.score_seconds
-            if not (full or last or due or save or tell):
+            if not (full or last or due or save or measure):
                 continue
 
             begun.step.unite(state)
@@ -453,7 +453,7 @@ def _train(  # noqa: PLR0915 - the loop in one piece, top to bottom
                 state.publish(problem)
                 entry["score"] = score.measure()
                 scored_at = progress.seconds
-            if tell or (last and not stopped):
+            if measure or (last and not stopped):
                 errors.measure(state, entry, progress)
             saving.require_held()
             monitor.record(_done(config, progress), entry)

@@ -37,7 +37,7 @@ import numpy as np
 
 from ..config import FitConfig, RoughnessSearchConfig
 from ..errors import UserError
-from ..fields.arrays import from_numpy
+from ..fields.arrays import from_numpy, shaped_like
 from ..fields.field import Field, holding
 from ..memory import lacks_memory
 from ..ranks import Ranks
@@ -212,7 +212,7 @@ class RoughnessSearch:
         if self._ranks.size == 1:
             return array
         found = from_numpy(mi.Float, self._ranks.as_first(array.numpy()))
-        return mi.TensorXf(found, array.shape) if dr.is_tensor_v(array) else found
+        return shaped_like(found, array)
 
 
 def _as_bytes(rows: np.ndarray) -> np.ndarray:

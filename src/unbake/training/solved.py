@@ -27,7 +27,7 @@ from safetensors.numpy import load, save_file
 from ..config.migration import as_before
 from ..config.tables import update
 from ..errors import UserError
-from ..fields.arrays import from_numpy
+from ..fields.arrays import from_numpy, shaped_like
 from ..fields.domain import Domain
 from ..fields.radiance import EXTRA, OUTPUTS, RadianceField, make_radiance
 from ..fields.registry import representation
@@ -126,7 +126,9 @@ def read_solved(folder: Path | str) -> Solved:
         raise UserError("does not fit its settings", file, _AGAIN)
     if not all(np.isfinite(value).all() for value in found.values()):
         raise UserError("has a number that is not finite", file, _AGAIN)
-    radiance.assign({key: _array(value, fresh[key]) for key, value in found.items()})
+    radiance.assign(
+        {key: shaped_like(from_numpy(mi.Float, value), fresh[key]) for key, value in found.items()}
+    )
     sha256 = hashlib.sha256(content).hexdigest()
     scene = str(manifest.get("scene"))
     return Solved(folder, radiance, form, settings, geometry, scene, steps, sha256)
@@ -150,8 +152,3 @@ def load_radiance(folder: Path | str) -> RadianceField:
         UserError: it cannot be read.
     """
     return read_solved(folder).radiance
-
-
-def _array(value: np.ndarray, like: mi.Float | mi.TensorXf) -> mi.Float | mi.TensorXf:
-    flat = from_numpy(mi.Float, value)
-    return mi.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat

@@ -55,7 +55,7 @@ class Inputs:
     second: mi.Sampler  # of those that L_θ learns from, if these are fewer
     single: mi.Sampler  # of one camera sample a pixel, for regularizers
     seed: mi.UInt32
-    told: mi.Float | None = None  # exposures of the views as the data set tells, if they are read
+    exposures: mi.Float | None = None  # of the views, as the data set has them, if they are read
     units: PoseUnits | None = None  # of corrections of poses, if there are any
     blocks: Blocks | None = None  # of pixels that lose their weight together, if they are to
 
@@ -121,10 +121,10 @@ class TrainingStep:
         self._config = config
         self.epsilon = config.epsilon(pixels.photographs.mean)
         self._path_sampler = make_sampler(_context(problem, config))
-        self._told = None
+        self._exposures = None
         if problem.camera is not None and problem.camera.has_response:
             exposures = pixels.exposures
-            self._told = from_numpy(
+            self._exposures = from_numpy(
                 mi.Float, np.ones(problem.camera.views) if exposures is None else exposures
             )
         self._units = None if problem.poses is None else problem.poses.units
@@ -412,7 +412,7 @@ class TrainingStep:
             second=self._second,
             single=self._single,
             seed=dr.opaque(mi.UInt32, int(seeds[1])),
-            told=self._told,
+            exposures=self._exposures,
             units=self._units,
             blocks=None if self._problem.outliers is None else self._problem.outliers.blocks,
         )
@@ -567,12 +567,12 @@ class TrainingStep:
         view = inputs.rays.view_of(numbers)
         gain = camera.gain(view, inputs.rays.radius2(numbers, view))
         if camera.has_response:
-            assert inputs.told is not None
+            assert inputs.exposures is not None
             # The response is of the photograph, before it was divided by its exposure.
-            told = dr.gather(mi.Float, inputs.told, view)
-            target = camera.exposed(target * told) / told
+            exposure = dr.gather(mi.Float, inputs.exposures, view)
+            target = camera.exposed(target * exposure) / exposure
             if reference is not None:
-                reference = dr.detach(camera.exposed(reference * told) / told)
+                reference = dr.detach(camera.exposed(reference * exposure) / exposure)
         return target, reference, gain
 
 
