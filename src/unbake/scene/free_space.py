@@ -295,9 +295,7 @@ def _trace_spheres(scene: mi.Scene, positions: np.ndarray, directions: np.ndarra
     return Hits(*(values.reshape(shape) for values in found))
 
 
-def _trace(
-    scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, ...]:
+def _trace(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
     ray = as_ray(origins, directions)
     hit = scene.ray_intersect(ray)
     valid = hit.is_valid()
