@@ -319,7 +319,7 @@ def test_rows_and_errors_of_all_ranks_come_together():
     ]
 
     class Two(Ranks):
-        def told(self, own):
+        def gather(self, own):
             assert json.loads(json.dumps(own)) == told[1]
             return told
 

@@ -170,7 +170,7 @@ class Half(Ranks):
         super().__init__()
         self.rank, self.size, self._shared, self._barrier = rank, 2, shared, barrier
 
-    def told(self, own):
+    def gather(self, own):
         self._shared[self.rank] = json.loads(json.dumps(own))
         self._barrier.wait(10)
         every = list(self._shared)

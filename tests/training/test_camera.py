@@ -482,7 +482,7 @@ def test_what_is_off_costs_nothing(built_in, one_thread, monkeypatch):
         if number:
             monkeypatch.setattr(RelativeL2, "error", as_before)
         step, state = start(built_in, CameraConfig(), estimator="all-pairs")
-        assert step.inputs(0).told is None and step._problem.camera is None
+        assert step.inputs(0).exposures is None and step._problem.camera is None
         terms = [step(state, i, rates(i)) for i in range(2)]
         arrays = {k: np.array(v) for _, o in state.optimizers() for k, v in o.items()}
         found.append(({k: float(v[0]) for t in terms for k, v in t.items()}, arrays))

@@ -90,7 +90,7 @@ class DegradeSettings:
     electrons: Annotated[
         float, Flag("Electrons per pixel at white, which adds shot noise; 0: no noise")
     ] = 0.0
-    read_noise: Annotated[float, Flag("Read noise in electrons; needs --electrons")] = 0.0
+    read_noise: Annotated[float, Flag("Read noise in electrons; only with --electrons given")] = 0.0
     clip: Annotated[
         float | None,
         Flag(
@@ -131,9 +131,9 @@ class DegradeSettings:
         ),
     ] = "half"
     tell_exposures: Annotated[
-        bool, Flag("Write the true exposures into transforms.json, as EXIF would have them")
+        bool, Flag("Write the true exposures to the frames, as EXIF would have them")
     ] = False
-    tell_noise: Annotated[bool, Flag("Write the noise of the sensor into transforms.json")] = False
+    tell_noise: Annotated[bool, Flag("Write the noise of the sensor to the frames")] = False
     seed: Annotated[int, Flag("Seed of all random numbers")] = 0
 
     def __post_init__(self) -> None:
