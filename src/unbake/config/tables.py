@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from textwrap import shorten
 from typing import Any, Literal, TypeVar, cast
 
-from ..errors import UserError, printable, raise_together
+from ..errors import UserError, collected, printable, raise_together
 
 Settings = TypeVar("Settings")
 
@@ -44,13 +44,11 @@ def update(
     changes, faults = {}, []
     for key, value in table.items():
         here = (*path, key)
-        try:
+        with collected(faults):
             if key not in current:
                 known = _known(key, list(current))
                 raise UserError("unknown key", where=".".join(here), remedy=known)
             changes[key] = _changed(current[key], value, hints[key], here)
-        except UserError as error:
-            faults.append(error)
     raise_together(faults)
     if isinstance(settings, Mapping):
         return cast(Settings, {**current, **changes})

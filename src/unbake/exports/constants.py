@@ -13,7 +13,7 @@ from typing import Any
 
 from ..scene.parse import ParsedScene
 
-#: Of `principled`, with a number beside which nothing is lost; glTF and OpenUSD have no such thing.
+#: Parameters of `principled` that are lost where they are not 0: glTF and OpenUSD have none such.
 _UNKNOWN = ("anisotropic", "flatness", "sheen", "spec_tint", "spec_trans")
 #: Quantities that glTF and OpenUSD have textures of.
 TEXTURED = ("albedo", "roughness", "metallic")

@@ -34,7 +34,7 @@ from .textures import picture
 
 _FLOAT, _UINT, _ARRAY, _INDEX = 5126, 5125, 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
-#: A mesh that lights pass through, and its index of refraction where a scene says none.
+#: BSDFs that light passes through.
 _GLASS = ("dielectric", "thindielectric", "roughdielectric")
 _CONDUCTORS = ("conductor", "roughconductor")
 _PLASTIC = "plastic"

@@ -49,7 +49,7 @@ from .schedule import learning_rates
 from .sharing import kept_whole
 from .solved import Solved, read_solved
 from .state import State, initial_state
-from .step import TrainingStep, with_share
+from .step import TrainingStep
 from .validation import Score
 from .warm_start import (
     OPTION,
@@ -247,8 +247,7 @@ def _begin(
     preview = Preview(problem, dataset, folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds
     score = Score(problem, dataset.heldout) if scored else None
-    of_rank = with_share(config, ranks.size)
-    aside, photographs = _probes(problem, dataset, pixels, step, of_rank, preview, clip_negative)
+    aside, photographs = _probes(problem, dataset, pixels, step, preview, clip_negative)
     step.require_memory(state)
     names = [view.name for view in dataset.train]
     return _Begun(
@@ -332,7 +331,6 @@ def _probes(
     dataset: Dataset,
     pixels: PixelSource,
     step: TrainingStep,
-    config: FitConfig,
     preview: Preview | None,
     clip_negative: bool,
 ) -> tuple[HeldAside | None, HeldOutPhotographs | None]:
@@ -350,7 +348,7 @@ def _probes(
     aside = None
     if held is not None:
         aside = HeldAside(
-            step, rays, held, config, camera=problem.camera, exposures=pixels.exposures
+            step, rays, held, step.config, camera=problem.camera, exposures=pixels.exposures
         )
     photographs = None
     if compared:
@@ -358,7 +356,7 @@ def _probes(
             step,
             rays,
             dataset,
-            config,
+            step.config,
             clip_negative=clip_negative,
             camera=problem.camera,
             poses=problem.poses,

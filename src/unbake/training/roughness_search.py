@@ -72,11 +72,7 @@ class RoughnessSearch:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        config: FitConfig,
-        step: TrainingStep,
-        ranks: Ranks,
+        self, problem: Problem, config: FitConfig, step: TrainingStep, ranks: Ranks
     ) -> None:
         self._problem, self._config, self._step, self._ranks = problem, config, step, ranks
         self._samples = SearchSamples(problem, step)

@@ -118,7 +118,7 @@ class TrainingStep:
             problem.materials.carried = True  # a run that was read back may stand alone
         self._problem = problem
         self.pixels = pixels
-        self._config = config
+        self.config = config  #: of this process, with its share of each batch
         self.epsilon = config.epsilon(pixels.photographs.mean)
         self._path_sampler = make_sampler(_context(problem, config))
         self._exposures = None
@@ -160,7 +160,7 @@ class TrainingStep:
         self.plan(state)
         self.require_memory(state)
         step = self._step if self._frozen is None else self._frozen
-        alone = self._ranks.size == 1 or self._config.sync_every > 1
+        alone = self._ranks.size == 1 or self.config.sync_every > 1
         try:
             with without_garbage_collection():
                 inputs = self.prepare(state, number, rates)
@@ -168,12 +168,12 @@ class TrainingStep:
         except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
                 raise
-            paths = self._config.samples_per_pass
+            paths = self.config.samples_per_pass
             raise UserError(
                 f"no memory for a step of {paths} paths", None, self._smaller()
             ) from None
         self._apart = alone and self._ranks.size > 1
-        if (number + 1) % self._config.sync_every == 0:
+        if (number + 1) % self.config.sync_every == 0:
             self.unite(state)
         return terms
 
@@ -186,7 +186,7 @@ class TrainingStep:
     def read(self, losses: Sequence[Mapping[str, mi.Float]]) -> list[dict[str, float]]:
         """The numbers of loss terms that steps returned, the same on all ranks."""
         read = [{term: float(x[0]) for term, x in terms.items()} for terms in losses]
-        if self._ranks.size == 1 or self._config.sync_every == 1 or not read:
+        if self._ranks.size == 1 or self.config.sync_every == 1 or not read:
             return read
         own = np.array([list(row.values()) for row in read], np.float32)
         names, rows = read[0], self._ranks.mean(own)
@@ -201,7 +201,7 @@ class TrainingStep:
         """
         if self._planned:
             return
-        config, path_sampler = self._config, self._path_sampler
+        config, path_sampler = self.config, self._path_sampler
         with dr.suspend_grad(), path_sampler.prepared():
             inputs = self.inputs(0, min(config.pixels, max(1, _PLANNED_PATHS // config.spp)))
             state.publish(self._problem)
@@ -222,14 +222,14 @@ class TrainingStep:
         """
         if self._fits_memory:
             return
-        paths, free, here = self._config.samples_per_pass, free_bytes(), self._ranks.here
+        paths, free, here = self.config.samples_per_pass, free_bytes(), self._ranks.here
         large = free is not None and here * paths * MOST_BYTES_A_SAMPLE > free
         found = self.forecast(state) if large or self._path_sampler.keeps_paths else None
         if found is not None:
-            what = f"a step of {paths} paths by {self._config.method} needs"
+            what = f"a step of {paths} paths by {self.config.method} needs"
             # Dr.Jit 1.5 rounds arrays up to powers of two, of which only a part is used
             factor = max(here, 2 if reserved_counts() else 1)
-            need = factor * found.bytes(self._config.pixels)
+            need = factor * found.bytes(self.config.pixels)
             require_memory(need, what, lambda free: self._smaller(found.pixels(free / factor)))
         self._fits_memory = True
 
@@ -243,7 +243,7 @@ class TrainingStep:
                 dr.eval(terms, [dr.grad(value) for value in optimizer.values()])
                 dr.clear_grad(dict(optimizer.items()))
 
-        return forecast(probe, self._config.pixels, self._config.spp)
+        return forecast(probe, self.config.pixels, self.config.spp)
 
     def _smaller(self, pixels: int | None = None) -> str:
         """The remedy where a step does not fit the memory.
@@ -253,8 +253,8 @@ class TrainingStep:
         """
         told, ranks = "Lower --batch or --spp", self._ranks.size
         if pixels is not None:
-            whole = self._config.pixels * ranks
-            if self._config.pixel_sampling == "one-view-crop":
+            whole = self.config.pixels * ranks
+            if self.config.pixel_sampling == "one-view-crop":
                 pixels = largest_crop(pixels)
             told = f"Lower --batch from {whole} to {pixels * ranks}, or --spp"
         if self._path_sampler.keeps_paths:
@@ -269,15 +269,15 @@ class TrainingStep:
     @property
     def rate_names(self) -> tuple[str, ...]:
         """The names of learning rates that a step takes."""
-        config = self._config
+        config = self.config
         outliers = ("outliers",) if self._problem.outliers is not None else ()
         return (*config.unknowns, *config.camera.unknowns, *outliers, "radiance")
 
     def loss_of_black(self) -> float:
         """About the photometric loss of black pictures."""
-        _, colours = self.pixels.draw(self._config.seed, _PLANNED_PATHS).read()
+        _, colours = self.pixels.draw(self.config.seed, _PLANNED_PATHS).read()
         target = colours[:, :3].astype(np.float64)
-        smoothed = self._config.loss_reference == "smoothed"
+        smoothed = self.config.loss_reference == "smoothed"
         reference = colours[:, 3:] if smoothed else target
         loss = (target**2 / (reference**2 + self.epsilon)).mean()
         return float(self._ranks.mean(self._weighted(np.array([loss])))[0])
@@ -286,7 +286,7 @@ class TrainingStep:
     def replay(self, state: State, number: int) -> Replay:
         """A step taken apart, for a diagnosis; the state stays as it is."""
         self.plan(state)
-        inputs, config = self.inputs(number), self._config
+        inputs, config = self.inputs(number), self.config
         terms = self._gradients(inputs, state)
         gradients = {
             key: dr.grad(value)
@@ -344,7 +344,7 @@ class TrainingStep:
 
     @carrying()
     def _probe(self, inputs: Inputs, state: State) -> mi.Color3f:
-        config, pixels, sampler = self._config, inputs.pixels, inputs.sampler
+        config, pixels, sampler = self.config, inputs.pixels, inputs.sampler
         with dr.suspend_grad(), self._path_sampler.prepared():
             state.publish(self._problem)
             sampler.seed(inputs.seed, pixels.count * config.spp)
@@ -401,7 +401,7 @@ class TrainingStep:
             number: of the step.
             probe: how many pixels of all views stand for its batch, where another one is wanted.
         """
-        entropy = [self._config.seed, number]
+        entropy = [self.config.seed, number]
         entropy += [self._ranks.rank] if self._ranks.rank else []
         seeds = np.random.SeedSequence(entropy).generate_state(2)
         return Inputs(
@@ -418,9 +418,9 @@ class TrainingStep:
         )
 
     def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
-        if probe is None and self._config.pixel_sampling == "one-view-crop":
-            return self.pixels.draw_crop(seed, self._config.pixels)
-        return self.pixels.draw(seed, probe or self._config.pixels)
+        if probe is None and self.config.pixel_sampling == "one-view-crop":
+            return self.pixels.draw_crop(seed, self.config.pixels)
+        return self.pixels.draw(seed, probe or self.config.pixels)
 
     def _shared_step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         """The same step on all ranks, with the mean of their gradients."""
@@ -475,7 +475,7 @@ class TrainingStep:
     @carrying()
     def _gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         """The loss terms on random pixels; their gradients are accumulated in the state."""
-        config, path_sampler = self._config, self._path_sampler
+        config, path_sampler = self.config, self._path_sampler
         scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
         state.publish(self._problem)
         sampler.seed(inputs.seed, pixels.count * config.spp)
@@ -516,7 +516,7 @@ class TrainingStep:
             The photographs as light, linear RGB, one lane a pixel; the loss; and the roots of what
             errors are multiplied by, where outliers are to be found.
         """
-        config, problem, pixels = self._config, self._problem, inputs.pixels
+        config, problem, pixels = self.config, self._problem, inputs.pixels
         smoothed = config.loss_reference == "smoothed"
         reference, target = batch.smoothed if smoothed else None, batch.target
         if problem.poses is not None:
@@ -538,7 +538,7 @@ class TrainingStep:
         self, inputs: Inputs, ray: mi.Ray3f, photometric: mi.Float | None
     ) -> dict[str, mi.Float]:
         """The regularizers, at the first camera sample of each pixel."""
-        problem, config = self._problem, self._config
+        problem, config = self._problem, self.config
         if not has_terms(problem, config):
             return {}
         chosen = _first_samples(inputs.pixels.count, config.spp, 1)
