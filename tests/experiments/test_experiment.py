@@ -302,7 +302,7 @@ def test_a_few_steps_of_each_method_are_taken_to_compile_them(cornell, tiny, mon
     real = TrainingStep.__call__
 
     def counted(self, state, number, rates):
-        steps.append((self._config.method, number))
+        steps.append((self.config.method, number))
         return real(self, state, number, rates)
 
     monkeypatch.setattr(TrainingStep, "__call__", counted)
