@@ -98,3 +98,51 @@ def test_a_mesh_without_triangles_does_not_disturb_the_next_one(parse, tmp_path)
         parse(flat + BALL.format(DIFFUSE)).instantiate()
     assert caught.tb is not None  # it lives on, as in a notebook
     assert np.isfinite(render(parse(triangle).instantiate(), 2)).all()
+
+
+TWO = (
+    '<shape type="{}">{}</shape>'
+    '<shape type="{}"><transform name="to_world">{}</transform>{}</shape>'
+)
+PAINT = '<bsdf type="principled"/>'
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "shapes"),
+    [("rectangle", "rectangle", 2), ("rectangle", "cube", 2), ("cube", "cube", 1)],
+)
+def test_shapes_of_one_material_keep_their_extent(first, second, shapes, parse):
+    """Mitsuba merges meshes; what it merges with a rectangle has no place in the scene's box."""
+    moved = '<translate x="5"/>'
+    made = [
+        parse(TWO.format(first, PAINT, second, moved, PAINT)).instantiate(merge=merge)
+        for merge in (True, False)
+    ]
+    assert [len(scene.shapes()) for scene in made] == [shapes, 2]
+    merged, apart = (np.ravel([scene.bbox().min, scene.bbox().max]) for scene in made)
+    np.testing.assert_allclose(merged, apart)
+    assert apart[3] == 6
+
+
+def test_a_room_of_rectangles_keeps_light_out(parse):
+    """An environment was seen through the walls: its sphere was that of a box without them."""
+    turns = ["", '<rotate y="1" angle="180"/>']
+    turns += [f'<rotate {axis}="1" angle="{angle}"/>' for axis in "xy" for angle in (90, -90)]
+    walls = "".join(
+        f'<shape type="rectangle"><transform name="to_world"><translate z="-1"/>{turn}</transform>'
+        '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>'
+        for turn in turns
+    )
+    ball = '<shape type="sphere"><float name="radius" value="0.3"/><bsdf type="diffuse"/></shape>'
+    scene = parse(walls + ball).instantiate()
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    inside = mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 0.9], [0, 0, 0], [0, 1, 0]),
+            "film": film,
+        }
+    )
+    path = mi.load_dict({"type": "path", "max_depth": 4})
+    image = mi.render(scene, sensor=inside, integrator=path, spp=16)
+    assert float(np.array(image)[..., :3].max()) == 0

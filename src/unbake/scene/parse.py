@@ -86,16 +86,21 @@ class ParsedScene:
                 node.props.mark_queried(key, False)
 
     def _merge_meshes(self) -> None:
-        """Merge meshes of one material; those with flipped normals among themselves.
+        """Merge meshes of one material, but no rectangles; flipped normals among themselves.
 
-        Mitsuba 3.9 would merge the two kinds, and fails: "Mesh::merge(): the two meshes are
-        incompatible".
+        Mitsuba 3.9 would merge meshes with flipped normals and others, and fails: "Mesh::merge():
+        the two meshes are incompatible". What it merges with a rectangle has a box without the
+        rectangle, and so has the scene: light from outside would pass through what is beyond.
         """
         mi.parser.transform_merge_meshes(self.config, self.state)
         nodes, root = self.state.nodes, self.state.root.props
         merged = nodes[len(nodes) - 1].props
         if merged.plugin_name() != "merge":
             return
+        for key in list(merged):
+            if nodes[merged[key].index()].props.plugin_name() == "rectangle":
+                root[f"rectangle {key}"] = merged[key]
+                del merged[key]
         every = list(merged)
         inward = [k for k in every if nodes[merged[k].index()].props.get("flip_normals", False)]
         if not 0 < len(inward) < len(every):
