@@ -96,6 +96,16 @@ def test_vertex_normals_that_are_not_numbers_are_told(spoilt, unbake):
     assert "hint: " in outcome.out and "geometry   hint" in outcome.out
 
 
+def test_photographs_are_read_where_the_scene_cannot_be(spoilt):
+    data = spoilt("cornell")
+    data.picture(data.frames[2], lambda pixels: np.full_like(pixels, np.nan))
+    folder = data.save()
+    (folder / data.content["scene"]).write_text("<scene")
+    told = found(folder)
+    assert {finding.check for finding in told} == {"scene", "files"}
+    assert any("train_002" in (finding.where or "") for finding in told)
+
+
 def test_every_fault_of_a_frame_is_told_before_a_fit(spoilt):
     data = spoilt("cornell")
     for i, frame in enumerate(data.frames[:5]):
@@ -447,3 +457,22 @@ def test_no_exposure_is_told_of_views_that_share_nothing(captured):
     points = shared_points(views, seen_by(scene, [v.camera for v in views]))
     known = exposures(points, 1)
     assert known.pairs == 0 and known.spread == 0 and turning_light(points, known) is None
+
+
+def test_of_many_views_those_are_compared_that_show_the_same(captured):
+    """Most of a long walk shares nothing with a view."""
+    dataset = Dataset.load(captured("cornell"))
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    inside = [view.camera for view in dataset.train][:4]
+    outside = [Camera.look_at([x, 0, 90], [x, 0, 99], [0, 1, 0], 40, 40, 40) for x in range(60)]
+    cameras = [*inside, *outside]
+    views = [
+        small_view(str(i), camera, np.full((camera.width * camera.height, 3), 1.0 + i), None)
+        for i, camera in enumerate(cameras)
+    ]
+    seen = seen_by(scene, [view.camera for view in views])
+    found = exposures(shared_points(views, seen), len(views))
+    alone = exposures(shared_points(views[:4], seen[:4]), 4)
+    assert min(found.pairs, alone.pairs) > len(inside)
+    np.testing.assert_allclose(found.stops[:4], alone.stops, atol=1e-6)
+    assert np.isnan(found.stops[4:]).all()

@@ -20,6 +20,7 @@ from support import (
 
 from unbake.acquisition.degrade import response
 from unbake.config import CameraConfig, from_toml, read_toml, to_toml
+from unbake.dataset.camera import Camera
 from unbake.dataset.fingerprint import changed, fingerprint
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays
@@ -34,7 +35,7 @@ from unbake.scene.parse import parse
 from unbake.training import first_gains as first_gains_module
 from unbake.training.first_gains import (
     SharedPoints,
-    _solved,
+    _partners,
     begin_cameras,
     first_gains,
     shared_points,
@@ -482,7 +483,7 @@ def test_what_is_off_costs_nothing(built_in, one_thread, monkeypatch):
         if number:
             monkeypatch.setattr(RelativeL2, "error", as_before)
         step, state = start(built_in, CameraConfig(), estimator="all-pairs")
-        assert step.inputs(0).exposures is None and step._problem.camera is None
+        assert step.batch_loss.inputs(0).exposures is None and step._problem.camera is None
         terms = [step(state, i, rates(i)) for i in range(2)]
         arrays = {k: np.array(v) for _, o in state.optimizers() for k, v in o.items()}
         found.append(({k: float(v[0]) for t in terms for k, v in t.items()}, arrays))
@@ -655,8 +656,23 @@ def test_green_tells_the_response_where_each_photograph_has_a_white_balance(monk
 def test_gains_of_views_are_the_least_squares_ones():
     whole = np.log([[1, 1, 1], [9, 9, 9], [3, 3, 3]])
     # Nothing is shared with the last view: what its photograph says as a whole has to do.
-    found = np.exp(_solved(whole, [(0, 1, 1e3, np.log([2, 4, 8]))]))
-    np.testing.assert_allclose(found, [[1, 1, 1], [2, 4, 8], [3, 3, 3]], rtol=1e-3)
+    count = 1000
+    pair = np.zeros((2, count, 3))
+    pair[1] = np.log([2, 4, 8])
+    views = np.repeat([[0], [1]], count, 1)
+    points = np.arange(count)
+    shared = SharedPoints(points, *views, np.zeros((2, count)), pair, np.zeros(pair.shape), whole)
+    np.testing.assert_allclose(first_gains(shared), [[1, 1, 1], [2, 4, 8], [3, 3, 3]], rtol=1e-3)
+
+
+def test_points_are_looked_for_in_views_that_may_show_them():
+    towards = [Camera.look_at([x, 0, 5], [0, 0, 0], [0, 1, 0], 40, 8, 8) for x in range(5)]
+    away = [Camera.look_at([x, 0, 5], [x, 0, 9], [0, 1, 0], 40, 8, 8) for x in range(95)]
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3))
+    found = _partners(0, [*towards, *away], points, np.random.default_rng(1))
+    assert set(found) >= {1, 2, 3, 4} and 0 not in found
+    assert len(set(found)) == len(found) == 24
+    assert _partners(1, towards, points, np.random.default_rng(1)) == [0, 2, 3, 4]
 
 
 @pytest.fixture(scope="module")

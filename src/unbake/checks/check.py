@@ -34,7 +34,7 @@ from ..dataset.photographs import Photographs
 from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
-from ..errors import UserError, named, printable
+from ..errors import UserError, collected, named, printable
 from ..scene import edit, free_space
 from ..scene.parse import parse
 from .pictures import PictureFacts, blurred, percentage, picture_facts
@@ -137,10 +137,8 @@ def check_data(
     """
     result = DataCheck(Path(folder))
     faults: list[UserError] = []
-    try:
+    with collected(faults):
         result.dataset = Dataset.load(folder, allow_outside=allow_outside, faults=faults)
-    except UserError as error:
-        faults.append(error)
     result.findings += _grouped(faults, Path(folder))
     if result.dataset is not None:
         _check_dataset(result, result.dataset, clip_negative)
@@ -162,25 +160,25 @@ def _grouped(faults: Sequence[UserError], folder: Path) -> list[Finding]:
 
 
 def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:
-    try:
+    faults: list[UserError] = []
+    parsed = scene = None
+    with collected(faults):
         parsed = parse(dataset.scene, dataset.root)
         edit.to_principled(parsed)
         result.scene = scene = parsed.instantiate()
-    except UserError as error:
-        result.findings += [replace(f, check="scene") for f in _grouped([error], dataset.folder)]
+    if parsed is None or scene is None:
+        result.findings += [replace(f, check="scene") for f in _grouped(faults, dataset.folder)]
+        _check_files(result, dataset, clip_negative)
         return
     if parsed.repaired_normals:
         what = f"vertex normals that are not numbers: {parsed.repaired_normals}"
         remedy = "Normals of the triangles take their place. Compute them anew if you want others"
         where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
         result.add(Finding("hint", "normals", what, where, remedy))
-    faults: list[UserError] = []
     cameras = [small_camera(view.camera) for view in dataset.views]
     for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):
-        try:
+        with collected(faults):
             result.views.append(_checked(seen, dataset, view, result, clip_negative))
-        except UserError as error:
-            faults.append(error)
     result.findings += _grouped(faults, dataset.folder)
     result.add(noise_at_black(found_noise(dataset, clip_negative)))
     _check_masks(result)
@@ -197,6 +195,15 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         what = f"{100 * result.coverage[0]:.0f} % of the surface is seen by no training view"
         remedy = "What no photograph shows is guessed: take more, or accept that"
         result.warn("coverage", what, None, remedy)
+
+
+def _check_files(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:
+    """What can be told of photographs without the scene: whether their pixels can be used."""
+    faults: list[UserError] = []
+    for view in dataset.views:
+        with collected(faults):
+            read_masked(view, clip_negative)
+    result.findings += _grouped(faults, dataset.folder)
 
 
 def _checked(

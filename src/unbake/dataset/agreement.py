@@ -12,12 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .pair_ratios import PairRatios, levels
 from .small_views import Seen, SmallView
 
-#: Points of a view that are compared, and views that each is compared with, at most.
+#: Points of a view that are compared, and views that share enough of them, at most.
 _POINTS, _PARTNERS = 400, 12
+#: Views in which points are looked for, at most: of many views, most show other things.
+_LOOKED_AT = 120
 #: Points that a pair of views must share, and that all must share to tell of light.
 _FEWEST_SHARED, _FEWEST_FOR_LIGHT = 24, 400
+#: Points beyond which a pair of views says no more.
+_MOST_COUNTED = 200
 #: A pixel is not compared if its neighbours differ by more than so many stops from it.
 _STEEP = 1.0
 #: Ratios count as at most so many stops.
@@ -90,10 +95,14 @@ def shared_points(views: Sequence[SmallView], seen: Sequence[Seen], seed: int = 
     for i, found in enumerate(seen):
         chosen = np.flatnonzero(usable[i])
         chosen = rng.permutation(chosen)[:_POINTS]
-        others = rng.permutation([j for j in range(len(views)) if j != i])[:_PARTNERS]
+        others = rng.permutation([j for j in range(len(views)) if j != i])[:_LOOKED_AT]
+        partners = 0
         for j in others.tolist():
+            if partners == _PARTNERS:
+                break
             at, matched = _matched(views[j], seen[j], usable[j], found, chosen)
             here = chosen[matched]
+            partners += len(here) >= _FEWEST_SHARED
             rows.append(
                 (
                     np.full(len(here), i),
@@ -114,36 +123,19 @@ def exposures(points: SharedPoints, views: int) -> Exposures:
 
     Views that no chain of pairs connects with the largest group have none.
     """
-    pair = points.first * views + points.second
-    order = np.argsort(pair, kind="stable")
-    numbers, starts, counts = np.unique(pair[order], return_index=True, return_counts=True)
-    enough = counts >= _FEWEST_SHARED
-    medians = [
-        float(np.median(points.stops[order[a : a + n]]))
-        for a, n in zip(starts[enough], counts[enough], strict=True)
-    ]
-    first, second = np.divmod(numbers[enough], views)
-    group = _largest_group(first, second, views)
-    inside = group[first] & group[second] if len(first) else np.zeros(0, bool)
+    pairs = PairRatios.of(points.first, points.second, points.stops[:, None], _FEWEST_SHARED)
+    group = _largest_group(pairs.first, pairs.second, views)
+    pairs = pairs.some(group[pairs.first] & group[pairs.second])
     stops = np.full(views, np.nan)
-    if not inside.any():
+    if not len(pairs.first):
         return Exposures(stops, 0)
     members = np.flatnonzero(group)
-    place = np.full(views, -1)
+    place = np.zeros(views, int)
     place[members] = np.arange(len(members))
-    # The normal equations, and one more that puts the mean at 0: the graph's Laplacian is singular.
-    a, b = place[first[inside]], place[second[inside]]
-    weight = np.minimum(counts[enough][inside], 200).astype(np.float64)
-    ratio = weight * np.array(medians)[inside]
-    system = np.full((len(members), len(members)), weight.mean())
-    right = np.zeros(len(members))
-    for one, other, sign in ((a, b, -1.0), (b, a, 1.0)):
-        np.add.at(system, (one, one), weight)
-        np.add.at(system, (one, other), -weight)
-        np.add.at(right, one, sign * ratio)
-    solved = np.linalg.solve(system, right)
-    stops[members] = solved - np.median(solved)
-    return Exposures(stops, int(inside.sum()))
+    weight = np.minimum(pairs.counts, _MOST_COUNTED).astype(np.float64)
+    found = levels(place[pairs.first], place[pairs.second], pairs.logs, weight)[:, 0]
+    stops[members] = found - np.median(found)
+    return Exposures(stops, len(pairs.first))
 
 
 def turning_light(points: SharedPoints, found: Exposures) -> TurningLight | None:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from unbake.dataset.data_folder import TRANSFORMS
-from unbake.errors import UserError, raise_together
+from unbake.errors import UserError, collected, raise_together
 from unbake.io import array, integer, number, read_json, write_text
 
 SPLITS = ("train", "heldout")
@@ -401,7 +401,7 @@ def read_cameras(
     cameras, faults = [], []
     for index, entry in enumerate(entries):
         where = f"{path}: camera {index}"
-        try:
+        with collected(faults):
             if not isinstance(entry, dict):
                 raise UserError("the entry is not an object", where, _NO_CAMERA_FILE)
             split = read_split(entry, where)
@@ -409,9 +409,6 @@ def read_cameras(
                 camera = camera_from_frame(entry, top, where, (width, height))
             else:
                 camera = _camera_from_entry(entry, where, width, height)
-        except UserError as error:
-            faults.append(error)
-        else:
             cameras.append((split, camera if keep_size else camera.rescaled(width, height)))
     raise_together(faults)
     return cameras

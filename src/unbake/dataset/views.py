@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, final
 
@@ -15,7 +14,7 @@ import numpy as np
 from unbake.dataset.camera import Camera, camera_from_frame, frame_of, read_split, spread_rays
 from unbake.dataset.data_folder import TRANSFORMS, DataFolder
 from unbake.dataset.scene_kind import SceneKind, scene_kind
-from unbake.errors import UserError, raise_together
+from unbake.errors import UserError, collected, raise_together
 from unbake.imaging.coded import decode, read_codes
 from unbake.imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, read_header
 from unbake.io import number, require_file, text
@@ -412,44 +411,36 @@ def _read_views(
     views, names = [], set()
     for index, frame in enumerate(frames):
         where = f"{file}: frame {index}"
-        try:
+        found: list[UserError] = []
+        with collected(found):
             if not isinstance(frame, dict):
                 raise UserError("the frame is not an object", where, "Each view is one frame")
             view = _read_view(data, frame, top, where)
             if view.name in names:
                 raise UserError(f"two frames are named {view.name!r}", where, "Rename one image")
             names.add(view.name)
-        except UserError as error:
-            faults.append(error)
-            continue
-        found = _file_faults(view)
+            found += _file_faults(view)
+            if not found:
+                views.append(view)
         faults += found
-        if not found:
-            views.append(view)
     return tuple(views)
 
 
 def _file_faults(view: View) -> list[UserError]:
     """What is wrong with the files of a view, without reading their pixels."""
     size = view.camera.width, view.camera.height
-
-    def fault(check: Callable[[], None]) -> list[UserError]:
-        try:
-            check()
-        except UserError as error:
-            return [error]
-        return []
-
-    def check_mask() -> None:
-        if view.mask is not None:
-            require_file(view.mask, "mask", "Add it, or remove 'mask_path' from the frame")
-            _check_header(view.mask, *size, "srgb")
-
-    found = fault(lambda: _check_header(view.image, *size, view.encoding))
+    found: list[UserError] = []
+    with collected(found):
+        _check_header(view.image, *size, view.encoding)
     # True pictures have the size of the image: if that is wrong, it is told once.
     for image in () if found else view.truth.values():
-        found += fault(partial(_check_header, image, *size))
-    return found + fault(check_mask)
+        with collected(found):
+            _check_header(image, *size)
+    if view.mask is not None:
+        with collected(found):
+            require_file(view.mask, "mask", "Add it, or remove 'mask_path' from the frame")
+            _check_header(view.mask, *size, "srgb")
+    return found
 
 
 def _read_view(data: DataFolder, frame: dict[str, Any], top: dict[str, Any], where: str) -> View:
@@ -588,11 +579,9 @@ Read = TypeVar("Read")
 
 def _or_none(found: list[UserError], read: Callable[..., Read], *args: Any) -> Read | None:
     """What is read of a file; None, and what is wrong, where it cannot be."""
-    try:
+    with collected(found):
         return read(*args)
-    except UserError as error:
-        found.append(error)
-        return None
+    return None
 
 
 def _is_to_train(frame: object) -> bool:

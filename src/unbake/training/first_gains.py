@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..dataset.camera import Camera
+from ..dataset.pair_ratios import PairRatios, levels
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset, View
 from ..fields.arrays import from_numpy
@@ -21,6 +23,10 @@ from .problem import Problem
 _PIXELS, _OF_EACH = 1 << 16, 256
 #: The most views that a pixel is looked for in.
 _PARTNERS = 24
+#: Views that are tried for that, at most: of many views, most show other things.
+_LOOKED_AT = 240
+#: Points of a view that are tried in another one, about, and the share that must be in its picture.
+_TRIED, _INSIDE = 32, 0.15
 #: Points that two views must share.
 _FEWEST = 8
 #: Weight of what two photographs say as a whole, in points that they share: where they share none.
@@ -104,13 +110,11 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
     firsts = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)])
     origins = np.array([view.camera.origin for view in views])
 
+    cameras = [view.camera for view in views]
     sources, targets, found = [], [], []
     for i in range(len(views)):
-        others = [j for j in range(len(views)) if j != i]
-        if len(others) > _PARTNERS:
-            others = sorted(rng.choice(others, _PARTNERS, replace=False))
         mine = np.flatnonzero(own == i)
-        for j in others:
+        for j in _partners(i, cameras, points[mine], rng):
             place = views[j].camera.pixel_of(points[mine])
             inside = place >= 0
             seen, place = mine[inside], place[inside]
@@ -149,14 +153,15 @@ def first_gains(shared: SharedPoints) -> np.ndarray:
         Linear RGB over what the data set tells of the exposures, shape (views, 3); the first is 1.
     """
     logs = np.where(shared.bound == 0, shared.logs, np.nan)
-    ratios = logs[1] - logs[0]
-    known = []
-    for i, j in sorted(set(zip(shared.first.tolist(), shared.second.tolist(), strict=True))):
-        ratio = ratios[(shared.first == i) & (shared.second == j)]
-        count = int(np.isfinite(ratio).sum(0).min())
-        if count >= _FEWEST:
-            known.append((i, j, float(count), np.nanmedian(ratio, 0)))
-    return np.exp(_solved(shared.whole, known))
+    pairs = PairRatios.of(shared.first, shared.second, logs[1] - logs[0], _FEWEST)
+    views = np.arange(1, len(shared.whole))
+    found = levels(
+        np.concatenate([pairs.first, np.zeros_like(views)]),
+        np.concatenate([pairs.second, views]),
+        np.concatenate([pairs.logs, shared.whole[1:]]),
+        np.concatenate([pairs.counts, np.full(len(views), _PRIOR)]),
+    )
+    return np.exp(found - found[0])
 
 
 def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> str | None:
@@ -219,25 +224,29 @@ def _or(curve: np.ndarray | None, other: np.ndarray) -> np.ndarray:
     return other if curve is None else curve
 
 
-def _solved(whole: np.ndarray, known: Sequence[tuple[int, int, float, np.ndarray]]) -> np.ndarray:
-    """Logs of gains, shape (views, 3), of which the first is zero.
+def _partners(
+    view: int, cameras: Sequence[Camera], points: np.ndarray, rng: np.random.Generator
+) -> list[int]:
+    """Views to look for points in: all, or random ones of those that have some in the picture.
+
+    Where these are few, others are among them: what hides or leaves out a point is not known yet.
 
     Args:
-        whole: what photographs say as a whole.
-        known: two views, the weight of their ratio, and its log, (3,).
+        view: that sees the points.
+        cameras: of all views.
+        points: positions, shape (n, 3).
     """
-    count = len(whole)
-    matrix, right = np.zeros((count, count)), np.zeros((count, 3))
-    pairs = [*known, *((0, j, _PRIOR, whole[j]) for j in range(1, count))]
-    for i, j, weight, ratio in pairs:
-        matrix[[i, j], [i, j]] += weight
-        matrix[[i, j], [j, i]] -= weight
-        right[j] += weight * ratio
-        right[i] -= weight * ratio
-    logs = np.zeros((count, 3))
-    if count > 1:
-        logs[1:] = np.linalg.solve(matrix[1:, 1:], right[1:])
-    return logs
+    others = [j for j in range(len(cameras)) if j != view]
+    if len(others) <= _PARTNERS:
+        return others
+    some = points[:: max(1, len(points) // _TRIED)]
+    near, far = [], []
+    for j in rng.permutation(others)[:_LOOKED_AT].tolist():
+        inside = (cameras[j].pixel_of(some) >= 0).mean() if len(some) else 0.0
+        (near if inside >= _INSIDE else far).append(j)
+        if len(near) == _PARTNERS:
+            break
+    return sorted([*near, *far][:_PARTNERS])
 
 
 def _logs(
