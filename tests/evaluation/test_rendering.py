@@ -196,6 +196,10 @@ def test_recovered_lights_are_kept_where_that_is_asked(folder, tmp_path):
         relight(tmp_path / "run", tmp_path / f"out-{keep}", light, settings, **SILENT)
         means[keep] = read_exr(tmp_path / f"out-{keep}" / "heldout_000.exr").mean()
     assert means[False] < 1e-6 and means[True] > 1e-3
+    # Others are put into the scene beside the recovered ones, which are as many as they were.
+    light = LightConfig(lights=folder / "lights.xml", keep_lights=True)
+    relight(tmp_path / "run", tmp_path / "out-more", light, settings, **SILENT)
+    assert read_exr(tmp_path / "out-more" / "heldout_000.exr").mean() > means[True]
 
 
 # ------------------------------------------------------------------------------------------- output

@@ -96,6 +96,12 @@ def test_the_untrained_strength_is_the_scale():
     assert list(emission.parameters()) == ["log"]
 
 
+def test_lights_begin_with_strengths_of_their_own():
+    emission = Emission(2, scale=0.5)
+    emission.start([1, 1e8])
+    np.testing.assert_allclose(emission.values, [[0.5, 5e7]] * 3, rtol=1e-5)
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_extreme_parameters_stay_finite_and_keep_a_gradient(sign):
     emission = Emission(2, scale=1.0)

@@ -79,6 +79,28 @@ def test_lights_are_told_by_name_and_strength(parse_lit):
     assert told == {n: s if s is None else pytest.approx(s) for n, s in LIGHTS}
 
 
+def test_intensities_are_of_the_order_of_a_squared_distance(parse_lit):
+    """Of what is seen from there; where nothing is, of the middle of the scene or its corners."""
+    far = '<emitter type="point"><point name="position" value="0,0,9"/></emitter>'
+    inside = '<emitter type="spot"/>'
+    parsed = parse_lit(far + LAMP + inside)
+    places = emitters.places(parsed)
+    names = [light.name for light in emitters.named_emitters(parsed)]
+    assert dict(zip(names, [p is None for p in places], strict=True)) == {
+        "point light": False,
+        "lamp": True,
+        "spot light": False,
+    }
+    scene = parsed.instantiate()
+    found = dict(zip(names, emitters.squared_distances(scene, places), strict=True))
+    assert found["lamp"] == 1 and found["spot light"] == pytest.approx(1, rel=0.01)
+    assert 8**2 < found["point light"] < 9.5**2
+    away = emitters.squared_distances(scene, [np.array([1e3, 0.0, 0.0])])
+    low, high = np.ravel(scene.bbox().min), np.ravel(scene.bbox().max)
+    assert away == [pytest.approx(np.linalg.norm([1e3, 0, 0] - (low + high) / 2) ** 2, rel=1e-3)]
+    assert emitters.squared_distances(mi.load_dict({"type": "scene"}), [np.zeros(3)]) == [1.0]
+
+
 def test_no_two_lights_have_one_name(parse_lit):
     lights = '<emitter type="point"/>' * 3 + '<emitter type="spot"/>'
     names = [light.name for light in emitters.named_emitters(parse_lit(lights))]

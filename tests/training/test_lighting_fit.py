@@ -79,6 +79,27 @@ def test_the_strength_of_a_lamp_is_found(photographs, method):
     assert light.emission_error < 0.05
 
 
+@pytest.mark.parametrize("size", [1.0, 0.01, 100.0])
+def test_points_begin_as_bright_as_the_size_of_the_scene_asks_for(size, tmp_path):
+    """In a room of any size, so that a surface has about the mean radiance of photographs."""
+    floor = f'<scale value="{size}"/><rotate x="1" angle="-90"/>'
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f"""<scene version="3.0.0">
+          <shape type="rectangle"><transform name="to_world">{floor}</transform>
+            <bsdf type="principled"/></shape>
+          <shape type="rectangle"><transform name="to_world">{floor}
+            <translate y="{2 * size}"/></transform><bsdf type="principled"/></shape>
+          <emitter type="point"><point name="position" value="0,{size},0"/></emitter>
+          <emitter type="constant"/></scene>"""
+    )
+    config = dataclasses.replace(TINY_FIT, unknown="emission")
+    problem = make_problem(scene, "visible", config, 0.5)
+    point, sky = np.array(problem.emission.values).T
+    np.testing.assert_allclose(sky, 0.5, rtol=1e-5)
+    assert size**2 < point[0] / 0.5 < 2 * size**2
+
+
 @pytest.mark.parametrize("method", ["ours", "prb"])
 def test_low_frequencies_of_an_environment_are_found(photographs, method):
     dataset = photographs("still")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from ..scene.emitters import ENVIRONMENTS, emitter_nodes, named_emitters
+from ..scene.emitters import ENVIRONMENTS, emitter_nodes, named_emitters, placement
 from ..scene.parse import ParsedScene
 from ..training.problem import Problem
 
@@ -60,7 +60,7 @@ def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
                 props.plugin_name(),
                 strength,
                 recovered is not None,
-                _placement(props),
+                placement(props),
                 _cone(props),
             )
         )
@@ -72,21 +72,6 @@ def environment_picture(problem: Problem) -> np.ndarray | None:
     if problem.environment is None:
         return None
     return problem.environment.to_latlong(max(ROWS, 2 * problem.environment.resolution))
-
-
-def _placement(props: mi.Properties) -> np.ndarray:
-    matrix = np.eye(4)
-    if "to_world" in props:
-        matrix = np.array(props["to_world"].matrix, np.float64).reshape(4, 4)
-    elif "position" in props:
-        matrix[:3, 3] = np.ravel(np.array(props["position"], np.float64))
-    elif "direction" in props:
-        z = np.ravel(np.array(props["direction"], np.float64))
-        z = z / max(float(np.linalg.norm(z)), 1e-30)
-        x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-        x /= np.linalg.norm(x)
-        matrix[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    return matrix
 
 
 def _cone(props: mi.Properties) -> tuple[float, float]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-BOUND = 20.0  #: of the log of strength over scale, so that nothing overflows single precision
+from .arrays import from_numpy
+
+BOUND = 20.0  #: of the log of strength over that at the start, so that nothing overflows
 
 
 class Emission:
@@ -15,9 +20,9 @@ class Emission:
 
     Args:
         count: number of lights.
-        scale: strength at the start: radiance in W·sr⁻¹·m⁻² for area lights and constant
-            environments, intensity in W·sr⁻¹ for point and spot lights, irradiance in W·m⁻² for
-            directional ones.
+        scale: strength at the start, unless `start` says another: radiance in W·sr⁻¹·m⁻² for area
+            lights and constant environments, intensity in W·sr⁻¹ for point and spot lights,
+            irradiance in W·m⁻² for directional ones.
 
     Paper: Sec. 5.1.
     """
@@ -27,8 +32,23 @@ class Emission:
         self.scale = scale
         self._log = dr.zeros(mi.Float, 3 * count)
         dr.make_opaque(self._log)
-        #: What `prepare` computes; textures hold it too.
-        self.tables: dict[str, mi.Color3f] = {}
+        #: The logs at the start, and what `prepare` computes; textures hold it too.
+        self.tables = {"start": dr.zeros(mi.Color3f, count)}
+        dr.make_opaque(self.tables)
+        self.prepare()
+
+    def start(self, factors: Sequence[float]) -> None:
+        """Begin with other strengths than the scale.
+
+        Args:
+            factors: of each light, on the scale.
+        """
+        if len(factors) != self.count:
+            raise ValueError(f"{len(factors)} factors for {self.count} lights")
+        logs = np.repeat(np.log(factors), 3).astype(np.float32)
+        self._log = from_numpy(mi.Float, logs)
+        self.tables["start"] = dr.unravel(mi.Color3f, from_numpy(mi.Float, logs))
+        dr.make_opaque(self.tables)
         self.prepare()
 
     def parameters(self) -> dict[str, mi.Float]:
@@ -42,8 +62,9 @@ class Emission:
     def prepare(self) -> None:
         """Compute `values`; to be called outside of virtual calls and loops."""
         log = dr.unravel(mi.Color3f, self._log)
+        moved = log - self.tables["start"]
         # Clipped entries keep a gradient, which brings them back.
-        log += dr.detach(dr.clip(log, -BOUND, BOUND) - log)
+        log += dr.detach(dr.clip(moved, -BOUND, BOUND) - moved)
         self.tables["values"] = self.scale * dr.exp(log)
         dr.eval(self.tables)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..fields.envmap import latlong
+from . import free_space
 from .parse import ParsedScene, is_reference, reason, referenced
 
 #: Plugins that surround the scene.
@@ -24,6 +26,10 @@ STRENGTHS = {
     "spot": "intensity",
     "directional": "irradiance",
 }
+
+
+#: In which surfaces are looked for from a point or a spot.
+_DIRECTIONS = 256
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,60 @@ def named_emitters(scene: ParsedScene) -> list[NamedEmitter]:
 def emitter_nodes(scene: ParsedScene) -> list[int]:
     """Indices of the nodes that are emitters of `STRENGTHS`, in the order of `named_emitters`."""
     return [i for i, n in enumerate(scene.state.nodes) if n.props.plugin_name() in STRENGTHS]
+
+
+def placement(props: mi.Properties) -> np.ndarray:
+    """Where an emitter stands, and where it looks along +z, (4, 4)."""
+    matrix = np.eye(4)
+    if "to_world" in props:
+        matrix = np.array(props["to_world"].matrix, np.float64).reshape(4, 4)
+    elif "position" in props:
+        matrix[:3, 3] = np.ravel(np.array(props["position"], np.float64))
+    elif "direction" in props:
+        z = np.ravel(np.array(props["direction"], np.float64))
+        z = z / max(float(np.linalg.norm(z)), 1e-30)
+        x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+        x /= np.linalg.norm(x)
+        matrix[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    return matrix
+
+
+def places(scene: ParsedScene) -> list[np.ndarray | None]:
+    """Where points and spots stand, (3,), in the order of `named_emitters`; None for others."""
+    props = [scene.state.nodes[i].props for i in emitter_nodes(scene)]
+    return [
+        placement(each)[:3, 3] if STRENGTHS[each.plugin_name()] == "intensity" else None
+        for each in props
+    ]
+
+
+def squared_distances(scene: mi.Scene, places: Sequence[np.ndarray | None]) -> list[float]:
+    """The squared distance between emitters and what they light, in m²; 1 where there is no place.
+
+    An intensity of so many times a radiance causes light of about that radiance: what arrives
+    falls with the squared distance.
+
+    Args:
+        scene: with surfaces.
+        places: of its emitters, as the function of that name gives them.
+
+    Returns:
+        For each place the squared median distance to what is seen from there, in all directions.
+        Where that is nothing, the one to the middle of the scene, at least to its corners.
+    """
+    low, high, diagonal = free_space.bounds(scene)
+    found = []
+    for place in places:
+        if place is None or not np.isfinite(diagonal):
+            found.append(1.0)
+            continue
+        directions = free_space.sphere_directions(_DIRECTIONS)
+        origins = np.broadcast_to(place, directions.shape)
+        away = free_space.trace(scene, origins, directions).distance
+        away = away[np.isfinite(away) & (away > 0)]
+        far = max(float(np.linalg.norm(place - (low + high) / 2)), diagonal / 2)
+        found.append(float(np.median(away) if len(away) else far) ** 2 or 1.0)
+    return found
 
 
 def environment_latlong(scene: mi.Scene, height: int) -> np.ndarray:

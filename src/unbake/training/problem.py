@@ -142,7 +142,7 @@ def make_problem(
         scene: the Mitsuba scene; its own values of the unknowns are ignored.
         background: `visible` or `hidden`.
         scale: radiance of the untrained radiance field and emitters, and of the environment unless
-            the settings say it.
+            the settings say it. Points and spots begin with the intensity that causes about that.
         root: folder that the scene's files must not leave; None: the scene's own.
         views: the training views, where something of their cameras is unknown.
         change: called with the scene once the fields are in it, such as to change its light. Points
@@ -160,6 +160,7 @@ def make_problem(
     seeds = np.random.SeedSequence(config.seed).generate_state(2)
     materials = environment = emission = None
     emitter_names: list[str] = []
+    places: list[np.ndarray | None] = []
     if config.learns_materials:
         materials = _unknown_materials(parsed, config, int(seeds[0]))
     if config.learns_environment:
@@ -167,12 +168,15 @@ def make_problem(
         environment = EnvironmentMap(config.lighting.resolution, scale=start)
         edit.set_environment(parsed, environment_emitter(environment))
     if config.unknown == "emission":
+        places = emitters.places(parsed)
         emission, emitter_names = _unknown_emission(parsed, scale)
     if change is not None:
         change(parsed)
     loaded = parsed.instantiate()
     emitters.require_emitters(loaded, scene)
     unchanged = loaded if change is None else parse(scene, root).instantiate()
+    if emission is not None:
+        emission.start(emitters.squared_distances(unchanged, places))
     domain = Domain.of(unchanged.bbox())
     if materials is not None:
         materials.domain = domain
