@@ -56,7 +56,9 @@ def measure(tree: Path, data: Path, method: str, steps: int) -> dict[str, Any]:
     """What `unbake bench step` of a checkout writes."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "step.json"
-        words = ["bench", "step", "--data", data.resolve(), "--methods", method]
+        separate = (tree / "src/unbake/cli/bench.py").is_file()  # `bench` was one command
+        option = "--method" if separate else "--methods"
+        words = ["bench", "step", "--data", data.resolve(), option, method]
         words += ["--steps", steps, "--out", out]
         subprocess.run(
             [sys.executable, "-m", "unbake", *map(str, words)],

@@ -424,7 +424,7 @@ def plan_machine(bench: Bench, benchmark: Machine) -> Planned:
             continue
         label = f"step-{data}-{method.replace(':', '-')}"
         files.append(bench.work / "steps" / f"{label}.json")
-        words = ["bench", "step", "--data", bench.data(data), "--methods", method]
+        words = ["bench", "step", "--data", bench.data(data), "--method", method]
         words += ["--steps", steps, "--out", files[-1]]
         jobs += bench.capture(data)
         jobs.append(bench.command(label, words, files[-1], data, settings, 25.0))

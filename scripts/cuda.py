@@ -120,7 +120,8 @@ class Machine:
     def _bench(self, name: str, what: str, *methods: str) -> Job:
         steps = 100 if self.scale == "paper" else 10
         file = self.out / f"{name}.json"
-        words = ["bench", what, "--data", self._data, "--methods", *methods, "--steps", steps]
+        option = "--method" if what == "step" else "--methods"
+        words = ["bench", what, "--data", self._data, option, *methods, "--steps", steps]
         work = partial(unbake, *words, "--settings", self.settings_file, "--out", file)
         described = {"methods": methods, "steps": steps, "settings": self.settings}
         return Job(name, described, lambda: work() or {}, files=[file])

@@ -385,17 +385,12 @@ def test_the_defaults_of_methods_are_those_that_were_found(repository):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("rates", "--out", "o.json"), "--data: is needed for rates"),
-        (("rates", "--data", "x"), "--out: is needed for rates"),
-        (("rates", "--data", "x", "--out", "o", "--steps", 0), "--steps: must be 1 or more"),
-        (("rates", "--data", "x", "--out", "o", "--steps", 1, "--seconds", 1), "--steps: cannot"),
-        (("methods", "--seconds", 3), "--seconds: is an option of rates"),
-        (("methods", "--schedule"), "--schedule: is an option of rates"),
-        (("step", "--data", "x", "y"), "--data: step takes one data set"),
-        (("rates", "--data", "x", "--out", "o.json"), "x: the data folder does not exist"),
+        (("--data", "x", "--methods", "prb", "--steps", 0), "--steps: must be 1 or more"),
+        (("--data", "x", "--methods", "prb", "--steps", 1, "--seconds", 1), "--steps: cannot"),
+        (("--data", "x", "--methods", "prb"), "x: the data folder does not exist"),
     ],
 )
 def test_a_wrong_word_is_named(words, message, unbake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    outcome = unbake("bench", *words)
+    outcome = unbake("bench", "rates", "--out", "o.json", *words)
     assert outcome.status == 2 and outcome.err.startswith(f"error: {message}"), outcome.err

@@ -202,10 +202,9 @@ def test_a_ceiling_that_cannot_be_kept_is_told(data, tiny, tmp_path, short):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "ceiling needs a data set. unbake bench ceiling DATA"),
-        (["data", "--seeds", 1], "--seeds: ceiling has no such option"),
-        (["data", "--methods", "prb"], "--methods: ceiling has no such option"),
-        (["data", "--spp", 2], "--spp: is an option of gradients"),
+        ([], "DATA"),
+        (["data", "--seeds", 1], "--seeds"),
+        (["data", "--spp", 2], "--spp"),
         (["data", "--steps", 2], "--steps: must be 10 or more, not 2"),
     ],
 )

@@ -11,8 +11,8 @@ from unbake.version import VERSION
 
 
 def bench(unbake, what, data, tiny, out, *methods):
-    words = ("--data", data, "--settings", tiny, "--steps", 10, "--out", out, "--methods", *methods)
-    return unbake("bench", what, *words)
+    words = ("--data", data, "--settings", tiny, "--steps", 10, "--out", out)
+    return unbake("bench", what, *words, f"--method{'s' * (what == 'methods')}", *methods)
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_options_that_make_no_sense_are_told_in_one_line(unbake, words, message)
 @pytest.mark.parametrize(
     ("what", "methods", "message"),
     [
-        ("step", ["ours", "prb"], "--methods: step takes one method. Or: unbake bench methods"),
+        ("step", ["best"], "--method: no method named 'best'. There are ours, no-prior"),
         ("methods", ["best"], "--methods: no method named 'best'. There are ours, no-prior"),
         ("methods", ["prb:paint"], "no representation named 'paint'. There are neural, grid"),
         ("methods", ["prb:grid:both"], "no estimator named 'both'. There are auto, all-pairs"),

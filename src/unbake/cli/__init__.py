@@ -6,15 +6,14 @@ import dataclasses
 import inspect
 import os
 import re
-import shlex
 import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -30,10 +29,11 @@ from ..evaluation.settings import EvaluationSettings, RenderSettings
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
 from ..memory import NO_MEMORY, lacks_memory
-from ..ranks import Agreed, Ranks, started
 from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
 from ..version import VERSION
+from . import bench
+from .console import LONGEST, fail, quoted, say
 from .flags import flags, given, with_options
 from .help import NARROWEST, columns, wrapped_help
 from .options import (
@@ -69,9 +69,8 @@ from .options import (
     require,
     with_length,
 )
+from .processes import require_one_process, sharing_ranks
 
-#: Characters of a line that is printed: more than a path can have.
-_LONGEST = 1 << 14
 #: Between scores of a comparison, unless a file or an option says otherwise.
 _SCORE_SECONDS = 5.0
 
@@ -116,35 +115,62 @@ def main() -> None:
     if shutil.get_terminal_size().columns < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)  # Tyro 1.0 wraps texts forever below 10
     words = sys.argv[1:]
-    if words in ([], ["-h"], ["--help"]):
-        print(_overview(), file=sys.stdout if words else sys.stderr)
-        sys.exit(0 if words else 2)
+    family = words[0] if words and words[0] in FAMILIES else None
+    asked = words if family is None else words[1:]
+    if asked in ([], ["-h"], ["--help"]):
+        told = _overview() if family is None else _overview_of(family)
+        print(told, file=sys.stdout if asked else sys.stderr)
+        sys.exit(0 if asked else 2)
     if words == ["--version"]:
-        _say(f"unbake {VERSION}")
+        say(f"unbake {VERSION}")
         sys.exit(0)
     for command in COMMANDS.values():
         # Tyro 1.0 keeps the line breaks of some arguments' texts.
         command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.getdoc(command) or "")
     try:
-        if words[0] in COMMANDS.keys() - SHARED and not {"-h", "--help"} & {*words}:
-            _require_one_process(words[0])
+        name = words[0] if family is None else " ".join(words[:2])
+        if name in COMMANDS.keys() - SHARED and not {"-h", "--help"} & {*words}:
+            require_one_process(name, SHARED)
         with wrapped_help(words):
-            status = tyro.extras.subcommand_cli_from_dict(
-                dict(COMMANDS), prog="unbake", description=_DESCRIPTION
-            )
+            status = _run(family, asked)
     except UserError as error:
-        _fail(str(error))
+        fail(str(error))
     except (MemoryError, RuntimeError, ImportError) as error:  # Dr.Jit raises the second
         if not lacks_memory(error):
             raise
-        _fail(NO_MEMORY)
+        fail(NO_MEMORY)
     except OSError as error:
         # A full disk, a file taken away: nothing that a traceback would explain.
-        _fail(of_system(error))
+        fail(of_system(error))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(signals.status())
     sys.exit(status or 0)
+
+
+def _run(family: str | None, words: list[str]) -> int | None:
+    """Run a command; returns its status.
+
+    Args:
+        family: its first word, if it has two.
+        words: the others.
+    """
+    if family is not None:
+        return tyro.extras.subcommand_cli_from_dict(
+            _of_family(family), prog=f"unbake {family}", description=FAMILIES[family], args=words
+        )
+    # Families are told among the commands where a word is wrong.
+    families = {name: partial(_tell_family, name) for name in FAMILIES}
+    single = {n: c for n, c in COMMANDS.items() if " " not in n} | families
+    return tyro.extras.subcommand_cli_from_dict(
+        single, prog="unbake", description=_DESCRIPTION, args=words
+    )
+
+
+def _tell_family(family: str) -> int:
+    """Tell the commands whose first word this is."""
+    print(_overview_of(family), file=sys.stderr)
+    return 2
 
 
 def capture(
@@ -180,10 +206,10 @@ def capture(
     from ..acquisition.capture import capture as run
 
     start = time.perf_counter()
-    options: dict[str, Any] = {"allow_outside": allow_outside, "tell": _say}
+    options: dict[str, Any] = {"allow_outside": allow_outside, "tell": say}
     run(scene, out, settings, cameras=cameras, light=other, **options)
     took = f"{time.perf_counter() - start:.0f} s"
-    _say(f"wrote {out} in {took}; next: unbake fit {_word(out)} --out RUN")
+    say(f"wrote {out} in {took}; next: unbake fit {quoted(out)} --out RUN")
 
 
 def import_(
@@ -230,13 +256,13 @@ def import_(
     start = time.perf_counter()
     files: dict[str, Any] = {"images": images, "exposures": exposures, "light": known}
     try:
-        import_data(source, out, mesh, chosen, **files, allow_outside=allow_outside, tell=_say)
+        import_data(source, out, mesh, chosen, **files, allow_outside=allow_outside, tell=say)
     except ImportFaults as error:
         for fault in error.faults:
-            print(f"  {printable(fault, _LONGEST)}", file=sys.stderr)
+            print(f"  {printable(fault, LONGEST)}", file=sys.stderr)
         raise UserError(f"{error.count}, listed above", source, error.remedy) from None
     took = f"{time.perf_counter() - start:.0f} s"
-    _say(f"wrote {out} in {took}; next: {_fit_of(out, light_known=known is not None)}")
+    say(f"wrote {out} in {took}; next: {_fit_of(out, light_known=known is not None)}")
 
 
 def data(
@@ -274,18 +300,18 @@ def data(
         line = Text.assemble(f"{check:11}", (f"{verdict:8}", marks[verdict]), printable(told, 200))
         console.print(line)
     for finding in result.findings:
-        _say("")
+        say("")
         console.print(Text.assemble((f"{finding.level}: ", marks[finding.level]), str(finding)))
-    _say("")
+    say("")
     if out is not None:
         from ..report.check_page import write_check
 
-        _say(f"wrote {write_check(result, out, clip_negative=clip_negative)}")
+        say(f"wrote {write_check(result, out, clip_negative=clip_negative)}")
     kinds = {kind: result.count(kind) for kind in ("error", "warning", "hint")}
     told = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in kinds.items() if n)
     known = result.dataset is None or result.dataset.light == "known"
     ready = f"next: {_fit_of(folder, light_known=known)}"
-    _say(f"{told or 'nothing is wrong'}; {ready if result.usable else 'a fit makes no sense yet'}")
+    say(f"{told or 'nothing is wrong'}; {ready if result.usable else 'a fit makes no sense yet'}")
     return 0 if result.usable else 2
 
 
@@ -316,8 +342,8 @@ def degrade(
     backend.activate()
     from ..acquisition.degrade import degrade as run
 
-    run(data, out, settings, allow_outside=allow_outside, tell=_say)
-    _say(f"wrote {out}; next: unbake data check {_word(out)}")
+    run(data, out, settings, allow_outside=allow_outside, tell=say)
+    say(f"wrote {out}; next: unbake data check {quoted(out)}")
 
 
 def fit(
@@ -385,7 +411,7 @@ def fit(
     from ..training.loop import fit as run
 
     console = Console(highlight=False)
-    with _ranks() as ranks:
+    with sharing_ranks() as ranks:
         progress = run(
             data,
             out,
@@ -404,11 +430,11 @@ def fit(
     if (progress.seconds < chosen.seconds) if chosen.seconds else (progress.step < chosen.steps):
         return signals.status()
     if not progress.step:
-        _say(f"nothing was learned: the fields are untrained; next: unbake evaluate {_word(out)}")
+        say(f"nothing was learned: the fields are untrained; next: unbake evaluate {quoted(out)}")
         return 0
     skipped = f" ({progress.skipped} skipped)" if progress.skipped else ""
     done = f"{progress.step} steps{skipped}, {progress.samples / 1e6:.1f} M samples in "
-    _say(f"{done}{progress.seconds:.0f} s; next: unbake evaluate {_word(out)}")
+    say(f"{done}{progress.seconds:.0f} s; next: unbake evaluate {quoted(out)}")
     return 1 if progress.warning else 0
 
 
@@ -433,9 +459,9 @@ def evaluate(
     from ..evaluation.evaluate import evaluate as go
     from ..evaluation.yardsticks import told_yardsticks
 
-    metrics = go(run, settings, allow_outside=allow_outside, tell=_say)
+    metrics = go(run, settings, allow_outside=allow_outside, tell=say)
     if not metrics["steps"]:
-        _say("untrained: after 0 steps the fields have their initial values")
+        say("untrained: after 0 steps the fields have their initial values")
     found = metrics.get("yardsticks")
     told = told_yardsticks(metrics["heldout"], found) if found else []
     for split in ("heldout", "train"):
@@ -443,16 +469,16 @@ def evaluate(
         if not metrics["quantities"]:  # of known materials there are no scores
             values = {k: v for k, v in values.items() if v is not None}
         shown = _scores(values)
-        _say(f"{split} ({metrics[split]['views']} views): {shown}")
+        say(f"{split} ({metrics[split]['views']} views): {shown}")
         if split == "heldout":
             for line in told:
-                _say(f"  {line}")
+                say(f"  {line}")
     if told and found and found["ceiling"] is None:
         folder = RunFolder(run)
-        data, settings = _word(folder.data(metrics["data"])), _word(folder.config_file)
-        _say(f"for a ceiling: unbake bench ceiling {data} --settings {settings}")
+        data, settings = quoted(folder.data(metrics["data"])), quoted(folder.config_file)
+        say(f"for a ceiling: unbake bench ceiling {data} --settings {settings}")
     wrote = f"wrote {RunFolder(run).evaluation}"
-    _say(f"{wrote}; next: unbake report {_word(run)} --out report.html")
+    say(f"{wrote}; next: unbake report {quoted(run)} --out report.html")
 
 
 def report(
@@ -478,7 +504,7 @@ def report(
     from ..report.page import write_report
 
     shown: dict[str, Any] = {"exported": exported, "relit": relit}
-    _say(f"wrote {write_report(runs, out, **shown, allow_outside=allow_outside)}")
+    say(f"wrote {write_report(runs, out, **shown, allow_outside=allow_outside)}")
 
 
 def export(
@@ -511,11 +537,11 @@ def export(
     from ..exports.export import export as run_export
 
     console = Console(highlight=False)
-    options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
+    options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": say}
     run_export(run, out, format, texels=texels, **options)
     files = {"gltf": "scene.glb", "textures": "textures", "mitsuba": "mitsuba/scene.xml"}
     files |= {"usd": "usd/scene.usdc"}
-    _say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")
+    say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")
 
 
 def render(
@@ -551,8 +577,8 @@ def render(
     from ..evaluation.rendering import render as go
 
     places: dict[str, Any] = {"cameras": cameras, "turntable": turntable}
-    made = go(run, out, settings, **places, allow_outside=allow_outside, tell=_say)
-    _say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
+    made = go(run, out, settings, **places, allow_outside=allow_outside, tell=say)
+    say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
 
 
 def relight(
@@ -600,12 +626,12 @@ def relight(
     from ..evaluation.rendering import relight as go
 
     places: dict[str, Any] = {"cameras": cameras, "turntable": turntable, "truth": truth}
-    made = go(run, out, chosen, settings, **places, allow_outside=allow_outside, tell=_say)
+    made = go(run, out, chosen, settings, **places, allow_outside=allow_outside, tell=say)
     if made["mean"] is not None:
         scores = {k: v for k, v in made["mean"].items() if k != "views"}
         shown = _scores(scores)
-        _say(f"mean over {made['mean']['views']} views: {shown}")
-    _say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
+        say(f"mean over {made['mean']['views']} views: {shown}")
+    say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
 
 
 def _scores(values: Mapping[str, float | None]) -> str:
@@ -662,7 +688,7 @@ def view(
     backend.activate()
     from ..viewer.view import view as run
 
-    run(folder, port, allow_outside=allow_outside, tell=_say)
+    run(folder, port, allow_outside=allow_outside, tell=say)
     return signals.status()
 
 
@@ -719,14 +745,14 @@ def solve(
     from ..solver.solve import solve as run
 
     console = Console(highlight=False)
-    options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": _say}
+    options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": say}
     options |= {"cameras": cameras, "light": other}
     if from_ is not None:
         made = fine_tune(from_, out, settings, **options)
     else:
         made = run(str(scene), out, settings, **options)
     last = made["measurements"][-1]
-    _say(f"{last['step']} steps in {last['seconds']:.0f} s; wrote {out}")
+    say(f"{last['step']} steps in {last['seconds']:.0f} s; wrote {out}")
     return 0 if made["finished"] else signals.status()
 
 
@@ -792,7 +818,7 @@ def compare(
     evaluation = EvaluationSettings(
         spp=evaluate_spp, clip_negative=clip_negative, truth=evaluate_truth
     )
-    with _ranks() as ranks:
+    with sharing_ranks() as ranks:
         result = run(
             data,
             variants,
@@ -806,186 +832,8 @@ def compare(
         )
     if not ranks.leads:
         return 0
-    _say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
+    say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
     return 1 if any("error" in row for row in result["methods"].values()) else 0
-
-
-def bench(
-    what: Positional[Literal["step", "methods", "rates", "gradients", "ceiling"]] = "step",
-    folder: Positional[
-        Annotated[Path | None, arg(metavar="[FOLDER]", help_behavior_hint="")]
-    ] = None,
-    /,
-    data: Folders = (),
-    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None,
-    methods: Annotated[tuple[str, ...], arg(metavar="METHODS")] = ("ours",),
-    steps: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
-    seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
-    seeds: Annotated[tuple[int, ...], arg(metavar="SEEDS", help_behavior_hint="")] = (),
-    schedule: Flag = False,
-    batches: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
-    batch: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
-    spp: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None,
-    allow_outside: Flag = False,
-    preset: Preset = None,
-    settings: File = None,
-    out: OutFile = None,
-) -> None:
-    """Measure the training step, its gradients, learning rates, or the ceiling of the fields.
-
-    step takes one method apart: samples a second, and where the time goes. methods measures several
-    side by side, their steps in turn.
-
-    rates searches the learning rates of each method on each data set, and the estimator of those
-    that follow paths, by fits that are scored on held-out views. The same command goes on after the
-    fits that --out has. Processes that mpiexec starts share the searches.
-
-    gradients takes a run on a data set with true materials. It measures the slope of the loss as a
-    quantity goes from the fitted to the true values, and the signal to noise of one batch: of that
-    slope, and of the gradients by the fields' parameters.
-
-    ceiling takes a data set with true maps. It trains the fields of the settings on those of the
-    training views, without rendering, and scores them on held-out views: no fit with these fields
-    can be expected to be better. `unbake evaluate` then shows it beside a result.
-
-    Args:
-        what: What to measure.
-        folder: For gradients: of a run. For ceiling: of a data set.
-        data: Folder of a data set; rates takes several.
-        scene: Without --data: a scene to render a small data set of (default: demo).
-        methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
-            prb:bitmap prb:bitmap:all-pairs.
-        steps: Steps to take the median of, after warm-up (default: 100). For rates, the length of a
-            fit (default: as in the settings). For ceiling, steps on the true maps (default: as
-            many as they need).
-        seconds: For rates, the length of a fit in seconds of training, instead of steps.
-        seeds: For rates, seeds of the fits whose scores are averaged, such as 0 1 2 (default: 0).
-        schedule: For rates, also search how far all rates fall, and the warm-up of the unknowns.
-        batches: For gradients, how many to measure (default: 64).
-        batch: For gradients, pixels in a batch (default: as in the run).
-        spp: For gradients, samples per pixel (default: as in the run).
-        allow_outside: For gradients and ceiling, read files that the data set or its scene names
-            outside of its folder.
-        preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
-            release-lighting (theirs for an unknown environment map).
-        settings: TOML file with settings; instead of --preset.
-        out: JSON file to write the numbers to.
-    """
-    of_gradients = {"batches": batches, "batch": batch, "spp": spp}
-    others = {"data": data, "scene": scene, "methods": methods != ("ours",)}
-    others |= {"seconds": seconds, "seeds": seeds, "schedule": schedule}
-    if what != "rates":
-        _require_one_process(f"bench {what}")
-    if what == "gradients":
-        others |= {"steps": steps, "preset": preset, "settings": settings}
-        _refuse("gradients has no such option", others)
-        _bench_gradients(folder, of_gradients, out, allow_outside)
-        return
-    _refuse("is an option of gradients", of_gradients, "Or: unbake bench gradients RUN")
-    if what == "ceiling":
-        _refuse("ceiling has no such option", others)
-        _bench_ceiling(folder, chosen_settings(preset, settings), steps, out, allow_outside)
-        return
-    outside = {"allow-outside": allow_outside}
-    _refuse("is an option of gradients and ceiling", outside, "Or: unbake bench gradients RUN")
-    if folder is not None:
-        raise UserError(f"{what} takes no folder", folder, "Or: unbake bench gradients RUN")
-    if data:
-        exclude("data", {"scene": scene})
-    chosen = chosen_settings(preset, settings)
-    if what == "rates":
-        length = {"steps": steps, "seconds": seconds}
-        chosen = with_length(chosen, {k: v for k, v in length.items() if v is not None})
-        with _ranks() as ranks:
-            _bench_rates(data, methods, chosen, out, seeds or (0,), schedule, ranks)
-        return
-    only = {"seconds": seconds, "seeds": seeds, "schedule": schedule}
-    _refuse("is an option of rates", only, "Or: unbake bench rates")
-    if len(data) > 1:
-        raise UserError(f"{what} takes one data set", "--data", "Or: unbake bench rates")
-    steps = 100 if steps is None else steps
-    require("steps", steps, 10)
-    backend.activate()
-    from ..comparison.bench_methods import bench_methods
-    from ..comparison.method_variant import MethodVariant
-    from ..profiling.bench_step import bench_step, small_data
-
-    variants = [MethodVariant.of(method) for method in methods]
-    if what == "step" and len(variants) != 1:
-        raise UserError("step takes one method", "--methods", "Or: unbake bench methods")
-    console = Console(highlight=False)
-    with small_data(next(iter(data), None), scene or "demo") as small:
-        if what == "step":
-            bench_step(small, variants[0].settings(chosen), steps, out, console)
-        else:
-            bench_methods(small, variants, chosen, steps, out, console)
-
-
-def _refuse(what: str, options: dict[str, Any], remedy: str | None = None) -> None:
-    """Raise UserError for the first of these options that was given."""
-    for name, value in options.items():
-        if value is not None and value is not False and value != ():
-            raise UserError(what, f"--{name}", remedy)
-
-
-def _bench_gradients(
-    run: Path | None, options: dict[str, Any], out: Path | None, allow_outside: bool
-) -> None:
-    if run is None:
-        raise UserError("gradients needs a run", remedy="unbake bench gradients RUN")
-    batches = 64 if options["batches"] is None else options["batches"]
-    folder = RunFolder(run)
-    folder.require_fitted()
-    changes = {name: options[name] for name in ("batch", "spp") if options[name] is not None}
-    config = with_options(folder.settings(), changes)
-    backend.activate()
-    from ..profiling.bench_gradients import FEWEST, bench_gradients
-
-    require("batches", batches, FEWEST)
-    console = Console(highlight=False)
-    bench_gradients(run, config, batches, out, console, allow_outside=allow_outside)
-
-
-def _bench_ceiling(
-    data: Path | None, chosen: FitConfig, steps: int | None, out: Path | None, allow_outside: bool
-) -> None:
-    if data is None:
-        raise UserError("ceiling needs a data set", remedy="unbake bench ceiling DATA")
-    if steps is not None:
-        require("steps", steps, 10)
-    backend.activate()
-    from ..profiling.bench_ceiling import bench_ceiling
-
-    bench_ceiling(data, chosen, steps, out, Console(highlight=False), allow_outside=allow_outside)
-
-
-def _bench_rates(
-    data: tuple[Path, ...],
-    methods: tuple[str, ...],
-    chosen: FitConfig,
-    out: Path | None,
-    seeds: tuple[int, ...],
-    schedule: bool,
-    ranks: Ranks,
-) -> None:
-    for option, value in {"data": data, "out": out}.items():
-        if not value:
-            remedy = "unbake bench rates --data FOLDER [FOLDER ...] --methods prb --out rates.json"
-            raise UserError("is needed for rates", f"--{option}", remedy)
-    if not chosen.steps and not chosen.seconds:
-        raise UserError("must be 1 or more, not 0", "--steps")
-    backend.activate()
-    from ..comparison.bench_rates import bench_rates
-    from ..comparison.method_variant import MethodVariant
-
-    assert out is not None
-    for seed in seeds:
-        require("seeds", seed, 0)
-    variants = [MethodVariant.of(method) for method in methods]
-    console = Console(highlight=False)
-    bench_rates(data, variants, chosen, out, console, seeds, schedule=schedule, ranks=ranks)
-    if ranks.leads:
-        _say(f"wrote {out}")
 
 
 def reproduce(
@@ -1026,7 +874,7 @@ def reproduce(
     if seeds is not None:
         require("seeds", seeds, 1)
     context = ExperimentContext(scale, out, scenes, seeds=seeds, only=only)
-    with _ranks() as ranks:
+    with sharing_ranks() as ranks:
         run(experiments.load(what), context, plan=plan, ranks=ranks)
 
 
@@ -1058,7 +906,7 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
     },
     "Compare and measure": {
         "compare": compare,
-        "bench": bench,
+        **{f"bench {name}": measure for name, measure in bench.MEASUREMENTS.items()},
         "degrade": degrade,
         "reproduce": reproduce,
     },
@@ -1066,80 +914,66 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., int | None]]] = {
         "doctor": doctor,
     },
 }
-#: All commands by name.
+#: All commands by name, of which some have two words.
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
-
-
+#: What commands that share their first word have in common.
+FAMILIES: Mapping[str, str] = {"bench": bench.SUMMARY}
 #: Those whose work several processes share. All others are refused to several: each process would
 #: do all of the work, and write the same files.
-#: Of `bench`, it is `rates` whose work they share.
-SHARED = frozenset({"bench", "compare", "fit", "reproduce"})
+SHARED = frozenset({"bench rates", "compare", "fit", "reproduce"})
 
 
-def _require_one_process(command: str) -> None:
-    """Raise a `UserError` where several processes were started for a command that is of one."""
-    several = started()
-    if several < 2:
-        return
-    try:
-        ranks = Ranks.of_environment()
-    except UserError:  # they do not know of each other, and each tells it
-        ranks = Ranks()
-    with ranks.guarded(_say):
-        what = f"{several} processes were started, and unbake {command} takes one"
-        names = sorted(SHARED - {"bench"} | {"bench rates"})
-        remedy = f"Run it without mpiexec; processes share {', '.join(names)}"
-        raise Agreed(what, remedy=remedy)
+def _of_family(family: str) -> dict[str, Callable[..., int | None]]:
+    """The commands whose first word this is, by their second one."""
+    start = f"{family} "
+    return {n.removeprefix(start): c for n, c in COMMANDS.items() if n.startswith(start)}
+
+
+def _summary(command: Callable[..., int | None]) -> str:
+    """The first paragraph of the help of a command, without its full stop."""
+    return " ".join((inspect.getdoc(command) or "").partition("\n\n")[0].split()).removesuffix(".")
+
+
+def _listed(summaries: Mapping[str, str], width: int) -> list[str]:
+    """Names with what they stand for, as wrapped lines.
+
+    Args:
+        width: of the longest name.
+    """
+    lines = []
+    for name, text in summaries.items():
+        first, further = f"  {name:{width}}  ", " " * (width + 4)
+        lines += textwrap.wrap(text, columns(), initial_indent=first, subsequent_indent=further)
+    return lines
 
 
 def _overview() -> str:
     """The help of `unbake` alone: its commands, a line or two each."""
-    indent = 4 + max(map(len, COMMANDS))
-
-    def wrapped(text: str, first: str = "", further: str = "") -> list[str]:
-        return textwrap.wrap(text, columns(), initial_indent=first, subsequent_indent=further)
-
-    lines = ["usage: unbake COMMAND ...", "", *wrapped(_DESCRIPTION)]
+    width = max(len(name.split()[0]) for name in COMMANDS)
+    lines = ["usage: unbake COMMAND ...", "", *textwrap.wrap(_DESCRIPTION, columns())]
     for title, group in GROUPS.items():
-        lines += ["", f"{title}:"]
+        summaries = {}
         for name, command in group.items():
-            summary = (inspect.getdoc(command) or "").partition("\n\n")[0]
-            text = " ".join(summary.split()).removesuffix(".")
-            lines += wrapped(text, f"  {name:{indent - 2}}", " " * indent)
+            family = name.split()[0]
+            summaries[family] = FAMILIES.get(family) or _summary(command)
+        lines += ["", f"{title}:", *_listed(summaries, width)]
     more = "unbake COMMAND --help tells its options; unbake --version tells the version."
-    lines += ["", *wrapped(more)]
+    lines += ["", *textwrap.wrap(more, columns())]
     lines += ["", "From nothing to a result:", *(f"  {command}" for command in _START)]
-    return "\n".join([*lines, "", *wrapped(_STATUS)])
+    return "\n".join([*lines, "", *textwrap.wrap(_STATUS, columns())])
 
 
-def _word(path: Path) -> str:
-    """A path, quoted for a shell."""
-    text = str(path)
-    return shlex.quote(f"./{text}" if text.startswith("-") else text)
+def _overview_of(family: str) -> str:
+    """The help of commands that share their first word."""
+    summaries = {name: _summary(command) for name, command in _of_family(family).items()}
+    lines = [f"usage: unbake {family} COMMAND ...", ""]
+    lines += textwrap.wrap(f"{FAMILIES[family]}.", columns())
+    lines += ["", *_listed(summaries, max(map(len, summaries))), ""]
+    lines += textwrap.wrap(f"unbake {family} COMMAND --help tells its options.", columns())
+    return "\n".join(lines)
 
 
 def _fit_of(data: Path, *, light_known: bool) -> str:
     """The command that fits a data set."""
     unknown = "" if light_known else " --unknown materials+lighting"
-    return f"unbake fit {_word(data)}{unknown} --out RUN"
-
-
-def _say(line: str) -> None:
-    """Print a line; names in it may have control characters, which a terminal would obey."""
-    print(printable(line, _LONGEST), flush=True)
-
-
-@contextmanager
-def _ranks() -> Iterator[Ranks]:
-    """The ranks that this process is one of; what fails on one of them ends all, in one line."""
-    ranks = Ranks.of_environment()
-    with ranks.guarded(lambda line: print(printable(line, _LONGEST), file=sys.stderr)):
-        yield ranks
-        ranks.leave()
-
-
-def _fail(message: str) -> NoReturn:
-    """Tell what is wrong, on one line whatever the width of the terminal, and exit."""
-    line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
-    Console(stderr=True).print(line, soft_wrap=True)
-    sys.exit(2)
+    return f"unbake fit {quoted(data)}{unknown} --out RUN"
