@@ -24,13 +24,13 @@ def compute_with_a_thread_a_core() -> None:
     """Let fits of this process go on with a thread a core when all input is read."""
     from unbake.training import loop
 
-    agree = loop._agree
+    agree = loop.agree
 
     def agreed(*begun: object) -> None:
         agree(*begun)
         backend.share_cores(1, least=1)
 
-    loop._agree = agreed
+    loop.agree = agreed
 
 
 if __name__ == "__main__":

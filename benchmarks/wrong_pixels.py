@@ -16,6 +16,7 @@ import os
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,8 @@ from unbake.evaluation.settings import EvaluationSettings  # noqa: E402
 from unbake.experiments.seeds import across_seeds  # noqa: E402
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402
-from unbake.training import loop  # noqa: E402
+from unbake.training import beginning  # noqa: E402
+from unbake.training.loop import fit  # noqa: E402
 from unbake.training.step import TrainingStep  # noqa: E402
 
 #: Steps between looks for what is wrong, batches of a look, and the edge of a block in pixels.
@@ -90,8 +92,8 @@ def scored(data: Path, share: float, seed: int, steps: int) -> dict[str, float]:
     config = replace(preset("cpu"), steps=steps, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        with patch.object(loop, "TrainingStep", Step):
-            loop.fit(data, run, config, console=Console(quiet=True))
+        with patch.object(beginning, "TrainingStep", Step):
+            fit(data, run, config, console=Console(quiet=True))
         metrics = evaluate(run, EvaluationSettings(train_views=0))
     return {key: metrics["heldout"][key] for key in SCORES}
 
@@ -102,6 +104,10 @@ class Following(TrainingStep):
     followed = 0.5
     _errors: np.ndarray | None = None  # of each block
 
+    def __init__(self, *words):
+        super().__init__(*words)
+        self.batch_loss._drawn = partial(self._followed, self.batch_loss._drawn)
+
     def __call__(self, state, number, rates):
         """Take a step, and look for what is wrong first where it is time."""
         if self.followed and number and number % EVERY == 0:
@@ -109,16 +115,16 @@ class Following(TrainingStep):
         return super().__call__(state, number, rates)
 
     def _look(self, state: Any, number: int) -> None:
-        rng = np.random.default_rng([self._config.seed, number])
+        rng = np.random.default_rng([self.config.seed, number])
         found: list[tuple[np.ndarray, np.ndarray]] = []
         for _ in range(BATCHES):
             drawn, seed = (int(n) for n in rng.integers(1 << 31, size=2))
-            numbers, colours = self.pixels.draw(drawn, self._config.pixels).read()
+            numbers, colours = self.pixels.draw(drawn, self.config.pixels).read()
             batch = PixelBatch.of(numbers, colours[:, :3])
             halves = self.probe(state, self.pixels.rays, batch, seed).astype(np.float64)
             first, second = (half - colours[:, :3] for half in np.moveaxis(halves, 1, 0))
             reference = colours[:, 3:].astype(np.float64)
-            errors = (first * second / (reference**2 + self._config.loss_epsilon)).mean(1)
+            errors = (first * second / (reference**2 + self.config.loss_epsilon)).mean(1)
             found.append((numbers, np.clip(np.nan_to_num(errors), -1, 1)))
         numbers, errors = (np.concatenate(parts) for parts in zip(*found, strict=True))
         blocks = self._blocks(numbers)
@@ -135,10 +141,11 @@ class Following(TrainingStep):
         row, column = np.divmod(numbers.astype(np.int64) - first, width)
         return view * _STRIDE + row // EDGE * int(_STRIDE**0.5) + column // EDGE
 
-    def _drawn(self, seed, probe):
+    def _followed(self, plain, seed, probe):
+        """The pixels of a step: `plain` draws them without a look."""
         if probe is not None or self._errors is None:
-            return super()._drawn(seed, probe)
-        size, some = self._config.pixels, round(self.followed * self._config.pixels)
+            return plain(seed, probe)
+        size, some = self.config.pixels, round(self.followed * self.config.pixels)
         rng = np.random.default_rng(seed)
         numbers, colours = self.pixels.draw(seed, (1 + CANDIDATES) * size).read()
         weight = self._errors[self._blocks(numbers[size:])]

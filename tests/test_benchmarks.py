@@ -607,11 +607,11 @@ def test_one_process_computes_with_a_thread_a_core_when_all_is_read(benchmarks, 
     from unbake.training import loop
 
     agreed, shared = [], []
-    monkeypatch.setattr(loop, "_agree", lambda *begun: agreed.append(begun))
+    monkeypatch.setattr(loop, "agree", lambda *begun: agreed.append(begun))
     module = benchmarks("one_process")
     monkeypatch.setattr(
         module["backend"], "share_cores", lambda *words, **more: shared.append((words, more))
     )
     module["compute_with_a_thread_a_core"]()
-    loop._agree("begun", "ranks")
+    loop.agree("begun", "ranks")
     assert agreed == [("begun", "ranks")] and shared == [((1,), {"least": 1})]

@@ -27,6 +27,7 @@ from unbake.machine import machine
 from unbake.ranks import Ranks
 from unbake.training import loop
 from unbake.training.run_folder import RunFolder
+from unbake.training.step import TrainingStep
 
 
 @pytest.fixture(autouse=True)
@@ -245,7 +246,7 @@ def test_paths_may_be_texts(cornell, tiny, tmp_path):
 
 
 def test_an_interrupted_comparison_goes_on(compare, tmp_path, monkeypatch):
-    real = loop.TrainingStep.__call__
+    real = TrainingStep.__call__
 
     def interrupted(self, state, step, *rates):
         if step == 4:
@@ -253,7 +254,7 @@ def test_an_interrupted_comparison_goes_on(compare, tmp_path, monkeypatch):
         return real(self, state, step, *rates)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop.TrainingStep, "__call__", interrupted)
+        patch.setattr(TrainingStep, "__call__", interrupted)
         outcome = compare("direct", "ours")
     assert outcome.status == 130 and "the same command goes on" in outcome.out
     assert not (tmp_path / "out" / "ours").exists()

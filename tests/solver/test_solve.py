@@ -31,7 +31,7 @@ from unbake.solver.points import SurfacePoints
 from unbake.solver.settings import SolveSettings
 from unbake.solver.solve import fine_tune, solve
 from unbake.solver.step import SolverStep
-from unbake.training import loop
+from unbake.training import beginning
 from unbake.training.loop import fit
 from unbake.training.recovered import load_run
 from unbake.training.run_folder import RunFolder
@@ -343,7 +343,7 @@ def test_a_fit_without_a_checkpoint_begins_again_with_the_solved_field(
         return start_radiance(problem, solved)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "start_radiance", seen)
+        patch.setattr(beginning, "start_radiance", seen)
         done = unbake(*words, "--resume", "--steps", 2)
     assert done.status == 0 and "it begins again" in done.out
     assert started == [RunFolder(tmp_path / "warm").origin().warm_start.sha256]

@@ -27,7 +27,7 @@ def start(built_in, precision, **settings):
 
 def gradients(step, state, number):
     """The loss terms of a step's batch, and the gradients of all parameters in one row."""
-    terms = step._gradients(step.prepare(state, number, RATES), state)
+    terms = step.batch_loss.backward(step.prepare(state, number, RATES), state)
     rows = []
     for _, optimizer in state.optimizers():
         rows += [np.array(dr.grad(v)).ravel() for v in optimizer.values()]

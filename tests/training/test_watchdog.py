@@ -14,6 +14,7 @@ from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photo
 from unbake.dataset.pixels import PixelSource
 from unbake.errors import UserError
 from unbake.training import watchdog as watchdog_module
+from unbake.training.batch_loss import BatchLoss
 from unbake.training.checkpoint import Progress
 from unbake.training.diagnosis import diagnose
 from unbake.training.problem import make_problem
@@ -115,7 +116,7 @@ def test_moments_of_adam_count_as_well(begun):
 
 def test_a_gradient_whose_square_is_infinite_is_left_out(begun, monkeypatch):
     step, state = begun(method="direct")
-    whole = TrainingStep._gradients
+    whole = BatchLoss.backward
 
     def huge(self, inputs, state):
         terms = whole(self, inputs, state)
@@ -123,7 +124,7 @@ def test_a_gradient_whose_square_is_infinite_is_left_out(begun, monkeypatch):
             dr.set_grad(value, dr.full(type(dr.detach(value)), 1e30, value.shape))
         return terms
 
-    monkeypatch.setattr(TrainingStep, "_gradients", huge)
+    monkeypatch.setattr(BatchLoss, "backward", huge)
     for i in range(3):
         step(state, i, RATES)
     assert state.broken() == []
@@ -424,7 +425,7 @@ def test_lights_that_are_far_too_strong_are_told(fit, cornell, tmp_path):
 
 
 def test_without_gradients_nothing_was_learned(fit, monkeypatch):
-    whole = TrainingStep._gradients
+    whole = BatchLoss.backward
 
     def none(self, inputs, state):
         terms = whole(self, inputs, state)
@@ -432,7 +433,7 @@ def test_without_gradients_nothing_was_learned(fit, monkeypatch):
             dr.set_grad(value, 0)
         return terms
 
-    monkeypatch.setattr(TrainingStep, "_gradients", none)
+    monkeypatch.setattr(BatchLoss, "backward", none)
     outcome, run = fit()
     assert outcome.status == 1 and "no gradient ever reached the unknowns" in notes(run)[-1]
 

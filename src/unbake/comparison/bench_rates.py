@@ -40,7 +40,7 @@ from ..quantities import QUANTITIES
 from ..ranks import Agreed, Ranks
 from ..training.defaults import own_warm_up, with_defaults
 from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
-from ..training.loop import what_ranks_share
+from ..training.same_on_ranks import what_ranks_share
 from ..training.schedule import learning_rates
 from ..training.validation import Score
 from .method_variant import MethodVariant

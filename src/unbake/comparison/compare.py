@@ -33,8 +33,9 @@ from ..ranks import Agreed, Ranks
 from ..report.page import write_report
 from ..training.checkpoint import Progress
 from ..training.defaults import told_unknown, with_data_defaults, with_defaults
-from ..training.loop import fit, what_ranks_share
+from ..training.loop import fit
 from ..training.run_folder import RunFolder, require_no_link
+from ..training.same_on_ranks import what_ranks_share
 from .method_variant import MethodVariant
 from .tables import print_comparison
 

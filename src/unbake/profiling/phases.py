@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..dataset.pixels import PixelBatch
 from ..fields.guide import LightGuide
-from ..training import step
+from ..training import batch_loss
 from ..transport import operator, path_sample, samplers, wavefront
 
 #: Kernels outside of the calls below belong to this phase.
@@ -31,7 +31,7 @@ _CALLS = (
     (samplers, "path_light", "paths"),
     (samplers, "path_radiance", "paths"),
     (samplers, "objective", "losses"),
-    (step, "regularization_terms", "regularizers"),
+    (batch_loss, "regularization_terms", "regularizers"),
     (LightGuide, "prepare", "BSDFs and lights"),
     (LightGuide, "loss", "losses"),
     (dr, "backward", "gradients"),

@@ -13,9 +13,10 @@ import numpy as np
 from ..dataset.pixels import PixelBatch
 from ..fields.materials import carrying
 from ..transport.by_roughness import PLACE, by_roughness, meet_one_piece, places, stratified
+from .batch_loss import Inputs
 from .problem import Problem
 from .state import State
-from .step import Inputs, TrainingStep
+from .step import TrainingStep
 
 #: Camera samples that look whether a pixel shows one piece of surface.
 _LOOKS = 4
@@ -34,7 +35,7 @@ class SearchSamples:
     """
 
     def __init__(self, problem: Problem, step: TrainingStep) -> None:
-        self._problem, self._step, self._pixels = problem, step, step.pixels
+        self._problem, self._loss, self._pixels = problem, step.batch_loss, step.pixels
         self._weight = step.pixels.weight(crops=False)  # of this rank's pixels among all
 
     @carrying()
@@ -53,18 +54,18 @@ class SearchSamples:
             Those of the pixels that can be told so, and whose numbers are finite, as rows of
             `by_roughness.row_type`.
         """
-        problem, step, sampler = self._problem, self._step, stratified(spp)
+        problem, sampler = self._problem, stratified(spp)
         assert problem.radiance is not None
         of_pixels, of_samples = map(int, seeds)
         with dr.suspend_grad():
             state.publish(problem)
-            inputs = step.inputs(0, 1)  # one pixel, which is not used
+            inputs = self._loss.inputs(0, 1)  # one pixel, which is not used
             pixels = self._of_one_piece(inputs, of_pixels, count)
             inputs = replace(inputs, pixels=pixels)
             sampler.seed(dr.opaque(mi.UInt32, of_samples), count * spp)
-            placed = step.placed(inputs)
+            placed = self._loss.placed(inputs)
             batch = pixels.batch(placed, sampler, spp)
-            target, loss, _ = step.compared(inputs, batch, placed)
+            target, loss, _ = self._loss.compared(inputs, batch, placed)
             weight = loss.weight(target) * (1 if loss.trust is None else loss.trust)
             if batch.clipped is not None:
                 weight = dr.select(batch.clipped, 0, weight)
@@ -104,7 +105,8 @@ class SearchSamples:
             state.publish(problem)
             pixels = self._pixels.draw(of_pixels, count)
             sampler.seed(dr.opaque(mi.UInt32, of_samples), count)
-            ray = pixels.batch(self._step.placed(self._step.inputs(0, 1)), sampler, 1).ray
+            placed = self._loss.placed(self._loss.inputs(0, 1))
+            ray = pixels.batch(placed, sampler, 1).ray
             return places(problem.scene_view, ray, sampler, hide_emitters=problem.hide_emitters)
 
     def _of_one_piece(self, inputs: Inputs, seed: int, count: int) -> PixelBatch:
@@ -112,7 +114,7 @@ class SearchSamples:
 
         Where there are few of them in many draws, the others are any pixels.
         """
-        problem, sampler, placed = self._problem, stratified(_LOOKS), self._step.placed(inputs)
+        problem, sampler, placed = self._problem, stratified(_LOOKS), self._loss.placed(inputs)
         seeds = np.random.SeedSequence(seed).generate_state(2 * _DRAWS).tolist()
         found, last, left = [], np.zeros(0, np.int64), count
         for of_pixels, of_samples in zip(seeds[::2], seeds[1::2], strict=True):

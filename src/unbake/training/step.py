@@ -11,56 +11,33 @@ import gc
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..dataset.pixels import CameraRays, PixelBatch, PixelSource, RayBatch, largest_crop
+from ..dataset.pixels import CameraRays, PixelBatch, PixelSource, largest_crop
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..fields.camera import CameraModel
-from ..fields.materials import carrying
 from ..memory import free_bytes, lacks_memory, require_memory, reserved_counts
 from ..ranks import Ranks
-from ..transport.loss import RelativeL2, pixel_means
-from ..transport.methods import PHOTOMETRIC
-from ..transport.path_sample import SampleSubset
-from ..transport.samplers import SamplerContext, make_sampler
+from .batch_loss import BatchLoss, Inputs
 from .gradients import flat_gradients, set_gradients
 from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
-from .outliers import Blocks
-from .poses import PoseUnits
 from .problem import Problem
-from .regularizers import has_terms, regularization_terms
 from .state import State
 
-#: Camera samples, at most, of the batch that a path sampler plans with.
-_PLANNED_PATHS = 1 << 15
+#: Pixels that tell the loss of black pictures.
+_OF_BLACK = 1 << 15
 #: The largest gradient whose square is finite in single precision, with some room.
 _LARGEST_GRADIENT = 1e18
 
 
-@dataclass
-class Inputs:
-    """The arguments of a frozen step; a PyTree."""
-
-    scene: mi.Scene
-    rays: CameraRays
-    pixels: PixelBatch
-    sampler: mi.Sampler  # of all camera samples
-    second: mi.Sampler  # of those that L_θ learns from, if these are fewer
-    single: mi.Sampler  # of one camera sample a pixel, for regularizers
-    seed: mi.UInt32
-    exposures: mi.Float | None = None  # of the views, as the data set has them, if they are read
-    units: PoseUnits | None = None  # of corrections of poses, if there are any
-    blocks: Blocks | None = None  # of pixels that lose their weight together, if they are to
-
-
-@dataclass(frozen=True)
+@final
+@dataclass(frozen=True, eq=False)
 class Replay:
     """A step taken apart."""
 
@@ -93,8 +70,9 @@ class TrainingStep:
 
     Raises:
         UserError: the batch cannot be shared equally, or crops cannot have its pixels.
+        ValueError: the loss needs smoothed photographs, and there are none.
 
-    Paper: Eq. 11, Eq. 14, Sec. 4, 5.4, 6.
+    Paper: Sec. 4, 5.4.
     """
 
     def __init__(
@@ -106,9 +84,6 @@ class TrainingStep:
     ) -> None:
         self._ranks = ranks or Ranks()
         config = with_share(config, self._ranks.size)
-        smoothed = config.loss_reference == "smoothed"
-        if smoothed and not pixels.photographs.smoothed:
-            raise ValueError("the loss is relative to smoothed photographs, which were not made")
         crops = config.pixel_sampling == "one-view-crop"
         if crops:
             pixels.require_crops(config.pixels, self._ranks.size)
@@ -119,29 +94,17 @@ class TrainingStep:
         self._problem = problem
         self.pixels = pixels
         self.config = config  #: of this process, with its share of each batch
-        self.epsilon = config.epsilon(pixels.photographs.mean)
-        self._path_sampler = make_sampler(_context(problem, config))
-        self._exposures = None
-        if problem.camera is not None and problem.camera.has_response:
-            exposures = pixels.exposures
-            self._exposures = from_numpy(
-                mi.Float, np.ones(problem.camera.views) if exposures is None else exposures
-            )
-        self._units = None if problem.poses is None else problem.poses.units
-        self._sampler = mi.load_dict({"type": "independent"})
-        self._second = mi.load_dict({"type": "independent"})
-        self._single = mi.load_dict({"type": "independent"})
-        recordable = self._path_sampler.can_be_recorded and all(
-            field.recordable for field in problem.fields()
-        )
+        #: Of its batches, for what is measured beside the steps as well.
+        self.batch_loss = BatchLoss(problem, pixels, config, self._ranks.rank)
+        self._path_sampler = self.batch_loss.path_sampler
+        recordable = self.batch_loss.recordable
         self._frozen = dr.freeze(self._step) if recordable else None
         self._own = dr.freeze(self._own_gradients) if recordable else self._own_gradients
         self._common = dr.freeze(self._step_by) if recordable else self._step_by
         self._terms: list[str] = []  # names of the loss terms, once a step was traced
         self._weight = pixels.weight(crops=crops)  # of this rank's gradients in their mean
         self._apart = False  # whether ranks have taken steps by themselves since they were united
-        self._probed = mi.load_dict({"type": "independent"})
-        self._frozen_probe = dr.freeze(self._probe) if recordable else None
+        self._probe = dr.freeze(self._halves) if recordable else self._halves
         self._fits_memory = False  # as far as is known
         self._planned = not self._path_sampler.keeps_paths
 
@@ -192,22 +155,14 @@ class TrainingStep:
         names, rows = read[0], self._ranks.mean(own)
         return [dict(zip(names, map(float, row), strict=True)) for row in rows]
 
-    @carrying()
     def plan(self, state: State) -> None:
         """Let the path sampler decide what it fixes for all steps, once.
 
         The first step does this by itself. A fit that may be resumed does it with the first state,
         so that it goes on as it would have without the interruption.
         """
-        if self._planned:
-            return
-        config, path_sampler = self.config, self._path_sampler
-        with dr.suspend_grad(), path_sampler.prepared():
-            inputs = self.inputs(0, min(config.pixels, max(1, _PLANNED_PATHS // config.spp)))
-            state.publish(self._problem)
-            inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
-            batch = inputs.pixels.batch(self._rays(inputs), inputs.sampler, config.spp)
-            path_sampler.plan(inputs.scene, batch.ray, inputs.sampler)
+        if not self._planned:
+            self.batch_loss.plan(state)
         self._planned = True
 
     def require_memory(self, state: State) -> None:
@@ -238,7 +193,7 @@ class TrainingStep:
         self.plan(state)
 
         def probe(pixels: int) -> None:
-            terms = self._gradients(self.inputs(0, pixels), state)
+            terms = self.batch_loss.backward(self.batch_loss.inputs(0, pixels), state)
             for _, optimizer in state.optimizers():
                 dr.eval(terms, [dr.grad(value) for value in optimizer.values()])
                 dr.clear_grad(dict(optimizer.items()))
@@ -273,21 +228,25 @@ class TrainingStep:
         outliers = ("outliers",) if self._problem.outliers is not None else ()
         return (*config.unknowns, *config.camera.unknowns, *outliers, "radiance")
 
+    @property
+    def epsilon(self) -> float:
+        """What the relative loss adds to squared references."""
+        return self.batch_loss.epsilon
+
     def loss_of_black(self) -> float:
         """About the photometric loss of black pictures."""
-        _, colours = self.pixels.draw(self.config.seed, _PLANNED_PATHS).read()
+        _, colours = self.pixels.draw(self.config.seed, _OF_BLACK).read()
         target = colours[:, :3].astype(np.float64)
         smoothed = self.config.loss_reference == "smoothed"
         reference = colours[:, 3:] if smoothed else target
         loss = (target**2 / (reference**2 + self.epsilon)).mean()
         return float(self._ranks.mean(self._weighted(np.array([loss])))[0])
 
-    @carrying()
     def replay(self, state: State, number: int) -> Replay:
         """A step taken apart, for a diagnosis; the state stays as it is."""
         self.plan(state)
-        inputs, config = self.inputs(number), self.config
-        terms = self._gradients(inputs, state)
+        inputs = self.batch_loss.inputs(number)
+        terms = self.batch_loss.backward(inputs, state)
         gradients = {
             key: dr.grad(value)
             for _, optimizer in state.optimizers()
@@ -296,11 +255,7 @@ class TrainingStep:
         broken = [k for k, g in gradients.items() if not np.isfinite(np.array(g.array)).all()]
         for _, optimizer in state.optimizers():
             dr.clear_grad(dict(optimizer.items()))
-        with dr.suspend_grad(), self._path_sampler.prepared():
-            inputs.sampler.seed(inputs.seed, inputs.pixels.count * config.spp)
-            batch = inputs.pixels.batch(self._rays(inputs), inputs.sampler, config.spp)
-            image = self._path_sampler.image(inputs.scene, batch.ray, inputs.sampler)
-            image = np.array(pixel_means(image, config.spp)).T
+        image = np.array(self.batch_loss.image(inputs, state)).T
         numbers, colours = inputs.pixels.read()
         photograph = colours[:, :3]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -327,32 +282,13 @@ class TrainingStep:
             Linear RGB, from half of the `spp` samples each, shape (pixels, 2, 3).
         """
         self.plan(state)
-        inputs = Inputs(
-            scene=self._problem.scene_view.scene,
-            rays=rays,
-            pixels=pixels,
-            sampler=self._probed,
-            second=self._second,
-            single=self._single,
-            seed=dr.opaque(mi.UInt32, seed),
-            units=self._units,
-        )
-        probe = self._probe if self._frozen_probe is None else self._frozen_probe
+        inputs = self.batch_loss.inputs_of(rays, pixels, seed)
         with without_garbage_collection():
-            halves = probe(inputs, state)
+            halves = self._probe(inputs, state)
         return np.array(halves).T.reshape(-1, 2, 3)
 
-    @carrying()
-    def _probe(self, inputs: Inputs, state: State) -> mi.Color3f:
-        config, pixels, sampler = self.config, inputs.pixels, inputs.sampler
-        with dr.suspend_grad(), self._path_sampler.prepared():
-            state.publish(self._problem)
-            sampler.seed(inputs.seed, pixels.count * config.spp)
-            batch = pixels.batch(self._rays(inputs), sampler, config.spp)
-            image = self._path_sampler.image(inputs.scene, batch.ray, sampler)
-            halves = pixel_means(image, config.spp // 2)
-            dr.eval(halves)
-        return halves
+    def _halves(self, inputs: Inputs, state: State) -> mi.Color3f:
+        return self.batch_loss.image(inputs, state, self.config.spp // 2)
 
     def place(self, pixel: int) -> tuple[int, int, int]:
         """The training view of a pixel, from 0, and its column and row in it."""
@@ -373,7 +309,7 @@ class TrainingStep:
     def unfrozen(self, state: State, number: int) -> dict[str, mi.Float]:
         """The same step traced anew, for measurements and tests."""
         self.plan(state)
-        return self._step(self.inputs(number), state)
+        return self._step(self.batch_loss.inputs(number), state)
 
     def gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float | mi.TensorXf]:
         """The gradients of the unknowns φ, by name, without a step: for measurements.
@@ -382,7 +318,7 @@ class TrainingStep:
             inputs: from `prepare`.
         """
         self.plan(state)
-        terms = self._gradients(inputs, state)
+        terms = self.batch_loss.backward(inputs, state)
         found = {name: dr.grad(value) for name, value in state.phi.items()}
         dr.eval(terms, found)
         for _, optimizer in state.optimizers():
@@ -392,35 +328,7 @@ class TrainingStep:
     def prepare(self, state: State, number: int, rates: Mapping[str, float]) -> Inputs:
         """The part of a replayed step that runs in Python."""
         state.set_learning_rates(rates)
-        return self.inputs(number)
-
-    def inputs(self, number: int, probe: int | None = None) -> Inputs:
-        """The inputs of a step.
-
-        Args:
-            number: of the step.
-            probe: how many pixels of all views stand for its batch, where another one is wanted.
-        """
-        entropy = [self.config.seed, number]
-        entropy += [self._ranks.rank] if self._ranks.rank else []
-        seeds = np.random.SeedSequence(entropy).generate_state(2)
-        return Inputs(
-            scene=self._problem.scene_view.scene,
-            rays=self.pixels.rays,
-            pixels=self._drawn(int(seeds[0]), probe),
-            sampler=self._sampler,
-            second=self._second,
-            single=self._single,
-            seed=dr.opaque(mi.UInt32, int(seeds[1])),
-            exposures=self._exposures,
-            units=self._units,
-            blocks=None if self._problem.outliers is None else self._problem.outliers.blocks,
-        )
-
-    def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
-        if probe is None and self.config.pixel_sampling == "one-view-crop":
-            return self.pixels.draw_crop(seed, self.config.pixels)
-        return self.pixels.draw(seed, probe or self.config.pixels)
+        return self.batch_loss.inputs(number)
 
     def _shared_step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
         """The same step on all ranks, with the mean of their gradients."""
@@ -435,7 +343,7 @@ class TrainingStep:
 
     def _own_gradients(self, inputs: Inputs, state: State) -> mi.Float:
         """This rank's loss terms, then its gradients, in one array."""
-        terms = self._gradients(inputs, state)
+        terms = self.batch_loss.backward(inputs, state)
         self._terms = list(terms)
         parts = [mi.Float(value) for value in terms.values()]
         for _, optimizer in state.optimizers():
@@ -455,7 +363,7 @@ class TrainingStep:
         return self._move(terms, state)
 
     def _step(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
-        return self._move(self._gradients(inputs, state), state)
+        return self._move(self.batch_loss.backward(inputs, state), state)
 
     def _move(self, terms: dict[str, mi.Float], state: State) -> dict[str, mi.Float]:
         """Move the parameters by their gradients, where all loss terms are finite."""
@@ -472,109 +380,6 @@ class TrainingStep:
         dr.eval(state, terms)
         return terms
 
-    @carrying()
-    def _gradients(self, inputs: Inputs, state: State) -> dict[str, mi.Float]:
-        """The loss terms on random pixels; their gradients are accumulated in the state."""
-        config, path_sampler = self.config, self._path_sampler
-        scene, pixels, sampler = inputs.scene, inputs.pixels, inputs.sampler
-        state.publish(self._problem)
-        sampler.seed(inputs.seed, pixels.count * config.spp)
-        placed = self.placed(inputs)
-        rays = inputs.rays if self._problem.poses is None else dr.detach(placed)
-        batch = pixels.batch(rays, sampler, config.spp)
-        with path_sampler.prepared():
-            primal = None
-            if config.two_passes:
-                with dr.suspend_grad():
-                    again = pixels.batch(rays, sampler, config.spp)
-                    image = path_sampler.image(scene, again.ray, sampler)
-                    primal = pixel_means(image, config.spp)
-            target, loss, roots = self.compared(inputs, batch, placed)
-            subset = _subset(config, inputs)
-            terms = path_sampler.terms(scene, batch.ray, target, sampler, subset, loss, primal)
-            terms |= self._regularization(inputs, batch.ray, terms.get(PHOTOMETRIC))
-            poses = self._problem.poses
-            if poses is not None:
-                sigma, count = config.camera.pose_sigma, self.pixels.photographs.count
-                terms["pose_prior"] = poses.prior(sigma, terms.get(PHOTOMETRIC), count)
-            outliers = self._problem.outliers
-            if outliers is not None and roots is not None and PHOTOMETRIC in terms:
-                terms["outliers"] = outliers.cost(roots, terms[PHOTOMETRIC])
-            total = sum(terms.values())
-            dr.backward(total if state.scale is None else total * state.scale)
-        return terms
-
-    def compared(
-        self, inputs: Inputs, batch: RayBatch, placed: CameraRays
-    ) -> tuple[mi.Color3f, RelativeL2, mi.Float | None]:
-        """What pixels are compared with, by what is known of the cameras by now, and how.
-
-        Args:
-            placed: camera rays of all pixels, which may pass gradients to corrections of poses.
-
-        Returns:
-            The photographs as light, linear RGB, one lane a pixel; the loss; and the roots of what
-            errors are multiplied by, where outliers are to be found.
-        """
-        config, problem, pixels = self.config, self._problem, inputs.pixels
-        smoothed = config.loss_reference == "smoothed"
-        reference, target = batch.smoothed if smoothed else None, batch.target
-        if problem.poses is not None:
-            target = problem.poses.target(inputs.scene, placed, pixels, batch)
-        gain = None
-        if problem.camera is not None:
-            target, reference, gain = self._through_camera(
-                problem.camera, inputs, target, reference
-            )
-        roots, trust = None, None
-        if problem.outliers is not None:
-            roots = problem.outliers.roots(inputs.rays, pixels.numbers(), inputs.blocks)
-            trust = dr.square(roots)
-        pairs = config.chosen_estimator == "all-pairs"
-        loss = RelativeL2(self.epsilon, reference, batch.clipped, gain, trust, pairs)
-        return target, loss, roots
-
-    def _regularization(
-        self, inputs: Inputs, ray: mi.Ray3f, photometric: mi.Float | None
-    ) -> dict[str, mi.Float]:
-        """The regularizers, at the first camera sample of each pixel."""
-        problem, config = self._problem, self.config
-        if not has_terms(problem, config):
-            return {}
-        chosen = _first_samples(inputs.pixels.count, config.spp, 1)
-        inputs.single.seed(inputs.seed + 2, inputs.pixels.count)
-        ray = dr.gather(mi.Ray3f, ray, chosen)
-        return regularization_terms(problem, config, inputs.scene, ray, inputs.single, photometric)
-
-    def _rays(self, inputs: Inputs) -> CameraRays:
-        """The camera rays, by what is known of the cameras by now."""
-        return dr.detach(self.placed(inputs))
-
-    def placed(self, inputs: Inputs) -> CameraRays:
-        """The same, which pass gradients to corrections of poses where there are any."""
-        poses, units = self._problem.poses, inputs.units
-        return inputs.rays if poses is None else poses.placed(inputs.rays, units)
-
-    def _through_camera(
-        self,
-        camera: CameraModel,
-        inputs: Inputs,
-        target: mi.Color3f,
-        reference: mi.Color3f | None,
-    ) -> tuple[mi.Color3f, mi.Color3f | None, mi.Color3f]:
-        """Photographs as light, what errors are relative to, and gains of renderings."""
-        numbers = inputs.pixels.numbers()
-        view = inputs.rays.view_of(numbers)
-        gain = camera.gain(view, inputs.rays.radius2(numbers, view))
-        if camera.has_response:
-            assert inputs.exposures is not None
-            # The response is of the photograph, before it was divided by its exposure.
-            exposure = dr.gather(mi.Float, inputs.exposures, view)
-            target = camera.exposed(target * exposure) / exposure
-            if reference is not None:
-                reference = dr.detach(camera.exposed(reference * exposure) / exposure)
-        return target, reference, gain
-
 
 def with_share(config: FitConfig, ranks: int) -> FitConfig:
     """Settings of one of several ranks, which takes an equal share of each batch.
@@ -587,40 +392,6 @@ def with_share(config: FitConfig, ranks: int) -> FitConfig:
         what = f"a batch of {config.pixels} pixels cannot be shared equally by {ranks} processes"
         raise UserError(what, "--batch", f"Use --batch {fewer}, or another number of processes")
     return replace(config, pixels=config.pixels // ranks)
-
-
-def _context(problem: Problem, config: FitConfig) -> SamplerContext:
-    """The inputs of the method's path sampler."""
-    return SamplerContext(
-        method=config.chosen_method,
-        scene_view=problem.scene_view,
-        radiance=problem.radiance,
-        hide_emitters=problem.hide_emitters,
-        spp=config.spp,
-        bounces=config.chosen_bounces,
-        max_depth=config.path.chosen_depth,
-        rr_depth=config.path.rr_depth,
-        read_by_scene=problem.read_by_scene,
-        guide=problem.guide,
-    )
-
-
-def _subset(config: FitConfig, inputs: Inputs) -> SampleSubset | None:
-    """The first camera samples of each pixel, if L_θ learns from these alone."""
-    each = config.radiance_samples
-    if each == config.spp:
-        return None
-    inputs.second.seed(inputs.seed + 1, inputs.pixels.count * each)
-    return SampleSubset(_first_samples(inputs.pixels.count, config.spp, each), inputs.second)
-
-
-def _first_samples(pixels: int, spp: int, each: int) -> mi.UInt32:
-    """The lanes of the first `each` of `spp` camera samples of pixels."""
-    lane = dr.arange(mi.UInt32, pixels * each)
-    chosen = lane // each * spp + lane % each
-    # Evaluated, because a replayed kernel takes its size from arrays in memory that it reads.
-    dr.eval(chosen)
-    return chosen
 
 
 @contextmanager
