@@ -661,9 +661,10 @@ def test_recovered_strengths_are_numbers_of_the_scene(data, tmp_path, monkeypatc
     options = {"texels": 4.0, "tell": lambda line: None}
     manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba", "gltf"], **options)
     assert [light["recovered"] for light in manifest["lights"]] == [True] * 3
-    (start,) = {x for light in manifest["lights"] for x in light["strength"]}
     text = (tmp_path / "out" / "mitsuba" / "scene.xml").read_text()
-    assert text.count(f"{start:.6g}"[:6]) >= 3
+    for light in manifest["lights"]:
+        (start,) = set(light["strength"])
+        assert f"{start:.6g}"[:6] in text
     assert any("learned no materials" in note for note in manifest["notes"])
 
 

@@ -131,9 +131,8 @@ def test_textures_find_their_bitmap_inside_virtual_calls(with_numbers):
 
 def test_meshes_are_merged_within_a_material_alone(with_numbers):
     scene_view, _ = with_numbers
-    assert (
-        sum(shape.is_mesh() for shape in scene_view.scene.shapes()) == 3
-    )  # wall, red twice, masked
+    # A rectangle and another wall, which are not merged; red twice, which is; masked.
+    assert sum(shape.is_mesh() for shape in scene_view.scene.shapes()) == 4
 
 
 def test_materials_without_a_name_get_one_of_their_own(tmp_path):

@@ -10,7 +10,7 @@ from unbake.transport.emitter_sampling import has_cut_outs, lights_pierce
 from unbake.transport.light_by_depth import light_by_depth
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.render import path_integrator
-from unbake.transport.vertex import SceneView
+from unbake.transport.vertex import SceneView, mis_weight
 
 LIGHTS = {
     "point": {
@@ -80,3 +80,12 @@ def test_the_depth_of_light_counts_what_passes():
         for d in (2, 4)
     )
     assert shares[1] == pytest.approx(direct / all_, abs=0.02)
+
+
+def test_weights_of_any_densities_are_numbers():
+    """Of an emitter that is seen edge on by a point on itself, they are beyond 10^19."""
+    pairs = [(1, 1), (3, 1), (1e20, 1e-17), (1e-30, 1e20), (1e-30, 0), (1e38, 1e38), (0, 1), (0, 0)]
+    a, b = (mi.Float(column) for column in zip(*pairs, strict=True))
+    found = np.array(mis_weight(a, b))
+    np.testing.assert_allclose(found, [0.5, 0.9, 1, 0, 1, 0.5, 0, 0], rtol=1e-5)
+    assert np.array(mis_weight(mi.Float(np.inf), mi.Float(np.inf))) == 0

@@ -267,6 +267,10 @@ def evaluate(sampler: mi.Sampler, *values: object) -> None:
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Power heuristic, β = 2: the weight of a sample drawn with density `pdf_a` (Veach 1997)."""
-    a2 = dr.square(pdf_a)
-    return dr.detach(dr.select(pdf_a > 0, a2 / dr.fma(pdf_b, pdf_b, a2), 0))
+    """Power heuristic, β = 2: the weight of a sample drawn with density `pdf_a` (Veach 1997).
+
+    Densities of points on an emitter that see it edge on are larger than the root of the largest
+    number: they are divided before they are squared.
+    """
+    ratio = pdf_b / pdf_a
+    return dr.detach(dr.select((pdf_a > 0) & dr.isfinite(ratio), dr.rcp(1 + dr.square(ratio)), 0))
