@@ -18,7 +18,7 @@ from unbake.dataset.camera import LookAt, read_cameras, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.rendering import relight, render
-from unbake.evaluation.renderings import render_camera
+from unbake.evaluation.renderings import render_camera, told_unit
 from unbake.evaluation.settings import RenderSettings
 from unbake.evaluation.turntable import turntable, up_of
 from unbake.imaging.metrics import psnr
@@ -477,3 +477,22 @@ def test_a_light_file_must_not_leave_its_folder(folder, tmp_path):
     relighting.put_lights(scene, file, tmp_path)
     # The environment of the file has taken the place of the scene's own.
     assert len(scene.instantiate().emitters()) == 3
+
+
+@pytest.mark.parametrize(
+    ("exposure", "told"), [(None, None), (2.9, None), (9.6, "darker"), (-10.0, "brighter")]
+)
+def test_photographs_far_from_white_are_told(exposure, told):
+    line = told_unit(exposure)
+    assert line is None if told is None else f"are far {told} than white" in line
+
+
+def test_evaluate_tells_that_photographs_are_far_from_white(unbake, folder, tmp_path):
+    data = shutil.copytree(folder / "data", tmp_path / "data")
+    for image in (data / "images").glob("*.exr"):
+        write_exr(image, 1e4 * read_exr(image))
+    config = replace(tiny_fields("grid"), method="direct", steps=0)
+    fit(data, tmp_path / "run", config)
+    outcome = unbake("evaluate", tmp_path / "run", "--spp", 2, "--train-views", 0)
+    assert outcome.status == 0 and outcome.err == ""
+    assert "note: photographs are far brighter than white, 1: render_psnr says" in outcome.out

@@ -457,6 +457,7 @@ def evaluate(
     settings = with_options(EvaluationSettings(), given(evaluate))
     backend.activate()
     from ..evaluation.evaluate import evaluate as go
+    from ..evaluation.renderings import told_unit
     from ..evaluation.yardsticks import told_yardsticks
 
     metrics = go(run, settings, allow_outside=allow_outside, tell=say)
@@ -473,6 +474,8 @@ def evaluate(
         if split == "heldout":
             for line in told:
                 say(f"  {line}")
+    if note := told_unit(metrics["display_exposure"]):
+        say(f"note: {note}")
     if told and found and found["ceiling"] is None:
         folder = RunFolder(run)
         data, settings = quoted(folder.data(metrics["data"])), quoted(folder.config_file)

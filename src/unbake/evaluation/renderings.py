@@ -18,6 +18,8 @@ from .settings import EvaluationSettings, RenderSettings
 
 #: Scores of a rendering; those of materials come after them.
 METRICS = ("render_psnr", "render_psnr_unclamped", "render_ssim", "render_flip")
+#: Stops of `display_exposure` beyond which a peak of 1 is that of no photograph.
+_FAR = 3.0
 #: What they are; `display_exposure` stands beside them.
 DEFINITIONS = {
     "render_ssim": "structural similarity of rendering and photograph as sRGB, clipped, at "
@@ -52,6 +54,18 @@ def render_camera(
         rr_depth=settings.rr_depth,
         hide_emitters=hide_emitters,
     ).reshape(camera.height, camera.width, 3)
+
+
+def told_unit(exposure: float | None) -> str | None:
+    """A line where PSNRs of renderings say little, as photographs are far from their white, 1.
+
+    Args:
+        exposure: as `display_exposure`; None: there is none.
+    """
+    if exposure is None or abs(exposure) <= _FAR:
+        return None
+    far = "darker than white, 1" if exposure > 0 else "brighter than white, 1"
+    return f"photographs are far {far}: render_psnr says little here; see render_ssim, render_flip"
 
 
 def counted_pixels(
