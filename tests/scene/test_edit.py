@@ -9,9 +9,11 @@ import pytest
 from scene_texts import BALL, DIFFUSE, PRINCIPLED, ROUGHPLASTIC, WRAPPERS, render
 
 from unbake.errors import UserError
+from unbake.fields.shapes import met_shapes
 from unbake.fields.texture import material_textures
 from unbake.imaging.pictures import write_exr
 from unbake.scene import edit
+from unbake.transport.optimized import has_optimized_material
 
 
 def plugins(parsed):
@@ -46,6 +48,20 @@ def test_the_defaults_of_mitsuba_are_kept(parse):
     assert edit.to_principled(parsed) == 2
     found = [(n.props["base_color"], n.props["roughness"]) for n in parsed.principled_nodes()]
     assert found == [(0.5, 0.9), (0.5, pytest.approx(math.sqrt(0.1)))]
+
+
+def test_shapes_without_a_bsdf_share_a_new_one(parse):
+    """Mitsuba takes them for diffuse grey: they are unknown like any other. Lamps are not."""
+    lamp = '<emitter type="area"/>'
+    group = f'<shape type="shapegroup" id="group">{BALL.format("")}</shape>'
+    instance = '<shape type="instance"><ref id="group"/></shape>'
+    shapes = [BALL.format(x) for x in ("", "", lamp, '<bsdf type="dielectric"/>', DIFFUSE)]
+    parsed = parse("".join([*shapes, group, instance]))
+    assert edit.to_principled(parsed) == 2 and edit.to_principled(parsed) == 0
+    assert edit.material_names(parsed)[-1] == "without-bsdf"
+    scene = parsed.instantiate(merge=False)
+    optimized = [has_optimized_material(shape) for shape in met_shapes(scene)]
+    assert sorted(optimized) == [False, False, True, True, True, True]
 
 
 def test_other_materials_stay(parse):

@@ -30,11 +30,16 @@ _PROPERTIES = {
 }
 
 
+#: Shapes that stand for others.
+_NO_SURFACES = ("instance", "merge", "shapegroup")
+
+
 def to_principled(scene: ParsedScene) -> int:
     """Turn every `diffuse` and rough plastic BSDF into `principled`, as the paper did (Sec. 6).
 
     Diffuse becomes roughness 0.9; rough plastic keeps its colour, with roughness √α, the perceptual
-    roughness of the same microfacet width.
+    roughness of the same microfacet width. Shapes without a BSDF are diffuse to Mitsuba, and share
+    a new one.
 
     Returns:
         The number of BSDFs changed.
@@ -70,7 +75,34 @@ def to_principled(scene: ParsedScene) -> int:
         props["base_color"] = colour
         props["roughness"] = roughness
         changed += 1
-    return changed
+    return changed + _give_bare_shapes_a_bsdf(scene)
+
+
+def _give_bare_shapes_a_bsdf(scene: ParsedScene) -> int:
+    """Give shapes without BSDF, emitter and medium one that is grey, as Mitsuba does.
+
+    Returns:
+        The number of BSDFs that are new.
+    """
+    nodes = scene.state.nodes
+    bare = []
+    for i, node in enumerate(nodes):
+        if node.type != mi.ObjectType.Shape or node.props.plugin_name() in _NO_SURFACES:
+            continue
+        kinds = {nodes[number].type for number in scene.references(i)}
+        if not kinds & {mi.ObjectType.BSDF, mi.ObjectType.Emitter, mi.ObjectType.Medium}:
+            bare.append(i)
+    if not bare:
+        return 0
+    grey = mi.parser.SceneNode()
+    grey.type = mi.ObjectType.BSDF
+    grey.props.set_plugin_name("principled")
+    grey.props.set_id("without-bsdf")
+    grey.props["base_color"], grey.props["roughness"] = 0.5, 0.9
+    number = scene.append(grey)
+    for i in bare:
+        scene.state.nodes[i].props["bsdf"] = mi.Properties.ResolvedReference(number)
+    return 1
 
 
 def _require_ranges(scene: ParsedScene, node: mi.parser.SceneNode) -> None:
