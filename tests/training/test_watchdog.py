@@ -17,6 +17,7 @@ from unbake.training import watchdog as watchdog_module
 from unbake.training.batch_loss import BatchLoss
 from unbake.training.checkpoint import Progress
 from unbake.training.diagnosis import diagnose
+from unbake.training.loss_scaling import next_scale
 from unbake.training.problem import make_problem
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
@@ -422,6 +423,25 @@ def test_lights_that_are_far_too_strong_are_told(fit, cornell, tmp_path):
     outcome, run = fit(data=data)
     assert outcome.status == 1, outcome
     assert "nothing useful was learned: the loss is" in notes(run)[-1]
+
+
+def test_a_loss_that_is_no_number_does_not_lower_the_scale_of_gradients(begun, monkeypatch):
+    """In half precision one step in two thousand would have brought it to zero."""
+    step, state = begun(method="direct", precision="half")
+    before, whole = float(state.scale[0]), BatchLoss.backward
+
+    def spoilt(self, inputs, state):
+        terms = whole(self, inputs, state)
+        return terms | {"photometric": terms["photometric"] * mi.Float(np.nan)}
+
+    monkeypatch.setattr(BatchLoss, "backward", spoilt)
+    for i in range(3):
+        assert float(step(state, i, RATES)["skipped"][0]) == 1
+    assert float(state.scale[0]) == before
+    scale = mi.Float(1)
+    for _ in range(100):
+        scale = next_scale(scale, mi.Bool(False))
+    assert float(scale[0]) > 0
 
 
 def test_without_gradients_nothing_was_learned(fit, monkeypatch):

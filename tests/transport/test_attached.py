@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from support import built_in_cameras, enable_gradients, pixel_rays, seeded
 
+from unbake.dataset.camera import Camera
 from unbake.transport.loss import RelativeL2
 from unbake.transport.methods import EXTRA, LHS, PHOTOMETRIC, PRIOR, PRIOR_PAIR, Attached
 from unbake.transport.objective import objective, requirements
+from unbake.transport.operator import attach_albedo
 from unbake.transport.path_sample import SampleSubset, trace
+from unbake.transport.vertex import SceneView, find_vertex
 
 SPP, FEW = 4, 2
 #: So large that what errors are relative to is next to constant, which it is for gradients.
@@ -191,3 +194,16 @@ def test_the_scene_is_reached_through_the_second_residual(problem, rays):
         assert np.abs(attached).max() > 0
         fixed = gradient(problem, rays, {EXTRA: Attached(lhs=True)}, "φ", subset=subset)
         assert not fixed.any()
+
+
+def test_the_albedo_of_metals_is_none_above_one():
+    """Mitsuba takes the peak of a lobe for it, which L_θ would be multiplied by."""
+    metal = {"type": "roughconductor", "alpha": 0.02}
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": metal}})
+    camera = Camera.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0], 40, 32, 32)
+    rays = pixel_rays([camera], 1, 0)
+    view = SceneView.of(scene, None, 4)
+    vertex = find_vertex(view, rays, mi.Bool(True), seeded(0, 32 * 32))
+    plain = np.array(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
+    found = np.array(attach_albedo(view, vertex).albedo)
+    assert plain.max() > 10 and found.max() == 1 and found.min() >= 0

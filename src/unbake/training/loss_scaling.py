@@ -13,6 +13,8 @@ import mitsuba as mi
 
 #: The factor at first, and what it grows by after each good step.
 _FIRST, _GROWTH = 65536.0, 2 ** (1 / 2000)
+#: The least factor. It is divided by.
+_LEAST = 2.0**-16
 
 
 def first_scale() -> mi.Float:
@@ -21,8 +23,12 @@ def first_scale() -> mi.Float:
 
 
 def next_scale(scale: mi.Float, finite: mi.Bool) -> mi.Float:
-    """The factor after a step: half of it where a gradient has overflowed."""
-    return scale * dr.select(finite, _GROWTH, 0.5)
+    """The factor after a step: half of it where a gradient has overflowed.
+
+    Args:
+        finite: whether none has.
+    """
+    return dr.maximum(scale * dr.select(finite, _GROWTH, 0.5), _LEAST)
 
 
 def gradients_are_finite(optimizers: Iterable[mi.ad.Adam]) -> mi.Bool:

@@ -367,12 +367,13 @@ class TrainingStep:
 
     def _move(self, terms: dict[str, mi.Float], state: State) -> dict[str, mi.Float]:
         """Move the parameters by their gradients, where all loss terms are finite."""
-        finite = dr.isfinite(sum(terms.values()))
+        known = finite = dr.isfinite(sum(terms.values()))
         factor = None
         if state.scale is not None:
-            finite &= gradients_are_finite(optimizer for _, optimizer in state.optimizers())
-            factor = dr.rcp(state.scale)
-            state.scale = next_scale(state.scale, finite)
+            fits = gradients_are_finite(optimizer for _, optimizer in state.optimizers())
+            factor, finite = dr.rcp(state.scale), known & fits
+            # A loss that is no number says nothing of gradients that overflow.
+            state.scale = dr.select(known, next_scale(state.scale, fits), state.scale)
         for _, optimizer in state.optimizers():
             drop_broken_gradients(optimizer)
             optimizer.step(active=finite, grad_scale=factor, eval=False)

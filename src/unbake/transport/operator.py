@@ -45,9 +45,14 @@ def attach_material(scene_view: SceneView, vertex: Vertex) -> Vertex:
 
 @carrying()
 def attach_albedo(scene_view: SceneView, vertex: Vertex) -> Vertex:
-    """Look up the albedo alone, for a vertex where L_θ is evaluated and no BSDF is."""
+    """Look up the albedo alone, for a vertex where L_θ is evaluated and no BSDF is.
+
+    Of metals Mitsuba takes the peak of their lobe for it, which may be thousands. L_θ, which is
+    multiplied by it, gets 1 at most.
+    """
     if scene_view.materials is None or "albedo" not in scene_view.materials:
         albedo = mi.Color3f(vertex.bsdf.eval_diffuse_reflectance(vertex.si, vertex.valid))
+        albedo = dr.clip(albedo, 0, 1)
     else:
         albedo = scene_view.materials.evaluate_one("albedo", vertex.si, vertex.valid)
     return replace(vertex, albedo=dr.detach(albedo))
