@@ -241,6 +241,25 @@ def test_parts_are_where_mitsuba_has_them(mixed, tmp_path):
         assert (error < near).mean() > 0.99
 
 
+def test_meshes_are_wound_to_the_side_that_they_are_shaded_on(tmp_path):
+    """A scale below zero turns triangles, and not their normals."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball.vertex_normals  # noqa: B018 - computes them, so that they are written
+    ball.export(tmp_path / "ball.ply", vertex_normal=True)
+    mirrored = '<transform name="to_world"><scale x="-1"/></transform>'
+    for place in ("", mirrored):
+        (tmp_path / "scene.xml").write_text(
+            f"""<scene version="3.0.0"><shape type="ply">{place}
+              <string name="filename" value="ball.ply"/><bsdf type="diffuse"/></shape>
+              <emitter type="constant"/></scene>"""
+        )
+        (part,) = read_parts(tmp_path / "scene.xml", tmp_path).parts
+        triangles = part.triangles
+        a, b, c = (triangles.positions[corner] for corner in triangles.faces.T)
+        outward = (np.cross(b - a, c - a) * (a + b + c)).sum(1) > 0
+        assert triangles.normals is not None and outward.all()
+
+
 # --------------------------------------------------------------------------- what others read of it
 
 

@@ -8,6 +8,7 @@ from scene_texts import BALL, DIFFUSE, ROOM, render
 from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
 from unbake.scene import parse as scenes
+from unbake.scene.free_space import surface_area
 
 
 @pytest.fixture
@@ -146,3 +147,11 @@ def test_a_room_of_rectangles_keeps_light_out(parse):
     path = mi.load_dict({"type": "path", "max_depth": 4})
     image = mi.render(scene, sensor=inside, integrator=path, spp=16)
     assert float(np.array(image)[..., :3].max()) == 0
+
+
+def test_curves_have_no_area_that_is_known(tmp_path):
+    points = tmp_path / "curve.txt"
+    points.write_text("0 0 0 0.1\n0 1 0 0.1\n1 1 0 0.1\n1 2 0 0.1\n")
+    curve = mi.load_dict({"type": "bsplinecurve", "filename": str(points)})
+    assert surface_area(curve) == 0
+    assert surface_area(mi.load_dict({"type": "sphere"})) == pytest.approx(4 * np.pi)

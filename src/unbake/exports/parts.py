@@ -193,7 +193,21 @@ def _of_mesh(mesh: mi.Mesh) -> Triangles:
         normals = unit(np.array(mesh.vertex_normals_buffer(), np.float32).reshape(-1, 3))
     if mesh.has_vertex_texcoords():
         uv = np.array(mesh.vertex_texcoords_buffer(), np.float32).reshape(-1, 2)
-    return _as_seen(mesh, Triangles(positions, faces, normals, uv))
+    return _as_shaded(_as_seen(mesh, Triangles(positions, faces, normals, uv)))
+
+
+def _as_shaded(triangles: Triangles) -> Triangles:
+    """The triangles wound to the side of their normals, which Mitsuba shades by.
+
+    Files may have them the other way around, and a scale below zero turns them.
+    """
+    if triangles.normals is None:
+        return triangles
+    a, b, c = (triangles.positions[corner].astype(np.float64) for corner in triangles.faces.T)
+    shading = triangles.normals[triangles.faces].sum(1)
+    against = (np.cross(b - a, c - a) * shading).sum(1) < 0
+    faces = np.where(against[:, None], triangles.faces[:, ::-1], triangles.faces)
+    return replace(triangles, faces=np.ascontiguousarray(faces))
 
 
 def _as_seen(mesh: mi.Mesh, triangles: Triangles) -> Triangles:

@@ -376,6 +376,12 @@ def _surfaces(scene: mi.Scene) -> list[_Surface]:
 
 def _area(shape: mi.Shape) -> float:
     """The shape's own area; zero if its material is not optimized."""
-    if not has_optimized_material(shape):
+    return surface_area(shape) if has_optimized_material(shape) else 0.0
+
+
+def surface_area(shape: mi.Shape) -> float:
+    """The area of a shape; zero where Mitsuba does not tell it, as of curves."""
+    try:
+        return float(np.asarray(shape.surface_area()).ravel()[0])
+    except RuntimeError:
         return 0.0
-    return float(np.asarray(shape.surface_area()).ravel()[0])

@@ -13,6 +13,7 @@ from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..fields.domain import Domain
 from ..fields.shapes import placed_shapes, registry_number
+from ..scene.free_space import surface_area
 
 #: Points that are drawn from. They lie closer than the cells of L_θ's grid and than pixels.
 POINTS = 1 << 20
@@ -101,7 +102,7 @@ def _sides(scene: mi.Scene) -> list[_Side]:
     sides = []
     for placed in placed_shapes(scene):
         pose = np.eye(4) if placed.to_world is None else placed.to_world
-        area = float(np.ravel(placed.shape.surface_area())[0])
+        area = surface_area(placed.shape)
         area *= abs(np.linalg.det(pose[:3, :3])) ** (2 / 3)
         if placed.shape.bsdf() is not None and np.isfinite(area) and area > 0:
             sides += [_Side(placed.shape, pose[:3], sign, area, _TRIED) for sign in (1.0, -1.0)]
