@@ -155,3 +155,39 @@ def test_curves_have_no_area_that_is_known(tmp_path):
     curve = mi.load_dict({"type": "bsplinecurve", "filename": str(points)})
     assert surface_area(curve) == 0
     assert surface_area(mi.load_dict({"type": "sphere"})) == pytest.approx(4 * np.pi)
+
+
+def test_participating_media_are_left_out(parse, tmp_path):
+    """With a cut-out they were rendered, and without they were not."""
+    fog = '<medium type="homogeneous" name="interior"><float name="sigma_t" value="2"/></medium>'
+    cube = f'<shape type="cube"><bsdf type="null"/>{fog}</shape>'
+    parsed = parse(cube + BALL.format(DIFFUSE))
+    assert parsed.media == 1
+    copied = scenes.parse(scenes.write(parsed, tmp_path))
+    assert copied.media == 0
+    assert not any(shape.is_medium_transition() for shape in copied.instantiate().shapes())
+
+
+@pytest.mark.parametrize(
+    ("shape", "scale", "told"),
+    [
+        ("sphere", 'x="2"', "the sphere is scaled more along one axis"),
+        ("cylinder", 'x="2" y="3"', "the cylinder is scaled more along one axis"),
+        ("cylinder", 'x="2" y="2" z="9"', None),
+        ("sphere", 'value="-2"', None),
+        ("disk", 'x="2"', None),
+        ("rectangle", 'z="0"', "the rectangle has no extent along an axis"),
+        ("sphere", 'value="1e-7"', None),
+    ],
+)
+def test_shapes_that_mitsuba_makes_otherwise_are_told(shape, scale, told, parse):
+    turned = f'<scale {scale}/><rotate y="1" angle="40"/><translate x="100"/>'
+    content = (
+        f'<shape type="{shape}"><transform name="to_world">{turned}</transform>{PAINT}</shape>'
+    )
+    if told is None:
+        assert parse(content).instantiate().bbox().valid()
+        return
+    with pytest.raises(UserError, match=rf"scene.xml.*line.*{told}") as caught:
+        parse(content)
+    assert "\n" not in str(caught.value)

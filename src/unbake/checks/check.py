@@ -175,6 +175,11 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         remedy = "Normals of the triangles take their place. Compute them anew if you want others"
         where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
         result.add(Finding("hint", "normals", what, where, remedy))
+    if parsed.media:
+        what = f"participating media, which are left out: {parsed.media}"
+        remedy = "Fog and murky glass go into the materials behind them"
+        where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
+        result.add(Finding("hint", "media", what, where, remedy))
     cameras = [small_camera(view.camera) for view in dataset.views]
     for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):
         with collected(faults):

@@ -35,6 +35,12 @@ _FOLDERS = {
 }
 
 
+#: Shapes without a file, and how many axes of each must have one scale.
+_ROUND = {"sphere": 3, "cylinder": 2, "disk": 0, "rectangle": 0, "cube": 0}
+#: Scales that differ by this part of the larger one are not the same.
+_UNEVEN = 1e-3
+
+
 @dataclass
 class ParsedScene:
     """A scene before it is instantiated: nodes that `edit` can change."""
@@ -45,6 +51,8 @@ class ParsedScene:
     state: mi.parser.ParserState
     #: Vertex normals that were not numbers, and were replaced when the scene was made.
     repaired_normals: int = 0
+    #: Shapes and sensors whose participating media are left out.
+    media: int = 0
 
     def instantiate(self, *, merge: bool = True) -> mi.Scene:
         """Make the scene, once: the nodes cannot be used again.
@@ -179,8 +187,10 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     scene = ParsedScene(path, root, config, state)
     _require_own_plugins(scene)
     _require_finite(scene)
+    _require_round(scene)
     _require_needed(scene)
     _resolve_files(scene, folders)
+    scene.media = _leave_out_media(scene)
     return scene
 
 
@@ -204,6 +214,22 @@ def write(scene: ParsedScene, folder: Path) -> Path:
     except (RuntimeError, ValueError) as error:
         raise UserError(f"cannot be copied: {reason(error)}", scene.path) from None
     return folder / "scene.xml"
+
+
+def _leave_out_media(scene: ParsedScene) -> int:
+    """Take participating media from shapes and sensors, and count these: nothing here has them."""
+    nodes, count = scene.state.nodes, 0
+    for i, node in enumerate(nodes):
+        media = [
+            key
+            for key in list(node.props)
+            if is_reference(node.props[key])
+            and nodes[node.props[key].index()].type == mi.ObjectType.Medium
+        ]
+        for key in media:
+            del nodes[i].props[key]
+        count += bool(media)
+    return count
 
 
 def _fault(scene: mi.Scene) -> tuple[str, str | None] | None:
@@ -294,6 +320,29 @@ def _require_finite(scene: ParsedScene) -> None:
                     mi.parser.file_location(scene.state, node),
                     "Write a finite number",
                 )
+
+
+def _require_round(scene: ParsedScene) -> None:
+    """Refuse placements of shapes without a file that Mitsuba 3.9 does not make as they say.
+
+    Spheres and cylinders stay round whatever their scale. Flat ones that are flattened once more
+    have normals that are no numbers.
+    """
+    for node in scene.state.nodes:
+        axes = _ROUND.get(node.props.plugin_name())
+        if axes is None or "to_world" not in node.props:
+            continue
+        matrix = np.array(node.props["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+        largest, _, least = np.linalg.svd(matrix, compute_uv=False)
+        fault = remedy = None
+        if least <= 1e-9 * largest:
+            fault, remedy = "has no extent along an axis", "Scale it by more than 0"
+        elif axes and np.ptp(np.linalg.svd(matrix[:, :axes], compute_uv=False)) > _UNEVEN * largest:
+            fault = "is scaled more along one axis than another, and Mitsuba keeps it round"
+            remedy = "Use a mesh instead"
+        if fault is not None:
+            where = mi.parser.file_location(scene.state, node)
+            raise UserError(f"the {node.props.plugin_name()} {fault}", where, remedy)
 
 
 def _require_needed(scene: ParsedScene) -> None:
