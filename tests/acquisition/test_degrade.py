@@ -194,7 +194,16 @@ def test_large_meshes_lose_triangles(cornell, degraded, monkeypatch):
     assert dataset.has_true_materials, "nothing in this room has a texture"
 
 
-def test_textures_are_lost_with_the_coordinates_of_decimated_meshes(cornell, tmp_path, monkeypatch):
+PAINTS = {
+    "bitmap": '<string name="filename" value="paint.exr"/>',
+    "checkerboard": '<rgb name="color0" value="0.2 0.5 0.4"/>',
+}
+
+
+@pytest.mark.parametrize("paint", PAINTS)
+def test_textures_are_lost_with_the_coordinates_of_decimated_meshes(
+    paint, cornell, tmp_path, monkeypatch
+):
     pytest.importorskip("pycolmap", reason="fewer triangles need pycolmap")
     monkeypatch.setattr("unbake.acquisition.degrade.FEWEST", 10)
     data = shutil.copytree(cornell, tmp_path / "data")
@@ -204,8 +213,7 @@ def test_textures_are_lost_with_the_coordinates_of_decimated_meshes(cornell, tmp
     colour = text.index("<rgb", text.index("principled"))
     end = text.index("/>", colour) + 2
     name = re.search(r'name="(\w+)"', text[colour:end])[1]
-    texture = f"""<texture type="bitmap" name="{name}">
-      <string name="filename" value="paint.exr"/></texture>"""
+    texture = f'<texture type="{paint}" name="{name}">{PAINTS[paint]}</texture>'
     scene.write_text(text[:colour] + texture + text[end:])
     assert Dataset.load(data).has_true_materials
     few = degrade(data, tmp_path / "few", DegradeSettings(decimate=0.5), tell=said.append)

@@ -228,3 +228,14 @@ def test_scenes_that_no_camera_fits_into_are_refused():
         place_room(scene(**walls()), 90000, 0)
     with pytest.raises(UserError, match="no shapes"):
         place_object(scene(sky={"type": "constant"}), 2, 1)
+
+
+def test_cameras_of_a_file_say_whether_they_stand_in_a_room():
+    """The scene's own sensor shows the house from outside."""
+    house = scene(**walls(), outside=sensor([0, 0, 6], [0, 0, 0]))
+    assert not is_room(house)
+    inside = Camera.look_at([0, 0, 0.8], [0, 0, 0], [0, 1, 0], 60.0, 8, 8)
+    outside = Camera.look_at([0, 0, 6], [0, 0, 0], [0, 1, 0], 60.0, 8, 8)
+    assert is_room(house, [inside]) and not is_room(house, [outside])
+    thing = scene(thing=box([0, 0, 0], 0.3), front=sensor([0, 0, 0.9], [0, 0, 0]))
+    assert not is_room(thing, [inside])

@@ -150,7 +150,8 @@ def _capture(
         f"{counts['train']} training and {counts['heldout']} held-out views; the training views "
         f"see {100 * seen:.0f} % of the surface"
     )
-    room = is_room(scene)
+    # Cameras of a file may stand elsewhere than the scene's own sensors.
+    room = is_room(scene, () if camera_file is None else [c for _, c in posed])
     rays = CameraRays.of([c for _, c in posed])
     # Stratified samples have a third less variance than independent ones at the same cost.
     spp = samples_of_grid(settings.spp)
@@ -224,6 +225,8 @@ def _copy_scene(
     parsed = parse(source, root)
     if light is not None:
         change_light(parsed, light, allow_outside, tell)
+    if parsed.media:
+        tell(f"participating media are left out: {parsed.media}")
     changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")

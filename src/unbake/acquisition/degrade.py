@@ -312,16 +312,21 @@ def _moved(scene: mi.Scene, cameras: list[Camera], settings: DegradeSettings) ->
     return moved(size)
 
 
+#: Textures that differ over a mesh, by its coordinates or its attributes.
+_LOOKED_INTO = ("bitmap", "checkerboard", "mesh_attribute")
+
+
 def _change_meshes(
     parsed: ParsedScene, folder: DataFolder, settings: DegradeSettings, diagonal: float
 ) -> tuple[list[str], bool]:
     """Move the vertices of all meshes by smooth noise, and leave out some.
 
     Returns:
-        The files it wrote, and whether meshes have lost the coordinates of textures in the scene.
+        The files it wrote, and whether meshes have lost coordinates or colours that textures of
+        the scene may look into.
     """
     files, bare = [], False
-    textured = any(node.props.plugin_name() == "bitmap" for node in parsed.state.nodes)
+    textured = any(node.props.plugin_name() in _LOOKED_INTO for node in parsed.state.nodes)
     for number, node in enumerate(parsed.state.nodes):
         plugin = node.props.plugin_name()
         if node.type != mi.ObjectType.Shape or plugin not in _MESHES:
@@ -335,7 +340,7 @@ def _change_meshes(
             positions += displacement(positions, settings, diagonal)
         faces = np.array(params["faces"]).reshape(-1, 3)
         if settings.decimate < 1 and len(faces) >= FEWEST:
-            bare |= textured and mesh.has_vertex_texcoords()
+            bare |= textured and (mesh.has_vertex_texcoords() or mesh.has_mesh_attributes())
             mesh = decimated(positions, faces, settings.decimate)
         else:
             params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())

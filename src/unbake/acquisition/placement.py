@@ -56,14 +56,25 @@ class _Candidates:
         )
 
 
-def is_room(scene: mi.Scene) -> bool:
+def is_room(scene: mi.Scene, cameras: Sequence[Camera] = ()) -> bool:
     """Whether the scene encloses its cameras (a room) or they stand around it (an object).
 
-    A room has surfaces in 75 % of all directions, on average over the space that the scene's
-    sensors see; without sensors, over the part of the bounding box outside closed objects.
+    A room has surfaces in 75 % of all directions, on average over the space that the cameras see;
+    without cameras, over the part of the bounding box outside closed objects.
+
+    Args:
+        cameras: that take the photographs; without any, the scene's own sensors stand for them.
     """
-    probes = free_space.sensor_probes(scene, 0)
-    if not scene.sensors():
+    if cameras:
+        rng, found = np.random.default_rng(0), []
+        for camera in cameras:
+            x, y = rng.random((2, free_space.PROBES))
+            rays = camera.rays(camera.width * x, camera.height * y)
+            found.append(free_space.probes_along(scene, *rays, rng))
+        probes = np.concatenate(found)
+    else:
+        probes = free_space.sensor_probes(scene, 0)
+    if not cameras and not scene.sensors():
         low, high, _ = free_space.bounds(scene)
         probes = low + (high - low) * np.random.default_rng(0).random((64, 3))
     probes = probes[~free_space.inside_geometry(scene, probes)]

@@ -27,6 +27,8 @@ _RAY_OFFSET = 1e-4
 ROOM_ENCLOSURE = 0.75
 
 _DIRECTIONS = 64
+#: View rays of a camera that tell what space it sees.
+PROBES = 64
 _CHUNK = 1 << 20
 # Segments whose visibility is tested at once: few are slow, and many take memory.
 _SEGMENTS = 1 << 16
@@ -221,22 +223,28 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
     They lie on view rays between the entry into the scene's bounding box and the first surface.
     """
     rng = np.random.default_rng(seed)
-    low, high, diagonal = bounds(scene)
     probes = [np.empty((0, 3))]
     for sensor in scene.sensors():
-        film = mi.Point2f(rng.random((2, 64)).astype(np.float32))
+        film = mi.Point2f(rng.random((2, PROBES)).astype(np.float32))
         ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
-        origins, directions = as_rows(ray.o), as_rows(ray.d)
-        far = trace(scene, origins, directions).distance
-        with np.errstate(divide="ignore", invalid="ignore"):
-            walls = np.stack([(low - origins) / directions, (high - origins) / directions])
-        enter = np.maximum(np.nanmax(walls.min(axis=0), axis=1), 0.0)
-        leave = np.minimum(np.nanmin(walls.max(axis=0), axis=1), far)
-        # A sensor close to the outside of a wall sees no space.
-        usable = leave > enter + CONTACT * diagonal
-        depth = enter + (leave - enter) * rng.random(len(far))
-        probes.append((origins + depth[:, None] * directions)[usable])
+        probes.append(probes_along(scene, as_rows(ray.o), as_rows(ray.d), rng))
     return np.concatenate(probes)
+
+
+def probes_along(
+    scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """The same on view rays, (n, 3) each, of any camera; one at most on each."""
+    low, high, diagonal = bounds(scene)
+    far = trace(scene, origins, directions).distance
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls = np.stack([(low - origins) / directions, (high - origins) / directions])
+    enter = np.maximum(np.nanmax(walls.min(axis=0), axis=1), 0.0)
+    leave = np.minimum(np.nanmin(walls.max(axis=0), axis=1), far)
+    # A camera close to the outside of a wall sees no space.
+    usable = leave > enter + CONTACT * diagonal
+    depth = enter + (leave - enter) * rng.random(len(far))
+    return (origins + depth[:, None] * directions)[usable]
 
 
 def free_positions(scene: mi.Scene, count: int, seed: int) -> np.ndarray:
