@@ -290,9 +290,13 @@ def test_large_scenes_are_capped(refused, monkeypatch):
     assert "has more than 1 MiB of XML" in refused(ROOM.format(" " * (1 << 20)))
 
 
-def test_a_scene_of_one_point_is_refused(refused):
+def test_a_scene_of_one_point_is_refused(refused, tmp_path):
     flat = '<transform name="to_world"><scale value="0"/></transform>'
     told = refused(ROOM.format(f'<shape type="cube">{flat}<bsdf type="diffuse"/></shape>'))
+    assert "the cube has no extent along an axis" in told
+    (tmp_path / "dot.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    file = '<string name="filename" value="dot.obj"/>'
+    told = refused(ROOM.format(f'<shape type="obj">{file}{flat}<bsdf type="diffuse"/></shape>'))
     assert "all shapes of the scene lie in one point" in told
 
 
