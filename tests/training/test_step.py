@@ -307,10 +307,15 @@ def growth(step, state, warm_up, steps):
 
 
 def test_memory_stays_flat(built_in):
-    megabytes, variables = growth(*start(built_in), warm_up=100, steps=300)
-    print(f"{megabytes:.2f} MB, {variables} variables")
-    assert megabytes <= 3
-    assert variables <= 8
+    step, state = start(built_in)
+    # What leaks grows again and again. The allocator may take some more once.
+    for warm_up in (100, 1, 1):
+        megabytes, variables = growth(step, state, warm_up=warm_up, steps=300)
+        print(f"{megabytes:.2f} MB, {variables} variables")
+        assert variables <= 8
+        if megabytes <= 3:
+            return
+    pytest.fail(f"{megabytes:.2f} MB more after 300 steps, three times")
 
 
 @pytest.mark.slow
