@@ -72,9 +72,9 @@ def is_room(scene: mi.Scene, cameras: Sequence[Camera] = ()) -> bool:
             rays = camera.rays(camera.width * x, camera.height * y)
             found.append(free_space.probes_along(scene, *rays, rng))
         probes = np.concatenate(found)
-    else:
+    elif scene.sensors():
         probes = free_space.sensor_probes(scene, 0)
-    if not cameras and not scene.sensors():
+    else:
         low, high, _ = free_space.bounds(scene)
         probes = low + (high - low) * np.random.default_rng(0).random((64, 3))
     probes = probes[~free_space.inside_geometry(scene, probes)]

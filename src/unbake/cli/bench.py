@@ -10,6 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from .. import backend
+from ..config import FitConfig, PresetName
 from ..errors import UserError
 from ..training.run_folder import RunFolder
 from .console import say
@@ -44,6 +45,25 @@ DataSets = Annotated[tuple[Path, ...], arg(metavar="FOLDERS", help_behavior_hint
 _FEWEST = 10
 
 
+def _ready(
+    data: Path | None,
+    scene: str | None,
+    steps: int,
+    preset: PresetName | None,
+    settings: Path | None,
+) -> FitConfig:
+    """The settings that steps are measured with, once the options are known to be good.
+
+    A variant is active from then on.
+    """
+    if data is not None:
+        exclude("data", {"scene": scene})
+    chosen = chosen_settings(preset, settings)
+    require("steps", steps, _FEWEST)
+    backend.activate()
+    return chosen
+
+
 def step(
     data: Folder = None,
     scene: SmallScene = None,
@@ -66,11 +86,7 @@ def step(
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
-    if data is not None:
-        exclude("data", {"scene": scene})
-    chosen = chosen_settings(preset, settings)
-    require("steps", steps, _FEWEST)
-    backend.activate()
+    chosen = _ready(data, scene, steps, preset, settings)
     from ..comparison.method_variant import MethodVariant
     from ..profiling.bench_step import bench_step, small_data
 
@@ -104,11 +120,7 @@ def methods(
         settings: TOML file with settings; instead of --preset.
         out: JSON file to write the numbers to.
     """
-    if data is not None:
-        exclude("data", {"scene": scene})
-    chosen = chosen_settings(preset, settings)
-    require("steps", steps, _FEWEST)
-    backend.activate()
+    chosen = _ready(data, scene, steps, preset, settings)
     from ..comparison.bench_methods import bench_methods
     from ..comparison.method_variant import MethodVariant
     from ..profiling.bench_step import small_data

@@ -79,7 +79,7 @@ def to_principled(scene: ParsedScene) -> int:
 
 
 def _give_bare_shapes_a_bsdf(scene: ParsedScene) -> int:
-    """Give shapes without BSDF, emitter and medium one that is grey, as Mitsuba does.
+    """Give shapes without BSDF and emitter one that is grey, as Mitsuba does.
 
     Returns:
         The number of BSDFs that are new.
@@ -90,7 +90,7 @@ def _give_bare_shapes_a_bsdf(scene: ParsedScene) -> int:
         if node.type != mi.ObjectType.Shape or node.props.plugin_name() in _NO_SURFACES:
             continue
         kinds = {nodes[number].type for number in scene.references(i)}
-        if not kinds & {mi.ObjectType.BSDF, mi.ObjectType.Emitter, mi.ObjectType.Medium}:
+        if not kinds & {mi.ObjectType.BSDF, mi.ObjectType.Emitter}:
             bare.append(i)
     if not bare:
         return 0

@@ -77,27 +77,27 @@ def places(scene: ParsedScene) -> list[np.ndarray | None]:
     ]
 
 
-def squared_distances(scene: mi.Scene, places: Sequence[np.ndarray | None]) -> list[float]:
-    """The squared distance between emitters and what they light, in m²; 1 where there is no place.
+def squared_distances(scene: mi.Scene, positions: Sequence[np.ndarray | None]) -> list[float]:
+    """The squared distance between emitters and what they light, in m²; 1 without a position.
 
     An intensity of so many times a radiance causes light of about that radiance: what arrives
     falls with the squared distance.
 
     Args:
         scene: with surfaces.
-        places: of its emitters, as the function of that name gives them.
+        positions: of its emitters, as `places` gives them.
 
     Returns:
-        For each place the squared median distance to what is seen from there, in all directions.
+        For each position the squared median distance to what is seen from there, in all directions.
         Where that is nothing, the one to the middle of the scene, at least to its corners.
     """
     low, high, diagonal = free_space.bounds(scene)
+    directions = free_space.sphere_directions(_DIRECTIONS)
     found = []
-    for place in places:
+    for place in positions:
         if place is None or not np.isfinite(diagonal):
             found.append(1.0)
             continue
-        directions = free_space.sphere_directions(_DIRECTIONS)
         origins = np.broadcast_to(place, directions.shape)
         away = free_space.trace(scene, origins, directions).distance
         away = away[np.isfinite(away) & (away > 0)]

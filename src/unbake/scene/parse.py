@@ -219,7 +219,7 @@ def write(scene: ParsedScene, folder: Path) -> Path:
 def _leave_out_media(scene: ParsedScene) -> int:
     """Take participating media from shapes and sensors, and count these: nothing here has them."""
     nodes, count = scene.state.nodes, 0
-    for i, node in enumerate(nodes):
+    for node in nodes:
         media = [
             key
             for key in list(node.props)
@@ -227,7 +227,7 @@ def _leave_out_media(scene: ParsedScene) -> int:
             and nodes[node.props[key].index()].type == mi.ObjectType.Medium
         ]
         for key in media:
-            del nodes[i].props[key]
+            del node.props[key]
         count += bool(media)
     return count
 
