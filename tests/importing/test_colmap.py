@@ -22,6 +22,7 @@ from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.frames import _lens
 from unbake.importing.import_data import import_data
 from unbake.importing.settings import ImportSettings
+from unbake.importing.source import Reading
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP models need pycolmap")
 
@@ -112,7 +113,7 @@ def test_the_cameras_of_a_rig_have_their_places(captured, tmp_path):
     found.register_frame(1)
     found.write_binary(str(tmp_path))
     faults = Faults()
-    shots = read_colmap(tmp_path, None, False, faults).shots
+    shots = read_colmap(tmp_path, Reading(), faults).shots
     assert not faults and [shot.name for shot in shots] == ["cam1/0.png", "cam2/0.png"]
     for shot, view in zip(shots, (first, second), strict=True):
         assert np.abs(shot.to_world - view.camera.to_world).max() < 1e-6
@@ -170,12 +171,13 @@ def test_faults_of_a_model_are_told(captured, meshes, tmp_path):
     model_of(captured, project).write_text(str(model))
     names = sorted(file.name for file in (project / "images").iterdir())
     (project / "images" / names[0]).unlink()
-    save(np.zeros((8, 8, 3), np.uint8), project / "images" / names[1])
+    save(np.zeros((8, 9, 3), np.uint8), project / "images" / names[1])
     with pytest.raises(ImportFaults) as caught:
         import_data(project, tmp_path / "data", meshes, tell=quiet)
     assert caught.value.faults == (
-        f"the image does not exist: {names[0]}",
-        f"its camera is for 16 x 16 pixels, it has 8 x 8: {names[1]}",
+        f"the image does not exist: {names[0]}. --leave-out-missing imports the others",
+        f"its camera is for 16 x 16 pixels, it has 9 x 8: {names[1]}. "
+        "Give the photographs that were posed, whole or scaled as a whole",
     )
     (model / "images.txt").write_text("# nothing\n")
     with pytest.raises(ImportFaults, match="no image of the model has a pose"):
@@ -228,7 +230,7 @@ def test_real_models_project_their_points_where_they_were_seen(name, tmp_path):
         header = grey_header(image.camera.width, image.camera.height)
         file.write_bytes(header)
     faults = Faults()
-    shots = {s.name: s for s in read_colmap(model, tmp_path / "images", False, faults).shots}
+    shots = {s.name: s for s in read_colmap(model, Reading(tmp_path / "images"), faults).shots}
     assert not faults and len(shots) == found.num_reg_images()
     errors = []
     for image in found.images.values():

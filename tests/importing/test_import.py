@@ -522,7 +522,7 @@ def test_all_faults_are_told_at_once(nerfstudio, meshes, tmp_path, unbake):
     )  # fmt: skip
     assert outcome.status == 2 and not out.exists()
     *faults, last = outcome.err.splitlines()
-    assert last.endswith("5 faults, listed above. Correct them and import again")
+    assert last.endswith("6 faults, listed above. Correct them and import again")
     told = "\n".join(faults)
     for part in ("the image does not exist", "the image cannot be read (", "truncated",
                  "the key 'transform_matrix' is missing", "none.csv", "broken.glb",
@@ -564,7 +564,7 @@ def set_frame(key, value):
         (set_top("camera_model", "EQUIRECTANGULAR"), "unknown camera_model 'EQUIRECTANGULAR'"),
         (set_top("k4", 0.1), "the lens has k4, k5 or k6"),
         (set_frame("file_path", "/etc/a.png"), "lies outside the source.*--allow-outside"),
-        (set_top("w", 32), "the camera is for 32 x 16, the image has 16 x 16 pixels"),
+        (set_top("w", 32), "its camera is for 32 x 16 pixels, it has 16 x 16"),
         (set_top("applied_transform", [1]), "'applied_transform' is not an array of 3 x 4"),
         (set_top("applied_transform", (2 * np.eye(4)).tolist()), "'applied_transform' is no rota"),
         (set_top("scene", "scene.xml"), "the folder is a data set already"),

@@ -1,12 +1,18 @@
 """Meshes of other programs: every corner of every triangle keeps its place, normal and texture."""
 
+import json
+import struct
+
 import numpy as np
 import pytest
 import trimesh
+from layouts import quiet, write_blender, write_nerfstudio
 
 from unbake.errors import UserError
 from unbake.importing.faults import Faults, ImportFaults
-from unbake.importing.meshes import read_parts, write_scene
+from unbake.importing.import_data import import_data
+from unbake.importing.meshes import TO_Z_UP, read_parts, write_scene
+from unbake.importing.settings import ImportSettings
 from unbake.scene.edit import material_names
 from unbake.scene.parse import parse
 
@@ -171,3 +177,75 @@ def test_a_node_that_flattens_its_mesh_is_a_fault(tmp_path):
     scene.export(tmp_path / "a.glb")
     with pytest.raises(UserError, match="the transform of 'flat' flattens it"):
         parts_of(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    ("extension", "told"),
+    [("KHR_draco_mesh_compression", "Draco"), ("EXT_meshopt_compression", "meshopt"),
+     ("KHR_mesh_quantization", "quantized")],
+)  # fmt: skip
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_packed_gltf_files_are_faults(extension, told, suffix, tmp_path):
+    content = json.dumps({"asset": {"version": "2.0"}, "extensionsRequired": [extension]}).encode()
+    content += b" " * (-len(content) % 4)
+    file = tmp_path / f"packed{suffix}"
+    head = b"glTF" + struct.pack("<III4s", 2, 20 + len(content), len(content), b"JSON")
+    file.write_bytes(head + content if suffix == ".glb" else content)
+    faults = Faults()
+    read_parts([file], faults)
+    with pytest.raises(ImportFaults, match=rf"compressed \({told}\).*without compression"):
+        faults.require_none(file)
+
+
+def test_a_mesh_at_one_point_is_a_fault(tmp_path):
+    mesh = trimesh.creation.box()
+    mesh.vertices[:] = 2.0
+    mesh.export(tmp_path / "point.glb")
+    with pytest.raises(ImportFaults, match="all vertices of the mesh lie at one point"):
+        parts_of(tmp_path / "point.glb")
+
+
+def test_meshes_with_y_up_are_turned(captured, tmp_path):
+    """Blender's glTF export turns z up into y up: (x, y, z) into (x, z, -y)."""
+    write_blender(captured, tmp_path / "blender")
+    box = trimesh.creation.box((1, 2, 3))
+    box.apply_translation((0.1, 0.2, 0.3))
+    turned = box.copy()
+    turned.apply_transform(np.linalg.inv(TO_Z_UP))
+    turned.export(tmp_path / "turned.glb")
+    settings = ImportSettings(mesh_y_up=True)
+    source, out = tmp_path / "blender", tmp_path / "data"
+    import_data(source, out, [tmp_path / "turned.glb"], settings, tell=quiet)
+    (part,) = parts_of(*(out / "scene" / "meshes").iterdir())
+    assert np.allclose(sorted(part.positions.tolist()), sorted(box.vertices.tolist()), atol=1e-6)
+    corners = part.positions[part.faces]
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ni,ni->n", outwards, corners.mean(1) - (0.1, 0.2, 0.3)) > 0).all()
+
+
+def test_meshes_of_ns_export_are_taken_back(captured, tmp_path):
+    """Nerfstudio trains where `scale * transform` takes the cameras of COLMAP."""
+    write_nerfstudio(captured, tmp_path / "nerf")
+    angle, scale = 0.7, 0.25
+    transform = np.eye(4)
+    transform[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    transform[:3, 3] = (0.5, -1.0, 2.0)
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": transform[:3].tolist(), "scale": scale}))
+    box = trimesh.creation.icosphere(1)
+    trained = box.copy()
+    trained.apply_transform(np.diag([scale, scale, scale, 1]) @ transform)
+    trained.export(tmp_path / "trained.ply", vertex_normal=True)
+    given = [tmp_path / "trained.ply"]
+    more = {"mesh_transform": file, "tell": quiet}
+    import_data(tmp_path / "nerf", tmp_path / "data", given, **more)
+    (part,) = parts_of(*(tmp_path / "data" / "scene" / "meshes").iterdir())
+    assert np.allclose(part.positions, box.vertices, atol=1e-5)
+    assert np.allclose(part.normals, box.vertex_normals, atol=1e-5)
+    both = ImportSettings(keep_applied_transform=True)
+    with pytest.raises(ImportFaults, match="--keep-applied-transform leaves cameras in another"):
+        import_data(tmp_path / "nerf", tmp_path / "none", given, both, **more)
+    for wrong, told in (({"scale": 0.0}, "'scale' is not positive"), ({"transform": 1}, "3 x 4")):
+        file.write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1} | wrong))
+        with pytest.raises(ImportFaults, match=told):
+            import_data(tmp_path / "nerf", tmp_path / "none", given, **more)

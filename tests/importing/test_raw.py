@@ -145,6 +145,27 @@ def test_camera_raw_takes_the_place_of_photographs(captured, project, meshes, tm
     assert any("(2.0 stops apart), by EXIF" in line for line in told)
 
 
+def test_edges_that_photographs_lack_are_cut_off(captured, meshes, tmp_path):
+    """Sensors have some rows and columns that the camera's own JPEG file lacks."""
+    wide, tall, edge = 104, 104, 2
+    light = np.full((tall + edge, wide + edge, 3), 0.5)
+    light[:1], light[-1:], light[:, :1], light[:, -1:] = 0.05, 0.05, 0.05, 0.05
+    write_dng(tmp_path / "nerf" / "a.dng", light)
+    lens = {"fl_x": 80.0, "fl_y": 80.0, "w": wide, "h": tall}
+    pose = captured.views[0].camera.to_world.tolist()
+    frames = [{"file_path": "a.jpg", "transform_matrix": pose}]
+    write_json(tmp_path / "nerf" / "transforms.json", lens | {"frames": frames})
+    import_data(tmp_path / "nerf", tmp_path / "data", meshes, tell=quiet)
+    (view,) = Dataset.load(tmp_path / "data").views
+    pixels = read_photograph(view)[..., :3]
+    assert pixels.shape == (tall, wide, 3)
+    for side in (pixels[1], pixels[-2], pixels[:, 1], pixels[:, -2]):
+        assert side[2:-2] == pytest.approx(0.5, abs=2e-3)
+    write_json(tmp_path / "nerf" / "transforms.json", lens | {"w": 96} | {"frames": frames})
+    with pytest.raises(ImportFaults, match="its camera is for 96 x 104 pixels, it has 106 x 106"):
+        import_data(tmp_path / "nerf", tmp_path / "none", meshes, tell=quiet)
+
+
 def test_photographs_have_one_white_balance(project, meshes, tmp_path):
     write_dng(project / "jpg" / "1.DNG", grey(0.4, 0.2, 0.1), 100, (0.4, 1.0, 0.8))
     told = []

@@ -218,7 +218,9 @@ def import_(
     out: Out,
     mesh: Meshes = (),
     images: Folder = None,
+    masks: Folder = None,
     exposures: File = None,
+    mesh_transform: File = None,
     envmap: File = None,
     lights: File = None,
     allow_outside: Flag = False,
@@ -240,8 +242,13 @@ def import_(
         mesh: Mesh (PLY, OBJ, GLB), which only FIPT rooms have themselves; may be given several
             times.
         out: Folder to write to, new or empty.
-        images: Folder of the photographs, where it is not the one that the source names.
+        images: Folder of the photographs, where it is not the one that the source names; they may
+            have been made smaller as a whole.
+        masks: Folder of masks, black where a pixel does not count: NAME.jpg.png or NAME.png for
+            NAME.jpg. By default the one that the source names.
         exposures: Table (CSV) with the columns name and exposure, instead of EXIF.
+        mesh_transform: The dataparser_transforms.json of a nerfstudio run, whose ns-export wrote
+            the mesh: takes the mesh back to the frame of COLMAP.
         envmap: Environment map (OpenEXR, HDR) that is the known light.
         lights: Mitsuba XML file with the known lights: emitters, and shapes that emit light.
         allow_outside: Read files that the source and --lights name outside of their folders.
@@ -254,7 +261,13 @@ def import_(
     from ..importing.import_data import import_data
 
     start = time.perf_counter()
-    files: dict[str, Any] = {"images": images, "exposures": exposures, "light": known}
+    files: dict[str, Any] = {
+        "images": images,
+        "masks": masks,
+        "exposures": exposures,
+        "mesh_transform": mesh_transform,
+        "light": known,
+    }
     try:
         import_data(source, out, mesh, chosen, **files, allow_outside=allow_outside, tell=say)
     except ImportFaults as error:

@@ -138,6 +138,6 @@ def _read_tiff(path: Path) -> np.ndarray:
         raise _Unreadable("16 bits of TIFF need tifffile: pip install 'unbake[import]'") from None
     with TiffFile(path) as file:
         page = file.pages[0]
-        if page.planarconfig != 1 and page.samplesperpixel > 1:
-            raise _Unreadable("its channels lie one after the other")
-        return np.asarray(page.asarray())
+        codes = np.asarray(page.asarray())
+        apart = page.planarconfig != 1 and page.samplesperpixel > 1
+        return np.moveaxis(codes, 0, 2) if apart else codes

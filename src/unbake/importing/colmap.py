@@ -14,11 +14,12 @@ from ..errors import UserError, named
 from ..imaging.headers import CODED_SUFFIXES, SUFFIXES
 from .faults import Faults
 from .lens import Lens
-from .source import Shot, Source, find_image, first_folder, image_header
+from .source import Reading, Shot, Source, find_image, first_folder, suited
 
 #: Folders of a project that its model may lie in, and those that images lie in beside it.
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", "model")
 _IMAGES = ("images", "input")
+_MASKS = "masks"
 _ENDINGS = (".bin", ".txt")
 _STRAIGHT = ("PINHOLE", "SIMPLE_PINHOLE")
 _SPHERICAL = ("EQUIRECTANGULAR",)
@@ -34,20 +35,19 @@ def _is_model(folder: Path) -> bool:
     return any(all((folder / f"{n}{end}").is_file() for n in names) for end in _ENDINGS)
 
 
-def read_colmap(model: Path, images: Path | None, allow_outside: bool, faults: Faults) -> Source:
+def read_colmap(model: Path, reading: Reading, faults: Faults) -> Source:
     """The photographs of a COLMAP model: rigs, shared cameras, and images in folders included.
 
     Args:
         model: the folder of `cameras`, `images` and `points3D`, `.bin` or `.txt`.
-        images: the folder of the images; None: the first of `images` beside the model or in one of
-            the two folders above it.
-        allow_outside: read images that lie outside of their folder.
+        reading: without a folder of images, that is the first `images` beside the model or in one
+            of the folders above it. Masks lie in `masks` beside it.
         faults: all that is wrong is added to it.
 
     Raises:
         UserError: pycolmap is missing, or cannot read the model.
     """
-    found = images or _folder_of_images(model)
+    found = reading.images or _folder_of_images(model)
     if found is None or not found.is_dir():
         faults.add("there is no folder of images (name it with --images)", found)
         found = None
@@ -62,11 +62,26 @@ def read_colmap(model: Path, images: Path | None, allow_outside: bool, faults: F
         with faults.collected(image.name):
             if image.camera_id not in lenses:
                 lenses[image.camera_id] = _lens(image.camera)
-            shots.append(_shot(image, lenses[image.camera_id], found, allow_outside))
+            file = find_image(
+                found, image.name, "folder of images", allow_outside=reading.allow_outside
+            )
+            if reading.has(file, image.name):
+                shots.append(_shot(image, lenses[image.camera_id], file))
     if not shots and not faults:
-        faults.add("no image of the model has a pose", model)
+        what = (
+            "no photograph of the model exists"
+            if reading.missing
+            else "no image of the model has a pose"
+        )
+        faults.add(what, model)
     ordered = tuple(sorted(shots, key=lambda shot: shot.name))
-    return Source("COLMAP", ordered, (*_other_models(model), *_without_pose(ordered, found)))
+    masks = None if found is None else found.parent / _MASKS
+    return Source(
+        "COLMAP",
+        ordered,
+        (*_other_models(model), *_without_pose(ordered, found)),
+        masks=masks if masks is not None and masks.is_dir() else None,
+    )
 
 
 def _other_models(model: Path) -> list[str]:
@@ -113,18 +128,11 @@ def _is_binary(model: Path) -> bool:
     return (model / "cameras.bin").is_file()
 
 
-def _shot(image: Any, lens: Lens, folder: Path, allow_outside: bool) -> Shot:
-    name = image.name
-    file = find_image(folder, name, "folder of images", allow_outside=allow_outside)
-    header = image_header(file)
-    if (header.width, header.height) != (lens.width, lens.height):
-        size = f"{header.width} x {header.height}"
-        told = f"its camera is for {lens.width} x {lens.height} pixels, it has {size}"
-        raise UserError(told, name)
+def _shot(image: Any, lens: Lens, file: Path) -> Shot:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
     # COLMAP's cameras look along z with y down.
-    return Shot(name, None, file, lens, pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    return Shot(image.name, None, file, suited(lens, file), pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
 
 def _lens(camera: Any) -> Lens:

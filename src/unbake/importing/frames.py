@@ -15,7 +15,7 @@ from ..errors import UserError, named, printable
 from ..io import array, number, read_object, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
-from .source import Shot, Source, find_image, image_header
+from .source import Reading, Shot, Source, find_image, image_header, suited
 
 #: The files of a folder with one file a split, and our names of the splits.
 SPLIT_FILES = {
@@ -37,19 +37,19 @@ _SPLITS = {
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _LENSES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
+_INSTANT_NGP = (
+    f"{TRANSFORMS} is of instant-ngp, which turns and scales cameras unless colmap2nerf.py is run "
+    "with --keep_colmap_coords: a mesh of COLMAP then does not fit"
+)
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def read_one_file(
-    file: Path, images: Path | None, keep_frame: bool, allow_outside: bool, faults: Faults
-) -> Source:
+def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
     """A folder with one `transforms.json`, as nerfstudio, instant-ngp and others write it.
 
     Args:
         file: the JSON file.
-        images: folder of the images instead of that of the file; None: that of the file.
-        keep_frame: leave cameras in the frame of the file, where it has an `applied_transform`.
-        allow_outside: read images that lie outside of the folder.
+        reading: where images are, and whether `applied_transform` is taken back.
         faults: all that is wrong is added to it.
     """
     top = None
@@ -60,9 +60,9 @@ def read_one_file(
     if "scene" in top:
         faults.add(f"the folder is a data set already: {file.name} names a 'scene'")
         return Source("data set", ())
-    back, notes = _taken_back(top, file, keep_frame, faults)
+    back, notes = _taken_back(top, file, reading.keep_applied_transform, faults)
     splits = _listed_splits(top, file, faults)
-    shots = _read_frames(file, top, images, None, allow_outside, faults)
+    shots = _read_frames(file, top, reading, None, faults)
     placed = [
         Shot(
             shot.name,
@@ -108,9 +108,7 @@ def _unknown_names(top: dict[str, Any], splits: Mapping[PurePosixPath, str]) -> 
     return (f"lists of splits name images that no frame has: {named(unknown)}",)
 
 
-def read_split_files(
-    folder: Path, images: Path | None, allow_outside: bool, faults: Faults
-) -> Source:
+def read_split_files(folder: Path, reading: Reading, faults: Faults) -> Source:
     """A folder with `transforms_train.json` and its like; arguments as in `read_one_file`.
 
     The views of `transforms_test.json` are held out; those of `transforms_val.json` where there is
@@ -121,7 +119,7 @@ def read_split_files(
     found = {name: folder / name for name in SPLIT_FILES if (folder / name).is_file()}
     notes = []
     for name in [name for name, split in SPLIT_FILES.items() if split == "heldout"]:
-        if name in found and _without_pictures(found[name], images, allow_outside):
+        if name in found and _without_pictures(found[name], reading):
             del found[name]
             notes.append(f"{name} is left out: its cameras have no pictures")
     if {"transforms_test.json", "transforms_val.json"} <= found.keys():
@@ -131,13 +129,13 @@ def read_split_files(
     for name, file in found.items():
         split = None if alone else SPLIT_FILES[name]
         with faults.collected():
-            shots += _read_frames(file, read_object(file), images, split, allow_outside, faults)
+            shots += _read_frames(file, read_object(file), reading, split, faults)
     if "transforms_train.json" not in found:
         faults.add("there is no transforms_train.json")
     return Source("Blender", tuple(shots), tuple(notes))
 
 
-def _without_pictures(file: Path, images: Path | None, allow_outside: bool) -> bool:
+def _without_pictures(file: Path, reading: Reading) -> bool:
     """Whether a file is one of cameras alone: without frames, or without the image of any frame."""
     frames = None
     with suppress(UserError):
@@ -151,7 +149,7 @@ def _without_pictures(file: Path, images: Path | None, allow_outside: bool) -> b
 
     def has_image(name: str) -> bool:
         try:
-            return _image(file.parent, _slashed(name), images, allow_outside).is_file()
+            return _image(file.parent, name, reading)[1].is_file()
         except UserError:  # which is told, too
             return True
 
@@ -160,15 +158,14 @@ def _without_pictures(file: Path, images: Path | None, allow_outside: bool) -> b
 
 def _slashed(name: str) -> str:
     """The name of a file as it is here, where Windows wrote it."""
-    return name if "/" in name else name.replace("\\", "/")
+    return name.replace("\\", "/")
 
 
 def _read_frames(
     file: Path,
     top: dict[str, Any],
-    images: Path | None,
+    reading: Reading,
     split: str | None,
-    allow_outside: bool,
     faults: Faults,
 ) -> list[Shot]:
     frames, shots = top.get("frames"), []
@@ -181,7 +178,7 @@ def _read_frames(
             faults.add("the frame is not an object", place)
             continue
         with faults.collected(place):
-            shots.append(_shot(file, top, frame, images, split, allow_outside, faults))
+            shots.append(_shot(file, top, frame, reading, split, faults))
     return [shot for shot in shots if shot is not None]
 
 
@@ -189,24 +186,25 @@ def _shot(
     file: Path,
     top: dict[str, Any],
     frame: dict[str, Any],
-    images: Path | None,
+    reading: Reading,
     split: str | None,
-    allow_outside: bool,
     faults: Faults,
 ) -> Shot | None:
-    """A frame; None where its image, pose or lens is faulty, each of which is told."""
-    name = _slashed(text(frame, "file_path", file.name))
+    """A frame; None where its image, pose or lens is faulty, each of which is told, or left out."""
+    name = text(frame, "file_path", file.name)
     image = mask = pose = lens = None
     with faults.collected(name):
-        image = _image(file.parent, name, images, allow_outside)
+        name, image = _image(file.parent, name, reading)
+        if not reading.has(image, name):
+            return None
         header = image_header(image)
-        lens = _lens(with_top(top, frame), header.width, header.height, name)
+        lens = suited(_lens(with_top(top, frame), header.width, header.height, name), image)
     with faults.collected(f"{file.name}: {name}"):
         pose = _pose(frame, name)
     if "mask_path" in frame:
         with faults.collected(frame["mask_path"]):
             said = text(frame, "mask_path", name)
-            mask = find_image(file.parent, said, "source", allow_outside=allow_outside)
+            mask = _named_file(file.parent, said, reading)[1]
             image_header(mask)
     if image is None or lens is None or pose is None:
         return None
@@ -230,21 +228,33 @@ def _own_split(frame: dict[str, Any]) -> str | None:
     return _SPLITS[said]
 
 
-def _image(folder: Path, name: str, images: Path | None, allow_outside: bool) -> Path:
-    """The file of an image.
+def _named_file(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
+    """A file that a frame names, and its name as it is here: Windows separates by backslashes."""
+    outside = reading.allow_outside
+    file = find_image(folder, name, "source", allow_outside=outside)
+    if file.is_file() or "\\" not in name:
+        return name, file
+    name = _slashed(name)
+    return name, find_image(folder, name, "source", allow_outside=outside)
+
+
+def _image(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
+    """The name and the file of an image.
 
     Args:
         folder: of the JSON file.
         name: of the image there.
-        images: has it instead, by this name, or by the end of it: `0001.png` of `images/0001.png`.
-        allow_outside: it may lie outside of its folder.
+        reading: its folder of images has it instead, by this name, or by the end of it: `0001.png`
+            of `images/0001.png`.
     """
-    if images is None:
-        return find_image(folder, name, "source", allow_outside=allow_outside)
+    if reading.images is None:
+        return _named_file(folder, name, reading)
+    name = _slashed(name)
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     ends = [str(PurePosixPath(*parts[first:])) for first in range(len(parts))] or [name]
-    files = [find_image(images, end, "source", allow_outside=allow_outside) for end in ends]
-    return next((file for file in files if file.is_file()), files[0])
+    outside = reading.allow_outside
+    files = [find_image(reading.images, end, "source", allow_outside=outside) for end in ends]
+    return name, next((file for file in files if file.is_file()), files[0])
 
 
 def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
@@ -257,7 +267,7 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
-    """The lens of a frame; `width` and `height` are those of its image."""
+    """The lens of a frame; `width` and `height` are those of its image, where it tells none."""
     # instant-ngp has no model, but a flag.
     model = _FISHEYE if keys.get("is_fisheye") is True else keys.get("camera_model", "OPENCV")
     if model not in (*_PINHOLES, *_LENSES, _FISHEYE):
@@ -267,9 +277,6 @@ def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
     if "w" not in plain or "h" not in plain:
         plain |= {"w": width, "h": height}
     camera = camera_from_frame(plain, {}, where)
-    if (camera.width, camera.height) != (width, height):
-        told = f"{camera.width} x {camera.height}, the image has {width} x {height} pixels"
-        raise UserError(f"the camera is for {told}", where)
     values = {k: number(dict(keys), k, where) for k in _DISTORTION if k in keys}
     k1, k2, k3, k4, k5, k6, p1, p2 = (values.get(k, 0.0) for k in _DISTORTION)
     focal, centre = (camera.fl_x, camera.fl_y), (camera.cx, camera.cy)
@@ -280,7 +287,7 @@ def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
         if k4 or k5 or k6:
             raise UserError("the lens has k4, k5 or k6, which programs use differently", where)
         project = opencv(focal, centre, np.array([k1, k2, k3]), p1, p2)
-    return Lens(width, height, *focal, *centre, project)
+    return Lens(camera.width, camera.height, *focal, *centre, project)
 
 
 def _taken_back(
@@ -291,7 +298,10 @@ def _taken_back(
     def same(pose: np.ndarray) -> np.ndarray:
         return pose
 
-    if keep or ("applied_transform" not in top and "applied_scale" not in top):
+    if "applied_transform" not in top and "applied_scale" not in top:
+        # instant-ngp writes the key; its script turns and scales what COLMAP found by default.
+        return same, (_INSTANT_NGP,) if "aabb_scale" in top else ()
+    if keep:
         return same, ()
     applied, scale = np.eye(4), 1.0
     with faults.collected(file.name):

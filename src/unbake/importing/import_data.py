@@ -12,6 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from PIL import Image
 
 from ..acquisition.new_light import put_light
 from ..config.light import LightConfig
@@ -21,6 +22,7 @@ from ..dataset.views import LONGEST_NAME, PIXEL_BYTES, counted_by, read_radiance
 from ..errors import UserError
 from ..imaging.coded import decode, encode, read_codes
 from ..imaging.pictures import write_exr
+from ..imaging.profiles import linear_srgb, profile_name, read_profile
 from ..io import filled_folder, require_new_folder, require_utf8, write_atomically
 from ..memory import require_memory
 from ..scene import free_space, relight
@@ -30,12 +32,12 @@ from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import Lens
-from .meshes import Part, read_parts, write_scene
+from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
 from .raw import CLIPPED as CLIPPED_RAW
 from .raw import raw_balance, raw_told, read_raw
 from .rooms import is_room, read_room
 from .settings import ImportSettings
-from .source import Shot, Source, image_header
+from .source import Reading, Shot, Source, image_header, masks_in, same_shape
 
 #: Codes at and above this share of the largest one are taken for clipped: 250 of 255.
 CLIPPED_CODE = 250 / 255
@@ -56,7 +58,9 @@ def import_data(
     settings: ImportSettings | None = None,
     *,
     images: str | Path | None = None,
+    masks: str | Path | None = None,
     exposures: str | Path | None = None,
+    mesh_transform: str | Path | None = None,
     light: LightConfig | None = None,
     allow_outside: bool = False,
     tell: Callable[[str], None] = print,
@@ -73,7 +77,9 @@ def import_data(
         meshes: PLY, OBJ or GLB files; none are needed where the source has its own (FIPT).
         settings: None: the defaults.
         images: folder of the images, where it is not the source's own.
+        masks: folder of masks, where it is not the source's own: zero where pixels do not count.
         exposures: table of `name,exposure`; None: EXIF tells.
+        mesh_transform: nerfstudio's `dataparser_transforms.json`, which is taken back of the mesh.
         light: the known light; None: the light is unknown, and a constant environment stands for
             it.
         allow_outside: read files that lie outside of the source.
@@ -86,14 +92,19 @@ def import_data(
     require_new_folder(out)
     require_utf8(source, "source")
     faults = Faults()
-    found = _read_source(
-        source, None if images is None else Path(images), settings, allow_outside, faults
+    reading = Reading(
+        None if images is None else Path(images),
+        allow_outside,
+        settings.keep_applied_transform,
+        settings.leave_out_missing,
     )
+    found = _read_source(source, reading, faults)
+    found = masks_in(found, None if masks is None else Path(masks), faults)
     given = [Path(mesh) for mesh in meshes] or ([] if found.mesh is None else [found.mesh])
     if not given:
         faults.add("no mesh was given (--mesh FILE)")
     found = _balanced(found)
-    parts = read_parts(given, faults)
+    parts = _placed(read_parts(given, faults), settings, mesh_transform, faults)
     known, told = exposures_of(found.shots)
     if exposures is not None:
         with faults.collected():
@@ -119,7 +130,8 @@ def import_data(
         for shot in found.shots:
             cut = background == "hidden" and shot.name not in pictures.transparent
             on_mesh = _on_mesh(scene, shot.lens.camera(shot.to_world)) if cut else None
-            same = shot.lens.straight and not shot.raw and shot.name not in pictures.negative
+            changed = pictures.negative | pictures.profiles.keys()
+            same = shot.lens.straight and not shot.raw and shot.name not in changed
             name, split = names[shot.name], splits[shot.name]
             frames.append(_write_view(data, shot, name, split, known, on_mesh, same=same))
         _complete_masks(data, frames)
@@ -128,6 +140,8 @@ def import_data(
             | ({"light": "unknown"} if light is None else {})
             | {"frames": frames}
         )
+    notes = (*reading.notes(), *_scaled(found.shots), *pictures.told())
+    found = replace(found, notes=(*found.notes, *notes))
     for line in _summary(found, splits, seen, parts, told):
         tell(line)
     if pictures.negative:
@@ -144,29 +158,38 @@ def import_data(
 # ------------------------------------------------------------------------------------------ reading
 
 
-def _read_source(
-    source: Path,
-    images: Path | None,
-    settings: ImportSettings,
-    allow_outside: bool,
-    faults: Faults,
-) -> Source:
+def _read_source(source: Path, reading: Reading, faults: Faults) -> Source:
     folder = source if source.is_dir() else source.parent
     if not source.exists():
         raise UserError("the source does not exist", source, "Check the path")
     if source.suffix == ".json" and source.name not in SPLIT_FILES:
-        return read_one_file(source, images, settings.keep_applied_transform, allow_outside, faults)
+        return read_one_file(source, reading, faults)
     if any((folder / name).is_file() for name in SPLIT_FILES):
-        return read_split_files(folder, images, allow_outside, faults)
+        return read_split_files(folder, reading, faults)
     if (folder / TRANSFORMS).is_file():
-        file = folder / TRANSFORMS
-        return read_one_file(file, images, settings.keep_applied_transform, allow_outside, faults)
+        return read_one_file(folder / TRANSFORMS, reading, faults)
     if is_room(folder):
-        return read_room(folder, images, allow_outside, faults)
+        return read_room(folder, reading, faults)
     model = find_model(folder)
     if model is not None:
-        return read_colmap(model, images, allow_outside, faults)
+        return read_colmap(model, reading, faults)
     raise UserError("no cameras were found in the source", source, _KNOWN)
+
+
+def _placed(
+    parts: list[Part], settings: ImportSettings, transform: str | Path | None, faults: Faults
+) -> list[Part]:
+    """The parts in the frame of the cameras."""
+    if transform is not None:
+        if settings.keep_applied_transform:
+            what = (
+                "a mesh is taken back to the frame of COLMAP, and --keep-applied-transform leaves "
+            )
+            faults.add(f"{what}cameras in another", remedy="Leave one of them out")
+        with faults.collected(transform):
+            back = read_transform(Path(transform))
+            parts = [part.moved(back) for part in parts]
+    return [part.moved(TO_Z_UP) for part in parts] if settings.mesh_y_up else parts
 
 
 def _balanced(source: Source) -> Source:
@@ -238,17 +261,30 @@ class _Pictures:
         with_alpha: have an alpha channel.
         transparent: have pixels whose alpha is less than 1.
         negative: have negative radiance.
+        profiles: the names of colour profiles that are not those of sRGB.
     """
 
     with_alpha: set[str] = field(default_factory=set)
     transparent: set[str] = field(default_factory=set)
     negative: set[str] = field(default_factory=set)
+    profiles: dict[str, str] = field(default_factory=dict)
+
+    def told(self) -> list[str]:
+        """What was changed of the colours, for people."""
+        count = Counter(self.profiles.values())
+        return [
+            f"colours: {n} photographs have the profile {name}, converted to sRGB"
+            for name, n in sorted(count.items())
+        ]
 
     def add(self, shot: Shot, pixels: np.ndarray) -> None:
         """Take a photograph into account: (H, W, 4)."""
         if (pixels[..., 3] < 1).any():
             self.transparent.add(shot.name)
-        if (pixels < 0).any():
+        profile = _profile(shot)
+        if profile is not None:
+            self.profiles[shot.name] = profile_name(profile)
+        elif (pixels < 0).any():
             self.negative.add(shot.name)
         if shot.name in self.transparent or image_header(shot.image).channels in (2, 4):
             self.with_alpha.add(shot.name)
@@ -270,7 +306,7 @@ def _check_pictures(shots: Sequence[Shot], faults: Faults) -> _Pictures:
             continue
         with faults.collected(shot.mask):
             header = image_header(shot.mask)
-            if (header.width, header.height) != size:
+            if not same_shape((header.width, header.height), size):
                 raise UserError("the mask has another size than its image")
             _mask(shot)
     return found
@@ -281,9 +317,13 @@ def _pixels(shot: Shot) -> np.ndarray:
     need = PIXEL_BYTES * shot.lens.width * shot.lens.height
     require_memory(need, "the image needs", "Use a smaller image", shot.name)
     if shot.coded:
-        return decode(read_codes(shot.image))
+        codes, profile = read_codes(shot.image), _profile(shot)
+        pixels = decode(codes)
+        if profile is not None and codes.shape[2] >= 3:
+            pixels[..., :3] = linear_srgb(codes[..., :3], profile) * pixels[..., 3:]
+        return pixels
     if shot.raw:
-        linear = read_raw(shot.image, shot.balance)
+        linear = read_raw(shot.image, shot.balance, shot.size)
         return np.concatenate([linear, np.ones_like(linear[..., :1])], 2)
     pixels = read_radiance(shot.image, shot.lens.width, shot.lens.height)
     return pixels.reshape(shot.lens.height, shot.lens.width, 4)
@@ -291,11 +331,46 @@ def _pixels(shot: Shot) -> np.ndarray:
 
 def _mask(shot: Shot) -> np.ndarray | None:
     """Which pixels count, (H, W) bool; None: all do."""
-    mask = None if shot.mask is None else counted_by(read_codes(shot.mask))
-    told = raw_told(shot.image, shot.balance) if shot.raw else None
+    mask = None if shot.mask is None else _of_size(counted_by(read_codes(shot.mask)), shot.size)
+    told = raw_told(shot.image, shot.balance, shot.size) if shot.raw else _told(shot)
     if told is None or told.all():
         return mask
     return told if mask is None else mask & told
+
+
+def _of_size(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask for an image that was made smaller or larger: a pixel counts if all of it does."""
+    if mask.shape == size[::-1]:
+        return mask
+    share = Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).resize(
+        size, Image.Resampling.BOX
+    )
+    return np.equal(np.asarray(share), 255)
+
+
+def _told(shot: Shot) -> np.ndarray | None:
+    """As `raw_told`, of a photograph whose colours are mixed to those of sRGB; None: all pixels."""
+    if _profile(shot) is None:
+        return None
+    codes = read_codes(shot.image)[..., :3]
+    clipped = codes >= CLIPPED_CODE * np.iinfo(codes.dtype).max
+    return np.logical_or(clipped.all(2), ~clipped.any(2))
+
+
+def _profile(shot: Shot) -> bytes | None:
+    """The colour profile of a photograph, unless it is that of sRGB."""
+    return read_profile(shot.image) if shot.coded else None
+
+
+def _scaled(shots: Sequence[Shot]) -> list[str]:
+    """A note of cameras that were made for images of another size."""
+    changed = [shot for shot in shots if shot.lens.scale != 1]
+    if not changed:
+        return []
+    every = "" if len(changed) == len(shots) else f"{len(changed)} "
+    sizes = sorted({shot.lens.scale for shot in changed})
+    by = f"{sizes[0]:.3g}" if len(sizes) == 1 else f"{sizes[0]:.3g} to {sizes[-1]:.3g}"
+    return [f"{every}cameras are scaled by {by}, to the size of their photographs"]
 
 
 def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:
@@ -470,8 +545,14 @@ def _clipped(shot: Shot) -> float | None:
         return CLIPPED_RAW
     if not shot.coded:
         return None
-    code = np.full((1, 1, 1), round(CLIPPED_CODE * 255), np.uint8)
-    return round(float(decode(code)[0, 0, 0]), 6)
+    profile = _profile(shot)
+    if profile is None:
+        code = np.full((1, 1, 1), round(CLIPPED_CODE * 255), np.uint8)
+        return round(float(decode(code)[0, 0, 0]), 6)
+    # The least that any mixture of clipped colours can be.
+    codes = np.array([round(CLIPPED_CODE * 255), 255], np.uint8)
+    mixtures = np.stack(np.meshgrid(codes, codes, codes), -1).reshape(1, -1, 3)
+    return round(float(linear_srgb(mixtures, profile).min()), 6)
 
 
 # ------------------------------------------------------------------------------------------ telling

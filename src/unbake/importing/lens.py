@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +36,7 @@ class Lens:
         fl_x, fl_y: focal lengths in pixels; of a distorted lens those in its middle.
         cx, cy: principal point in pixels from the upper left corner.
         project: of a distorted lens; None: a pinhole.
+        scale: of the photograph, relative to the one that the camera was made for.
     """
 
     width: int
@@ -44,11 +46,43 @@ class Lens:
     cx: float
     cy: float
     project: Projection | None = None
+    scale: float = 1.0
 
     @property
     def straight(self) -> bool:
         """Whether photographs can stay as they are: a pinhole with square pixels."""
         return self.project is None and abs(self.fl_x / self.fl_y - 1) <= _SQUARE
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """The lens of the same photograph with other numbers of pixels, as a whole.
+
+        Sizes are rounded to whole pixels: square ones stay square, which moves no point by more
+        than half of that rounding.
+        """
+        across, down = width / self.width, height / self.height
+        project = self.project
+        if project is None:
+            if self.straight:
+                both = math.sqrt(across * down)
+                focal = (self.fl_x * both, self.fl_y * both)
+            else:
+                focal = (self.fl_x * across, self.fl_y * down)
+            middle = self.cx * across, self.cy * down
+            return Lens(width, height, *focal, *middle, scale=self.scale * across)
+
+        def smaller(points: np.ndarray) -> np.ndarray:
+            return project(points) * (across, down)
+
+        return Lens(
+            width,
+            height,
+            self.fl_x * across,
+            self.fl_y * down,
+            self.cx * across,
+            self.cy * down,
+            smaller,
+            self.scale * across,
+        )
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
         """Where points (n, 2) of the plane at distance 1 are seen, (n, 2); see `Projection`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import mmap
 import re
@@ -16,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError, printable
-from ..io import require_file
+from ..io import array, number, read_object, require_file
 from ..scene.meshes import HEADER, check_mesh
 from ..scene.normals import repaired
 from ..scene.triangles import write_mesh
@@ -26,6 +27,15 @@ from .faults import Faults
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf")
 #: Albedo and roughness of all parts: a fit does not read them.
 _ALBEDO, _ROUGHNESS = 0.5, 0.5
+#: Extensions of glTF that pack numbers, by what one may know them as.
+_PACKED = {
+    "KHR_draco_mesh_compression": "Draco",
+    "EXT_meshopt_compression": "meshopt",
+    "KHR_meshopt_compression": "meshopt",
+    "KHR_mesh_quantization": "quantized",
+}
+#: From y up to z up.
+TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 #: Steps between positions in single precision, as a share of all geometry, that do not show.
 _COARSEST = 1e-5
 #: Of the constant environment.
@@ -51,6 +61,14 @@ class Part:
     faces: np.ndarray
     normals: np.ndarray | None
     uv: np.ndarray | None
+
+    def moved(self, matrix: np.ndarray) -> Part:
+        """The part after a similarity (4, 4), float64."""
+        linear = matrix[:3, :3]
+        normals = None
+        if self.normals is not None:
+            normals = self.normals @ (linear.T / np.cbrt(np.linalg.det(linear)))
+        return replace(self, positions=self.positions @ linear.T + matrix[:3, 3], normals=normals)
 
     def write(self, file: Path) -> None:
         """Write it as binary PLY."""
@@ -89,6 +107,9 @@ def _check_place(parts: Sequence[Part], faults: Faults) -> None:
     extent = float(np.ptp(corners, axis=0).max())
     largest = float(np.abs(corners).max())
     step = float(np.spacing(np.float32(largest)))
+    if not extent:
+        faults.add("all vertices of the mesh lie at one point")
+        return
     if step > _COARSEST * extent:
         faults.add(
             f"the mesh is {extent:.3g} units wide and lies up to {largest:.3g} units from the "
@@ -198,6 +219,8 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
         raise UserError("the mesh is of a format that is not read (PLY, OBJ, GLB)", file)
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     of_nodes = suffix in (".glb", ".gltf")
+    if of_nodes:
+        _require_plain(file)
     options: dict[str, Any] = {"process": False}
     if suffix == ".obj":
         # Not maintain_order: with it, trimesh 5.2 gives vertices the normals and texture
@@ -224,6 +247,47 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     if len(found) == 1 and not of_nodes:
         return [("", *found[0][1:])]
     return found
+
+
+def _require_plain(file: Path) -> None:
+    """Refuse a glTF file whose numbers are packed: trimesh 5.2 reads some as zeros."""
+    with file.open("rb") as opened:
+        head = opened.read(20)
+        if head[:4] == b"glTF" and len(head) == 20:
+            told = opened.read(int.from_bytes(head[12:16], "little"))
+        else:
+            told = head + opened.read()
+    try:
+        top = json.loads(told)
+        packed = [_PACKED[name] for name in top.get("extensionsRequired", ()) if name in _PACKED]
+    except (ValueError, TypeError, AttributeError):
+        return  # trimesh tells what is wrong with it
+    if packed:
+        what = f"the mesh is compressed ({', '.join(packed)})"
+        raise UserError(what, file, "Export it without compression")
+
+
+def read_transform(file: Path) -> np.ndarray:
+    """What takes a mesh of `ns-export` back to the frame of COLMAP, (4, 4) float64.
+
+    Args:
+        file: the `dataparser_transforms.json` of the run: `transform` (3, 4) and `scale`, which
+            have taken the cameras to the frame that it trained in.
+
+    Raises:
+        UserError: the file is of another kind.
+    """
+    top = read_object(file)
+    forwards = np.eye(4)
+    forwards[:3] = array(top, "transform", (3, 4), str(file))
+    scale = number(top, "scale", str(file))
+    rotation = forwards[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
+        raise UserError("'transform' is no rotation with a translation", file)
+    if not scale > 0:
+        raise UserError("'scale' is not positive", file)
+    forwards[:3] *= scale
+    return np.linalg.inv(forwards)
 
 
 def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:

@@ -17,6 +17,8 @@ from ..imaging.headers import ImageHeader
 Balance = tuple[float, float, float, float]
 #: Of the files of cameras that photographers meet most.
 SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef")
+#: Of its width and height, what camera RAW may have more than the photograph, at most.
+_EDGES = 0.02
 #: From this share of the largest value on a channel is taken for clipped.
 CLIPPED = 0.99
 
@@ -26,13 +28,20 @@ def is_raw(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
+def is_cut(raw: tuple[int, int], photograph: tuple[int, int]) -> bool:
+    """Whether a photograph may be the camera's own, of this size, without the edges of its RAW."""
+    return all(b <= a <= (1 + _EDGES) * b for a, b in zip(raw, photograph, strict=True))
+
+
 def raw_header(path: Path) -> ImageHeader:
     """Its size, as `read_raw` gives it; errors as there."""
     with _opened(path) as raw:
         return ImageHeader(raw.sizes.width, raw.sizes.height, 3, 16)
 
 
-def read_raw(path: Path, balance: Balance | None = None) -> np.ndarray:
+def read_raw(
+    path: Path, balance: Balance | None = None, size: tuple[int, int] | None = None
+) -> np.ndarray:
     """Linear RGB of the sRGB primaries, (H, W, 3) float32, clipped at 1, not turned by its EXIF.
 
     The black level is taken away and a white balance applied. There is no curve, and no
@@ -41,31 +50,50 @@ def read_raw(path: Path, balance: Balance | None = None) -> np.ndarray:
     Args:
         path: the file.
         balance: as from `raw_balance`; None: that of daylight, as LibRaw knows it of the camera.
+        size: width and height of the camera's photograph; what the RAW file has beyond it is cut
+            off, where the file says, else alike on both sides. None: all of it.
 
     Raises:
         UserError: rawpy is missing, or LibRaw cannot read the file.
     """
     with _opened(path) as raw:
-        pixels = raw.postprocess(**_as_it_is(balance))
+        pixels = raw.postprocess(**_as_it_is(balance))[_part(raw.sizes, size)]
     return (pixels / 65535).astype(np.float32)
 
 
-def raw_told(path: Path, balance: Balance | None = None) -> np.ndarray:
+def raw_told(
+    path: Path, balance: Balance | None = None, size: tuple[int, int] | None = None
+) -> np.ndarray:
     """Which pixels of `read_raw` say what they say, or that they are clipped, (H, W) bool.
 
     The colours of the sensor are mixed to those of sRGB. Where some of them are clipped and others
     are not, no mixture is true, nor the least that it can be.
 
     Args:
-        path, balance: as of `read_raw`; errors as there.
+        path, balance, size: as of `read_raw`; errors as there.
     """
     with _opened(path) as raw:
         import rawpy
 
         colours = rawpy.ColorSpace.raw  # pyright: ignore[reportAttributeAccessIssue]
         sensor = raw.postprocess(output_color=colours, **_as_it_is(balance))
+        sensor = sensor[_part(raw.sizes, size)]
         clipped = sensor >= round(65535 * CLIPPED)
     return clipped.all(2) | ~clipped.any(2)
+
+
+def _part(sizes: Any, size: tuple[int, int] | None) -> tuple[slice, slice]:
+    """The rows and columns of a picture that belong to the photograph."""
+    width, height = size or (sizes.width, sizes.height)
+    left, top = (sizes.width - width) // 2, (sizes.height - height) // 2
+    if (sizes.crop_width, sizes.crop_height) == (width, height):
+        told = (
+            sizes.crop_left_margin - sizes.left_margin,
+            sizes.crop_top_margin - sizes.top_margin,
+        )
+        if 0 <= told[0] <= sizes.width - width and 0 <= told[1] <= sizes.height - height:
+            left, top = told
+    return slice(top, top + height), slice(left, left + width)
 
 
 def _as_it_is(balance: Balance | None) -> dict[str, Any]:

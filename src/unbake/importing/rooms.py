@@ -31,7 +31,7 @@ from ..errors import UserError
 from ..io import array, number, read_object, read_text
 from .faults import Faults
 from .lens import Lens
-from .source import Shot, Source, find_image, image_header
+from .source import Reading, Shot, Source, find_image, image_header
 
 _MESH, _POSES, _LENSES, _IMAGES = "scene.obj", "cam.txt", "K_list.txt", "Image"
 _EXPOSURES, _RESPONSE = Path("cam", "exposure.npy"), Path("cam", "crf.npy")
@@ -50,29 +50,28 @@ def is_room(folder: Path) -> bool:
     return photographed or _has_split(folder / "train")
 
 
-def read_room(folder: Path, images: Path | None, allow_outside: bool, faults: Faults) -> Source:
+def read_room(folder: Path, reading: Reading, faults: Faults) -> Source:
     """The photographs of a room, and its mesh.
 
     Args:
         folder: of the room.
-        images: folder of the images of a room that was photographed; None: `Image`.
-        allow_outside: read images that lie outside of the folder.
+        reading: without a folder of images, those of a room that was photographed are in `Image`.
         faults: all that is wrong is added to it.
     """
     mesh = folder / _MESH if (folder / _MESH).is_file() else None
     shots: list[Shot] = []
     if not _has_split(folder / "train"):
-        root = images or folder / _IMAGES
+        root = reading.images or folder / _IMAGES
         with faults.collected():
-            shots += _photographed(folder, root, allow_outside, faults)
+            shots += _photographed(folder, root, reading, faults)
         notes = (_UNKNOWN_RESPONSE,) if (root / _RESPONSE).is_file() else ()
         return Source("FIPT", tuple(shots), notes, mesh)
-    if images is not None:
-        faults.add("a room with train and val has no other folder of images", images)
+    if reading.images is not None:
+        faults.add("a room with train and val has no other folder of images", reading.images)
     for name, split in _SPLITS.items():
         if _has_split(folder / name):
             with faults.collected(f"{name}/{TRANSFORMS}"):
-                shots += _rendered(folder, name, split, allow_outside, faults)
+                shots += _rendered(folder, name, split, reading, faults)
     return Source("FIPT", tuple(shots), mesh=mesh)
 
 
@@ -80,7 +79,7 @@ def _has_split(folder: Path) -> bool:
     return (folder / TRANSFORMS).is_file() and (folder / _IMAGES).is_dir()
 
 
-def _photographed(folder: Path, root: Path, allow_outside: bool, faults: Faults) -> list[Shot]:
+def _photographed(folder: Path, root: Path, reading: Reading, faults: Faults) -> list[Shot]:
     poses, lenses = _rows(folder / _POSES), _rows(folder / _LENSES)
     if len(poses) != len(lenses):
         what = f"{len(poses)} cameras in {_POSES}, {len(lenses)} in {_LENSES}"
@@ -89,7 +88,9 @@ def _photographed(folder: Path, root: Path, allow_outside: bool, faults: Faults)
     for index, (pose, rows) in enumerate(zip(poses, lenses, strict=True)):
         name = f"{index:03d}_0001"
         with faults.collected(name):
-            image = _image(root, name, allow_outside)
+            image = _image(root, name, reading)
+            if not reading.has(image, name):
+                continue
             header = image_header(image)
             _require_size_of(folder / _IMAGES / f"{name}.exr", image)
             lens = _pinhole(rows, header.width, header.height)
@@ -123,9 +124,7 @@ def _exposures(root: Path, count: int) -> list[float] | None:
     raise UserError(f"the file is not {count} positive numbers, one for each camera", file)
 
 
-def _rendered(
-    folder: Path, name: str, split: str, allow_outside: bool, faults: Faults
-) -> list[Shot]:
+def _rendered(folder: Path, name: str, split: str, reading: Reading, faults: Faults) -> list[Shot]:
     top = read_object(folder / name / TRANSFORMS)
     angle, frames, shots = number(top, "camera_angle_x", name), top.get("frames"), []
     if not 0 < angle < math.pi:
@@ -136,7 +135,9 @@ def _rendered(
         with faults.collected(f"{name}: frame {index}"):
             if not isinstance(frame, dict):
                 raise UserError("the frame is not an object")
-            image = _image(folder / name / _IMAGES, f"{index:03d}_0001", allow_outside)
+            image = _image(folder / name / _IMAGES, f"{index:03d}_0001", reading)
+            if not reading.has(image, f"{name}/{index:03d}_0001"):
+                continue
             header = image_header(image)
             focal = 0.5 * header.width / math.tan(0.5 * angle)
             middle = 0.5 * header.width, 0.5 * header.height
@@ -146,8 +147,8 @@ def _rendered(
     return shots
 
 
-def _image(folder: Path, name: str, allow_outside: bool) -> Path:
-    return find_image(folder, name, "source", allow_outside=allow_outside)
+def _image(folder: Path, name: str, reading: Reading) -> Path:
+    return find_image(folder, name, "source", allow_outside=reading.allow_outside)
 
 
 def _rows(file: Path) -> np.ndarray:

@@ -34,6 +34,17 @@ class ImportSettings:
         bool,
         Flag("Leave nerfstudio's cameras in the frame of their file, instead of that of COLMAP"),
     ] = False
+    mesh_y_up: Annotated[
+        bool,
+        Flag(
+            "Turn the mesh from y up to z up, the world of Blender's cameras: glTF files, and OBJ "
+            "files as Blender writes them, have y up"
+        ),
+    ] = False
+    leave_out_missing: Annotated[
+        bool,
+        Flag("Go on without photographs that the source names and that do not exist"),
+    ] = False
 
     def __post_init__(self) -> None:
         require_ranges(self, {"holdout": (0, 10**6)})

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path, PurePath
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePath, PurePosixPath
 from typing import final
 
 import numpy as np
+from PIL import Image
 
-from ..errors import UserError
+from ..errors import UserError, named
 from ..imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, ImageHeader, read_header
 from ..io import inside, require_file
+from .faults import Faults
 from .lens import Lens
 from .raw import SUFFIXES as RAW_SUFFIXES
-from .raw import Balance, is_raw, raw_header
+from .raw import Balance, is_cut, is_raw, raw_header
 
 #: Suffixes that are tried where the name of an image has none: radiance before code values.
 _TRIED = tuple(s for suffix in (".exr", *CODED_SUFFIXES) for s in (suffix, suffix.upper()))
+#: Difference of the factors of width and height that rounding may cause, at most.
+_ROUNDED = 0.02
+#: The tag of EXIF.
+_ORIENTATION = 0x0112
 
 
 @final
@@ -47,6 +53,11 @@ class Shot:
     balance: Balance | None = None
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the photograph, in pixels."""
+        return self.lens.width, self.lens.height
+
+    @property
     def coded(self) -> bool:
         """Whether the image holds code values and not radiance."""
         return self.image.suffix.lower() in CODED_SUFFIXES
@@ -59,6 +70,50 @@ class Shot:
 
 @final
 @dataclass(frozen=True, eq=False)
+class Reading:
+    """How the files of a source are found.
+
+    Args:
+        images: folder of the images instead of that of the source; None: that of the source.
+        allow_outside: read files that lie outside of their folder.
+        keep_applied_transform: leave cameras in the frame of nerfstudio's file.
+        leave_out_missing: go on without photographs that do not exist.
+        missing: names of those that were left out; `require` adds to it.
+    """
+
+    images: Path | None = None
+    allow_outside: bool = False
+    keep_applied_transform: bool = False
+    leave_out_missing: bool = False
+    missing: list[str] = field(default_factory=list)
+
+    def has(self, image: Path, name: str) -> bool:
+        """Whether there is a photograph; false where it is missing and left out.
+
+        Args:
+            image: its file.
+            name: that the source has for it.
+
+        Raises:
+            UserError: it is missing and not left out, or is no file.
+        """
+        if self.leave_out_missing and not image.exists():
+            self.missing.append(name)
+            return False
+        require_file(image, "image", "--leave-out-missing imports the others")
+        return True
+
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, for people."""
+        if not self.missing:
+            return ()
+        count = len(self.missing)
+        what = "one photograph does" if count == 1 else f"{count} photographs do"
+        return (f"{what} not exist, left out: {named(sorted(self.missing))}",)
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Source:
     """What a folder of another program holds.
 
@@ -67,12 +122,14 @@ class Source:
         shots: the photographs.
         notes: what the user should know of how it was read.
         mesh: the file of the geometry, where it belongs to the layout.
+        masks: the folder of masks, where it belongs to the layout.
     """
 
     kind: str
     shots: tuple[Shot, ...]
     notes: tuple[str, ...] = ()
     mesh: Path | None = None
+    masks: Path | None = None
 
 
 def image_header(path: Path) -> ImageHeader:
@@ -122,6 +179,92 @@ def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Pa
     return path if found is None else checked(os.fspath(found))
 
 
+def masks_in(source: Source, folder: Path | None, faults: Faults) -> Source:
+    """Give photographs the masks of a folder, where they have none.
+
+    Masks of `a/0001.jpg` are `a/0001.jpg.png`, as COLMAP has them, or `a/0001.png`; or the same
+    without folders at the beginning.
+
+    Args:
+        source: with photographs.
+        folder: None: that of the source, where it has one.
+        faults: a folder that is none, or has no mask of any photograph, is added to it.
+    """
+    given = folder is not None
+    folder = folder or source.masks
+    if folder is None or not source.shots:
+        return source
+    if not folder.is_dir():
+        faults.add("there is no folder of masks", folder)
+        return source
+    shots = [
+        shot if shot.mask else replace(shot, mask=_mask_of(shot, folder)) for shot in source.shots
+    ]
+    bare = [shot.name for shot in shots if shot.mask is None]
+    if len(bare) == len(shots):
+        if given:
+            remedy = f"They are named as {PurePosixPath(bare[0]).name}.png"
+            faults.add("no photograph has a mask in the folder", folder, remedy)
+        return source
+    note = (f"{len(bare)} photographs have no mask: {named(bare)}",) if bare else ()
+    return replace(source, shots=tuple(shots), notes=(*source.notes, *note))
+
+
+def _mask_of(shot: Shot, folder: Path) -> Path | None:
+    parts = [part for part in PurePosixPath(shot.name).parts if part not in ("/", "..")]
+    for first in range(len(parts)):
+        end = PurePosixPath(*parts[first:])
+        for name in (f"{end}.png", str(end.with_suffix(".png")), str(end)):
+            if (folder / name).is_file():
+                return folder / name
+    return None
+
+
 def first_folder(folders: Sequence[Path]) -> Path | None:
     """The first of these folders that there is."""
     return next((folder for folder in folders if folder.is_dir()), None)
+
+
+def suited(lens: Lens, image: Path) -> Lens:
+    """The lens of a camera for its image, which may have been made smaller or larger as a whole.
+
+    Camera RAW has some pixels at its edges that the photograph lacks; `read_raw` cuts them off.
+
+    Raises:
+        UserError: the image has another shape, or cannot be read.
+    """
+    header = image_header(image)
+    size = (header.width, header.height)
+    if size == (lens.width, lens.height):
+        return lens
+    if is_raw(image) and is_cut(size, (lens.width, lens.height)):
+        return lens
+    if not is_raw(image) and same_shape(size, (lens.width, lens.height)):
+        return lens.scaled(*size)
+    what = f"its camera is for {lens.width} x {lens.height} pixels, it has {size[0]} x {size[1]}"
+    if same_shape((size[1], size[0]), (lens.width, lens.height)) and _turned_by_exif(image):
+        told = f"{what}; its EXIF says that it is to be turned"
+        remedy = "Save the photographs turned (ImageMagick: mogrify -auto-orient)"
+        raise UserError(told, image, remedy)
+    raise UserError(what, image, "Give the photographs that were posed, whole or scaled as a whole")
+
+
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size is the other times a factor, but for rounding by a pixel."""
+    factors = [a / b for a, b in zip(size, other, strict=True)]
+    if max(factors) > (1 + _ROUNDED) * min(factors):
+        return False
+    low = max((a - 1) / b for a, b in zip(size, other, strict=True))
+    high = min((a + 1) / b for a, b in zip(size, other, strict=True))
+    return low <= high
+
+
+def _turned_by_exif(image: Path) -> bool:
+    """Whether an image's EXIF asks for a quarter turn."""
+    if image.suffix.lower() not in CODED_SUFFIXES:
+        return False
+    try:
+        with Image.open(image) as opened:
+            return opened.getexif().get(_ORIENTATION) in (5, 6, 7, 8)
+    except (OSError, ValueError):
+        return False

@@ -1,0 +1,305 @@
+"""Photographs as people have them: scaled, missing, with masks and colour profiles of their own."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import tifffile
+from layouts import codes, quiet, save, write_colmap, write_nerfstudio
+from PIL import Image
+
+from unbake.dataset.views import Dataset, read_masked, read_photograph
+from unbake.errors import UserError
+from unbake.imaging.coded import decode, read_codes
+from unbake.imaging.profiles import linear_srgb, profile_name, read_profile
+from unbake.imaging.srgb import from_srgb, to_srgb
+from unbake.importing.faults import ImportFaults
+from unbake.importing.frames import _lens
+from unbake.importing.import_data import CLIPPED_CODE, import_data
+from unbake.importing.lens import Lens
+from unbake.importing.settings import ImportSettings
+from unbake.importing.source import same_shape
+
+imagecodecs = pytest.importorskip("imagecodecs", reason="colour profiles need imagecodecs")
+
+WHITE = (0.3127, 0.3290, 1.0)
+#: CIE xy of the primaries of Display P3, with Y = 1.
+P3 = (0.680, 0.320, 1.0, 0.265, 0.690, 1.0, 0.150, 0.060, 1.0)
+#: Linear Display P3 to linear sRGB (CSS Color 4).
+TO_SRGB = np.array(
+    [[1.2249, -0.2247, 0.0], [-0.0420, 1.0419, 0.0], [-0.0197, -0.0786, 1.0979]], np.float64
+)
+#: The orientation in EXIF, and a quarter turn.
+ORIENTATION, QUARTER = 0x0112, 6
+
+
+@pytest.fixture
+def project(captured, tmp_path):
+    write_colmap(captured, tmp_path / "project")
+    return tmp_path / "project"
+
+
+def profile_of(primaries, gamma):
+    return imagecodecs.cms_profile("rgb", whitepoint=WHITE, primaries=primaries, gamma=gamma)
+
+
+def imported(source, out, meshes, **more):
+    """The data set, and what was told."""
+    told = []
+    settings = ImportSettings(holdout=0, **{k: more.pop(k) for k in list(more) if k in SETTINGS})
+    import_data(source, out, meshes, settings, tell=told.append, **more)
+    return Dataset.load(out), told
+
+
+SETTINGS = ("leave_out_missing", "mesh_y_up", "keep_applied_transform")
+
+
+# -------------------------------------------------------------------------------------------- sizes
+
+
+def test_cameras_are_scaled_to_photographs_that_were_made_smaller(
+    captured, project, meshes, tmp_path
+):
+    for file in sorted((project / "images").iterdir()):
+        small = Image.open(file).resize((8, 8), Image.Resampling.BOX)
+        save(np.asarray(small), project / "images_2" / file.name)
+    data, told = imported(project, tmp_path / "data", meshes, images=project / "images_2")
+    assert "cameras are scaled by 0.5, to the size of their photographs" in told
+    known = {view.name: view.camera for view in captured.views}
+    assert len(data.views) == len(known)
+    for view in data.views:
+        small, large = view.camera, known[view.name]
+        assert (small.width, small.height) == (8, 8)
+        assert (small.fl_x, small.cx, small.cy) == (large.fl_x / 2, large.cx / 2, large.cy / 2)
+        assert np.allclose(small.to_world, large.to_world)
+
+
+def test_sizes_that_were_rounded_keep_square_pixels():
+    """4946 x 3286 pixels at a quarter are 1237 x 822, of which 1236.5 x 821.5 are exact."""
+    lens = Lens(4946, 3286, 4000.0, 4000.0, 2473.0, 1643.0)
+    small = lens.scaled(1237, 822)
+    assert small.straight and small.fl_x == small.fl_y == pytest.approx(1000.5, abs=0.1)
+    points = np.array([[-0.6, -0.4], [0.6, 0.4], [0.0, 0.0]])
+    exact = lens.pixels(points) * (1237 / 4946, 822 / 3286)
+    assert np.abs(small.pixels(points) - exact).max() < 0.25
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_distorted_lenses_are_scaled(model):
+    keys = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 81.0, "cx": 45.0, "cy": 33.0, "k1": -0.1}
+    lens = _lens(keys | {"camera_model": model}, 96, 64, "here")
+    small = lens.scaled(48, 32)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    assert np.allclose(small.pixels(points), lens.pixels(points) / 2)
+    assert small.camera(np.eye(4)).fl_x == pytest.approx(lens.camera(np.eye(4)).fl_x / 2, rel=1e-3)
+
+
+def test_photographs_of_another_shape_are_refused(project, meshes, tmp_path):
+    first, second = sorted((project / "images").iterdir())[:2]
+    save(np.zeros((8, 10, 3), np.uint8), first)
+    save(np.zeros((9, 16, 3), np.uint8), second)
+    with pytest.raises(ImportFaults) as caught:
+        import_data(project, tmp_path / "data", meshes, tell=quiet)
+    told = "; ".join(caught.value.faults)
+    assert f"its camera is for 16 x 16 pixels, it has 10 x 8: {first.name}" in told
+    assert "it has 16 x 9" in told and "Give the photographs that were posed" in told
+
+
+def test_shapes_are_the_same_but_for_rounding():
+    assert same_shape((1237, 822), (4946, 3286)) and same_shape((1236, 821), (4946, 3286))
+    assert same_shape((9892, 6572), (4946, 3286))
+    assert not same_shape((822, 1237), (4946, 3286)) and not same_shape((1237, 840), (4946, 3286))
+
+
+def test_photographs_that_wait_to_be_turned_are_told(project, meshes, tmp_path):
+    cameras = project / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text().replace("16 16", "12 16", 1))
+    for file in sorted((project / "images").iterdir()):
+        exif = Image.Exif()
+        exif[ORIENTATION] = QUARTER
+        Image.new("RGB", (16, 12)).save(file, exif=exif)
+    with pytest.raises(ImportFaults, match=r"its EXIF says.*mogrify -auto-orient"):
+        import_data(project, tmp_path / "data", meshes, tell=quiet)
+
+
+# ------------------------------------------------------------------------------------------ missing
+
+
+def test_missing_photographs_may_be_left_out(captured, project, meshes, tmp_path):
+    first = sorted((project / "images").iterdir())[0]
+    first.unlink()
+    with pytest.raises(ImportFaults, match=r"the image does not exist.*--leave-out-missing"):
+        import_data(project, tmp_path / "data", meshes, tell=quiet)
+    data, told = imported(project, tmp_path / "data", meshes, leave_out_missing=True)
+    assert f"one photograph does not exist, left out: {first.name}" in told
+    left = {view.name for view in captured.views} - {first.stem}
+    assert {view.name for view in data.views} == left
+    shutil.rmtree(project / "images")
+    (project / "images").mkdir()
+    with pytest.raises(ImportFaults, match="no photograph of the model exists"):
+        imported(project, tmp_path / "none", meshes, leave_out_missing=True)
+
+
+def test_names_that_windows_wrote_are_found(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        name = frame["file_path"].rsplit("/", 1)[1]
+        save(np.full((16, 16, 3), 255, np.uint8), folder / "masks" / name)
+        frame |= {"file_path": f"./.\\images\\{name}", "mask_path": f"masks\\{name}"}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    data, _ = imported(folder, tmp_path / "data", meshes)
+    assert sorted(view.name for view in data.views) == sorted(v.name for v in captured.views)
+    assert all(view.mask is not None for view in data.views)
+
+
+# -------------------------------------------------------------------------------------------- masks
+
+
+@pytest.mark.parametrize("named", ["{}.png", "{stem}.png"], ids=["COLMAP", "stem"])
+def test_masks_beside_the_images_of_colmap_are_taken(named, project, meshes, tmp_path):
+    files = sorted((project / "images").iterdir())
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[:, :4] = 0
+    for file in files[1:]:
+        save(mask, project / "masks" / named.format(file.name, stem=file.stem))
+    data, told = imported(project, tmp_path / "data", meshes)
+    assert f"1 photographs have no mask: {files[0].name}" in told
+    first, *others = data.views
+    assert read_masked(first)[1].all()
+    for view in others:
+        assert np.array_equal(read_masked(view)[1], mask > 0)
+
+
+def test_masks_of_the_size_of_the_whole_photograph_suit_a_smaller_one(project, meshes, tmp_path):
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[:, :5] = 0
+    for file in sorted((project / "images").iterdir()):
+        save(np.asarray(Image.open(file).resize((8, 8))), project / "small" / file.name)
+        save(mask, project / "other" / f"{file.name}.png")
+    folders = {"images": project / "small", "masks": project / "other"}
+    data, _ = imported(project, tmp_path / "data", meshes, **folders)
+    for view in data.views:
+        counted = read_masked(view)[1]
+        assert not counted[:, :3].any() and counted[:, 3:].all(), "half of a pixel is masked"
+
+
+def test_a_folder_without_masks_is_a_fault(project, meshes, tmp_path):
+    (project / "empty").mkdir()
+    for folder, told in (("empty", "no photograph has a mask"), ("none", "no folder of masks")):
+        with pytest.raises(ImportFaults, match=told):
+            import_data(project, tmp_path / "data", meshes, masks=project / folder, tell=quiet)
+
+
+# ---------------------------------------------------------------------------------- colour profiles
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
+def test_profiles_are_read(suffix, tmp_path):
+    file, p3 = tmp_path / f"a{suffix}", profile_of(P3, 2.2)
+    Image.new("RGB", (4, 4)).save(file, icc_profile=p3)
+    assert read_profile(file) == p3
+    Image.new("RGB", (4, 4)).save(file, icc_profile=imagecodecs.cms_profile("srgb"))
+    assert read_profile(file) is None, "that of sRGB changes nothing"
+    Image.new("RGB", (4, 4)).save(file)
+    assert read_profile(file) is None
+    assert profile_name(p3)
+
+
+def test_profiles_of_tiff_with_16_bits_are_read(tmp_path):
+    file, p3 = tmp_path / "a.tif", profile_of(P3, 2.2)
+    pixels = np.random.default_rng(0).integers(0, 1 << 16, (4, 4, 3), np.uint16)
+    tifffile.imwrite(file, pixels, photometric="rgb", iccprofile=p3)
+    assert read_profile(file) == p3
+
+
+@pytest.mark.parametrize("deep", [False, True], ids=["8 bits", "16 bits"])
+def test_colours_become_those_of_srgb(deep):
+    colours = np.random.default_rng(0).random((1, 500, 3))
+    most, kind = ((1 << 16) - 1, np.uint16) if deep else (255, np.uint8)
+    read = np.round(most * colours).astype(kind)
+    expected = ((read / most) ** 2.2) @ TO_SRGB.T
+    assert linear_srgb(read, profile_of(P3, 2.2)) == pytest.approx(expected, abs=1.5e-3)
+
+
+def test_photographs_with_a_profile_are_converted(captured, meshes, tmp_path):
+    """What a camera wrote in Display P3 comes back as the light that it took."""
+    folder, kept = tmp_path / "nerf", {}
+    write_nerfstudio(captured, folder)
+    for view in captured.views:
+        linear = np.clip(read_photograph(view)[..., :3], 0, 0.8)
+        wide = np.clip(linear @ np.linalg.inv(TO_SRGB).T, 0, 1)
+        file = folder / "images" / f"{view.name}.png"
+        stored = np.round(255 * wide ** (1 / 2.2)).astype(np.uint8)
+        Image.fromarray(stored).save(file, icc_profile=profile_of(P3, 2.2))
+        kept[view.name] = linear
+    data, told = imported(folder, tmp_path / "data", meshes)
+    assert any("colours: 3 photographs have the profile" in line for line in told)
+    for view in data.views:
+        found = read_photograph(view)[..., :3]
+        assert np.abs(to_srgb(found) - to_srgb(kept[view.name])).mean() < 3e-3
+        assert view.clipped == pytest.approx(from_srgb(CLIPPED_CODE), abs=0.03)
+
+
+def test_pixels_whose_colours_are_clipped_in_part_do_not_count(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    pixels = np.full((16, 16, 3), 100, np.uint8)
+    pixels[:, :4], pixels[:, 4:8] = (255, 100, 100), 255
+    for view in captured.views:
+        file = folder / "images" / f"{view.name}.png"
+        Image.fromarray(pixels).save(file, icc_profile=profile_of(P3, 2.2))
+    data, _ = imported(folder, tmp_path / "data", meshes)
+    for view in data.views:
+        shown, counted = read_masked(view)
+        assert not counted[:, :4].any() and counted[:, 4:].all()
+        assert (shown[:, 4:8, :3] >= view.clipped).all()
+        assert (shown[:, 8:, :3] < view.clipped).all()
+
+
+def test_photographs_of_srgb_are_copied_as_they_are(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    for view in captured.views:
+        file = folder / "images" / f"{view.name}.png"
+        Image.fromarray(codes(view)).save(file, icc_profile=imagecodecs.cms_profile("srgb"))
+    data, told = imported(folder, tmp_path / "data", meshes)
+    assert not any("profile" in line for line in told)
+    for view in data.views:
+        assert view.image.read_bytes() == (folder / "images" / f"{view.name}.png").read_bytes()
+
+
+def test_a_damaged_profile_is_a_fault(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    damaged = profile_of(P3, 2.2)[:200]
+    file = folder / "images" / f"{captured.views[0].name}.png"
+    Image.fromarray(codes(captured.views[0])).save(file, icc_profile=damaged)
+    with pytest.raises(ImportFaults, match="its colour profile cannot be used"):
+        import_data(folder, tmp_path / "data", meshes, tell=quiet)
+
+
+def test_tiff_with_16_bits_may_be_packed(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 1 << 16, (16, 16, 3), np.uint16)
+    for packing in ("lzw", "deflate", None):
+        file = tmp_path / f"{packing}.tif"
+        tifffile.imwrite(file, pixels, photometric="rgb", compression=packing)
+        assert np.array_equal(read_codes(file), pixels)
+    tifffile.imwrite(
+        tmp_path / "planes.tif",
+        np.moveaxis(pixels, 2, 0),
+        photometric="rgb",
+        planarconfig="separate",
+    )
+    assert np.array_equal(read_codes(tmp_path / "planes.tif"), pixels)
+    assert decode(pixels).shape == (16, 16, 4)
+
+
+def test_no_profile_is_read_of_what_is_no_image(tmp_path):
+    for name in ("a.png", "a.tif", "a.jpg"):
+        (tmp_path / name).write_bytes(b"nothing")
+        assert read_profile(tmp_path / name) is None
+    with pytest.raises(UserError, match="cannot be read"):
+        read_codes(tmp_path / "a.png")
