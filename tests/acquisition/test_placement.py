@@ -239,3 +239,81 @@ def test_cameras_of_a_file_say_whether_they_stand_in_a_room():
     assert is_room(house, [inside]) and not is_room(house, [outside])
     thing = scene(thing=box([0, 0, 0], 0.3), front=sensor([0, 0, 0.9], [0, 0, 0]))
     assert not is_room(thing, [inside])
+
+
+def lamp(centre, scale, target):
+    """A rectangle at `centre` that emits light towards `target`."""
+    to_world = mi.ScalarTransform4f().look_at(list(centre), list(target), [0, 1, 0]).scale(scale)
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}
+    return {"type": "rectangle", "to_world": to_world, "bsdf": MATTE, "light": light}
+
+
+def lawn(height, half):
+    to_world = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90).scale(half)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": MATTE}
+
+
+def test_a_house_on_a_lawn_has_rooms_as_large_as_without():
+    inside = sensor((-0.6, 0, -0.6), (0, 0, 0))
+    alone = scene(**walls(), sensor=inside)
+    house = scene(**walls(), lawn=lawn(-1.01, 50), sensor=inside)
+    assert free_space.bounds(house)[2] > 100
+    for one, other in zip(free_space.extent(house), free_space.extent(alone), strict=True):
+        np.testing.assert_allclose(one, other)
+    placed = place_room(house, 6, 2)
+    eyes = np.array([look_at.origin for _, look_at in placed])
+    assert (np.abs(eyes) < 1).all()
+    cameras = [look_at.camera(16, 16) for _, look_at in placed]
+    assert check_cameras(house, {str(i): camera for i, camera in enumerate(cameras)}) == []
+    assert is_room(house, cameras)
+
+
+def test_a_scene_without_ground_is_all_of_it(room, ball):
+    for one, other in zip(free_space.extent(room), free_space.bounds(room), strict=True):
+        np.testing.assert_array_equal(one, other)
+    low, high, _ = free_space.extent(ball)
+    np.testing.assert_allclose([low, high], [[-1, 0, 1], [3, 4, 5]], atol=1e-5)
+    flat = scene(first=lawn(0, 1), second=lawn(0.1, 50), sensor=sensor((0, 3, 3), (0, 0, 0)))
+    np.testing.assert_array_equal(free_space.extent(flat)[0], free_space.bounds(flat)[0])
+
+
+def test_lamps_around_an_object_do_not_move_its_cameras():
+    """A softbox at either side, as photographers have them."""
+    thing = {"type": "sphere", "center": [0, 1, 0], "radius": 1, "bsdf": MATTE}
+    look = sensor((0, 2, 6), (0, 1, 0))
+    lamps = {f"lamp{x}": lamp((x, 9, 8), 1.5, (0, 1, 0)) for x in (-9, 9)}
+    dark = scene(thing=thing, floor=lawn(0, 40), sensor=look)
+    lit = scene(thing=thing, floor=lawn(0, 40), sensor=look, **lamps)
+    for (_, one), (_, other) in zip(place_object(lit, 8, 2), place_object(dark, 8, 2), strict=True):
+        np.testing.assert_allclose(one.origin, other.origin, rtol=1e-5)
+        np.testing.assert_allclose(one.target, (0, 1, 0), atol=1e-5)
+
+
+def test_an_object_on_a_large_floor_fits_into_its_pictures():
+    """By area, all points would lie on the floor, and none on a long thing upon it."""
+    to_world = mi.ScalarTransform4f().translate([0, 0.4, 0]).scale([3, 0.4, 0.4])
+    thing = {"type": "cube", "to_world": to_world, "bsdf": MATTE}
+    small = scene(thing=thing, sensor=sensor((0, 3, 9), (0, 0, 0)))
+    large = scene(thing=thing, floor=lawn(0, 3000), sensor=sensor((0, 3, 9), (0, 0, 0)))
+    for (_, one), (_, other) in zip(
+        place_object(large, 8, 2), place_object(small, 8, 2), strict=True
+    ):
+        np.testing.assert_allclose(one.origin, other.origin, rtol=1e-3)
+
+
+def test_coverage_in_a_room_is_that_of_the_room_whatever_the_scene_s_own_sensor_shows():
+    house = scene(**walls(), outside=sensor([0, 0, 6], [0, 0, 0]))
+    cameras = [
+        Camera.look_at((0, 0, 0), d, (0, 1, 0) if d[1] == 0 else (1, 0, 0), 90.0, 8, 8)
+        for d in [tuple(sign * row) for row in np.eye(3) for sign in (1, -1)]
+    ]
+    assert coverage(house, cameras, 4000) == pytest.approx(1, abs=0.01)
+    # The walls' outer sides are the same surfaces, which a camera outside sees.
+    assert coverage(house, cameras[:1], 4000) == pytest.approx(1 / 6, abs=0.03)
+
+
+def test_a_room_without_a_material_to_fit_is_refused():
+    glass = {"type": "dielectric"}
+    bare = {name: wall | {"bsdf": glass} for name, wall in walls().items()}
+    with pytest.raises(UserError, match="no surface has a material to fit"):
+        place_room(scene(**bare, sensor=sensor((-0.6, 0, -0.6), (0, 0, 0))), 2, 1)

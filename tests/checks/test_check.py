@@ -1,6 +1,7 @@
 """What is wrong with a data set is told at once, with the remedy; good data raise no alarm."""
 
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -94,6 +95,23 @@ def test_vertex_normals_that_are_not_numbers_are_told(spoilt, unbake):
     outcome = unbake("data", "check", data.folder)
     assert outcome.status == 0
     assert "hint: " in outcome.out and "geometry   hint" in outcome.out
+
+
+def test_a_scene_that_no_fit_can_use_is_told(spoilt):
+    """Neither light nor a material that could be fitted, both at once."""
+    data = spoilt("cornell")
+    scene = data.folder / data.content["scene"]
+    root = ElementTree.parse(scene).getroot()
+    for child in [*root.findall("bsdf"), *root.findall("emitter")]:
+        root.remove(child)
+    for shape in root.findall("shape"):
+        for child in [x for x in shape if x.tag in ("bsdf", "ref", "emitter")]:
+            shape.remove(child)
+        ElementTree.SubElement(shape, "bsdf", type="roughconductor")
+    ElementTree.ElementTree(root).write(scene)
+    told = {finding.what for finding in found(data.folder) if finding.level == "error"}
+    assert any("no light source" in what for what in told)
+    assert any("no material to fit" in what for what in told)
 
 
 def test_photographs_are_read_where_the_scene_cannot_be(spoilt):

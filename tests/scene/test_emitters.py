@@ -35,8 +35,8 @@ LIGHTS = {
     ("bulb", (2.5, 2.5, 2.5)): '<emitter type="point" id="bulb">'
     '<float name="intensity" value="2.5"/></emitter>',
     ("spot light", (1, 1, 1)): '<emitter type="spot"/>',
-    ("sun", None): '<emitter type="directional" id="sun"><spectrum type="blackbody" '
-    'name="irradiance"><float name="temperature" value="5000"/></spectrum></emitter>',
+    ("sun", (5, 4, 3)): '<emitter type="directional" id="sun">'
+    '<rgb name="irradiance" value="5 4 3"/></emitter>',
     ("constant light", (1, 1, 1)): '<emitter type="constant"/>',
     ("lamp", (4, 5, 6)): LAMP,
     ("screen", None): '<shape type="rectangle" id="screen"><emitter type="area">'

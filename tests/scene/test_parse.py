@@ -8,6 +8,7 @@ from scene_texts import BALL, DIFFUSE, ROOM, render
 from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
 from unbake.scene import parse as scenes
+from unbake.scene.edit import material_names, require_optimized, set_textures
 from unbake.scene.free_space import surface_area
 
 
@@ -191,3 +192,52 @@ def test_shapes_that_mitsuba_makes_otherwise_are_told(shape, scale, told, parse)
     with pytest.raises(UserError, match=rf"scene.xml.*line.*{told}") as caught:
         parse(content)
     assert "\n" not in str(caught.value)
+
+
+UNUSED = {
+    "integrator": '<integrator type="bdpt"><integer name="max_depth" value="3"/></integrator>',
+    "stokes": '<integrator type="stokes"><integrator type="path"/></integrator>',
+    "film": '<sensor type="perspective"><film type="ldrfilm"><integer name="width" value="24"/>'
+    '<integer name="height" value="16"/><string name="fileFormat" value="png"/></film></sensor>',
+    "spectral film": '<sensor type="perspective"><film type="specfilm">'
+    '<integer name="width" value="24"/><integer name="height" value="16"/></film></sensor>',
+    "sampler": '<sensor type="perspective"><sampler type="sobol">'
+    '<integer name="scramble" value="5"/></sampler></sensor>',
+}
+
+
+@pytest.mark.parametrize("kind", UNUSED)
+def test_what_nothing_uses_need_not_be_there(kind, parse):
+    """Integrators, films and samplers of older versions, and for spectra and polarised light."""
+    scene = parse(BALL.format(DIFFUSE) + UNUSED[kind]).instantiate()
+    if "film" in kind:
+        assert list(scene.sensors()[-1].film().size()) == [24, 16]
+
+
+def test_integrators_that_mitsuba_has_stay(parse):
+    parsed = parse(BALL.format(DIFFUSE) + '<integrator type="volpath"/>')
+    assert "volpath" in [node.props.plugin_name() for node in parsed.state.nodes]
+
+
+@pytest.mark.parametrize("name", ["blackbody", "regular", "irregular"])
+def test_spectra_without_rgb_are_refused(name, parse):
+    light = '<emitter type="point"><spectrum type="{}" name="intensity"/></emitter>'
+    with pytest.raises(UserError, match=rf"type '{name}' has no RGB. Give <rgb>"):
+        parse(BALL.format(DIFFUSE) + light.format(name))
+
+
+def test_materials_that_lamps_alone_have_are_known(parse):
+    """No photograph tells what a lamp reflects; a BSDF that a wall has as well is fitted."""
+    own = '<bsdf type="principled" id="own"><rgb name="base_color" value="0"/></bsdf>'
+    both = '<bsdf type="principled" id="both"/>'
+    lit = '<emitter type="area"/>'
+    lamps = f'<shape type="sphere">{own}{lit}</shape>' + both
+    lamps += f'<shape type="sphere"><ref id="both"/>{lit}</shape>'
+    parsed = parse(lamps + '<shape type="cube"><ref id="both"/></shape>')
+    assert material_names(parsed) == ["both"]
+    set_textures(parsed, {"base_color": mi.load_dict({"type": "rgb", "value": 0.7})})
+    parsed.instantiate()
+    alone = parse(f'<shape type="sphere">{own}{lit}</shape>')
+    assert material_names(alone) == ["own"], "as of a furnace, where there are no others"
+    with pytest.raises(UserError, match=r"no material to fit.*those that lamps alone have, are"):
+        require_optimized(alone.instantiate(), alone.path)

@@ -145,7 +145,8 @@ def _capture(
         remedy = "Ask for at least one with --views"
         raise UserError("no training view", where=camera_file, remedy=remedy)
     counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
-    seen = coverage(scene, [c for split, c in posed if split == "train"])
+    trained = [c for split, c in posed if split == "train"]
+    seen = coverage(scene, trained, own=camera_file is None)
     tell(
         f"{counts['train']} training and {counts['heldout']} held-out views; the training views "
         f"see {100 * seen:.0f} % of the surface"
@@ -230,16 +231,14 @@ def _copy_scene(
     changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")
-    if not parsed.principled_nodes():
-        raise UserError(
-            "no material to fit: no shape has a principled, diffuse or roughplastic BSDF", source
-        )
+    edit.material_names(parsed)  # there are some
     original = parse(source, root)
     if light is not None:
         change_light(original, light, allow_outside, lambda line: None)
     edit.to_principled(original)
     scene = original.instantiate()
     emitters.require_emitters(scene, source)
+    edit.require_optimized(scene, source)
     path = write(parsed, folder)
     shutil.rmtree(made, ignore_errors=True)
     return path, scene
@@ -372,7 +371,11 @@ def _truth(
         values, mask = render_materials(
             SceneView.of(shown, None, specular), rays.through, rays.pixels, TRUTH_SAMPLES, seed=1
         )
-        pictures[name] = values["albedo"]
+        shown_values = values["albedo"]
+        if quantity.channels == 1:  # Mitsuba takes the luminance of textures with colours
+            grey = np.asarray(mi.luminance(mi.Color3f(shown_values.T.astype(np.float32))))
+            shown_values = np.repeat(grey[:, None], 3, axis=1)
+        pictures[name] = shown_values
     return pictures, mask
 
 

@@ -105,7 +105,7 @@ def degrade(
     cameras, diagonal = [view.camera for view in dataset.views], 0.0
     if settings.pose_jitter or settings.displace:
         scene = parse(dataset.scene, dataset.root).instantiate()
-        diagonal = free_space.bounds(scene)[2]
+        diagonal = free_space.extent(scene)[2]
         cameras = _moved(scene, cameras, settings)
     # Once more: the nodes of a scene that was instantiated cannot be written.
     parsed = parse(dataset.scene, dataset.root)

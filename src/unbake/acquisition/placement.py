@@ -66,21 +66,26 @@ def is_room(scene: mi.Scene, cameras: Sequence[Camera] = ()) -> bool:
         cameras: that take the photographs; without any, the scene's own sensors stand for them.
     """
     if cameras:
-        rng, found = np.random.default_rng(0), []
-        for camera in cameras:
-            x, y = rng.random((2, free_space.PROBES))
-            rays = camera.rays(camera.width * x, camera.height * y)
-            found.append(free_space.probes_along(scene, *rays, rng))
-        probes = np.concatenate(found)
+        probes = _probes(scene, cameras, 0)
     elif scene.sensors():
         probes = free_space.sensor_probes(scene, 0)
     else:
-        low, high, _ = free_space.bounds(scene)
+        low, high, _ = free_space.extent(scene)
         probes = low + (high - low) * np.random.default_rng(0).random((64, 3))
     probes = probes[~free_space.inside_geometry(scene, probes)]
     if len(probes) == 0:
         return False
     return bool(free_space.enclosure(scene, probes).mean() >= free_space.ROOM_ENCLOSURE)
+
+
+def _probes(scene: mi.Scene, cameras: Sequence[Camera], seed: int) -> np.ndarray:
+    """Positions in the space that cameras see, (n, 3); as `free_space.sensor_probes`."""
+    rng, found = np.random.default_rng(seed), []
+    for camera in cameras:
+        x, y = rng.random((2, free_space.PROBES))
+        rays = camera.rays(camera.width * x, camera.height * y)
+        found.append(free_space.probes_along(scene, *rays, rng))
+    return np.concatenate(found)
 
 
 def place(scene: mi.Scene, views: int, held_out: int, *, seed: int = 0) -> list[tuple[str, LookAt]]:
@@ -115,12 +120,16 @@ def place_room(
         UserError: the scene has no free space to stand in, or too little for that many views.
     """
     _check_counts(views, held_out)
-    diagonal = free_space.bounds(scene)[2]
+    diagonal = free_space.extent(scene)[2]
     up = free_space.up_axis(scene)
     positions = free_space.free_positions(scene, _POSITIONS, seed)
     if len(positions) == 0:
         raise UserError("no free space for a camera in the scene", remedy=_REMEDY)
     points = free_space.sample_surface(scene, _POINTS, seed, power=0.5)
+    if not len(points.position):
+        raise UserError(
+            "no surface has a material to fit, for which views are chosen", remedy=_REMEDY
+        )
     seen = free_space.visibility(scene, positions, points)
     candidates = _candidates(scene, positions, points, seen, up, fov, seed)
     if len(candidates.eye) < views + held_out:
@@ -159,7 +168,7 @@ def place_object(
     """
     _check_counts(views, held_out)
     up = free_space.up_axis(scene)
-    low, high = _object_box(scene, up)
+    low, high = _object_box(scene)
     centre, radius = _sphere(low, high)
     count = views + held_out
     # Views from the horizon show least; at the pole the up direction is degenerate.
@@ -170,8 +179,8 @@ def place_object(
     level = np.sqrt(1 - height**2)[:, None]
     around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * front
     outward = level * around + height[:, None] * up
-    points = free_space.sample_surface(scene, _POINTS, 0).position
-    points = points[((low <= points) & (points <= high)).all(axis=1)] - centre
+    # Of a large floor nearly all points would lie far away from the object.
+    points = free_space.sample_surface(scene, _POINTS, 0, within=(low, high)).position - centre
     eyes = centre + _fitting_distance(points, radius, outward, up, fov) * outward
     middle = ((np.arange(held_out) + 0.5) * count / max(held_out, 1)).astype(int)
     tests = set(middle.tolist())
@@ -182,7 +191,9 @@ def place_object(
     ]
 
 
-def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -> float:
+def coverage(
+    scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000, *, own: bool = False
+) -> float:
     """The fraction of the reachable surface area that at least one camera sees, in [0, 1].
 
     Only surfaces whose material is optimized count (no emitters, mirrors or glass). A point is
@@ -194,13 +205,15 @@ def coverage(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 20000) -
         scene: the scene.
         cameras: the training views.
         samples: number of surface points tested, uniform by area.
+        own: the scene's own sensors tell whether it is a room, and not these cameras.
     """
     points = free_space.sample_surface(scene, samples, 1)
     seen = np.zeros(len(points.position), dtype=bool)
     for camera in cameras:
         framed = np.flatnonzero(~seen & (camera.pixel_of(points.position) >= 0))
         seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
-    return float(seen.sum() / max(_reachable(scene, points, seen).sum(), 1))
+    reachable = _reachable(scene, points, seen, () if own else cameras)
+    return float(seen.sum() / max(reachable.sum(), 1))
 
 
 def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000) -> np.ndarray:
@@ -218,13 +231,18 @@ def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000)
         framed = np.flatnonzero(camera.pixel_of(points.position) >= 0)
         shown = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
         counts[framed] += shown
-    return counts[_reachable(scene, points, counts > 0)]
+    return counts[_reachable(scene, points, counts > 0, cameras)]
 
 
-def _reachable(scene: mi.Scene, points: free_space.SurfacePoints, seen: np.ndarray) -> np.ndarray:
+def _reachable(
+    scene: mi.Scene,
+    points: free_space.SurfacePoints,
+    seen: np.ndarray,
+    cameras: Sequence[Camera],
+) -> np.ndarray:
     """Points that were seen, or that one of the standpoints sees."""
     reachable = seen.copy()
-    positions = _standpoints(scene)
+    positions = _standpoints(scene, cameras)
     # Most points are seen from the first few positions: the others are tested from ever more.
     first, count = 0, 1
     while first < len(positions) and not reachable.all():
@@ -372,32 +390,20 @@ def _axes(forwards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return right, np.cross(right, forwards)
 
 
-def _standpoints(scene: mi.Scene) -> np.ndarray:
-    if is_room(scene):
-        return free_space.free_positions(scene, _FREE_POSITIONS, 1)
-    centre, radius = _sphere(*_object_box(scene, free_space.up_axis(scene)))
+def _standpoints(scene: mi.Scene, cameras: Sequence[Camera]) -> np.ndarray:
+    if is_room(scene, cameras):
+        probes = _probes(scene, cameras, 1) if cameras else None
+        return free_space.free_positions(scene, _FREE_POSITIONS, 1, probes)
+    centre, radius = _sphere(*_object_box(scene))
     return centre + 2 * radius * free_space.sphere_directions(_FREE_POSITIONS)
 
 
-def _object_box(scene: mi.Scene, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (3,) of the scene without its ground plane."""
-    boxes = []
-    for shape in scene.shapes():
-        box = shape.bbox()
-        corners = np.array([np.array(box.min).ravel(), np.array(box.max).ravel()], dtype=np.float64)
-        if np.isfinite(corners).all():
-            boxes.append(corners)
-    if not boxes:
+def _object_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (3,) of the scene without its ground and its lamps."""
+    low, high, diagonal = free_space.extent(scene, lamps=False)
+    if not np.isfinite(diagonal):
         raise UserError("the scene has no shapes", remedy="Give a scene with geometry")
-    extents = np.array([np.ptp(box, axis=0) for box in boxes])
-    flat = extents @ np.abs(up) < 0.01 * extents.max(axis=1)
-    rest = [box for box, level in zip(boxes, flat, strict=True) if not level]
-    if rest:
-        size = np.ptp(np.concatenate(rest), axis=0).max()
-        kept = [b for b, e in zip(boxes, extents, strict=True) if e.max() < 1.5 * size]
-        boxes = kept or rest
-    corners = np.concatenate(boxes)
-    return corners.min(axis=0), corners.max(axis=0)
+    return low, high
 
 
 def _sphere(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:

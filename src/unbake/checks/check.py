@@ -35,7 +35,7 @@ from ..dataset.poses import pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
 from ..errors import UserError, collected, named, printable
-from ..scene import edit, free_space
+from ..scene import edit, emitters, free_space
 from ..scene.parse import parse
 from .pictures import PictureFacts, blurred, percentage, picture_facts
 
@@ -166,6 +166,11 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         parsed = parse(dataset.scene, dataset.root)
         edit.to_principled(parsed)
         result.scene = scene = parsed.instantiate()
+        with collected(faults):
+            edit.require_optimized(scene, dataset.scene)
+        if dataset.light == "known":
+            with collected(faults):
+                emitters.require_emitters(scene, dataset.scene)
     if parsed is None or scene is None:
         result.findings += [replace(f, check="scene") for f in _grouped(faults, dataset.folder)]
         _check_files(result, dataset, clip_negative)
@@ -281,7 +286,7 @@ def _check_poses(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -
             remedy = "Check the pose, or remove the frame"
             result.warn("geometry", what, named(inside), remedy)
         _check_distance(result, scene, train)
-    _check_duplicates(result, free_space.bounds(scene)[2])
+    _check_duplicates(result, free_space.extent(scene)[2])
 
 
 def _pose_problems(
@@ -296,7 +301,7 @@ def _pose_problems(
 
 
 def _check_distance(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -> None:
-    low, high, diagonal = free_space.bounds(scene)
+    low, high, diagonal = free_space.extent(scene)
     away = [np.linalg.norm(v.view.camera.origin - (low + high) / 2) / diagonal for v in train]
     if np.median(away) > _FAR:
         what = f"cameras stand {np.median(away):.0f} times the scene's extent away from it"

@@ -280,6 +280,8 @@ class Camera:
     def from_mitsuba(cls, sensor: mi.Sensor) -> Camera:
         """The camera of a Mitsuba `perspective` sensor, its film's crop window included.
 
+        Of a `thinlens`, which has depth of field, it is the camera with the smallest aperture.
+
         Raises:
             UserError: the sensor is not a perspective camera, or it mirrors the image.
         """
@@ -294,8 +296,12 @@ class Camera:
         crop_width, crop_height = (int(v) for v in film.crop_size())
         left, top = (int(v) for v in film.crop_offset())
         focal = 0.5 * width / math.tan(math.radians(_scalar(params["x_fov"])) / 2)
-        cx = width * (0.5 - _scalar(params["principal_point_offset_x"])) - left
-        cy = height * (0.5 - _scalar(params["principal_point_offset_y"])) - top
+        middle = [
+            _scalar(params[key]) if key in params else 0.0
+            for key in ("principal_point_offset_x", "principal_point_offset_y")
+        ]
+        cx = width * (0.5 - middle[0]) - left
+        cy = height * (0.5 - middle[1]) - top
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         return cls(matrix @ _FLIP, focal, focal, cx, cy, crop_width, crop_height)
 

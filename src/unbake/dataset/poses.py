@@ -95,7 +95,7 @@ def _likely(scene: mi.Scene, cameras: Sequence[Camera], numbers: np.ndarray, sha
 
 def _scales(scene: mi.Scene, cameras: Sequence[Camera]) -> list[float]:
     """Scales that positions may need, by how they lie: scaled down, any camera is in the middle."""
-    low, high, diagonal = free_space.bounds(scene)
+    low, high, diagonal = free_space.extent(scene)
     origins = np.array([camera.origin for camera in cameras])
     away = np.median(np.linalg.norm(origins - (low + high) / 2, axis=1))
     apart = np.linalg.norm(np.ptp(origins, axis=0))

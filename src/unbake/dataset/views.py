@@ -395,7 +395,7 @@ def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
     if not cameras:
         return []
     inside = free_space.inside_geometry(scene, np.array([c.origin for c in cameras.values()]))
-    near = free_space.CONTACT * free_space.bounds(scene)[2]
+    near = free_space.CONTACT * free_space.extent(scene)[2]
     touching = free_space.trace(scene, *spread_rays([*cameras.values()], 16)).distance < near
     nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
     return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]

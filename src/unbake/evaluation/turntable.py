@@ -146,7 +146,7 @@ def _is_free(scene: mi.Scene, circle: np.ndarray, eyes: np.ndarray) -> bool:
     directions = free_space.sphere_directions(64)
     origins = np.repeat(circle, len(directions), axis=0)
     near = free_space.trace(scene, origins, np.tile(directions, (len(circle), 1))).distance
-    if near.min() < free_space.CLEARANCE * free_space.bounds(scene)[2]:
+    if near.min() < free_space.CLEARANCE * free_space.extent(scene)[2]:
         return False
     if not free_space.unoccluded(scene, circle, np.roll(circle, -1, axis=0)).all():
         return False

@@ -11,7 +11,7 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..scene import free_space
 
-#: How far from a point a ray towards it ends, as a fraction of the scene's diagonal.
+#: How far from a point a ray towards it ends, as a fraction of the diagonal of its extent.
 _OFFSET = 2e-4
 #: The cosine below which a surface is seen from its edge, where nothing can be read from it.
 _GRAZING = 0.02
@@ -29,7 +29,9 @@ class Views:
 
     def __init__(self, scene: mi.Scene, cameras: Sequence[Camera]) -> None:
         self._scene, self._cameras = scene, cameras
-        self._offset = _OFFSET * free_space.bounds(scene)[2]
+        self._offset = max(
+            _OFFSET * free_space.extent(scene)[2], 1e-6 * free_space.bounds(scene)[2]
+        )
 
     def see(self, p: mi.Point3f, n: mi.Normal3f, two_sided: mi.Bool, active: mi.Bool) -> mi.Bool:
         """Whether any camera sees points.

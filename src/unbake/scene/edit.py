@@ -11,8 +11,12 @@ import mitsuba as mi
 from ..errors import UserError, named
 from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
+from ..transport.optimized import optimized_shapes
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
 from .parse import ParsedScene, is_reference, referenced
+
+_NO_MATERIAL = "no material to fit: no surface has a principled, diffuse or roughplastic BSDF"
+_GIVE_ONE = "Give one a principled BSDF: all others, and those that lamps alone have, are known"
 
 #: Properties of the BSDFs that become `principled`.
 _PROPERTIES = {
@@ -130,6 +134,17 @@ def _alpha(scene: ParsedScene, node: mi.parser.SceneNode) -> float:
     )
 
 
+def require_optimized(scene: mi.Scene, path: Path) -> None:
+    """Raise a `UserError` if no surface of a scene has a material that could be fitted.
+
+    Args:
+        scene: after `to_principled`.
+        path: its file.
+    """
+    if not optimized_shapes(scene):
+        raise UserError(_NO_MATERIAL, path, _GIVE_ONE)
+
+
 def material_names(scene: ParsedScene) -> list[str]:
     """Unique names of the `principled` BSDFs, in the order of the nodes.
 
@@ -138,10 +153,7 @@ def material_names(scene: ParsedScene) -> list[str]:
     """
     nodes = scene.principled_nodes()
     if not nodes:
-        raise UserError(
-            "no material to fit: no shape has a principled, diffuse or roughplastic BSDF",
-            where=scene.path,
-        )
+        raise UserError(_NO_MATERIAL, scene.path, _GIVE_ONE)
     names: list[str] = []
     for number, node in enumerate(nodes):
         name = node.props.id() or f"material-{number}"

@@ -168,8 +168,4 @@ def _strength(scene: ParsedScene, props: mi.Properties) -> tuple[float, float, f
         ) from None
     if texture.is_spatially_varying():
         return None
-    try:
-        colour = texture.eval(dr.zeros(mi.SurfaceInteraction3f))
-    except RuntimeError:  # a spectrum that Mitsuba does not turn into RGB, such as a black body
-        return None
-    return tuple(np.ravel(colour).tolist())
+    return tuple(np.ravel(texture.eval(dr.zeros(mi.SurfaceInteraction3f))).tolist())

@@ -17,7 +17,7 @@ from ..fields.shapes import placed_shapes, registry_number
 from ..transport.optimized import has_optimized_material
 from ..transport.render import path_integrator
 
-# Fractions of the scene's diagonal.
+# Fractions of the diagonal of `extent`.
 CLEARANCE = 0.03
 CONTACT = 1e-3
 SMALL_OBJECT = 0.15
@@ -61,6 +61,36 @@ def bounds(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray, float]:
     return low.ravel(), high.ravel(), float(np.linalg.norm(high - low))
 
 
+def extent(scene: mi.Scene, *, lamps: bool = True) -> tuple[np.ndarray, np.ndarray, float]:
+    """The same of the scene without its ground: a level plane that is larger than all else.
+
+    Distances that must suit a scene are fractions of this diagonal: a house on a lawn has rooms as
+    large as without.
+
+    Args:
+        scene: of which all is infinite where it has no shapes.
+        lamps: shapes that emit light count, unless there are no others.
+    """
+    shapes = scene.shapes()
+    kept = shapes if lamps else [shape for shape in shapes if not shape.is_emitter()]
+    if not kept:
+        return bounds(scene)
+    found = [(*box.min, *box.max) for box in (shape.bbox() for shape in kept)]
+    corners = np.array(found, dtype=np.float64).reshape(-1, 2, 3)
+    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    extents = np.ptp(corners, axis=1)
+    level = extents @ np.abs(up_axis(scene)) < 0.01 * extents.max(axis=1)
+    rest = corners[~level]
+    if len(rest):
+        size = np.ptp(rest.reshape(-1, 3), axis=0).max()
+        smaller = corners[extents.max(axis=1) < 1.5 * size]
+        corners = smaller if len(smaller) else corners
+    if not len(corners) or (len(corners) == len(shapes)):
+        return bounds(scene)
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    return low, high, float(np.linalg.norm(high - low))
+
+
 def up_axis(scene: mi.Scene) -> np.ndarray:
     """The scene's up direction (3,), a signed coordinate axis.
 
@@ -98,7 +128,7 @@ def trace(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> Hits:
 
 def unoccluded(scene: mi.Scene, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Whether the segment between two points is free, (n,) bool; glass occludes."""
-    offset = _RAY_OFFSET * bounds(scene)[2]
+    offset = _offset(scene)
     free = np.empty(len(starts), dtype=bool)
     for i in range(0, len(starts), _CHUNK):
         start, segment = starts[i : i + _CHUNK], (ends - starts)[i : i + _CHUNK]
@@ -111,7 +141,7 @@ def unoccluded(scene: mi.Scene, starts: np.ndarray, ends: np.ndarray) -> np.ndar
 
 def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) -> np.ndarray:
     """Visibility of surface points (m) from positions (n), from either side: (n, m) bool."""
-    offset = _RAY_OFFSET * bounds(scene)[2]
+    offset = _offset(scene)
     result = np.empty((len(positions), len(points.position)), dtype=bool)
     if not result.size:
         return result
@@ -143,16 +173,33 @@ def outgoing_radiance(
     return np.array(colour, dtype=np.float64).mean(axis=0)
 
 
-def sample_surface(scene: mi.Scene, count: int, seed: int, power: float = 1.0) -> SurfacePoints:
+def sample_surface(
+    scene: mi.Scene,
+    count: int,
+    seed: int,
+    power: float = 1.0,
+    within: tuple[np.ndarray, np.ndarray] | None = None,
+) -> SurfacePoints:
     """Random points on the surfaces whose material is optimized.
 
     All other surfaces are left out: see `transport/optimized.py`. The probability of a shape is
     proportional to its area to the given power: 1 samples uniformly by area, less favours small
     shapes. Each instance of a shape is one more shape; where it is stretched along one axis, points
     inside of it are as dense as on the shape before that.
+
+    Args:
+        scene: with these surfaces.
+        count: number of points; none where there are no such surfaces.
+        seed: of all random choices.
+        power: of the areas.
+        within: lower and upper corner (3,) of a box, outside of which no shape may reach.
     """
     rng = np.random.default_rng(seed)
     surfaces = _surfaces(scene)
+    if within is not None:
+        slack = 1e-6 * np.linalg.norm(within[1] - within[0])
+        low, high = within[0] - slack, within[1] + slack
+        surfaces = [s for s in surfaces if (s.corners >= low).all() and (s.corners <= high).all()]
     share = np.array([surface.area for surface in surfaces]) ** power
     if share.sum() == 0:
         return SurfacePoints(np.empty((0, 3)), np.empty((0, 3)))
@@ -180,10 +227,10 @@ def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
     hit something, no chain of free segments through other positions connects it with the space
     that the scene's own sensors see, and one of these holds:
 
-    - nothing is farther away than 15 % of the scene's diagonal (the inside of a small object);
+    - nothing is farther away than 15 % of the diagonal of `extent` (the inside of a small object);
     - 75 % of the hits are back faces which reflect nothing (one-sided materials);
     - 75 % of the hits are back faces, and the box around the hits fills less than half of the
-      scene's bounding box (a larger object: a room with outward normals would fill it). 75 %
+      box of `extent` (a larger object: a room with outward normals would fill it). 75 %
       because an object on the floor often has no bottom face.
     """
     result = np.zeros(len(positions), dtype=bool)
@@ -197,14 +244,14 @@ def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
 
 def _enclosed(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
     """The tests of `inside_geometry` that need one position only."""
-    low, high, diagonal = bounds(scene)
+    low, high, diagonal = extent(scene)
     directions = sphere_directions(256)
     hits = _trace_spheres(scene, positions, directions)
     enclosed = np.isfinite(hits.distance).all(axis=1)
     distance = np.where(np.isfinite(hits.distance), hits.distance, 0.0)
-    extent = np.ptp(distance[..., None] * directions, axis=1)
+    reach = np.ptp(distance[..., None] * directions, axis=1)
     # A flat scene has no volume, so its box gets a minimal thickness.
-    filled = np.prod(extent / np.maximum(high - low, 1e-6 * diagonal), axis=1)
+    filled = np.prod(reach / np.maximum(high - low, 1e-6 * diagonal), axis=1)
     small = distance.max(axis=1) < SMALL_OBJECT * diagonal
     black = hits.black.mean(axis=1) >= 0.75
     backs = hits.back.mean(axis=1) >= 0.75
@@ -235,37 +282,50 @@ def probes_along(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """The same on view rays, (n, 3) each, of any camera; one at most on each."""
-    low, high, diagonal = bounds(scene)
+    low, high, _ = bounds(scene)
     far = trace(scene, origins, directions).distance
     with np.errstate(divide="ignore", invalid="ignore"):
         walls = np.stack([(low - origins) / directions, (high - origins) / directions])
     enter = np.maximum(np.nanmax(walls.min(axis=0), axis=1), 0.0)
     leave = np.minimum(np.nanmin(walls.max(axis=0), axis=1), far)
     # A camera close to the outside of a wall sees no space.
-    usable = leave > enter + CONTACT * diagonal
+    usable = leave > enter + CONTACT * extent(scene)[2]
     depth = enter + (leave - enter) * rng.random(len(far))
     return (origins + depth[:, None] * directions)[usable]
 
 
-def free_positions(scene: mi.Scene, count: int, seed: int) -> np.ndarray:
+def free_positions(
+    scene: mi.Scene, count: int, seed: int, probes: np.ndarray | None = None
+) -> np.ndarray:
     """Up to `count` quasi-random positions in a room where a camera can stand, (n, 3).
 
-    Each is enclosed by surfaces (75 % of all directions), at least 3 % of the scene's diagonal away
-    from them, and connected with the space that the scene's own sensors see by a chain of free
+    Each is enclosed by surfaces (75 % of all directions), at least 3 % of the diagonal of `extent`
+    away from them, and connected with the space that the scene's own sensors see by a chain of free
     segments. This rules out the insides of cupboards and the outside of the room. Without a sensor
     inside the room, all space outside objects counts.
+
+    Args:
+        scene: the room.
+        count: positions at most.
+        seed: of all random choices.
+        probes: positions in the space that counts, (n, 3); None: those of the scene's own sensors.
     """
-    low, high, diagonal = bounds(scene)
+    low, high, diagonal = extent(scene)
     # Candidates in furniture or outside are rejected below, hence four times as many.
     candidates = low + (high - low) * _quasi_random(max(4 * count, 4096), seed)
     hits = _trace_spheres(scene, candidates, sphere_directions(_DIRECTIONS))
     free = hits.distance.min(axis=1) > CLEARANCE * diagonal
     free &= np.isfinite(hits.distance).mean(axis=1) >= ROOM_ENCLOSURE
     candidates = candidates[free]
-    probes = sensor_probes(scene, seed)
+    probes = sensor_probes(scene, seed) if probes is None else probes
     if len(probes):
         return candidates[_connected(scene, candidates, probes, seed)][:count]
     return candidates[~inside_geometry(scene, candidates)][:count]
+
+
+def _offset(scene: mi.Scene) -> float:
+    """A distance that a ray on a surface is lifted: more than coordinates are rounded by."""
+    return max(_RAY_OFFSET * extent(scene)[2], 1e-6 * bounds(scene)[2])
 
 
 def _connected(scene: mi.Scene, positions: np.ndarray, starts: np.ndarray, seed: int) -> np.ndarray:

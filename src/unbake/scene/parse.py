@@ -24,6 +24,10 @@ from .normals import repair_normals
 from .preflight import check_xml
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
+#: Plugins for spectra and polarised light, and spectra that have no RGB.
+_SPECTRAL, _WITHOUT_RGB = ("specfilm", "stokes"), ("blackbody", "irregular", "regular")
+#: Names of a film's properties begin so: its size, and what of it is rendered.
+_FILM = ("width", "height", "crop_")
 _LIBRARY = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 #: Properties without which Mitsuba 3.9 crashes (segmentation fault) where other plugins complain.
 _NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}
@@ -33,8 +37,12 @@ _FOLDERS = {
     mi.ObjectType.Texture: "textures",
     mi.ObjectType.Emitter: "textures",
 }
-
-
+#: What stands for parts of a scene that nothing uses, by their types.
+_UNUSED = {
+    mi.ObjectType.Integrator: "path",
+    mi.ObjectType.Film: "hdrfilm",
+    mi.ObjectType.Sampler: "independent",
+}
 #: Shapes without a file, and how many axes of each must have one scale.
 _ROUND = {"sphere": 3, "cylinder": 2, "disk": 0, "rectangle": 0, "cube": 0}
 #: Scales that differ by this part of the larger one are not the same.
@@ -127,9 +135,27 @@ class ParsedScene:
         return [self.state.nodes[i] for i in self.principled_indices()]
 
     def principled_indices(self) -> list[int]:
-        """Their places among the nodes; their places in this list are the numbers of materials."""
+        """Their places among the nodes; their places in this list are the numbers of materials.
+
+        BSDFs that lamps alone have are left out, unless there are no others: no photograph tells
+        what a lamp reflects.
+        """
         nodes = self.state.nodes
-        return [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
+        found = [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
+        lamps = self._of_lamps_alone() if found else frozenset()
+        return [i for i in found if i not in lamps] or found
+
+    def _of_lamps_alone(self) -> frozenset[int]:
+        """The places of nodes that shapes with an emitter refer to, and no others."""
+        nodes, lamps, others = self.state.nodes, set(), set()
+        for place, node in enumerate(nodes):
+            if node.type != mi.ObjectType.Shape:
+                continue
+            own = self.references(place)
+            lit = any(nodes[i].type == mi.ObjectType.Emitter for i in own)
+            for i in own:
+                (lamps if lit else others).update(self.reachable(i))
+        return frozenset(lamps - others)
 
     def append(self, node: mi.parser.SceneNode) -> int:
         """Append a node and return its number; all handles of other nodes are void after it."""
@@ -186,6 +212,8 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
         raise UserError(f"not a scene that Mitsuba can read: {reason(error)}", path) from None
     scene = ParsedScene(path, root, config, state)
     _require_own_plugins(scene)
+    _replace_unused(scene)
+    _require_rgb(scene)
     _require_finite(scene)
     _require_round(scene)
     _require_needed(scene)
@@ -284,6 +312,33 @@ def _require_own_plugins(scene: ParsedScene) -> None:
             raise UserError(
                 f"the type {name[:80]!r} is no plugin of Mitsuba", where, "Correct its name"
             )
+
+
+def _replace_unused(scene: ParsedScene) -> None:
+    """Put usual plugins in place of those that Mitsuba cannot make here, and that nothing uses.
+
+    Integrators, films and samplers of a scene are not used. They may be of older versions of
+    Mitsuba, or for spectra and polarised light.
+    """
+    own = mitsuba_folder() / "plugins"
+    for node in scene.state.nodes:
+        usual, name = _UNUSED.get(node.type), node.props.plugin_name()
+        if usual is None or (name not in _SPECTRAL and (own / f"{name}{_LIBRARY}").exists()):
+            continue
+        node.props.set_plugin_name(usual)
+        for key in list(node.props):
+            if node.type != mi.ObjectType.Film or not key.startswith(_FILM):
+                del node.props[key]
+
+
+def _require_rgb(scene: ParsedScene) -> None:
+    """Refuse spectra that Mitsuba does not turn into RGB: it fails when light is computed."""
+    for node in scene.state.nodes:
+        name = node.props.plugin_name()
+        if name in _WITHOUT_RGB:
+            where = mi.parser.file_location(scene.state, node)
+            remedy = "Give <rgb>, or <spectrum> with a list of wavelengths and values"
+            raise UserError(f"a spectrum of the type {name!r} has no RGB", where, remedy)
 
 
 def _resolve_files(scene: ParsedScene, folders: list[Path]) -> None:

@@ -180,7 +180,8 @@ def _known_scene(
     view = SceneView.of(scene, None, settings.max_specular)
     points = SurfacePoints.of(scene, settings.seed)
     told = {"scene": name, "run": None, "light": None if light is None else light.told()}
-    return Known(view, _named(posed), is_room(scene), points, told)
+    given = [] if cameras is None else [camera for _, camera in posed]
+    return Known(view, _named(posed), is_room(scene, given), points, told)
 
 
 def _views(recovered: Recovered, cameras: Path | str | None) -> dict[str, Camera]:
