@@ -243,6 +243,29 @@ def test_what_is_clipped_has_neither_loss_nor_gradient_above(primal):
     np.testing.assert_allclose(gradient[1:], weight * 2 / 3 * np.array([-0.2, 0.4]), rtol=1e-5)
 
 
+def test_the_gradient_of_clipped_channels_has_no_bias_with_two_passes():
+    """Samples are a u², with noise on both sides of what the photograph shows at least."""
+    count, at_least, scale, spp = 1 << 20, 0.3, 1.0, 2
+    rng = np.random.default_rng(0)
+    noise = rng.random((2, spp, count)).astype(np.float32) ** 2
+
+    def shortfall(a):
+        return np.minimum(a * noise.astype(np.float64).mean(1) - at_least, 0).mean()
+
+    expected = (shortfall(scale + 0.01) ** 2 - shortfall(scale - 0.01) ** 2) / 0.02
+    a = mi.Float(scale)
+    dr.enable_grad(a)
+    samples = mi.Color3f(a * mi.Float(noise[0].T.ravel()))
+    other = mi.Color3f(mi.Float(scale * noise[1].mean(0)))
+    target = mi.Color3f(mi.Float(at_least))
+    target = dr.gather(mi.Color3f, target, dr.zeros(mi.UInt32, count))
+    clipped = dr.full(dr.mask_t(mi.Color3f), True, count)
+    error = squared_error(samples, target, spp, mi.Color3f(1), other, clipped)
+    dr.backward(error)
+    assert float(error[0]) == pytest.approx(shortfall(scale) ** 2, rel=0.01)
+    assert float(a.grad[0]) == pytest.approx(expected, rel=0.02)
+
+
 def test_of_all_pairs_clipped_channels_have_halves_and_others_pairs():
     rng = np.random.default_rng(6)
     samples = mi.Color3f([mi.Float(rng.uniform(0, 1, 24).astype(np.float32)) for _ in range(3)])

@@ -298,6 +298,8 @@ class _Training:
         Raises:
             UserError: there is no memory for it.
         """
+        if not self._watchdog.trusts:
+            return  # a state that may be taken back: it comes after that
         state, progress = self._begun.state, self._begun.progress
         try:
             samples = self._search.search_if_due(self._fraction, state, progress.step)

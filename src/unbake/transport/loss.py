@@ -97,6 +97,7 @@ def squared_error(
     (Iᵢ − G)(Iⱼ − G) for two independent samples is the squared error of the expected image, and so
     for its gradient. With `primal`, an estimate from other random numbers, the value is the product
     of the errors of the two estimates, and the factors of the gradient are that one's error and ∂I.
+    The two play the parts of halves where a channel is clipped.
 
     Of a clipped channel only a shortfall counts: an estimate above G has no error and no gradient.
     Single samples fall short of G too often, so that such channels always have halves, whose
@@ -126,9 +127,11 @@ def squared_error(
         if gain is not None:
             image, primal = image * gain, primal * dr.detach(gain)
         error = one_sided(dr.detach(primal) - target, clipped)
-        # The value is the product of the errors of both passes, the gradient 2 (primal − G) ∂I.
+        # The value is the product of the errors of both passes, the gradient 2 (primal − G) ∂I. Of
+        # clipped channels, ∂I counts where I falls short as well: E[min(I − G, 0)]² is learned.
         product = error * one_sided(dr.detach(image) - target, clipped)
-        squared = product + 2 * dr.detach(error) * (image - dr.detach(image))
+        shown = image if clipped is None else dr.select(clipped & (image > target), 0, image)
+        squared = product + 2 * dr.detach(error) * (shown - dr.detach(shown))
     elif not pairs:
         squared = _of_halves(samples, target, spp, clipped, gain)
     else:
