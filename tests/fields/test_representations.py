@@ -15,11 +15,12 @@ from unbake.fields.grid import DenseGrid
 from unbake.fields.materials import make_materials
 from unbake.fields.network import Network
 from unbake.fields.radiance import RadianceField, make_radiance
+from unbake.fields.registry import representations
 from unbake.fields.settings import TriPlaneConfig
 from unbake.fields.triplane import TriPlane
 
 LANES = 300
-REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
+REPRESENTATIONS = representations()
 
 
 def uniform(dimensions, lanes=LANES, seed=1):

@@ -19,6 +19,7 @@ from support import (
 from unbake.config import BitmapConfig
 from unbake.errors import UserError
 from unbake.fields.materials import make_materials
+from unbake.fields.registry import representations
 from unbake.fields.texture import material_numbers, material_textures
 from unbake.scene import edit
 from unbake.scene.parse import parse
@@ -29,7 +30,7 @@ from unbake.transport.operator import attach_albedo, attach_material
 from unbake.transport.path_sample import Requirements, rhs, trace
 from unbake.transport.vertex import SceneView, find_vertex
 
-REPRESENTATIONS = ["neural", "grid", "bitmap", "triplane"]
+REPRESENTATIONS = representations()
 
 
 def randomised(fields, seed=0, scale=0.7):

@@ -12,11 +12,12 @@ import pytest
 from support import tiny_fields
 
 from unbake.fields.materials import carry, make_materials
+from unbake.fields.registry import representations
 from unbake.fields.texture import material_textures
 
 #: Towards the camera, in the frame of the surface.
 DIRECTIONS = [(0, 0, 1), (0.6, 0, 0.8), (0.3, -0.8, 0.52), (-0.9, 0.1, 0.42), (0, 0.98, 0.2)]
-REPRESENTATIONS = ["neural", "grid", "triplane", "bitmap"]
+REPRESENTATIONS = representations()
 WRAPPERS = {
     "alone": lambda bsdf: bsdf,
     "twosided": lambda bsdf: {"type": "twosided", "bsdf": bsdf},

@@ -1,6 +1,6 @@
 """The settings of a fit, as frozen dataclasses.
 
-Every field cites the section of the paper (or says that the choice is ours).
+Fields cite the section of the paper, or say that the choice is ours, where one was made.
 """
 
 from __future__ import annotations

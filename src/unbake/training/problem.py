@@ -40,7 +40,7 @@ from .poses import PoseModel
 Parameters = Mapping[str, mi.Float | mi.TensorXf]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Problem:
     """A scene with unknowns φ, and the radiance field if the method has one.
 
@@ -203,19 +203,19 @@ def make_problem(
         guide = LightGuide(config.guide, domain)
     scene_view = SceneView.of(loaded, materials, config.transport.max_specular)
     return Problem(
-        scene_view,
-        materials,
-        environment,
-        emission,
-        emitter_names,
-        radiance,
-        background == "hidden",
-        config.half_precision,
-        _unknown_camera(config.camera, len(views)),
-        _unknown_poses(config.camera, unchanged, views),
-        _unknown_outliers(config.objective, views),
-        guide,
-        config.beta2 or OWN_BETA2,
+        scene_view=scene_view,
+        materials=materials,
+        environment=environment,
+        emission=emission,
+        emitter_names=emitter_names,
+        radiance=radiance,
+        hide_emitters=background == "hidden",
+        half_precision=config.half_precision,
+        camera=_unknown_camera(config.camera, len(views)),
+        poses=_unknown_poses(config.camera, unchanged, views),
+        outliers=_unknown_outliers(config.objective, views),
+        guide=guide,
+        beta2=config.beta2 or OWN_BETA2,
     )
 
 

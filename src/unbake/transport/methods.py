@@ -135,7 +135,7 @@ for _method in (
         sampler=PATH_REPLAY,
         follows_paths=True,
     ),
-    # The ablation of Fig. 7 and 8, from `direct` to `ours`, each with one thing more. The authors'
+    # The ablation of Fig. 7 and 8, from `direct` to `ours`: each has one term more. The authors'
     # row "+ prior" is `with-biased-prior`: their residuals are squared sample by sample, with one
     # sample of T(L_θ) each. `with-prior` is the same idea without that bias. The rows after these
     # take the square: with the scene detached its gradient has no bias.

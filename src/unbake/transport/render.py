@@ -9,8 +9,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.materials import carrying, read_carried
+from ..fields.radiance import RadianceField
 from .emitter_sampling import has_cut_outs
 from .operator import attach_material
+from .path_sample import Requirements, rhs, trace
 from .path_tracer import path_traced
 from .vertex import SceneView, find_vertex
 
@@ -52,6 +54,36 @@ def render_radiance(
             hide_emitters=hide_emitters,
         )
         image[part] = np.stack([_pixel_means(c, spp) for c in radiance], -1)
+    return image
+
+
+@carrying()
+def render_one_bounce(
+    scene_view: SceneView,
+    radiance: RadianceField,
+    through: RayGenerator,
+    pixels: int,
+    spp: int,
+    *,
+    seed: int,
+    hide_emitters: bool,
+) -> np.ndarray:
+    """Render pixels with one bounce that ends in the radiance field, E + T(L_θ) (box filter).
+
+    Returns:
+        Linear RGB, float32, shape (pixels, 3).
+
+    Paper: Eq. 12.
+    """
+    needed = Requirements(1, constant=frozenset([2]))
+    image = np.zeros((pixels, 3), np.float32)
+    sampler = mi.load_dict({"type": "independent"})
+    for part, ray, part_seed in parts_of(through, pixels, spp, seed):
+        sampler.seed(dr.opaque(mi.UInt32, part_seed), dr.width(ray))
+        with dr.suspend_grad():
+            sample = trace(scene_view, radiance, ray, sampler, needed, hide_emitters=hide_emitters)
+            value = rhs(sample, sample.radiance[1])
+            image[part] = np.stack([_pixel_means(c, spp) for c in value], -1)
     return image
 
 

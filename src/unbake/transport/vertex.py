@@ -139,21 +139,21 @@ def find_vertex(
         weight = _emission_weight(scene_view, si, origin, active)
         valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
         direct_view = mi.Bool(valid)
-        passed, moved = mi.Color3f(0), mi.Bool(False)
+        chain = None
         if scene_view.has_chains:
             hidden = hide_emitters and origin is None
             chain = _follow_chain(scene_view, pi, ray, valid, sampler, hidden)
-            pi, ray, β, passed, opacity, specular, moved = chain
-            direct_view &= ~specular
+            pi, ray, β = chain.pi, chain.ray, chain.throughput
+            direct_view &= ~chain.specular
             valid = valid & pi.is_valid()
             # Of a chain that ends nowhere it is that of the last hole, which may be 0.
-            opacity = dr.select(valid, opacity, 1)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid | moved)
+            opacity = dr.select(valid, chain.opacity, 1)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid | chain.sees_end)
 
     # The light that is met passes gradients: lighting may be unknown.
     emitted = weight * first.emitter(scene).eval(first, seen)
-    if scene_view.has_chains:
-        emitted += passed + β * si.emitter(scene, moved).eval(si, moved)
+    if chain is not None:
+        emitted += chain.emitted + β * si.emitter(scene, chain.sees_end).eval(si, chain.sees_end)
     unknown = dr.zeros(mi.Color3f)
     vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, unknown)
     evaluate(sampler, vertex)
@@ -187,6 +187,21 @@ def _emission_weight(
     return dr.select(lit, mis_weight(origin.pdf, pdf), 1)
 
 
+@dataclass
+class _Chain:
+    """Specular and cut-out surfaces that a ray has passed, up to one that scatters."""
+
+    pi: mi.PreliminaryIntersection3f  #: where it ends; invalid: nowhere, or in black
+    ray: mi.Ray3f  #: the last one
+    throughput: mi.Color3f
+    emitted: mi.Color3f  #: by surfaces on the way, times the throughput up to each
+    opacity: mi.Float  #: the probability with which a cut-out stopped the ray at the end
+    specular: mi.Bool  #: whether any surface was
+    #: Whether light at the end counts in addition to that of the first surface: the ray has left
+    #: that one, has not ended in black, and may see lights.
+    sees_end: mi.Bool
+
+
 @dr.syntax
 def _follow_chain(
     scene_view: SceneView,
@@ -195,17 +210,11 @@ def _follow_chain(
     active: mi.Bool,
     sampler: mi.Sampler,
     hide_emitters: bool,
-):
+) -> _Chain:
     """Follow specular and cut-out surfaces, as long as there are any.
 
     Args:
         hide_emitters: whether no light is seen through holes alone, as in `find_vertex`.
-
-    Returns:
-        Where the chain ends (an invalid `pi`: nowhere), its last ray, its throughput, the emission
-        of surfaces passed on the way, the probability with which a cut-out stopped it at the end,
-        whether there was anything specular, and whether light met at the end comes in addition (the
-        ray has left its first surface, has not ended in black, and may see lights).
     """
     scene, limit, ctx = scene_view.scene, scene_view.max_specular, mi.BSDFContext()
     pi = mi.PreliminaryIntersection3f(pi)
@@ -253,7 +262,8 @@ def _follow_chain(
         depth = dr.select(active, depth + 1, depth)
         active &= pi.is_valid()
 
-    return pi, ray, β, emitted, opacity, any_specular, (depth > 0) & ~lost & ~hidden
+    sees_end = (depth > 0) & ~lost & ~hidden
+    return _Chain(pi, ray, β, emitted, opacity, any_specular, sees_end)
 
 
 def evaluate(sampler: mi.Sampler, *values: object) -> None:

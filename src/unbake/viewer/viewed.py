@@ -16,6 +16,7 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
+from ..dataset.small_views import block_of, small_camera
 from ..dataset.views import Dataset, View, read_photograph, read_view
 from ..errors import UserError
 from ..exports.bake import OwnTextures, look_up, own_textures
@@ -28,11 +29,11 @@ from ..imaging.pictures import absolute_error, block_means, false_colour, shown,
 from ..quantities import QUANTITIES
 from ..training.cameras import Cameras
 from ..training.checkpoint import Progress, load_written
+from ..training.monitor import loss_terms
 from ..training.poses import refined_view
 from ..training.recovered import open_run
 from ..training.validation import MaterialBuffers
-from ..transport.path_sample import Requirements, rhs, trace
-from ..transport.render import parts_of, render_radiance
+from ..transport.render import render_one_bounce, render_radiance
 from .surface import Surface, make_surface
 
 #: What can be shown on surfaces beside quantities.
@@ -46,10 +47,6 @@ _CHUNK = 1 << 16
 LONGEST, MATERIAL_SPP, SPP = 192, 16, 64
 #: Paths of renderings of runs without a radiance field.
 _MAX_DEPTH, _RR_DEPTH = 16, 5
-#: Keys of the log that are no terms of the loss.
-_NO_TERMS = frozenset(
-    ("step", "seconds", "samples", "skipped", "samples_per_second", "memory_mb", "learning_rate")
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,19 +346,10 @@ class ViewedRun(ViewedData):
                 max_depth=_MAX_DEPTH, rr_depth=_RR_DEPTH, hide_emitters=problem.hide_emitters,
             )  # fmt: skip
             return image.reshape(shape), "path traced"
-        needed = Requirements(1, constant=frozenset([2]))
-        image = np.zeros((rays.pixels, 3), np.float32)
-        sampler = mi.load_dict({"type": "independent"})
-        for part, ray, seed in parts_of(rays.through, rays.pixels, SPP, seed=0):
-            sampler.seed(dr.opaque(mi.UInt32, seed), (part.stop - part.start) * SPP)
-            with dr.suspend_grad():
-                sample = trace(
-                    problem.scene_view, problem.radiance, ray, sampler, needed,
-                    hide_emitters=problem.hide_emitters,
-                )  # fmt: skip
-                value = rhs(sample, sample.radiance[1])
-                means = [dr.block_sum(channel, SPP) / SPP for channel in value]
-            image[part] = np.stack([np.array(channel) for channel in means], -1)
+        image = render_one_bounce(
+            problem.scene_view, problem.radiance, rays.through, rays.pixels, SPP, seed=0,
+            hide_emitters=problem.hide_emitters,
+        )  # fmt: skip
         return image.reshape(shape), "one bounce"
 
     # ---------------------------------------------------------------------------- the log
@@ -408,9 +396,8 @@ def log_tail(lines: Sequence[Mapping[str, Any]]) -> dict[str, str]:
             told["samples / s"] = f"{newest['samples_per_second']:,.0f}"
         if skipped := sum(line.get("skipped", 0) for line in losses):
             told["skipped steps"] = f"{skipped:.0f}"
-        for name, value in newest.items():
-            if name not in _NO_TERMS and isinstance(value, float):
-                told[f"loss: {name}"] = f"{value:.4f}"
+        for name in loss_terms(newest):
+            told[f"loss: {name}"] = f"{newest[name]:.4f}"
     for key in ("validation", "score"):
         scores = next((line[key] for line in reversed(lines) if key in line), {})
         for name, value in scores.items():
@@ -445,10 +432,7 @@ def _truth(view: View, name: str) -> np.ndarray:
 
 def _small(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     """An image of `LONGEST` pixels a side at most, and its camera."""
-    block = -(-max(image.shape[:2]) // LONGEST)
-    small = block_means(image, block)
-    pinhole = {k: getattr(camera, k) / block for k in ("fl_x", "fl_y", "cx", "cy")}
-    return small, replace(camera, width=small.shape[1], height=small.shape[0], **pinhole)
+    return block_means(image, block_of(camera, LONGEST)), small_camera(camera, LONGEST)
 
 
 def _chunks(count: int) -> list[np.ndarray]:
