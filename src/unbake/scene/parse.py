@@ -17,11 +17,13 @@ import numpy as np
 from ..backend import mitsuba_folder
 from ..errors import UserError
 from ..fields.shapes import met_shapes
+from .bumps import turn_rectangles, turn_textures
 from .files import find
 from .images import IMAGES, check_image
 from .meshes import FORMATS, check_mesh
 from .normals import repair_normals
 from .preflight import check_xml
+from .transforms import write_nodes
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
 #: Plugins for spectra and polarised light, and spectra that have no RGB.
@@ -93,6 +95,7 @@ class ParsedScene:
             self.state = mi.parser.ParserState()
             raise UserError(fault[0], self.path, fault[1])
         self.repaired_normals = repair_normals(scene)
+        turn_textures(scene)
         return scene
 
     def _forget_queries(self) -> None:
@@ -219,6 +222,7 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     _require_needed(scene)
     _resolve_files(scene, folders)
     scene.media = _leave_out_media(scene)
+    turn_rectangles(scene)
     return scene
 
 
@@ -238,7 +242,7 @@ def write(scene: ParsedScene, folder: Path) -> Path:
                 if source not in copies:
                     copies[source] = _copy(Path(source), folder, _FOLDERS.get(node.type, "assets"))
                 node.props["filename"] = copies[source]
-        mi.parser.write_file(scene.state, str(folder / "scene.xml"))
+        write_nodes(scene, folder / "scene.xml")
     except (RuntimeError, ValueError) as error:
         raise UserError(f"cannot be copied: {reason(error)}", scene.path) from None
     return folder / "scene.xml"
