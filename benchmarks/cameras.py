@@ -30,33 +30,27 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from variants import SCORES
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from variants import SCORES  # noqa: E402
-
-from unbake import backend  # noqa: E402
-from unbake.acquisition.degrade import degrade  # noqa: E402
-from unbake.acquisition.settings import DegradeSettings  # noqa: E402
-from unbake.dataset.data_folder import DataFolder  # noqa: E402
-from unbake.dataset.views import Dataset  # noqa: E402
-from unbake.evaluation.settings import EvaluationSettings  # noqa: E402
-from unbake.experiments.commands import unbake  # noqa: E402
-from unbake.experiments.seeds import across_seeds  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
+from unbake import backend
+from unbake.acquisition.degrade import degrade
+from unbake.acquisition.settings import DegradeSettings
+from unbake.dataset.data_folder import DataFolder
+from unbake.dataset.views import Dataset
+from unbake.evaluation.settings import EvaluationSettings
+from unbake.experiments.commands import unbake
+from unbake.experiments.seeds import across_seeds
+from unbake.io import write_json
+from unbake.machine import machine
 
 LENGTH = ("samples", "seconds")
 #: Of a measurement, all of which rows have in common.

@@ -10,19 +10,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
-from unbake.acquisition.capture import capture  # noqa: E402
-from unbake.experiments.experiment import ExperimentContext  # noqa: E402
-from unbake.experiments.scenes import SCENES, STAIRCASE, PaperScene  # noqa: E402
+from unbake import backend
+from unbake.acquisition.capture import capture
+from unbake.experiments.experiment import ExperimentContext
+from unbake.experiments.scenes import SCENES, STAIRCASE, PaperScene
 
 #: Samples of fig. 6 over those here, in rooms.
 _FEWER = 4

@@ -16,7 +16,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from variants import ROOT, SCORES, described, fit
+from here import ROOT
+
+from variants import SCORES, described, fit
 
 from unbake import backend
 from unbake.dataset.views import Dataset

@@ -18,9 +18,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from cameras import FAULTS, GAMMA, about_data, errors, true_light  # puts src on the path
+import here
 
-import numpy as np  # isort: skip
+import numpy as np
+from cameras import FAULTS, GAMMA, about_data, errors, true_light
 
 from unbake import backend
 from unbake.acquisition.degrade import degrade

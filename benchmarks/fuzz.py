@@ -14,14 +14,15 @@ import sys
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT / "src"), str(ROOT / "tests")]
+from here import ROOT
 
-from fuzzing.engine import CORPUS, Campaign, Worker, shares  # noqa: E402
-from fuzzing.formats import FORMATS  # noqa: E402
+sys.path.insert(0, str(ROOT / "tests"))
 
-from unbake import backend  # noqa: E402
-from unbake.io import write_json  # noqa: E402
+from fuzzing.engine import CORPUS, Campaign, Worker, shares
+from fuzzing.formats import FORMATS
+
+from unbake import backend
+from unbake.io import write_json
 
 RESULT = ROOT / "benchmarks" / "results" / "fuzz.json"
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import os
 import random
 import re
 import signal
@@ -34,30 +33,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from here import ROOT
+
 import numpy as np
 import psutil
-
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from kill import GOES_ON, last_logged, until  # noqa: E402
-from ranks import ALONE, SEVERAL, WARM_UP, ms_per_step  # noqa: E402
-from scaling import (  # noqa: E402
+from kill import GOES_ON, last_logged, until
+from ranks import ALONE, SEVERAL, WARM_UP, ms_per_step
+from scaling import (
     NETWORKS,
     computing,
     seconds_a_byte_exchanged,
     seconds_of_step,
     seconds_to_exchange,
 )
-from small_run import mpiexec, prepare  # noqa: E402
-from two_hosts import TwoHosts, why_not  # noqa: E402
+from small_run import mpiexec, prepare
+from two_hosts import TwoHosts, why_not
 
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
-from unbake.training.checkpoint import newest_progress  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake.io import write_json
+from unbake.machine import machine
+from unbake.training.checkpoint import newest_progress
+from unbake.training.run_folder import RunFolder
 
 SCALING = ROOT / "benchmarks" / "results" / "scaling.json"
 #: Bits a second of the cable; None: as many as the machine can.

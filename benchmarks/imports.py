@@ -16,33 +16,30 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from here import ROOT
+
 import numpy as np
+from poses import as_seen, fit  # activates a variant
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path[:0] = [SRC, str(ROOT / "tests")]
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+sys.path.insert(0, str(ROOT / "tests"))
 
-from poses import as_seen, fit  # noqa: E402 # isort: skip; activates a variant
+import layouts
 
-import layouts  # noqa: E402
-
-from unbake.config.light import LightConfig  # noqa: E402
-from unbake.dataset.views import Dataset, View  # noqa: E402
-from unbake.experiments.seeds import across_seeds  # noqa: E402
-from unbake.importing.import_data import import_data  # noqa: E402
-from unbake.importing.settings import ImportSettings  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
-from unbake.training.recovered import load_run  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake.config.light import LightConfig
+from unbake.dataset.views import Dataset, View
+from unbake.experiments.seeds import across_seeds
+from unbake.importing.import_data import import_data
+from unbake.importing.settings import ImportSettings
+from unbake.io import write_json
+from unbake.machine import machine
+from unbake.training.recovered import load_run
+from unbake.training.run_folder import RunFolder
 
 #: The data set as it was captured.
 CAPTURED = "captured"

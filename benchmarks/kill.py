@@ -26,6 +26,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import here
+
 import psutil
 from small_run import prepare, start
 

@@ -14,20 +14,16 @@ clock.
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
+import numpy as np
+
+from unbake import backend
 
 backend.activate()
 
-import numpy as np  # noqa: E402
 from export_process import export_measured  # noqa: E402
 
 from unbake.experiments.commands import unbake  # noqa: E402

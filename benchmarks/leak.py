@@ -18,9 +18,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from variants import SCORES, described  # puts src on the path
+import here
 
-import numpy as np  # isort: skip
+import numpy as np
+from variants import SCORES, described
 
 from unbake import backend
 from unbake.errors import UserError

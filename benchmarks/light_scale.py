@@ -20,7 +20,9 @@ import shutil
 from pathlib import Path
 from statistics import mean
 
-from poses import SCORES, fit  # which puts the package on the path, and activates a variant
+import here
+
+from poses import SCORES, fit  # which activates a variant
 
 from unbake.config import preset
 from unbake.dataset.data_folder import DataFolder

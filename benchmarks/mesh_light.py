@@ -16,9 +16,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from cameras import about_data  # puts src on the path
+import here
 
-import numpy as np  # isort: skip
+import numpy as np
+from cameras import about_data
 
 from unbake import backend
 from unbake.acquisition.degrade import degrade

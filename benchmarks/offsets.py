@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import argparse
 import gc
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
+import here
+
+import numpy as np
 
 from unbake import backend
 
@@ -28,7 +29,6 @@ backend.activate()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
 
 from unbake.config import FitConfig, read_toml  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402

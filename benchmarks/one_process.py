@@ -9,15 +9,9 @@ compared.
 
 from __future__ import annotations
 
-import os
-import sys
-from pathlib import Path
+import here
 
-SRC = str(Path(__file__).parents[1] / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from unbake import backend, cli  # noqa: E402
+from unbake import backend, cli
 
 
 def compute_with_a_thread_a_core() -> None:

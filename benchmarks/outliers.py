@@ -17,8 +17,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
-from poses import SCORES, fit  # which puts the package on the path, and activates a variant
+from poses import SCORES, fit  # which activates a variant
 
 from unbake.dataset.data_folder import DataFolder
 from unbake.dataset.views import Dataset

@@ -17,23 +17,18 @@ roughness of these pixels against the true one, PSNR in dB:
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import here
+
 import numpy as np
+from roughness_curves import opened
+from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from roughness_curves import opened  # noqa: E402
-from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs  # noqa: E402
-
-from unbake.config import RoughnessSearchConfig  # noqa: E402
+from unbake.config import RoughnessSearchConfig
 
 #: A piece counts as moved if its mean roughness did by more.
 MOVED = 0.01

@@ -14,23 +14,18 @@ differ, linear RGB, root mean square over these.
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from roughness_curves import opened
+from roughness_limits import AT_ONCE, means_of, told_of_runs
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from roughness_curves import opened  # noqa: E402
-from roughness_limits import AT_ONCE, means_of, told_of_runs  # noqa: E402
-
-from unbake.config import RoughnessSearchConfig  # noqa: E402
+from unbake.config import RoughnessSearchConfig
 
 
 def main() -> None:

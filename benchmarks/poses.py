@@ -16,23 +16,17 @@ What FOLDER has already is not made again.
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from variants import SCORES
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from variants import SCORES  # noqa: E402
-
-from unbake import backend  # noqa: E402
+from unbake import backend
 
 backend.activate()  # before modules with types of Dr.Jit
 

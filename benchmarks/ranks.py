@@ -17,27 +17,23 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from small_run import mpiexec  # noqa: E402
-from variants import SCORES  # noqa: E402
+from small_run import mpiexec
+from variants import SCORES
 
-from unbake import backend  # noqa: E402
-from unbake.experiments.commands import command, unbake  # noqa: E402
-from unbake.experiments.seeds import across_seeds  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake import backend
+from unbake.experiments.commands import command, unbake
+from unbake.experiments.seeds import across_seeds
+from unbake.io import write_json
+from unbake.machine import machine
+from unbake.training.run_folder import RunFolder
 
 #: Steps that compile and warm up, which are not timed.
 WARM_UP = 100

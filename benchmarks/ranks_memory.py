@@ -28,22 +28,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from small_run import mpiexec
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from small_run import mpiexec  # noqa: E402
-
-from unbake import backend  # noqa: E402
-from unbake.config import FitConfig, preset  # noqa: E402
-from unbake.dataset.data_folder import DataFolder  # noqa: E402
-from unbake.dataset.shares import dealt  # noqa: E402
-from unbake.dataset.views import Dataset, View  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
+from unbake import backend
+from unbake.config import FitConfig, preset
+from unbake.dataset.data_folder import DataFolder
+from unbake.dataset.shares import dealt
+from unbake.dataset.views import Dataset, View
+from unbake.io import write_json
+from unbake.machine import machine
 
 #: Views of a data set, and their width and height in pixels. Each takes less than goes to a file.
 CASES = [(5, 1632, 1224), (10, 1632, 1224), (40, 800, 600), (150, 400, 300)]

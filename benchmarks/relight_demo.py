@@ -21,24 +21,20 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import os
 import shutil
-import sys
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
+import numpy as np
+
+from unbake import backend
 
 backend.activate()
 
-import numpy as np  # noqa: E402
 from views import of_size  # noqa: E402
 
 from unbake.config.light import LightConfig  # noqa: E402

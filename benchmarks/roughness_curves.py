@@ -10,20 +10,16 @@ a search does it. What differs between the two is what holds roughness back.
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from unbake import backend  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
+from unbake import backend
+from unbake.io import write_json
+from unbake.machine import machine
 
 #: Width of the bins of true roughness.
 BIN = 0.04

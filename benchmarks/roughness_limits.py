@@ -20,24 +20,19 @@ from __future__ import annotations
 
 import argparse
 import functools
-import os
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from roughness_curves import numbers_of, opened
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from roughness_curves import numbers_of, opened  # noqa: E402
-
-from unbake import backend  # noqa: E402
-from unbake.config import RoughnessSearchConfig  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
+from unbake import backend
+from unbake.config import RoughnessSearchConfig
+from unbake.io import write_json
+from unbake.machine import machine
 
 #: Camera samples that are traced at once, for the largest number of them a pixel.
 AT_ONCE = 1 << 18
@@ -275,8 +270,8 @@ class Shared:
 
 def means_of(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """The mean of values over the group of each pixel, shape (n,), as the arguments."""
-    _, here = np.unique(groups, return_inverse=True)
-    return (np.bincount(here, values) / np.bincount(here))[here]
+    _, which = np.unique(groups, return_inverse=True)
+    return (np.bincount(which, values) / np.bincount(which))[which]
 
 
 def psnr(values: np.ndarray, truth: np.ndarray) -> float:

@@ -13,20 +13,19 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
+import here
 
-import unbake  # noqa: E402
+import numpy as np
+
+import unbake
 
 unbake.activate()
 
 import drjit as dr  # noqa: E402
-import numpy as np  # noqa: E402
 
 from unbake.config import FitConfig, PathConfig, update  # noqa: E402
 from unbake.io import write_json  # noqa: E402

@@ -23,17 +23,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
+import numpy as np
+
+from unbake import backend
 
 backend.activate()
 
 import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
 import trimesh  # noqa: E402
 from export_process import export_measured  # noqa: E402
 from gltf_judges import browser_lacks, shown, validated, validator_lacks  # noqa: E402
@@ -354,12 +352,12 @@ def in_browser(run: unbake.Run, file: Path, picture: Path | None) -> dict[str, A
     there = shown(file, camera)
     scene_view, rays = run.recovered.problem.scene_view, CameraRays.of([camera])
     values, coverage = render_materials(scene_view, rays.through, rays.pixels, 16, seed=0)
-    here = tonemap(values["albedo"].reshape(camera.height, camera.width, 3))
+    seen = tonemap(values["albedo"].reshape(camera.height, camera.width, 3))
     known = coverage.reshape(camera.height, camera.width) > 0.999
     if picture is not None:
         gap = np.full((camera.height, 16, 3), 255, np.uint8)
-        write_png(picture, np.concatenate([here, gap, there], 1))
-    return {"psnr": psnr(there / 255, here / 255, known), "pixels": int(known.sum())}
+        write_png(picture, np.concatenate([seen, gap, there], 1))
+    return {"psnr": psnr(there / 255, seen / 255, known), "pixels": int(known.sum())}
 
 
 if __name__ == "__main__":

@@ -14,25 +14,24 @@ from __future__ import annotations
 import argparse
 import gc
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
+import here
 
-import unbake  # noqa: E402
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import unbake
 
 unbake.activate()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
 
 from unbake.dataset.views import Dataset  # noqa: E402
 from unbake.io import write_json  # noqa: E402

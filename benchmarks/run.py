@@ -16,36 +16,25 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-# The code of this checkout, here and in the commands that jobs run.
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+from here import ROOT
 
-from rich.console import Console  # noqa: E402
-from summary import machine_results, read, summarized, summary  # noqa: E402
+from rich.console import Console
+from summary import machine_results, read, summarized, summary
 
-from unbake.acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES  # noqa: E402
-from unbake.config import from_toml, method_defaults, with_method  # noqa: E402
-from unbake.dataset.data_folder import DataFolder  # noqa: E402
-from unbake.errors import UserError  # noqa: E402
-from unbake.experiments.commands import (  # noqa: E402
-    call_settings,
-    end_of_call,
-    main,
-    run_jobs,
-    unbake,
-)
-from unbake.experiments.jobs import Findings, Job, JobRunner, Unfinished, digest  # noqa: E402
-from unbake.experiments.scales import SMOKE  # noqa: E402
-from unbake.io import write_atomically, write_json  # noqa: E402
+from unbake.acquisition.settings import LIGHT_PIXELS, LIGHT_SAMPLES
+from unbake.config import from_toml, method_defaults, with_method
+from unbake.dataset.data_folder import DataFolder
+from unbake.errors import UserError
+from unbake.experiments.commands import call_settings, end_of_call, main, run_jobs, unbake
+from unbake.experiments.jobs import Findings, Job, JobRunner, Unfinished, digest
+from unbake.experiments.scales import SMOKE
+from unbake.io import write_atomically, write_json
 
 RESULTS = ROOT / "benchmarks" / "results"
 STAIRCASE = "staircase"

@@ -26,7 +26,6 @@ import argparse
 import dataclasses
 import json
 import math
-import os
 import statistics
 import subprocess
 import sys
@@ -35,18 +34,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from small_run import mpiexec
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from small_run import mpiexec  # noqa: E402
-
-from unbake import backend  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
+from unbake import backend
+from unbake.io import write_json
+from unbake.machine import machine
 
 #: Bytes a second, and seconds of latency a message.
 NETWORKS = {

@@ -16,32 +16,27 @@ photograph, which begins without EXIF. There are no true materials. Told are:
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
 from PIL import Image
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
-
-from unbake import backend  # noqa: E402
-from unbake.dataset.data_folder import DataFolder  # noqa: E402
-from unbake.dataset.views import Dataset, read_photograph  # noqa: E402
-from unbake.evaluation.settings import EvaluationSettings  # noqa: E402
-from unbake.experiments.commands import unbake  # noqa: E402
-from unbake.imaging.coded import decode, encode, read_codes  # noqa: E402
-from unbake.imaging.pictures import read_exr  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake import backend
+from unbake.dataset.data_folder import DataFolder
+from unbake.dataset.views import Dataset, read_photograph
+from unbake.evaluation.settings import EvaluationSettings
+from unbake.experiments.commands import unbake
+from unbake.imaging.coded import decode, encode, read_codes
+from unbake.imaging.pictures import read_exr
+from unbake.io import write_json
+from unbake.machine import machine
+from unbake.training.run_folder import RunFolder
 
 #: The folder of photographs of a project.
 IMAGES = "images"

@@ -13,25 +13,20 @@ standard deviation over resampled pixels, the median over groups of more than a 
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
-import sys
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from roughness_curves import opened
+from roughness_limits import Shared, sampled
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from roughness_curves import opened  # noqa: E402
-from roughness_limits import Shared, sampled  # noqa: E402
-
-from unbake import backend  # noqa: E402
-from unbake.experiments.seeds import spread  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
+from unbake import backend
+from unbake.experiments.seeds import spread
+from unbake.io import write_json
+from unbake.machine import machine
 
 #: Brightnesses of a piece that are told apart, and times that pixels are resampled.
 BRIGHTNESSES, RESAMPLED = 8, 16

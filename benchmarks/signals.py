@@ -24,6 +24,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import here
+
 from small_run import prepare, start
 
 from unbake.backend import activate

@@ -25,17 +25,17 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
+from here import ROOT
 
-from unbake import backend  # noqa: E402
+import numpy as np
+import psutil
+from rich.console import Console
+
+from unbake import backend
 
 backend.activate()
 
 import drjit as dr  # noqa: E402
-import numpy as np  # noqa: E402
-import psutil  # noqa: E402
-from rich.console import Console  # noqa: E402
 
 from unbake.acquisition.capture import capture  # noqa: E402
 from unbake.acquisition.settings import CaptureSettings  # noqa: E402

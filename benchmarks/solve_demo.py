@@ -12,22 +12,17 @@ were at work for it (`cpu_seconds`); how many other programs kept busy is writte
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
+import psutil
+
+from unbake import backend
 
 backend.activate()
-
-import psutil  # noqa: E402
 
 from unbake.io import write_json  # noqa: E402
 from unbake.machine import machine  # noqa: E402

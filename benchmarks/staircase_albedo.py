@@ -31,12 +31,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import here
+
+import numpy as np
+from rich.console import Console
+
 import unbake
 
 unbake.activate()
-
-import numpy as np  # noqa: E402
-from rich.console import Console  # noqa: E402
 
 from unbake.config import PAPER_DEPTH  # noqa: E402
 from unbake.dataset.camera import read_cameras  # noqa: E402
@@ -237,12 +239,12 @@ def told(row: Mapping[str, Any]) -> str:
             continue
         lines.append(f"  {loss}, {len(row['values'])} roughnesses; noise {row[loss]['noise']:.0%}:")
         for method in METHODS:
-            here, paper = row[loss][method], row["published"][method]
-            one, other = here["halves"]
+            found, paper = row[loss][method], row["published"][method]
+            one, other = found["halves"]
             lines.append(
-                f"    {method}: relative RMSE {here['relative_rmse']:.2f} ({one:.2f}, {other:.2f} "
-                f"by halves; published {paper['relative_rmse']:.2f}), slope {here['slope']:.2f} "
-                f"({paper['slope']:.2f}), sign agreement {here['sign_agreement']:.2f} "
+                f"    {method}: relative RMSE {found['relative_rmse']:.2f} ({one:.2f}, {other:.2f} "
+                f"by halves; published {paper['relative_rmse']:.2f}), slope {found['slope']:.2f} "
+                f"({paper['slope']:.2f}), sign agreement {found['sign_agreement']:.2f} "
                 f"({paper['sign_agreement']:.2f})"
             )
     return "\n".join(lines)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import re
 import statistics
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
+import here
 
 from unbake.experiments.seeds import across_seeds
 from unbake.imaging.metrics import mean_psnr

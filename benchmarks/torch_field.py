@@ -12,23 +12,22 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
+from here import ROOT
 
-import unbake  # noqa: E402
+import numpy as np
+
+import unbake
 
 unbake.activate()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
 import torch  # noqa: E402
 
 from unbake.acquisition import built_in  # noqa: E402

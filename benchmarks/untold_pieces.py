@@ -12,22 +12,17 @@ photographs show that is of such pieces, and the roughness of held-out views, PS
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import here
+
 import numpy as np
+from piece_middles import replaced, searchable
+from roughness_limits import told_of_runs
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from piece_middles import replaced, searchable  # noqa: E402
-from roughness_limits import told_of_runs  # noqa: E402
-
-from unbake.config import RoughnessSearchConfig  # noqa: E402
+from unbake.config import RoughnessSearchConfig
 
 
 def main() -> None:

@@ -14,26 +14,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
-import sys
 import tempfile
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
-from unbake.dataset.views import Dataset  # noqa: E402
-from unbake.errors import UserError  # noqa: E402
-from unbake.experiments.commands import unbake  # noqa: E402
-from unbake.experiments.seeds import across_seeds  # noqa: E402
-from unbake.io import write_json  # noqa: E402
-from unbake.machine import machine  # noqa: E402
-from unbake.training.run_folder import RunFolder  # noqa: E402
+from unbake import backend
+from unbake.dataset.views import Dataset
+from unbake.errors import UserError
+from unbake.experiments.commands import unbake
+from unbake.experiments.seeds import across_seeds
+from unbake.io import write_json
+from unbake.machine import machine
+from unbake.training.run_folder import RunFolder
 
 #: What is kept of a fit's scores.
 SCORES = ("albedo_psnr", "roughness_psnr", "render_psnr")

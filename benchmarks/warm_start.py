@@ -14,8 +14,6 @@ the folder is kept: data set, runs, solved fields, pictures.
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,16 +21,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-SRC = str(ROOT / "src")
-sys.path.insert(0, SRC)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (SRC, os.environ.get("PYTHONPATH"))))
+import here
 
-from unbake import backend  # noqa: E402
+import numpy as np
+
+from unbake import backend
 
 backend.activate()
 
-import numpy as np  # noqa: E402
 from relight_demo import LAMPS, lamps  # noqa: E402
 
 from unbake.acquisition.new_light import change_light  # noqa: E402

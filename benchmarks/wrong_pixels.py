@@ -12,8 +12,6 @@ likely as their mean error is large. Scores are PSNRs in dB of linear RGB, mean 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import tempfile
 from dataclasses import replace
 from functools import partial
@@ -22,18 +20,16 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import here
+
 import numpy as np
+from rich.console import Console
+from variants import SCORES, described
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
-os.environ["PYTHONPATH"] = str(ROOT / "src")
-
-from rich.console import Console  # noqa: E402
-from variants import SCORES, described  # noqa: E402
-
-from unbake import backend  # noqa: E402
+from unbake import backend
 
 backend.activate()
+
 from unbake.config import preset  # noqa: E402
 from unbake.dataset.pixels import PixelBatch  # noqa: E402
 from unbake.evaluation.evaluate import evaluate  # noqa: E402

@@ -145,11 +145,8 @@ def built_in(tmp_path_factory):
 
 @pytest.fixture
 def one_thread():
-    """Sums come in one order, so that equal steps give equal numbers."""
-    import drjit as dr
+    """A test on one thread: see `support.one_thread`."""
+    import support
 
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.sync_thread()
-    dr.set_thread_count(threads)
+    with support.one_thread():
+        yield

@@ -34,6 +34,7 @@ from unbake.fields.materials import Material
 from unbake.quantities import QUANTITIES
 from unbake.ranks import Ranks
 from unbake.training.loop import fit
+from unbake.training.state import State
 from unbake.training.step import TrainingStep
 from unbake.transport.methods import method_named
 from unbake.transport.operator import attach_material, bounce
@@ -119,15 +120,20 @@ def pixel_rays(cameras: list[Camera], spp: int, seed: int) -> mi.Ray3f:
     return ray
 
 
-def randomised(field, seed: int = 0) -> dict[str, mi.Float | mi.TensorXf]:
-    """Give a field large random parameters with gradients: untrained ones are nearly zero."""
+def random_values(fields, seed: int = 0, scale: float = 0.7) -> dict[str, mi.Float | mi.TensorXf]:
+    """Random parameters for fields, large ones: those of untrained fields are nearly zero."""
     rng = np.random.default_rng(seed)
-    values = {
-        k: type(v)(rng.normal(0, 0.7, v.shape).astype(np.float32))
-        for k, v in field.parameters().items()
+    return {
+        k: type(v)(rng.normal(0, scale, v.shape).astype(np.float32))
+        for k, v in fields.parameters().items()
     }
+
+
+def randomised(fields, seed: int = 0, scale: float = 0.7) -> dict[str, mi.Float | mi.TensorXf]:
+    """Give fields random parameters, with gradients enabled; returns these."""
+    values = random_values(fields, seed, scale)
     dr.enable_grad(values)
-    field.assign(values)
+    fields.assign(values)
     return values
 
 
@@ -224,6 +230,57 @@ def assert_only_replayed(step, state, rates, steps: int = 4) -> None:
                 terms = step(state, i, rates(i))
                 assert float(terms["skipped"][0]) == 0
     assert step.recordings() == recorded <= 3
+
+
+def parameters_of(state: State) -> dict[str, np.ndarray]:
+    """Copies of all parameters φ and θ by name, each as one row of numbers."""
+    return {
+        f"{name}.{key}": np.array(value).ravel().copy()
+        for name, optimizer in state.optimizers()
+        for key, value in optimizer.items()
+    }
+
+
+def assert_frozen_as_unfrozen(
+    one: tuple[TrainingStep, State],
+    other: tuple[TrainingStep, State],
+    rates: Callable[[int], dict[str, float]],
+    *,
+    of_terms: dict[str, float],
+    atol: float,
+) -> list[dict[str, float]]:
+    """Take five steps of two equal fits, those of one frozen: both learn the same.
+
+    Every parameter is trained.
+
+    Args:
+        rates: learning rates of a step.
+        of_terms: how far loss terms may be apart, `rtol` and `atol`.
+        atol: how far parameters may be apart, beside an `rtol` of 1e-4.
+
+    Returns:
+        The loss terms of each frozen step.
+    """
+    (frozen, state_a), (unfrozen, state_b) = one, other
+    before, taken = parameters_of(state_a), []
+    for i in range(5):
+        a = frozen(state_a, i, rates(i))
+        state_b.set_learning_rates(rates(i))
+        b = unfrozen.unfrozen(state_b, i)
+        assert a.keys() == b.keys()
+        for term in a:
+            pair = float(a[term][0]), float(b[term][0])
+            np.testing.assert_allclose(*pair, **of_terms, err_msg=term)
+        taken.append({term: float(value[0]) for term, value in a.items()})
+    after_a, after_b = parameters_of(state_a), parameters_of(state_b)
+    for name, values in after_a.items():
+        assert (values != before[name]).any(), f"{name} was not trained"
+        np.testing.assert_allclose(values, after_b[name], rtol=1e-4, atol=atol, err_msg=name)
+    # Each step has random numbers of its own, in the recording too.
+    assert len({terms["photometric"] for terms in taken}) == len(taken)
+    # The last steps were replayed: the comparison was not one of two traced steps.
+    assert frozen.recordings() < 5
+    return taken
 
 
 def losses_of_light(
@@ -491,41 +548,11 @@ def assert_same_mean(
     return seen
 
 
-def whole_and_in_parts(
-    data: Path, folder: Path, settings: FitConfig, monkeypatch: pytest.MonkeyPatch
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], TrainingStep]:
-    """What a fit of one thread ends with, and one that is stopped after five steps and resumed.
-
-    Their runs are `whole` and `parts` in the folder. The step is that of the whole one.
-    """
-    threads, call, stop_at, steps = dr.thread_count(), TrainingStep.__call__, [], []
-
-    def one_thread(self, state, number, learning_rates):
-        # From the first step on: Mitsuba reads no OpenEXR without a second thread.
-        dr.set_thread_count(1)
-        steps.append(self)
-        if number in stop_at:
-            signal.raise_signal(signal.SIGINT)
-        return call(self, state, number, learning_rates)
-
-    def train(name, **more):
-        try:
-            fit(data, folder / name, settings, **more)
-        finally:
-            dr.set_thread_count(threads)
-        last = sorted((folder / name / "checkpoints").glob("step-*"))[-1]
-        return load_file(last / "state.safetensors")
-
-    monkeypatch.setattr(TrainingStep, "__call__", one_thread)
-    whole = train("whole")
-    stop_at.append(4)
-    train("parts")
-    stop_at.clear()
-    return whole, train("parts", resume=True), steps[0]
+# --------------------------------------------------------------- whole fits, and work on one thread
 
 
 @contextmanager
-def one_thread():
+def one_thread() -> Iterator[None]:
     """Sums come in one order, so that equal work gives equal numbers.
 
     Scenes are to be loaded before: OpenEXR waits for ever for a second thread.
@@ -537,3 +564,75 @@ def one_thread():
         dr.sync_thread()
     finally:
         dr.set_thread_count(threads)
+
+
+@contextmanager
+def one_thread_from_first_step() -> Iterator[None]:
+    """A block of fits whose steps are taken on one thread, so that equal fits agree bit by bit.
+
+    What is loaded before the first step has all threads: see `one_thread`.
+    """
+    plain, threads = TrainingStep.__call__, dr.thread_count()
+
+    def call(self, *words):
+        dr.set_thread_count(1)
+        return plain(self, *words)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainingStep, "__call__", call)
+        try:
+            yield
+        finally:
+            dr.set_thread_count(threads)
+
+
+def at_step(monkeypatch: pytest.MonkeyPatch, step: int, act: Callable[[], object]) -> None:
+    """Do something before a step of a fit, once."""
+    plain, done = TrainingStep.__call__, []
+
+    def call(self, state, number, *rates):
+        if number == step and not done:
+            done.append(True)
+            act()
+        return plain(self, state, number, *rates)
+
+    monkeypatch.setattr(TrainingStep, "__call__", call)
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, *steps: int) -> None:
+    """Press Ctrl-C during each of some steps of a fit, once."""
+    for step in steps:
+        at_step(monkeypatch, step, lambda: signal.raise_signal(signal.SIGINT))
+
+
+def last_state(run: Path) -> dict[str, np.ndarray]:
+    """The arrays of a run's newest checkpoint."""
+    last = sorted((run / "checkpoints").glob("step-*"))[-1]
+    return load_file(last / "state.safetensors")
+
+
+def whole_and_in_parts(
+    data: Path, folder: Path, settings: FitConfig, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], TrainingStep]:
+    """What a fit of one thread ends with, and one that is stopped after five steps and resumed.
+
+    Their runs are `whole` and `parts` in the folder. The step is that of the whole one.
+    """
+    plain, taken = TrainingStep.__call__, []
+
+    def noted(self, *words):
+        taken.append(self)
+        return plain(self, *words)
+
+    def train(name, **more):
+        with one_thread_from_first_step():
+            return fit(data, folder / name, settings, **more).step
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingStep, "__call__", noted)
+        assert train("whole") == settings.steps
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 4)
+        assert train("parts") == 5
+    assert train("parts", resume=True) == settings.steps
+    return last_state(folder / "whole"), last_state(folder / "parts"), taken[0]

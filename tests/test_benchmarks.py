@@ -416,7 +416,9 @@ def test_roulette_is_measured_by_time_and_noise(repository, cornell, tmp_path):
 
 @pytest.fixture(scope="module")
 def soak(repository):
-    return runpy.run_path(str(repository / "benchmarks" / "soak.py"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(repository / "benchmarks"))
+        return runpy.run_path(str(repository / "benchmarks" / "soak.py"))
 
 
 def watched(soak, count=60, memory=lambda i: 400.0, files=lambda i: 9, variables=lambda i: 300):

@@ -250,7 +250,7 @@ def test_several_processes_are_refused_by_commands_that_do_not_share_work(
     monkeypatch.setenv("PMI_SIZE", "3")
     monkeypatch.setitem(sys.modules, "mpi4py", None)
     assert unbake(*command.split(), "--help").status == 0
-    monkeypatch.setattr(cli.tyro.extras, "subcommand_cli_from_dict", called)
+    monkeypatch.setattr("tyro.extras.subcommand_cli_from_dict", called)
     outcome = unbake(*command.split())
     refused = f"error: 3 processes were started, and unbake {command} takes one. Run it without "
     assert outcome.status == 2 and outcome.err.count("\n") == 1

@@ -158,7 +158,9 @@ def test_same_scene_twice(tmp_path):
 @pytest.mark.parametrize("name", ["demo", "annex"])
 def test_textures_are_in_range(tmp_path, name):
     built_in.write_scene(name, tmp_path)
-    for path in (tmp_path / "textures").glob("*.exr"):
+    paths = sorted((tmp_path / "textures").glob("*.exr"))
+    assert paths
+    for path in paths:
         values = np.array(mi.Bitmap(str(path))).astype(np.float32)
         low, high = (0.15, 0.95) if "roughness" in path.name else (0.02, 0.95)
         assert values.min() > low - 0.02 and values.max() < high, path.name

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from held import Held
 from support import ConstantMaterials, built_in_cameras, pixel_rays, seeded
 
 from unbake.fields.texture import material_textures
@@ -25,30 +26,16 @@ SPP, DEPTH = 16, 4
 def held_plugin():
     """Register the BSDF that samples as one material and evaluates as another."""
 
-    class Held(mi.BSDF):
-        def __init__(self, props):
-            super().__init__(props)
-            self.sampled, self.evaluated = props["sampled"], props["evaluated"]
-            count = self.sampled.component_count()
-            self.m_components = [self.sampled.flags(i) for i in range(count)]
-            self.m_flags = self.sampled.flags()
+    class HeldAlongPaths(Held):
+        """The weight of a sample is the value with φ over the density with φ₀."""
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            bs, weight = self.sampled.sample(ctx, si, sample1, sample2, active)
+            bs, weight = super().sample(ctx, si, sample1, sample2, active)
             value = self.evaluated.eval(ctx, si, bs.wo, active)
             alive = (bs.pdf > 0) & (dr.max(weight) > 0)
             return bs, dr.select(alive, value / dr.select(alive, bs.pdf, 1), 0)
 
-        def eval(self, ctx, si, wo, active=True):
-            return self.evaluated.eval(ctx, si, wo, active)
-
-        def pdf(self, ctx, si, wo, active=True):
-            return self.sampled.pdf(ctx, si, wo, active)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-    mi.register_bsdf("held_along_paths", lambda props: Held(props))
+    mi.register_bsdf("held_along_paths", lambda props: HeldAlongPaths(props))
 
 
 def principled(albedo, roughness):

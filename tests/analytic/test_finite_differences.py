@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from held import Held
 from support import ConstantMaterials, built_in_cameras, pieces, pixel_rays, seeded
 
 from unbake.fields.texture import material_textures
@@ -23,30 +24,11 @@ SPP = 64
 def held_plugin():
     """Register the BSDF that samples as one material and evaluates as another."""
 
-    class Held(mi.BSDF):
-        def __init__(self, props):
-            super().__init__(props)
-            self.sampled, self.evaluated = props["sampled"], props["evaluated"]
-            count = self.sampled.component_count()
-            self.m_components = [self.sampled.flags(i) for i in range(count)]
-            self.m_flags = self.sampled.flags()
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            return self.sampled.sample(ctx, si, sample1, sample2, active)
-
-        def eval(self, ctx, si, wo, active=True):
-            return self.evaluated.eval(ctx, si, wo, active)
-
-        def pdf(self, ctx, si, wo, active=True):
-            return self.sampled.pdf(ctx, si, wo, active)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
+    class HeldSampling(Held):
         def eval_diffuse_reflectance(self, si, active=True):
             return mi.Color3f(0)
 
-    mi.register_bsdf("held_sampling", lambda props: Held(props))
+    mi.register_bsdf("held_sampling", lambda props: HeldSampling(props))
 
 
 def principled(colour, roughness, metallic=None):

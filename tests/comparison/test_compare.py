@@ -3,15 +3,13 @@
 import dataclasses
 import io
 import json
-import os
 import shutil
-import signal
 import subprocess
 import sys
 
 import pytest
 from rich.console import Console
-from support import MPIEXEC, needs_mpi
+from support import MPIEXEC, interrupt_at, needs_mpi
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
@@ -27,7 +25,6 @@ from unbake.machine import machine
 from unbake.ranks import Ranks
 from unbake.training import loop
 from unbake.training.run_folder import RunFolder
-from unbake.training.step import TrainingStep
 
 
 @pytest.fixture(autouse=True)
@@ -246,15 +243,8 @@ def test_paths_may_be_texts(cornell, tiny, tmp_path):
 
 
 def test_an_interrupted_comparison_goes_on(compare, tmp_path, monkeypatch):
-    real = TrainingStep.__call__
-
-    def interrupted(self, state, step, *rates):
-        if step == 4:
-            os.kill(os.getpid(), signal.SIGINT)
-        return real(self, state, step, *rates)
-
     with monkeypatch.context() as patch:
-        patch.setattr(TrainingStep, "__call__", interrupted)
+        interrupt_at(patch, 4)
         outcome = compare("direct", "ours")
     assert outcome.status == 130 and "the same command goes on" in outcome.out
     assert not (tmp_path / "out" / "ours").exists()

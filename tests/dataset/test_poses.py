@@ -120,7 +120,7 @@ def test_poses_that_see_nothing_are_refused_with_the_likely_mistake(name, mistak
 def test_a_world_with_another_axis_up_is_named(seen):
     scene, cameras, photographs = seen("still")
     (line,) = warnings(scene, [moved(turn=Z_UP)(c) for c in cameras], photographs)
-    assert "of a world with z up (turn them by -90° about x: y, z become z, -y)" in line
+    assert "of a world with z up (turn them by -90° about x: y, z become z, -y; or the mesh" in line
 
 
 def test_poses_of_another_scene_are_told_without_a_guess(seen):

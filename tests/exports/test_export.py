@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from support import tiny_fields
+from support import random_values, tiny_fields
 
 import unbake
 from unbake.dataset.camera import Camera, LookAt
@@ -138,17 +138,6 @@ def data(mixed, tmp_path_factory) -> Path:
     return grey_data(mixed, tmp_path_factory.mktemp("seen") / "data")
 
 
-def randomise(fields, scale=0.7):
-    """Give fields random parameters."""
-    rng = np.random.default_rng(1)
-    fields.assign(
-        {
-            k: type(v)(rng.normal(0, scale, v.shape).astype(np.float32))
-            for k, v in fields.parameters().items()
-        }
-    )
-
-
 def as_if_seen(patch):
     """Have exports take every point as seen."""
     patch.setattr(Views, "see", lambda self, p, n, two_sided, active: active & mi.Bool(True))
@@ -165,8 +154,8 @@ def exported(data, tmp_path_factory) -> Exported:
     recovered = load_run(run)
     problem = recovered.problem
     assert problem.materials is not None and problem.environment is not None
-    randomise(problem.materials)
-    randomise(problem.environment, 0.4)
+    problem.materials.assign(random_values(problem.materials, 1))
+    problem.environment.assign(random_values(problem.environment, 1, 0.4))
     problem.environment.prepare()
     problem.materials.stand_alone()  # with the new parameters
     with pytest.MonkeyPatch.context() as patch:
@@ -349,7 +338,8 @@ def with_metallic(data, tmp_path_factory) -> Exported:
     config = replace(config, quantities=("albedo", "roughness", "metallic"))
     fit(data, folder / "run", config)
     recovered = load_run(folder / "run")
-    randomise(recovered.problem.materials)
+    materials = recovered.problem.materials
+    materials.assign(random_values(materials, 1))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exporting, "load_run", lambda *_, **__: recovered)
         as_if_seen(patch)
@@ -512,6 +502,7 @@ def test_masks_of_what_no_view_saw_come_with_all_formats(kind, exported, tmp_pat
     exported.use(monkeypatch)
     options = {"texels": 2.0, "tell": lambda line: None}
     manifest = exporting.export(exported.run, tmp_path / "out", [kind], **options)
+    assert manifest["materials"]
     for row in manifest["materials"]:
         assert (tmp_path / "out" / row["unobserved"]).is_file()
 
@@ -739,7 +730,7 @@ def test_bitmaps_are_looked_up_in_the_coordinates_of_the_scene(mixed, tmp_path, 
     recovered = load_run(tmp_path / "run")
     materials, scene = recovered.problem.materials, recovered.problem.scene_view.scene
     assert materials is not None
-    randomise(materials)
+    materials.assign(random_values(materials, 1))
     monkeypatch.setattr(exporting, "load_run", lambda *_, **__: recovered)
     as_if_seen(monkeypatch)
     options = {"texels": 60.0, "tell": lambda line: None}

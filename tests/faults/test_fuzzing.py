@@ -35,7 +35,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(worker, name):
 def test_what_has_failed_once_is_refused_in_one_line(worker):
     campaign = Campaign(worker)
     campaign.replay()
-    assert campaign.total == len(list(kept()))
+    assert campaign.total == len(list(kept())) > 0
     assert not campaign.failures, [f.told for f in campaign.failures.values()]
 
 

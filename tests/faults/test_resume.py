@@ -10,15 +10,12 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
-from functools import partial
+from contextlib import nullcontext
 from pathlib import Path
 
-import drjit as dr
 import numpy as np
 import pytest
-from safetensors.numpy import load_file
-from support import tiny_fields
+from support import interrupt_at, last_state, one_thread_from_first_step, tiny_fields
 
 from unbake import cli
 from unbake.acquisition.capture import capture
@@ -30,7 +27,6 @@ from unbake.imaging.pictures import read_exr, write_exr
 from unbake.quantities import QUANTITIES
 from unbake.training import loop
 from unbake.training.run_folder import RunFolder
-from unbake.training.step import TrainingStep
 from unbake.transport.methods import METHODS
 
 
@@ -76,43 +72,6 @@ def checkpoints(run):
 
 def step_of(checkpoint):
     return int(checkpoint.name.removeprefix("step-"))
-
-
-def state_of(checkpoint):
-    return load_file(checkpoint / "state.safetensors")
-
-
-def interrupt_at(monkeypatch, *steps):
-    """Press Ctrl-C during each of some steps, once."""
-    plain, left = TrainingStep.__call__, set(steps)
-
-    def call(self, state, number, *rates):
-        if number in left:
-            left.remove(number)
-            signal.raise_signal(signal.SIGINT)
-        return plain(self, state, number, *rates)
-
-    monkeypatch.setattr(TrainingStep, "__call__", call)
-
-
-@contextmanager
-def one_thread(monkeypatch):
-    """Train on one thread, so that sums have one order and results agree bit by bit.
-
-    From the first step on: Mitsuba reads no OpenEXR without a second thread.
-    """
-    plain, threads = TrainingStep.__call__, dr.thread_count()
-
-    def call(self, *words):
-        dr.set_thread_count(1)
-        return plain(self, *words)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(TrainingStep, "__call__", call)
-        try:
-            yield
-        finally:
-            dr.set_thread_count(threads)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -163,15 +122,15 @@ def test_a_killed_fit_goes_on(started, fit, tmp_path):
 def test_a_resumed_fit_ends_where_an_uninterrupted_one_does(
     method, words, fit, tmp_path, monkeypatch
 ):
-    with one_thread(monkeypatch):
+    with one_thread_from_first_step():
         assert fit("--steps", 12, *words, name="whole", method=method).status == 0
     interrupt_at(monkeypatch, 6)
-    with one_thread(monkeypatch):
+    with one_thread_from_first_step():
         outcome = fit("--steps", 12, *words, name="parts", method=method)
     assert outcome.status == 130 and "stopped at step 7" in outcome.out
-    with one_thread(monkeypatch):
+    with one_thread_from_first_step():
         assert fit("--resume", name="parts").status == 0
-    whole, parts = (state_of(checkpoints(tmp_path / name)[-1]) for name in ("whole", "parts"))
+    whole, parts = (last_state(tmp_path / name) for name in ("whole", "parts"))
     assert whole.keys() == parts.keys() and len(whole) >= 8
     for key in whole:
         assert np.array_equal(whole[key], parts[key]), key
@@ -199,7 +158,7 @@ def in_parts_and_whole(data, config, folder, monkeypatch, threads=nullcontext):
             with threads():
                 progress = loop.fit(data, folder / "parts", config, resume=after > 1)
             assert progress.step == after
-    return [state_of(checkpoints(folder / name)[-1]) for name in ("whole", "parts")]
+    return [last_state(folder / name) for name in ("whole", "parts")]
 
 
 FORMS = [(form, "neural") for form in representations()]
@@ -224,7 +183,7 @@ def test_every_fit_that_is_interrupted_three_times_ends_bit_for_bit_as_uninterru
     config = tiny_fields(*(changes.get(form, "neural") for form in forms))
     config = dataclasses.replace(config, **{"method": "ours"} | changes)
     data = still if "lighting" in config.unknown else cornell
-    threads = partial(one_thread, monkeypatch)
+    threads = one_thread_from_first_step
     whole, parts = in_parts_and_whole(data, config, tmp_path, monkeypatch, threads)
     assert whole.keys() == parts.keys() and len(whole) >= 4
     for key in whole:
@@ -239,6 +198,7 @@ def test_with_several_threads_a_resumed_fit_ends_as_near_as_another_one(
     """Sums have no fixed order then."""
     config = dataclasses.replace(tiny_fields(), method=method)
     whole, parts = in_parts_and_whole(cornell, config, tmp_path, monkeypatch)
+    assert whole.keys() == parts.keys() and len(whole) >= 4
     for key in whole:
         scale = np.abs(whole[key]).max()
         assert np.abs(whole[key].astype(float) - parts[key]).max() <= 1e-5 * scale, key

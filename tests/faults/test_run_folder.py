@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 
 import pytest
+from support import at_step
 
 from unbake import cli
 from unbake.errors import UserError
@@ -20,7 +21,6 @@ from unbake.training import saving
 from unbake.training.checkpoint import Progress, newest_progress
 from unbake.training.run_folder import Origin, RunFolder
 from unbake.training.saving import FIRST, SHARE, Saving
-from unbake.training.step import TrainingStep
 
 
 @pytest.fixture
@@ -47,19 +47,6 @@ def fit(unbake, cornell, often, run):
         return unbake("fit", data, "--out", run.path, *start, *words)
 
     return call
-
-
-def at_step(monkeypatch, step, act):
-    """Do something before a step, once."""
-    plain, done = TrainingStep.__call__, []
-
-    def call(self, state, number, *rates):
-        if number == step and not done:
-            done.append(True)
-            act()
-        return plain(self, state, number, *rates)
-
-    monkeypatch.setattr(TrainingStep, "__call__", call)
 
 
 def one_line(outcome, *told):

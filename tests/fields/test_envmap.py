@@ -6,7 +6,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import assert_same_expectation, losses_of_light, pixel_rays, seeded, stock_path
+from support import (
+    assert_same_expectation,
+    losses_of_light,
+    pixel_rays,
+    randomised,
+    seeded,
+    stock_path,
+)
 
 from unbake.dataset.camera import Camera
 from unbake.fields.envmap import BOUND, EnvironmentMap, environment_emitter, from_square, to_square
@@ -24,13 +31,7 @@ CAMERA_PLUGIN = {
 def filled(resolution=8, spread=0.7, scale=2.0, seed=0):
     """A map with random levels, and the arrays that gradients arrive in."""
     environment = EnvironmentMap(resolution, scale=scale)
-    rng = np.random.default_rng(seed)
-    values = {
-        k: mi.Float(rng.normal(0, spread, dr.width(v)).astype(np.float32))
-        for k, v in environment.parameters().items()
-    }
-    dr.enable_grad(values)
-    environment.assign(values)
+    values = randomised(environment, seed, spread)
     environment.prepare()
     return environment, values
 

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import seeded
+from support import random_values, seeded
 
 from unbake.errors import UserError
 from unbake.fields.domain import Domain
@@ -16,9 +16,8 @@ DOMAIN = Domain((1.0, 2.0, 3.0), 4.0)
 
 
 def random_guide(seed=1) -> LightGuide:
-    guide, rng = LightGuide(SIZES, DOMAIN), np.random.default_rng(seed)
-    values = guide.parameters()
-    guide.assign({k: mi.Float(rng.normal(0, 0.2, v.shape)) for k, v in values.items()})
+    guide = LightGuide(SIZES, DOMAIN)
+    guide.assign(random_values(guide, seed, 0.2))
     guide.prepare()
     return guide
 

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import seeded, tiny_fields
+from support import randomised, seeded, tiny_fields
 
 from unbake.config import BitmapConfig, DenseGridConfig
 from unbake.errors import UserError
@@ -27,18 +27,6 @@ def uniform(dimensions, lanes=LANES, seed=1):
     sampler = seeded(seed, lanes)
     values = [sampler.next_1d() for _ in range(dimensions)]
     dr.eval(values)
-    return values
-
-
-def randomised(fields, seed=0, scale=0.7):
-    """Fill the parameters of fields at random; returns them, with gradients enabled."""
-    rng = np.random.default_rng(seed)
-    values = {
-        k: type(v)(rng.normal(0, scale, v.shape).astype(np.float32))
-        for k, v in fields.parameters().items()
-    }
-    dr.enable_grad(values)
-    fields.assign(values)
     return values
 
 

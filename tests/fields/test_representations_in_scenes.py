@@ -11,7 +11,9 @@ from support import (
     built_in_cameras,
     grey_photographs,
     one_thread,
+    parameters_of,
     pixel_rays,
+    randomised,
     seeded,
     tiny_fields,
 )
@@ -31,18 +33,6 @@ from unbake.transport.path_sample import Requirements, rhs, trace
 from unbake.transport.vertex import SceneView, find_vertex
 
 REPRESENTATIONS = representations()
-
-
-def randomised(fields, seed=0, scale=0.7):
-    """Fill the parameters of fields at random; returns them, with gradients enabled."""
-    rng = np.random.default_rng(seed)
-    values = {
-        k: type(v)(rng.normal(0, scale, v.shape).astype(np.float32))
-        for k, v in fields.parameters().items()
-    }
-    dr.enable_grad(values)
-    fields.assign(values)
-    return values
 
 
 def assign_values(bitmaps, values):
@@ -267,12 +257,10 @@ def test_a_frozen_step_trains_every_representation(built_in, representation, rad
     config, problem = cornell_problem(built_in, representation, radiance)
     pixels = grey_photographs(built_in_cameras("cornell", 8, views=2))
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
-    optimizers = state.optimizers()
-    before = {(n, k): np.array(v).copy() for n, o in optimizers for k, v in o.items()}
+    before = parameters_of(state)
     assert_only_replayed(step, state, rates)
-    for (name, key), old in before.items():
-        new = np.array(dict(optimizers)[name][key])
-        assert np.isfinite(new).all() and (new != old).any(), f"{name}.{key} was not trained"
+    for name, new in parameters_of(state).items():
+        assert np.isfinite(new).all() and (new != before[name]).any(), f"{name} was not trained"
     # What was trained is what is seen.
     state.publish(problem)
     ray = pixel_rays(built_in_cameras("cornell", 8), 1, seed=1)

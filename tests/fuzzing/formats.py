@@ -113,9 +113,10 @@ def _coded(suffix: str) -> Callable[[], Sequence[bytes]]:
 def _read_foreign(folder: Path) -> None:
     from unbake.importing.faults import Faults
     from unbake.importing.frames import read_one_file
+    from unbake.importing.source import Reading
 
     faults = Faults()
-    read_one_file(folder / "transforms.json", None, False, False, faults)
+    read_one_file(folder / "transforms.json", Reading(), faults)
     faults.require_none(folder)
 
 

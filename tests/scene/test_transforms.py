@@ -1,5 +1,7 @@
 """Transforms of copied scenes are those of the original, however large or small."""
 
+import itertools
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -18,7 +20,8 @@ SCENE = """<scene version="3.0.0">
   <shape type="cube"><transform name="to_world">
     <scale x="{k}" y="{half}" z="{thin}"/><rotate y="1" x="0.3" angle="{angle}"/>
     <translate x="{k}" y="1" z="2"/></transform>
-    <bsdf type="principled"><float name="specular" value="0.4"/><texture type="checkerboard" name="base_color">
+    <bsdf type="principled"><float name="specular" value="0.4"/>
+      <texture type="checkerboard" name="base_color">
       <transform name="to_uv"><scale x="{k}" y="{half}"/><rotate z="1" angle="{angle}"/>
       <translate x="2"/></transform></texture></bsdf></shape>
 </scene>"""
@@ -52,6 +55,27 @@ def test_transforms_are_written_as_they_are(size, angle, tmp_path):
         np.testing.assert_allclose(copied[key][:3, 3], matrix[:3, 3], rtol=1e-6, atol=1e-9)
     for key, matrix in transforms(original).items():
         np.testing.assert_array_equal(matrix, before[key])
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("angle", [0, 90, 180, 270, 33])
+def test_mirrors_are_written_as_they_are(axis, angle, tmp_path):
+    signs = np.array(list(itertools.product((1, -1), repeat=3)))
+    shapes = [
+        f'<shape type="cube"><transform name="to_world"><scale x="{2 * x}" y="{3 * y}" z="{z}"/>'
+        f'<rotate {axis}="1" angle="{angle}"/><translate x="1" y="2" z="{n}"/></transform></shape>'
+        for n, (x, y, z) in enumerate(signs)
+    ]
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{"".join(shapes)}</scene>')
+    original = parse(tmp_path / "scene.xml")
+    (tmp_path / "copy").mkdir()
+    copied = parse(write(original, tmp_path / "copy"))
+    kinds = [
+        [np.array(n.props["to_world"].matrix) for n in scene.state.nodes if "to_world" in n.props]
+        for scene in (original, copied)
+    ]
+    assert len(kinds[0]) == len(signs)
+    np.testing.assert_allclose(kinds[0], kinds[1], atol=1e-9)
 
 
 def test_usual_transforms_stay_readable(tmp_path):

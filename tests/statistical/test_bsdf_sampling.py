@@ -7,9 +7,8 @@ textures ask the fields for.
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
-from support import tiny_fields
+from support import random_values, tiny_fields
 
 from unbake.fields.materials import carry, make_materials
 from unbake.fields.registry import representations
@@ -47,13 +46,7 @@ def make_bsdf(representation: str, wrapper: str, carried: bool, seed: int):
     names = ("albedo", "roughness")
     settings = {name: config.material_settings[name] for name in names}
     materials = make_materials(representation, settings, ["paint"], seed=seed)
-    rng = np.random.default_rng(seed)
-    materials.assign(
-        {
-            key: type(value)(rng.normal(0, 0.7, value.shape).astype(np.float32))
-            for key, value in materials.parameters().items()
-        }
-    )
+    materials.assign(random_values(materials, seed))
     if not carried:
         materials.stand_alone()
     paint = {"type": "principled", "metallic": 0.3, **material_textures(materials)}

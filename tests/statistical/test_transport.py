@@ -11,6 +11,7 @@ from support import (
     built_in_cameras,
     pieces,
     pixel_rays,
+    random_values,
     seeded,
     stock_path,
 )
@@ -70,9 +71,7 @@ def compare(
 def random_guide(scene: mi.Scene) -> LightGuide:
     """A guide with a random distribution and share in each cell."""
     guide = LightGuide(GuideConfig(cells=3, bands=4, sectors=4), Domain.of(scene.bbox()))
-    rng = np.random.default_rng(11)
-    values = guide.parameters().items()
-    guide.assign({key: mi.Float(rng.normal(0, 0.15, value.shape)) for key, value in values})
+    guide.assign(random_values(guide, 11, 0.15))
     return guide
 
 

@@ -65,7 +65,9 @@ def test_a_fit_writes_what_its_log_has(cornell, tmp_path):
     fit(cornell, tmp_path / "run", config, tensorboard=True)
     folder = RunFolder(tmp_path / "run")
     (file,) = folder.tensorboard.iterdir()
-    for name in folder.log()[-1].keys() - {"step", "note"}:
+    names = folder.log()[-1].keys() - {"step", "note"}
+    assert names
+    for name in names:
         assert name.encode() in file.read_bytes()
     with pytest.raises(UserError, match="there is a run"):
         fit(cornell, tmp_path / "run", config, tensorboard=True)

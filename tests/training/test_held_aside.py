@@ -4,7 +4,6 @@ import dataclasses
 import io
 import json
 import shutil
-import signal
 from types import SimpleNamespace
 
 import drjit as dr
@@ -12,8 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
-from safetensors.numpy import load_file
-from support import nothing_compiled
+from support import interrupt_at, last_state, nothing_compiled, one_thread_from_first_step
 
 from unbake.config import from_toml, preset, read_toml
 from unbake.dataset.pixels import HELD_GROUPS, CameraRays
@@ -26,7 +24,6 @@ from unbake.training.loop import fit
 from unbake.training.monitor import Monitor
 from unbake.training.poses import PoseModel
 from unbake.training.run_folder import RunFolder
-from unbake.training.step import TrainingStep
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +43,6 @@ def run(cornell, config, tmp_path_factory):
 def lines(folder, key="held_aside"):
     log = (folder / "log.jsonl").read_text().splitlines()
     return [line for line in map(json.loads, log) if key in line]
-
-
-def state(folder):
-    last = sorted((folder / "checkpoints").glob("step-*"))[-1]
-    return load_file(last / "state.safetensors")
 
 
 def test_the_error_is_logged_after_each_quarter_and_told(run):
@@ -84,30 +76,17 @@ def test_an_evaluation_has_what_the_fit_told(run, tmp_path):
 def test_measuring_disturbs_nothing_and_a_resumed_fit_measures_the_same(
     cornell, config, tmp_path, monkeypatch
 ):
-    threads, call, stop_at = dr.thread_count(), TrainingStep.__call__, []
-
-    def one_thread(self, state, number, rates):
-        # From the first step on: Mitsuba reads no OpenEXR without a second thread.
-        dr.set_thread_count(1)
-        if number in stop_at:
-            signal.raise_signal(signal.SIGINT)
-        return call(self, state, number, rates)
-
     def train(name, **more):
-        try:
+        with one_thread_from_first_step():
             return fit(cornell, tmp_path / name, config, **more).step
-        finally:
-            dr.set_thread_count(threads)
 
-    monkeypatch.setattr(TrainingStep, "__call__", one_thread)
     assert train("whole") == 40
-    stop_at.append(23)
+    interrupt_at(monkeypatch, 23)
     assert train("parts") == 24
-    stop_at.clear()
     assert train("parts", resume=True) == 40
     monkeypatch.setattr(HeldAside, "measure", lambda self, state: {})
     assert train("unmeasured") == 40
-    whole, parts, unmeasured = (state(tmp_path / n) for n in ("whole", "parts", "unmeasured"))
+    whole, parts, unmeasured = (last_state(tmp_path / n) for n in ("whole", "parts", "unmeasured"))
     for key, value in whole.items():
         assert np.array_equal(value, parts[key]) and np.array_equal(value, unmeasured[key]), key
     measured = [

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import built_in_cameras, whole_and_in_parts
+from support import built_in_cameras, randomised, whole_and_in_parts
 
 from unbake.config import CameraConfig, from_toml, read_toml, to_toml
 from unbake.dataset.camera import Camera
@@ -46,13 +46,7 @@ def start(scene, seed=None, **unknown):
     cameras = built_in_cameras("cornell", SIZE, views=3)
     model = PoseModel.of(scene, cameras[:2], **({"poses": True, "intrinsics": True} | unknown))
     if seed is not None:
-        rng = np.random.default_rng(seed)
-        arrays = {
-            key: mi.Float(rng.normal(0, 1, dr.width(value)).astype(np.float32))
-            for key, value in model.parameters().items()
-        }
-        dr.enable_grad(arrays)
-        model.assign(arrays)
+        randomised(model, seed, 1)
     return cameras, model
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,7 +14,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from searches import SEARCH, SMALL, made_up
-from support import MPIEXEC, TINY_FIT, built_in_cameras, needs_mpi, nothing_compiled, randomised
+from support import (
+    MPIEXEC,
+    TINY_FIT,
+    built_in_cameras,
+    interrupt_at,
+    needs_mpi,
+    nothing_compiled,
+    randomised,
+)
 
 from unbake.config import FitConfig, from_toml, preset, read_toml, to_toml
 from unbake.dataset.pixels import PixelBatch, PixelSource
@@ -343,16 +350,11 @@ def test_a_shorter_fit_makes_up_for_the_searches_that_it_missed(built_in):
 def test_a_fit_that_goes_on_makes_the_searches_of_its_new_length(cornell, tmp_path, unbake):
     settings = tmp_path / "settings.toml"
     settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20)))
-    made, search, step = [], RoughnessSearch._search, TrainingStep.__call__
+    made, search = [], RoughnessSearch._search
 
     def counted(self, state, number, *args):
         made.append(number)
         return search(self, state, number, *args)
-
-    def stopped(self, state, number, rates):
-        if number == 6:
-            os.kill(os.getpid(), signal.SIGINT)
-        return step(self, state, number, rates)
 
     def fitted(name, *words):
         made.clear()
@@ -363,7 +365,7 @@ def test_a_fit_that_goes_on_makes_the_searches_of_its_new_length(cornell, tmp_pa
         assert fitted("longer", "--settings", settings) == (0, [8, 15])
         assert fitted("longer", "--resume", "--steps", 40) == (0, [30]), "the first is at 16"
         with patch.context() as other:
-            other.setattr(TrainingStep, "__call__", stopped)
+            interrupt_at(other, 6)
             assert fitted("shorter", "--settings", settings) == (130, [])
         assert fitted("shorter", "--resume", "--steps", 8) == (0, [8]), "both were due before"
     manifests = sorted((tmp_path / "shorter" / "checkpoints").glob("step-*/manifest.json"))

@@ -11,7 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
+from support import (
+    TINY_FIT,
+    assert_frozen_as_unfrozen,
+    assert_only_replayed,
+    built_in_cameras,
+    grey_photographs,
+    parameters_of,
+)
 
 import unbake.memory as memory_module
 import unbake.transport.samplers as samplers_module
@@ -31,15 +38,6 @@ def start(built_in, config=TINY_FIT, pixels=None, scene="cornell"):
     problem = make_problem(built_in(scene), "visible", config, 0.2)
     pixels = pixels or grey_photographs(built_in_cameras(scene, 8, views=2))
     return TrainingStep(problem, pixels, config), initial_state(problem)
-
-
-def parameters(state):
-    """All of φ and θ as one array."""
-    return {
-        f"{name}.{key}": np.array(value).ravel().copy()
-        for name, optimizer in state.optimizers()
-        for key, value in optimizer.items()
-    }
 
 
 def moments(state):
@@ -87,26 +85,8 @@ def with_passes(config, passes):
 @pytest.mark.parametrize("passes", ["one-pass", "two-pass"])
 def test_frozen_and_unfrozen_steps_are_the_same(built_in, one_thread, settings, passes):
     config = with_passes(dataclasses.replace(TINY_FIT, **settings), passes)
-    frozen, state_a = start(built_in, config)
-    unfrozen, state_b = start(built_in, config)
-    before = parameters(state_a)
-    seen = []
-    for i in range(5):
-        a = frozen(state_a, i, rates(i))
-        state_b.set_learning_rates(rates(i))
-        b = unfrozen.unfrozen(state_b, i)
-        assert a.keys() == b.keys()
-        for term in a:
-            np.testing.assert_allclose(float(a[term][0]), float(b[term][0]), rtol=1e-5)
-        seen.append(float(a["photometric"][0]))
-    after_a, after_b = parameters(state_a), parameters(state_b)
-    for name, values in after_a.items():
-        assert (values != before[name]).any(), f"{name} was not trained"
-        np.testing.assert_allclose(values, after_b[name], rtol=1e-4, atol=1e-6, err_msg=name)
-    # Each step has random numbers of its own, in the recording too.
-    assert len(set(seen)) == len(seen)
-    # The last steps were replayed: the comparison was not one of two traced steps.
-    assert frozen.recordings() < 5
+    fits = [start(built_in, config) for _ in range(2)]
+    assert_frozen_as_unfrozen(*fits, rates, of_terms={"rtol": 1e-5}, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -140,12 +120,12 @@ def test_ad_pt_and_prb_see_the_same_loss(built_in, passes):
         config = dataclasses.replace(TINY_FIT, method=method, spp=64, **SHORT)
         config = with_passes(config, passes)
         step, state = start(built_in, config)
-        before = parameters(state)
+        before = parameters_of(state)
         # Rates so small that all losses are those of the start
         rate = dict.fromkeys(rates(0), 1e-6)
         losses = [float(step(state, i, rate)["photometric"][0]) for i in range(12)]
         assert len(set(losses)) == len(losses)
-        assert all((v != before[k]).any() for k, v in parameters(state).items())
+        assert all((v != before[k]).any() for k, v in parameters_of(state).items())
         means.append(np.mean(losses))
     print(f"{means[0]:.4f} and {means[1]:.4f}")
     np.testing.assert_allclose(means[0], means[1], rtol=0.01)
@@ -154,7 +134,7 @@ def test_ad_pt_and_prb_see_the_same_loss(built_in, passes):
 def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
     config = dataclasses.replace(TINY_FIT, method="ad-pt", pixels=2048, **SHORT)
     step, state = start(built_in, config)
-    before = parameters(state)
+    before = parameters_of(state)
     monkeypatch.setattr(memory_module, "free_bytes", lambda: 100_000)
     with pytest.raises(UserError) as error:
         step(state, 0, rates(0))
@@ -167,7 +147,7 @@ def test_ad_pt_is_refused_where_memory_is_short(built_in, monkeypatch):
     )
     assert needed and 0 <= float(needed[1]) < 5000
     # The probe leaves nothing behind, and with memory the step is taken.
-    after = parameters(state)
+    after = parameters_of(state)
     assert all((before[name] == after[name]).all() for name in before)
     assert all(not np.array(dr.grad(v)).any() for v in state.phi.values())
     for free in (None, 10**12):
@@ -241,11 +221,11 @@ def test_a_gradient_that_is_not_finite_is_dropped_and_no_other(built_in, monkeyp
     monkeypatch.setattr(samplers_module, "objective", with_broken_entry)
 
     def move(i):
-        before = parameters(state)
+        before = parameters_of(state)
         state.set_learning_rates(dict.fromkeys(rates(0), 1e-3))
         terms = step.unfrozen(state, i)
         assert float(terms["skipped"][0]) == 0
-        after = parameters(state)
+        after = parameters_of(state)
         assert all(np.isfinite(v).all() for v in (*after.values(), *moments(state)))
         return {k: after[k] != before[k] for k in after}
 
@@ -269,9 +249,9 @@ def test_a_step_without_a_finite_loss_changes_nothing_and_is_counted(built_in, b
     step, state = start(built_in, few, pixels)
     outcomes = []
     for i in range(16):
-        before = parameters(state), moments(state)
+        before = parameters_of(state), moments(state)
         terms = step(state, i, rates(i))
-        after = parameters(state), moments(state)
+        after = parameters_of(state), moments(state)
         skipped = float(terms["skipped"][0])
         total = sum(float(v[0]) for k, v in terms.items() if k != "skipped")
         assert skipped == (not np.isfinite(total))
@@ -282,7 +262,7 @@ def test_a_step_without_a_finite_loss_changes_nothing_and_is_counted(built_in, b
                 np.testing.assert_array_equal(a, b)
         outcomes.append(skipped)
     assert {0.0, 1.0} == set(outcomes), "the test needs steps of both kinds"
-    assert all(np.isfinite(v).all() for v in parameters(state).values())
+    assert all(np.isfinite(v).all() for v in parameters_of(state).values())
 
 
 # ---------------------------------------------------------------------------- memory and repetition

@@ -7,7 +7,13 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from support import TINY_FIT, assert_only_replayed, built_in_cameras, grey_photographs
+from support import (
+    TINY_FIT,
+    assert_only_replayed,
+    built_in_cameras,
+    grey_photographs,
+    parameters_of,
+)
 
 from unbake import config
 from unbake.comparison.method_variant import MethodVariant
@@ -217,9 +223,9 @@ def test_a_method_that_attaches_every_edge_is_recorded_and_replayed(built_in, ra
     register_method(Method("all", "every edge", row, takes_bounces=True, takes_prior=True))
     settings = replace(TINY_FIT, method="all", bounces=2, radiance_spp=radiance_spp)
     step, state = start(built_in, settings)
-    before = {k: np.array(v).copy() for _, adam in state.optimizers() for k, v in adam.items()}
+    before = parameters_of(state)
     assert_only_replayed(step, state, lambda i: RATES)
-    after = {k: np.array(v) for _, adam in state.optimizers() for k, v in adam.items()}
+    after = parameters_of(state)
     assert all((after[k] != before[k]).any() for k in before)
 
 

@@ -6,14 +6,14 @@ import dataclasses
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from .. import config, experiments, exports
 from ..config.light import LightConfig
 from ..errors import UserError
-from .flags import one_of, with_options
+from .flags import flags, one_of, with_options
 
 Scene = Annotated[str, arg(metavar="SCENE")]
 Data = Annotated[Path, arg(metavar="DATA")]
@@ -53,6 +53,11 @@ Quality = Annotated[
     arg(metavar="{draft,normal,high}", help_behavior_hint=""),
 ]
 Flag = FlagCreatePairsOff[Annotated[bool, arg(help_behavior_hint="")]]
+
+if TYPE_CHECKING:
+    LightFlags = Any
+else:
+    LightFlags = flags(LightConfig)
 
 
 def chosen_settings(preset: config.PresetName | None, settings: Path | None) -> config.FitConfig:

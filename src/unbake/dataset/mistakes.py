@@ -20,11 +20,11 @@ _FLIPS = {
 }
 #: A quarter turn about x, either way: between worlds whose z and whose y points up.
 _TURNS = {
-    "z up (turn them by -90° about x: y, z become z, -y)": np.array(
-        [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    "z up (turn them by -90° about x: y, z become z, -y; or the mesh: import --mesh-y-up)": (
+        np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     ),
-    "y up (turn them by 90° about x: y, z become -z, y)": np.array(
-        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
+    "y up (turn them by 90° about x: y, z become -z, y)": (
+        np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     ),
 }
 _INVERTED = "from world to camera (invert the matrices)"

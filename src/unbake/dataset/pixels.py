@@ -177,7 +177,7 @@ class PixelBatch:
         number = self._row(0, dr.arange(mi.UInt32, self.count * spp) // spp)
         ray = rays.through(number, sampler.next_2d())
         pixel = dr.arange(mi.UInt32, self.count)
-        columns = 6 if self.smoothed else 3
+        columns = self._colours
         rgb = [self._float(i, pixel) for i in range(columns)]
         target = mi.Color3f(rgb[:3])
         clipped = target >= self._float(columns, pixel) if self.clipped else None
@@ -195,16 +195,21 @@ class PixelBatch:
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Back to NumPy: the numbers, shape (n,), and the rows of `Photographs.table`."""
         packed = np.array(self._packed).reshape(-1, self.count)
-        return packed[0], packed[1 : 7 if self.smoothed else 4].view(np.float32).T
+        return packed[0], packed[1 : 1 + self._colours].view(np.float32).T
 
     def read_clipped(self) -> np.ndarray | None:
         """Which channels are clipped, shape (n, 3) bool, in NumPy; None where none can be."""
         if not self.clipped:
             return None
         _, colours = self.read()
-        row = 7 if self.smoothed else 4
-        limits = np.array(self._packed).reshape(-1, self.count)[row].view(np.float32)
+        limits = np.array(self._packed).reshape(-1, self.count)[1 + self._colours]
+        limits = limits.view(np.float32)
         return colours[:, :3] >= limits[:, None]
+
+    @property
+    def _colours(self) -> int:
+        """Rows of colours behind that of numbers: of the photograph, and of the smoothed one."""
+        return 6 if self.smoothed else 3
 
     def _float(self, column: int, pixel: mi.UInt32) -> mi.Float:
         return dr.reinterpret_array(mi.Float, self._row(1 + column, pixel))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from unbake.report import display
-from unbake.report.runs import Run
+from unbake.report.runs import EvaluatedRun
 
 #: Numbers of an image: column and format.
 _COLUMNS = {
@@ -20,7 +20,7 @@ _LENS = {"fl_x": "focal length", "cx": "cx", "cy": "cy"}
 _CHANNELS = ("red", "green", "blue")
 
 
-def camera_section(runs: list[Run]) -> dict[str, Any] | None:
+def camera_section(runs: list[EvaluatedRun]) -> dict[str, Any] | None:
     """The contents of the section; None if no run fitted anything of its cameras.
 
     `columns` and `rows` are of images, with a cell for each run and column; `lines` tell what all

@@ -14,7 +14,7 @@ from unbake.imaging import pictures
 from unbake.imaging.coded import read_picture
 from unbake.imaging.headers import CODED_SUFFIXES
 from unbake.imaging.pictures import percentile
-from unbake.report.runs import Run
+from unbake.report.runs import EvaluatedRun
 
 LONGEST_SIDE = 640  # pixels of an embedded picture: keeps a page of 24 views near 50 MB
 DASH = "—"
@@ -55,6 +55,25 @@ def percent(value: float | None) -> str:
     return DASH if value is None else f"{100 * value:.2f}"
 
 
+def count(value: object) -> str:
+    """A whole number in few characters: millions and more by their unit; a dash for no number."""
+    known = number(value)
+    if known is None:
+        return DASH
+    for unit, size in (("G", 1e9), ("M", 1e6)):
+        if known >= 0.9995 * size:  # what is rounded up to it, too
+            return f"{known / size:.3g}\N{NO-BREAK SPACE}{unit}"
+    return f"{known:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def seconds(value: object) -> str:
+    """Seconds with one digit below 100, else as `count`; a dash for no number."""
+    known = number(value)
+    if known is None:
+        return DASH
+    return f"{known:.1f}" if known < 100 else count(round(known))
+
+
 def best(values: Iterable[float | None], choose: Choice = max) -> float | None:
     """The best of at least two values, else None."""
     known = [value for value in values if value is not None]
@@ -72,7 +91,7 @@ def marked(
 # ----------------------------------------------------------------------------------------- pictures
 
 
-def evaluated(run: Run, picture: Path) -> Path:
+def evaluated(run: EvaluatedRun, picture: Path) -> Path:
     """A picture that the run's evaluation left; UserError if it is gone."""
     if not picture.is_file():
         again = f"{run.folder.evaluate_again} again"

@@ -11,7 +11,7 @@ from unbake.dataset.lighting import true_environment
 from unbake.dataset.views import Dataset
 from unbake.imaging import pictures
 from unbake.report import display
-from unbake.report.runs import Run
+from unbake.report.runs import EvaluatedRun
 
 #: Scores of an environment map: their format, and which is best.
 NUMBERS = {
@@ -22,7 +22,7 @@ NUMBERS = {
 }
 
 
-def lighting_section(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
+def lighting_section(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any] | None:
     """The contents of the section: `maps` and `emitters`, each None if no run optimized it.
 
     Raises:
@@ -33,7 +33,7 @@ def lighting_section(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None
     return {"maps": _maps(runs, dataset), "emitters": _emitters(runs)}
 
 
-def _maps(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
+def _maps(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any] | None:
     """Maps and their errors, at the exposure of the truth if it is known."""
     if not any(run.optimizes("environment") for run in runs):
         return None
@@ -80,7 +80,7 @@ def _maps(runs: list[Run], dataset: Dataset) -> dict[str, Any] | None:
     }
 
 
-def _numbers(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
+def _numbers(runs: list[EvaluatedRun]) -> dict[str, list[dict[str, Any]]]:
     """By score, a cell a run."""
     said = [run.metrics.get("environment") or {} for run in runs]
     return {
@@ -89,7 +89,7 @@ def _numbers(runs: list[Run]) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _emitters(runs: list[Run]) -> list[dict[str, Any]] | None:
+def _emitters(runs: list[EvaluatedRun]) -> list[dict[str, Any]] | None:
     """One row an emitter: its true strength, and each run's with its error."""
     if not any(run.optimizes("emission") for run in runs):
         return None

@@ -6,10 +6,10 @@ from typing import Any
 
 from unbake.imaging import pictures
 from unbake.report import display
-from unbake.report.runs import Run
+from unbake.report.runs import EvaluatedRun
 
 
-def outlier_section(runs: list[Run]) -> list[dict[str, Any]] | None:
+def outlier_section(runs: list[EvaluatedRun]) -> list[dict[str, Any]] | None:
     """A share and pictures for each run that looked for outliers; None if none did.
 
     Raises:

@@ -18,7 +18,7 @@ from unbake.formats import check_format
 from unbake.imaging import pictures
 from unbake.io import read_object
 from unbake.report import display
-from unbake.report.runs import Run, made_of
+from unbake.report.runs import EvaluatedRun, made_of
 
 #: Pictures of a folder that are shown, evenly spaced, and pixels along their longer side.
 MOST, LONGEST = 6, 320
@@ -32,7 +32,7 @@ _WORDS = {
 
 
 def relit_sections(
-    folders: Sequence[Path], runs: list[Run], allow_outside: bool
+    folders: Sequence[Path], runs: list[EvaluatedRun], allow_outside: bool
 ) -> list[dict[str, Any]]:
     """A strip of pictures for each light: the truth, if it is there, and each run under it.
 

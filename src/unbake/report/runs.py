@@ -8,19 +8,20 @@ from pathlib import Path
 from typing import Any, final
 
 from unbake.config.tables import flattened
-from unbake.dataset import views
 from unbake.dataset.spread import evenly
-from unbake.dataset.views import Dataset
+from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError, printable
 from unbake.quantities import DEFAULT_QUANTITIES
 from unbake.training.run_folder import RunFolder
 
+#: Splits of the data in the order of the page.
+SHOWN_SPLITS = ("heldout", "train")
 TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
 
 
 @final
 @dataclass(frozen=True)
-class Run:
+class EvaluatedRun:
     """The contents of an evaluated run folder; `label` is its name on the page.
 
     A run of no steps has untrained fields, and an empty log.
@@ -58,13 +59,13 @@ class Run:
 
 @final
 @dataclass(frozen=True)
-class View:
+class ShownView:
     """One posed image of the data set; `truth` holds the quantities that have ground truth."""
 
     name: str
     split: str
     truth: dict[str, Path]
-    source: views.View
+    source: View
 
 
 def labels(runs: Sequence[str | Path]) -> list[tuple[Path, str]]:
@@ -80,7 +81,7 @@ def labels(runs: Sequence[str | Path]) -> list[tuple[Path, str]]:
     ]
 
 
-def read_run(path: Path, label: str) -> Run:
+def read_run(path: Path, label: str) -> EvaluatedRun:
     """Read an evaluated run folder: its metrics, settings (keys dotted) and log.
 
     Raises:
@@ -104,10 +105,10 @@ def read_run(path: Path, label: str) -> Run:
         raise UserError("`emission` has no light", metrics_file, evaluate)
     settings = dict(flattened(folder.settings_table()))
     log = [] if metrics.get("steps") == 0 else folder.log()
-    return Run(folder, label, metrics, settings, log)
+    return EvaluatedRun(folder, label, metrics, settings, log)
 
 
-def made_of(manifest: dict[str, Any], where: Path, runs: list[Run]) -> int:
+def made_of(manifest: dict[str, Any], where: Path, runs: list[EvaluatedRun]) -> int:
     """The number of the run that a folder of an export or of pictures was made of.
 
     Args:
@@ -131,7 +132,7 @@ def made_of(manifest: dict[str, Any], where: Path, runs: list[Run]) -> int:
     raise UserError(f"was made of another run ({printable(named)})", where, "Name that run as well")
 
 
-def data_folder(runs: list[Run]) -> Path:
+def data_folder(runs: list[EvaluatedRun]) -> Path:
     """The one data set that all runs were evaluated on; UserError where they differ or it is gone.
 
     A relative `data` of an evaluation starts at the run folder.
@@ -153,7 +154,7 @@ def data_folder(runs: list[Run]) -> Path:
     return folders[0]
 
 
-def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
+def read_views(dataset: Dataset, runs: list[EvaluatedRun]) -> list[ShownView]:
     """Every evaluated held-out view, then at most four training views, evenly spaced.
 
     Raises:
@@ -172,5 +173,5 @@ def read_views(dataset: Dataset, runs: list[Run]) -> list[View]:
     return heldout + evenly(training, TRAINING_VIEWS)
 
 
-def _view(view: views.View) -> View:
-    return View(view.name, view.split, {"render": view.image, **view.truth}, view)
+def _view(view: View) -> ShownView:
+    return ShownView(view.name, view.split, {"render": view.image, **view.truth}, view)

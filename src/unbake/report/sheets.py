@@ -14,13 +14,13 @@ from unbake.formats import check_format
 from unbake.imaging import pictures
 from unbake.io import read_object
 from unbake.quantities import QUANTITIES
-from unbake.report.runs import Run, made_of
+from unbake.report.runs import EvaluatedRun, made_of
 
 #: Materials of an export that are shown, the largest ones, and pixels along the edge of a sheet.
 MOST, EDGE = 12, 256
 
 
-def texture_sections(folders: Sequence[Path], runs: list[Run]) -> list[dict[str, Any]]:
+def texture_sections(folders: Sequence[Path], runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
     """An entry for each export: its run, and the textures of its largest materials.
 
     Args:
@@ -33,7 +33,7 @@ def texture_sections(folders: Sequence[Path], runs: list[Run]) -> list[dict[str,
     return [_section(folder, runs) for folder in folders]
 
 
-def _section(folder: Path, runs: list[Run]) -> dict[str, Any]:
+def _section(folder: Path, runs: list[EvaluatedRun]) -> dict[str, Any]:
     file = folder / "export.json"
     remedy = "Make one with `unbake export RUN --out DIR --format textures`"
     manifest = read_object(file, remedy)

@@ -2,7 +2,7 @@
 
 Mitsuba 3.9.1 writes a transform along the axes as a scale, a rotation and a translation, which it
 finds by an iteration that ends too soon: a scale of 300 becomes 300.65, one of 3,000 becomes 9,128,
-one of 0.001 becomes 0.0013.
+one of 0.001 becomes 0.0013. Some that mirror and turn a shape lose the mirror.
 """
 
 from __future__ import annotations
@@ -71,8 +71,10 @@ def _is_misread(value: object) -> bool:
     """Whether a property is a transform that Mitsuba would write as another one."""
     if not isinstance(value, (mi.ScalarAffineTransform4d, mi.ScalarProjectiveTransform4d)):
         return False
-    scales = np.linalg.svd(_matrix(value)[:3, :3], compute_uv=False)
-    return not (_LEAST <= scales[-1] and scales[0] <= _LARGEST)
+    linear = _matrix(value)[:3, :3]
+    scales = np.linalg.svd(linear, compute_uv=False)
+    usual = _LEAST <= scales[-1] and scales[0] <= _LARGEST
+    return not usual or np.linalg.det(linear) < 0
 
 
 def _matrix(value: Any) -> np.ndarray:

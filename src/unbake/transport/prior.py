@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from .operator import transported
 
+if TYPE_CHECKING:
+    from .path_sample import PathSample
 
-def residual(sample, number: int, L: mi.Color3f, L_next: mi.Color3f) -> mi.Color3f:
+
+def residual(sample: PathSample, number: int, L: mi.Color3f, L_next: mi.Color3f) -> mi.Color3f:
     """L_θ(xᵢ) − T(L_θ)(xᵢ) at a vertex of path samples.
 
     At x₁, the vertices that cameras see, it is the one bounce prior. At x₂ as well, the extra
     bounce prior, it reaches surfaces that no camera sees. Emission is on both sides and cancels.
 
     Args:
+        sample: paths with the bounce at xᵢ.
         number: i, from 1.
         L: L_θ(xᵢ).
         L_next: L_θ(xᵢ₊₁).

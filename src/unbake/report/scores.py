@@ -1,0 +1,126 @@
+"""The page's section on numbers: PSNRs, SSIM and FLIP, and the yardsticks beside them."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+from unbake.quantities import QUANTITIES
+from unbake.report import display
+from unbake.report.runs import SHOWN_SPLITS, EvaluatedRun
+from unbake.report.wording import details, nothing_learned
+
+#: PSNRs: key, quantity and heading.
+PSNRS = [("render_psnr", "render", "Rendering")]
+for _name, _row in QUANTITIES.items():
+    PSNRS.append((f"{_name}_psnr", _name, _row.title))
+    if _name == "albedo":
+        PSNRS.append(("albedo_psnr_aligned", _name, "Aligned albedo"))
+#: Scores of renderings beside PSNR: key, heading, and which is best.
+SIMILAR: tuple[tuple[str, str, display.Choice], ...] = (
+    ("render_ssim", "SSIM", max),
+    ("render_flip", "FLIP", min),
+)
+#: What results are measured by, in the order of their rows, and what it is called.
+YARDSTICKS = {
+    "ceiling": "Ceiling",
+    "constant": "Constant",
+    "untrained": "Untrained",
+}
+
+
+def psnr_columns(runs: list[EvaluatedRun]) -> dict[str, str]:
+    """Keys and headings of the columns: quantities that some run optimized, and aligned albedo.
+
+    Materials without a number in any run, as where no truth is known, have none.
+    """
+    aligned = any("albedo_psnr_aligned" in (run.metrics.get("heldout") or {}) for run in runs)
+    return {
+        key: heading
+        for key, quantity, heading in PSNRS
+        if any(run.optimizes(quantity) for run in runs)
+        and (aligned or key != "albedo_psnr_aligned")
+        and (quantity == "render" or any(_has_number(run, key) for run in runs))
+    }
+
+
+def _has_number(run: EvaluatedRun, key: str) -> bool:
+    """Whether a PSNR of any split is a number."""
+    return any(
+        display.number((run.metrics.get(s) or {}).get(key)) is not None for s in SHOWN_SPLITS
+    )
+
+
+def score_rows(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
+    """One row a run: for each split and quantity its mean PSNR, the best of each column marked."""
+    columns = []
+    for split, key in ((split, key) for split in SHOWN_SPLITS for key in psnr_columns(runs)):
+        values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+        tops = [_ceiling(run, key) if split == "heldout" else None for run in runs]
+        marked = display.marked(values, display.decibels)
+        columns.append(
+            [c | {"gap": _gap(*pair)} for c, *pair in zip(marked, values, tops, strict=True)]
+        )
+    return [
+        {
+            "run": run,
+            "trouble": nothing_learned(run),
+            "method": "untrained" if run.untrained else run.metrics["method"],
+            "details": details(run),
+            "steps": display.count(run.metrics.get("steps")),
+            "samples": display.count(run.metrics.get("samples")),
+            "seconds": display.seconds(run.metrics.get("seconds")),
+            "cells": row,
+        }
+        for run, row in zip(runs, zip(*columns, strict=True), strict=True)
+    ]
+
+
+def _ceiling(run: EvaluatedRun, key: str) -> float | None:
+    found = run.metrics.get("yardsticks") or {}
+    return display.number((found.get("ceiling") or {}).get(key))
+
+
+def _gap(value: float | None, ceiling: float | None) -> str | None:
+    """How far a PSNR is from its ceiling, with its sign; None where that is not known."""
+    if value is None or ceiling is None:
+        return None
+    return f"{'−' if value < ceiling else '+'}{abs(value - ceiling):.2f}"
+
+
+def similar_rows(runs: list[EvaluatedRun]) -> list[tuple[EvaluatedRun, list[dict[str, Any]]]]:
+    """One row a run: SSIM and FLIP of each split, the best of each column marked.
+
+    Empty where no run has them, as after an evaluation by an earlier version.
+    """
+    columns = []
+    for split, (key, _, choose) in product(SHOWN_SPLITS, SIMILAR):
+        values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+        columns.append(display.marked(values, display.fraction, choose))
+    if all(cell["text"] == display.DASH for column in columns for cell in column):
+        return []
+    return [(run, list(row)) for run, row in zip(runs, zip(*columns, strict=True), strict=True)]
+
+
+def yardstick_rows(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
+    """A row for each yardstick: its PSNRs of held-out views, and the runs it is of if not all.
+
+    Fields before their first step have no row where there is a run of them.
+    """
+    rows: list[dict[str, Any]] = []
+    for kind in YARDSTICKS:
+        if kind == "untrained" and any(run.untrained for run in runs):
+            continue
+        for run in runs:
+            scores = (run.metrics.get("yardsticks") or {}).get(kind) or {}
+            values = [display.number(scores.get(key)) for key in psnr_columns(runs)]
+            if all(value is None for value in values):
+                continue
+            same = next((r for r in rows if (r["kind"], r["values"]) == (kind, values)), None)
+            if same is None:
+                cells = ["" if v is None else display.decibels(v) for v in values]
+                same = {"kind": kind, "values": values, "cells": cells, "labels": []}
+                rows.append(same)
+            same["labels"] += [] if run.untrained else [run.label]
+    trained = [run.label for run in runs if not run.untrained]
+    return [row | {"labels": [] if row["labels"] == trained else row["labels"]} for row in rows]

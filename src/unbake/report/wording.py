@@ -1,0 +1,132 @@
+"""What runs are called on the page, and what is told of them in a few words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from unbake.fields.registry import representation, representations
+from unbake.quantities import QUANTITIES
+from unbake.report import display
+from unbake.report.runs import EvaluatedRun
+
+#: How notes of fits that learned nothing begin.
+_LEARNED_NOTHING = ("nothing was learned", "nothing useful was learned")
+#: Names of the quantities that have pictures.
+NAMES = {"render": "Rendering"} | {name: row.title for name, row in QUANTITIES.items()}
+#: What runs optimized, by their setting, as the title says it.
+OPTIMIZED = {
+    "materials": "Materials",
+    "lighting": "Lighting",
+    "materials+lighting": "Materials and lighting",
+    "emission": "Lights",
+}
+
+
+def nothing_learned(run: EvaluatedRun) -> str | None:
+    """Why a run is no result, in a few words; None if it is one.
+
+    Its fit noted that nothing was learned, or each material of held-out views scores below that of
+    the untrained fields.
+    """
+    if run.untrained:
+        return None
+    if any(str(line.get("note", "")).startswith(_LEARNED_NOTHING) for line in run.log):
+        return "nothing learned"
+    before = (run.metrics.get("yardsticks") or {}).get("untrained") or {}
+    found = run.metrics.get("heldout") or {}
+    keys = [f"{name}_psnr" for name in QUANTITIES]
+    pairs = [(display.number(found.get(key)), display.number(before.get(key))) for key in keys]
+    known = [(score, first) for score, first in pairs if score is not None and first is not None]
+    below = known and all(score < first for score, first in known)
+    return "worse than untrained" if below else None
+
+
+def details(run: EvaluatedRun) -> list[tuple[str, str, str]]:
+    """What is to be known of a run, in a few words each: text, symbol and subscript."""
+    return [*_described(run), *((text, "", "") for text in [*_trend(run), *_warnings(run)])]
+
+
+def _trend(run: EvaluatedRun) -> list[str]:
+    """Whether the fit was still improving, by the error on pixels that it did not learn from."""
+    found = run.metrics.get("convergence") or {}
+    keys = ("change", "share", "noise")
+    change, share, noise = (display.number(found.get(key)) for key in keys)
+    word = {
+        "improving": "still improving",
+        "plateau": "at a plateau",
+        "rising": "getting worse",
+        "unclear": "too noisy",
+    }
+    if change is None or share is None or found.get("trend") not in word:
+        return []
+    spread = "" if noise is None else f" ± {100 * noise:.1f}"
+    moved = f"{'rose' if change > 0 else 'fell'} by {100 * abs(change):.1f}{spread} %"
+    told = f"the error on held-aside pixels {moved} over the last {100 * share:.0f} % of the fit"
+    return [f"{word[found['trend']]} ({told})"]
+
+
+def _warnings(run: EvaluatedRun) -> list[str]:
+    """Steps that were skipped, and what a fit's watchdog noted."""
+    skipped = sum(line.get("skipped", 0) for line in run.log)
+    told = [f"{display.count(skipped)} of {display.count(run.metrics.get('steps'))} steps skipped"]
+    return [*(told if skipped else []), *(line["note"] for line in run.log if "note" in line)]
+
+
+def _described(run: EvaluatedRun) -> list[tuple[str, str, str]]:
+    """Representations, unknown and estimator of a run as text, symbol and subscript."""
+    metrics = run.metrics
+    if "estimator" not in metrics:
+        return []
+    estimator = str(metrics["estimator"])
+    told = [(form, "φ", "")] if (form := _form(metrics.get("representation"))) else []
+    if differing := metrics.get("data_changed"):
+        told.append((f"evaluated on other {listed(differing)}", "", ""))
+    if run.untrained:
+        return [*told, ("initial values, the same for all methods", "", "")]
+    told.append((_form(metrics.get("radiance")) or "no", "L", "θ"))
+    if metrics.get("warm_start"):
+        told.append(("solved before the fit", "L", "θ"))
+    if _unknown(metrics) != "materials":
+        told.append((f"{OPTIMIZED.get(_unknown(metrics), 'something').lower()} optimized", "", ""))
+    if metrics.get("bounces", 1) != 1:
+        told.append((f"{metrics['bounces']} bounces", "", ""))
+    if metrics.get("prior", "extra-bounce") != "extra-bounce":
+        told.append((f"{metrics['prior']} prior".replace("-", " "), "", ""))
+    passes = {"all-pairs": "all pairs", "split-halves": "split halves", "two-pass": "two passes"}
+    return [*told, (passes.get(estimator, estimator), "", "")]
+
+
+def _form(name: object) -> str | None:
+    """What a representation is called on the page; the name of one that is not registered."""
+    if not isinstance(name, str):
+        return None
+    return representation(name).title if name in representations() else name
+
+
+def optimized(runs: list[EvaluatedRun]) -> str:
+    """What the runs optimized, for the title."""
+    kinds = {_unknown(run.metrics) for run in runs}
+    if len(kinds) == 1:
+        return OPTIMIZED.get(kinds.pop(), "Scene")
+    return "Materials and lighting" if any("materials" in k for k in kinds) else "Lighting"
+
+
+def _unknown(metrics: dict[str, Any]) -> str:
+    return str(metrics.get("unknown", "materials"))
+
+
+def materials(runs: list[EvaluatedRun]) -> list[str]:
+    """Quantities of materials that some run optimized."""
+    return [name for name in QUANTITIES if any(run.optimizes(name) for run in runs)]
+
+
+def words(names: Sequence[str], displayed: str | None = None) -> list[str]:
+    """Quantities in a sentence: all, or those that are displayed so."""
+    rows = [QUANTITIES[name] for name in names]
+    return [row.title.lower() for row in rows if displayed in (None, row.display)]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Words as a sentence lists them."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
