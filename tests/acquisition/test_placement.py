@@ -6,7 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unbake.acquisition.placement import coverage, is_room, place_object, place_room
+from unbake.acquisition.placement import (
+    black_share,
+    coverage,
+    is_room,
+    place_object,
+    place_room,
+)
 from unbake.dataset.camera import Camera
 from unbake.dataset.views import check_cameras
 from unbake.errors import UserError
@@ -317,3 +323,16 @@ def test_a_room_without_a_material_to_fit_is_refused():
     bare = {name: wall | {"bsdf": glass} for name, wall in walls().items()}
     with pytest.raises(UserError, match="no surface has a material to fit"):
         place_room(scene(**bare, sensor=sensor((-0.6, 0, -0.6), (0, 0, 0))), 2, 1)
+
+
+def test_backs_of_one_sided_materials_are_told():
+    def share(bsdf, eye):
+        wall = {"type": "rectangle", "bsdf": bsdf}
+        return black_share(
+            scene(wall=wall), [Camera.look_at(eye, (0, 0, 0), (0, 1, 0), 30.0, 8, 8)]
+        )
+
+    matte, front, back = {"type": "principled"}, (0, 0, 3), (0, 0, -3)
+    assert share(matte, back) == 1 and share(matte, front) == 0
+    assert share(MATTE, back) == 0
+    assert share({"type": "roughconductor"}, back) == 0, "that is known"

@@ -187,7 +187,7 @@ def test_a_world_that_is_turned_is_told(spoilt):
     data.poses(lambda pose: turn @ pose)
     (finding,) = found(data.save(), "alignment")
     assert finding.level == "error" and "of a world with z up" in finding.what
-    assert finding.remedy == "Turn them by -90° about x: y, z become z, -y"
+    assert finding.remedy.startswith("Turn them by -90° about x: y, z become z, -y; or the mesh")
 
 
 def test_masks_that_were_drawn_by_wrong_poses_do_not_confirm_them(spoilt):

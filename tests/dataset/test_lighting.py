@@ -139,9 +139,11 @@ def test_pixels_below_zero_are_taken_as_zero(truth):
 
 def test_what_is_written_is_plain_json(truth, tmp_path):
     path = tmp_path / "scene.xml"
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(tmp_path / "screen.exr"))
     path.write_text(
         '<scene version="3.0.0"><shape type="sphere"><emitter type="area">'
-        '<texture type="checkerboard" name="radiance"/></emitter></shape></scene>'
+        '<texture type="bitmap" name="radiance">'
+        '<string name="filename" value="screen.exr"/></texture></emitter></shape></scene>'
     )
     write_true_lighting(path, truth.parent)
     assert json.loads((truth / "emission.json").read_text()) == [

@@ -230,6 +230,37 @@ def test_parts_are_where_mitsuba_has_them(mixed, tmp_path):
         assert (error < near).mean() > 0.99
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk", "rectangle", "cube"])
+@pytest.mark.parametrize("flipped", ["false", "true"])
+@pytest.mark.parametrize("scale", [1, -1])
+def test_shapes_without_a_file_keep_their_sides(kind, flipped, scale, tmp_path):
+    file = tmp_path / "scene.xml"
+    file.write_text(
+        f'<scene version="3.0.0"><shape type="{kind}"><bsdf type="principled"/>'
+        f'<boolean name="flip_normals" value="{flipped}"/><transform name="to_world">'
+        f'<scale x="{scale}" y="1" z="1"/><rotate x="1" angle="40"/></transform></shape>'
+        "</scene>"
+    )
+    original = parsed_principled(file, tmp_path).instantiate(merge=False)
+    (part,) = read_parts(file, tmp_path).parts
+    write_mesh(tmp_path / "part.ply", *part.triangles.arrays)
+    flat = part.triangles.normals is None
+    ply = {"type": "ply", "filename": str(tmp_path / "part.ply"), "face_normals": flat}
+    rng = np.random.default_rng(0)
+    origins = rng.normal(0, 1, (3, 4000))
+    origins *= 5 / np.linalg.norm(origins, axis=0)
+    d = rng.uniform(-0.5, 0.5, origins.shape) - origins
+    d /= np.linalg.norm(d, axis=0)
+    ray = mi.Ray3f(mi.Point3f(origins.astype(np.float32)), mi.Vector3f(d.astype(np.float32)))
+    copy = mi.load_dict({"type": "scene", "a": ply})
+    a, b = original.ray_intersect(ray), copy.ray_intersect(ray)
+    dr.eval(a, b)
+    both = np.array(a.is_valid()) & np.array(b.is_valid())
+    assert both.sum() > 200
+    for shaded in (b.n, b.sh_frame.n):  # triangles are wound to the side that is shaded
+        assert (np.array(dr.dot(a.sh_frame.n, shaded))[both] > 0.9).mean() > 0.97
+
+
 def test_meshes_are_wound_to_the_side_that_they_are_shaded_on(tmp_path):
     """A scale below zero turns triangles, and not their normals."""
     ball = trimesh.creation.icosphere(subdivisions=1)

@@ -197,6 +197,17 @@ def test_packed_gltf_files_are_faults(extension, told, suffix, tmp_path):
         faults.require_none(file)
 
 
+def test_a_gltf_file_that_is_none_is_a_fault(tmp_path):
+    for name, content in (
+        ("deep.gltf", b"[" * 100_000),
+        ("none.glb", b"glTF"),
+        ("list.gltf", b"[]"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ImportFaults, match="cannot be read"):
+            parts_of(tmp_path / name)
+
+
 def test_a_mesh_at_one_point_is_a_fault(tmp_path):
     mesh = trimesh.creation.box()
     mesh.vertices[:] = 2.0

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import tifffile
-from layouts import codes, quiet, save, write_colmap, write_nerfstudio
+from layouts import codes, quiet, save, write_blender, write_colmap, write_nerfstudio
 from PIL import Image
 
 from unbake.dataset.views import Dataset, read_masked, read_photograph
@@ -65,7 +65,7 @@ def test_cameras_are_scaled_to_photographs_that_were_made_smaller(
         small = Image.open(file).resize((8, 8), Image.Resampling.BOX)
         save(np.asarray(small), project / "images_2" / file.name)
     data, told = imported(project, tmp_path / "data", meshes, images=project / "images_2")
-    assert "cameras are scaled by 0.5, to the size of their photographs" in told
+    assert "cameras are scaled by 0.5, to the size of their photographs: 3 of 3" in told
     known = {view.name: view.camera for view in captured.views}
     assert len(data.views) == len(known)
     for view in data.views:
@@ -137,8 +137,17 @@ def test_missing_photographs_may_be_left_out(captured, project, meshes, tmp_path
     assert {view.name for view in data.views} == left
     shutil.rmtree(project / "images")
     (project / "images").mkdir()
-    with pytest.raises(ImportFaults, match="no photograph of the model exists"):
+    with pytest.raises(ImportFaults, match=r"no photograph of the source exists: COLMAP. --images"):
         imported(project, tmp_path / "none", meshes, leave_out_missing=True)
+
+
+@pytest.mark.parametrize("layout", [write_nerfstudio, write_blender])
+def test_photographs_that_are_all_missing_are_told(layout, captured, meshes, tmp_path):
+    layout(captured, tmp_path / "source")
+    for file in (tmp_path / "source").rglob("*.png"):
+        file.unlink()
+    with pytest.raises(ImportFaults, match="no photograph of the source exists"):
+        imported(tmp_path / "source", tmp_path / "none", meshes, leave_out_missing=True)
 
 
 def test_names_that_windows_wrote_are_found(captured, meshes, tmp_path):
@@ -184,6 +193,44 @@ def test_masks_of_the_size_of_the_whole_photograph_suit_a_smaller_one(project, m
     for view in data.views:
         counted = read_masked(view)[1]
         assert not counted[:, :3].any() and counted[:, 3:].all(), "half of a pixel is masked"
+
+
+def test_masks_that_are_given_come_before_those_of_the_source(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        name = frame["file_path"].rsplit("/", 1)[1]
+        save(np.full((16, 16), 255, np.uint8), folder / "own" / name)
+        save(np.zeros((16, 16), np.uint8), folder / "given" / name)
+        frame["mask_path"] = f"own/{name}"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    data, _ = imported(folder, tmp_path / "data", meshes)
+    assert all(read_masked(view)[1].all() for view in data.views)
+    data, _ = imported(folder, tmp_path / "other", meshes, masks=folder / "given")
+    assert not any(read_masked(view)[1].any() for view in data.views)
+
+
+def test_masks_do_not_lead_out_of_their_folder(project, meshes, tmp_path):
+    file = sorted((project / "images").iterdir())[0]
+    save(np.zeros((16, 16), np.uint8), tmp_path / "secret.png")
+    (project / "masks").mkdir()
+    (project / "masks" / f"{file.name}.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(ImportFaults, match=r"lies outside the folder of masks.*--allow-outside"):
+        import_data(project, tmp_path / "data", meshes, tell=quiet)
+
+
+def test_a_camera_whose_size_is_not_told_must_suit_its_image(captured, meshes, tmp_path):
+    """Intrinsics of the whole photograph, and the photograph at a quarter."""
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["w"], content["h"]
+    for file in (folder / "images").iterdir():
+        Image.open(file).resize((4, 4)).save(file)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(ImportFaults, match=r"'cx' is 8, and the image has 4 pixels.*Give 'w'"):
+        import_data(folder, tmp_path / "data", meshes, tell=quiet)
 
 
 def test_a_folder_without_masks_is_a_fault(project, meshes, tmp_path):
@@ -236,7 +283,8 @@ def test_photographs_with_a_profile_are_converted(captured, meshes, tmp_path):
         Image.fromarray(stored).save(file, icc_profile=profile_of(P3, 2.2))
         kept[view.name] = linear
     data, told = imported(folder, tmp_path / "data", meshes)
-    assert any("colours: 3 photographs have the profile" in line for line in told)
+    assert any("converted to sRGB: 3" in line for line in told)
+    assert not any("sRGB lacks" in line for line in told)
     for view in data.views:
         found = read_photograph(view)[..., :3]
         assert np.abs(to_srgb(found) - to_srgb(kept[view.name])).mean() < 3e-3
@@ -257,6 +305,29 @@ def test_pixels_whose_colours_are_clipped_in_part_do_not_count(captured, meshes,
         assert not counted[:, :4].any() and counted[:, 4:].all()
         assert (shown[:, 4:8, :3] >= view.clipped).all()
         assert (shown[:, 8:, :3] < view.clipped).all()
+
+
+def test_colours_that_srgb_lacks_are_told(captured, meshes, tmp_path):
+    write_nerfstudio(captured, tmp_path / "nerf")
+    name = captured.views[0].name
+    vivid = np.full((16, 16, 3), (20, 230, 20), np.uint8)
+    file = tmp_path / "nerf" / "images" / f"{name}.png"
+    Image.fromarray(vivid).save(file, icc_profile=profile_of(P3, 2.2))
+    _, told = imported(tmp_path / "nerf", tmp_path / "data", meshes)
+    assert any("colours that sRGB lacks are cut off in" in line and name in line for line in told)
+
+
+def test_adobe_rgb_is_told_by_exif_as_well(tmp_path):
+    """Cameras write 'uncalibrated', and R03 in the directory of interoperability."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 0xFFFF
+    Image.new("RGB", (4, 4)).save(tmp_path / "other.jpg", exif=exif)
+    assert read_profile(tmp_path / "other.jpg") is None
+    exif.get_ifd(0xA005)[1] = "R03"
+    exif.get_ifd(0x8769)[0xA005] = dict(exif.get_ifd(0xA005))
+    Image.new("RGB", (4, 4)).save(tmp_path / "adobe.jpg", exif=exif)
+    profile = read_profile(tmp_path / "adobe.jpg")
+    assert profile is not None and "Adobe" in profile_name(profile)
 
 
 def test_photographs_of_srgb_are_copied_as_they_are(captured, meshes, tmp_path):

@@ -40,7 +40,8 @@ LIGHTS = {
     ("constant light", (1, 1, 1)): '<emitter type="constant"/>',
     ("lamp", (4, 5, 6)): LAMP,
     ("screen", None): '<shape type="rectangle" id="screen"><emitter type="area">'
-    '<texture type="checkerboard" name="radiance"/></emitter></shape>',
+    '<texture type="bitmap" name="radiance"><string name="filename" value="bump.exr"/></texture>'
+    '</emitter></shape>',
     ("panel", (2, 2, 2)): '<shape type="rectangle"><emitter type="area" id="panel">'
     '<texture type="d65" name="radiance"><float name="scale" value="2"/></texture>'
     "</emitter></shape>",

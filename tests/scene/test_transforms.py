@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unbake.scene.parse import parse, write
+from unbake.scene.parse import is_reference, parse, referenced, write
 
 SCENE = """<scene version="3.0.0">
   <sensor type="perspective"><transform name="to_world">
@@ -76,6 +76,22 @@ def test_mirrors_are_written_as_they_are(axis, angle, tmp_path):
     ]
     assert len(kinds[0]) == len(signs)
     np.testing.assert_allclose(kinds[0], kinds[1], atol=1e-9)
+
+
+def test_what_nothing_refers_to_is_not_missed(tmp_path):
+    """Exports and other lights take shapes and environments from a scene, and leave their nodes."""
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(tmp_path / "sky.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE.format(k=-300, half=1, thin=0.5, angle=90))
+    scene = parse(tmp_path / "scene.xml")
+    root = scene.state.root.props
+    for key in list(root):
+        if is_reference(root[key]) and referenced(scene, root[key]).props.plugin_name() != "cube":
+            del root[key]
+    (tmp_path / "copy").mkdir()
+    copied = transforms(parse(write(scene, tmp_path / "copy")))
+    assert copied.keys() == {("cube", "to_world"), ("checkerboard", "to_uv")}
+    for key, matrix in copied.items():
+        np.testing.assert_allclose(matrix, transforms(scene)[key], atol=1e-9)
 
 
 def test_usual_transforms_stay_readable(tmp_path):

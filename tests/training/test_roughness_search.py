@@ -46,6 +46,7 @@ from unbake.training.run_folder import RunFolder
 from unbake.training.search_samples import SearchSamples
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
+from unbake.training.watchdog import Watchdog
 from unbake.transport.by_roughness import moments, row_type, stratified
 
 #: With which a fit of few samples has enough of them for a search.
@@ -370,6 +371,22 @@ def test_a_fit_that_goes_on_makes_the_searches_of_its_new_length(cornell, tmp_pa
         assert fitted("shorter", "--resume", "--steps", 8) == (0, [8]), "both were due before"
     manifests = sorted((tmp_path / "shorter" / "checkpoints").glob("step-*/manifest.json"))
     assert [json.loads(x.read_text())["searches"] for x in manifests] == [0, 2]
+
+
+def test_a_search_waits_for_a_state_that_may_stay(cornell, tmp_path, unbake, monkeypatch):
+    """What the watchdog takes back must not count as made."""
+    settings = tmp_path / "settings.toml"
+    settings.write_text(to_toml(replace(SETTINGS, pixels=16, steps=20)))
+    made, search = [], RoughnessSearch._search
+
+    def counted(self, state, number, *args):
+        made.append(number)
+        return search(self, state, number, *args)
+
+    monkeypatch.setattr(RoughnessSearch, "_search", counted)
+    monkeypatch.setattr(Watchdog, "trusts", property(lambda self: self._progress.step > 11))
+    outcome = unbake("fit", cornell, "--out", tmp_path / "run", "--settings", settings)
+    assert outcome.status == 0 and made == [12, 15], "the first was due at 8"
 
 
 def test_steps_of_older_runs_move_roughness_as_before():

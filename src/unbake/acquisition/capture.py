@@ -33,7 +33,7 @@ from ..transport.render import parts_of, path_integrator, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
 from .new_light import change_light
-from .placement import coverage, is_room, place
+from .placement import BLACK, BLACK_BACKS, TURN_THEM, black_share, coverage, is_room, place
 from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
 #: Samples a pixel of the truth images, which are noisy at edges only.
@@ -151,6 +151,9 @@ def _capture(
         f"{counts['train']} training and {counts['heldout']} held-out views; the training views "
         f"see {100 * seen:.0f} % of the surface"
     )
+    black = black_share(scene, [camera for _, camera in posed])
+    if black > BLACK:
+        tell(f"warning: {100 * black:.0f} % {BLACK_BACKS}. {TURN_THEM}")
     # Cameras of a file may stand elsewhere than the scene's own sensors.
     room = is_room(scene, () if camera_file is None else [c for _, c in posed])
     rays = CameraRays.of([c for _, c in posed])
@@ -371,11 +374,7 @@ def _truth(
         values, mask = render_materials(
             SceneView.of(shown, None, specular), rays.through, rays.pixels, TRUTH_SAMPLES, seed=1
         )
-        shown_values = values["albedo"]
-        if quantity.channels == 1:  # Mitsuba takes the luminance of textures with colours
-            grey = np.asarray(mi.luminance(mi.Color3f(shown_values.T.astype(np.float32))))
-            shown_values = np.repeat(grey[:, None], 3, axis=1)
-        pictures[name] = shown_values
+        pictures[name] = values["albedo"]
     return pictures, mask
 
 

@@ -14,9 +14,11 @@ from typing import final
 import mitsuba as mi
 import numpy as np
 
-from unbake.dataset.camera import Camera, LookAt
+from unbake.dataset.camera import Camera, LookAt, spread_rays
 from unbake.errors import UserError
+from unbake.fields.shapes import met_shapes, registry_number
 from unbake.scene import free_space
+from unbake.transport.optimized import has_optimized_material
 
 # Sampling of candidate views: positions and surface points, directions and rays of each view.
 _POSITIONS = 240
@@ -30,6 +32,12 @@ _OVEREXPOSED = 30.0
 # One close view at normal incidence takes two thirds of a surface's value, 1 - exp(-1.1).
 _VALUE = 1.1
 _FREE_POSITIONS = 512
+#: Rays along an edge of an image that look for backs; from this share of them on it is told.
+_BACKS, BLACK = 16, 0.01
+BLACK_BACKS = "of the pixels see backs of one-sided materials, which are black"
+TURN_THEM = "Put these materials into 'twosided', or flip the normals of the shapes"
+#: Cameras whose space is probed, at most.
+_PROBING = 64
 _REMEDY = "Give a camera file instead"
 
 
@@ -81,7 +89,8 @@ def is_room(scene: mi.Scene, cameras: Sequence[Camera] = ()) -> bool:
 def _probes(scene: mi.Scene, cameras: Sequence[Camera], seed: int) -> np.ndarray:
     """Positions in the space that cameras see, (n, 3); as `free_space.sensor_probes`."""
     rng, found = np.random.default_rng(seed), []
-    for camera in cameras:
+    step = -(-len(cameras) // _PROBING)
+    for camera in cameras[::step]:
         x, y = rng.random((2, free_space.PROBES))
         rays = camera.rays(camera.width * x, camera.height * y)
         found.append(free_space.probes_along(scene, *rays, rng))
@@ -214,6 +223,28 @@ def coverage(
         seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
     reachable = _reachable(scene, points, seen, () if own else cameras)
     return float(seen.sum() / max(reachable.sum(), 1))
+
+
+def black_share(scene: mi.Scene, cameras: Sequence[Camera]) -> float:
+    """The share of the pixels of all cameras that see backs of one-sided materials, from 0 to 1.
+
+    They are black. Materials that are known do not count.
+    """
+    hits = free_space.trace(scene, *spread_rays(cameras, _BACKS))
+    one_sided = [registry_number(shape) for shape in met_shapes(scene) if _is_one_sided(shape)]
+    return float((hits.back & np.isin(hits.shape, one_sided)).mean())
+
+
+def _is_one_sided(shape: mi.Shape) -> bool:
+    """Whether a shape's back is black, and could be fitted were it not."""
+    if not has_optimized_material(shape):
+        return False
+    params = mi.traverse(shape.bsdf())
+    if any(node.class_name() == "TwoSidedBRDF" for node in params.hierarchy):
+        return False
+    # Principled BSDFs say that they have a back; without transmission it is black.
+    transmitting = [params[key] for key in params.keys() if "spec_trans" in key]  # noqa: SIM118
+    return not any(np.max(np.array(value)) > 0 for value in transmitting)
 
 
 def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000) -> np.ndarray:

@@ -11,7 +11,13 @@ from typing import final
 import mitsuba as mi
 import numpy as np
 
-from ..acquisition.placement import view_counts
+from ..acquisition.placement import (
+    BLACK,
+    BLACK_BACKS,
+    TURN_THEM,
+    black_share,
+    view_counts,
+)
 from ..dataset.agreement import (
     Exposures,
     TurningLight,
@@ -286,6 +292,9 @@ def _check_poses(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -
             remedy = "Check the pose, or remove the frame"
             result.warn("geometry", what, named(inside), remedy)
         _check_distance(result, scene, train)
+        black = black_share(scene, [v.view.camera for v in train])
+        if black > BLACK:
+            result.warn("geometry", f"{100 * black:.0f} % {BLACK_BACKS}", None, TURN_THEM)
     _check_duplicates(result, free_space.extent(scene)[2])
 
 

@@ -307,8 +307,14 @@ def _share_near(
     return float((off[counted] <= NEAR).mean()) if counted.any() else 1.0
 
 
-def bake_texture(baked: Baked, texture: mi.Texture) -> np.ndarray:
-    """A texture of the scene in the coordinates of an atlas, (n, n, 3) float32, as stored."""
+def bake_texture(baked: Baked, texture: mi.Texture, *, colour: bool) -> np.ndarray:
+    """A texture of the scene in the coordinates of an atlas, (n, n, 3) float32, as stored.
+
+    Args:
+        baked: a material.
+        texture: of one of its BSDFs.
+        colour: the BSDF reads colours of it, and not one number.
+    """
     atlas, n = baked.atlas, baked.atlas.resolution
     mesh = _lookup(atlas)
     found, covered = np.zeros((n * n, 3), np.float32), np.zeros(n * n, bool)
@@ -319,7 +325,8 @@ def bake_texture(baked: Baked, texture: mi.Texture) -> np.ndarray:
         si = mesh.eval_parameterization(uv)
         own = mesh.eval_attribute_3("vertex_own", si, si.is_valid())
         si.uv = mi.Point2f(own.x, own.y)
-        found[start : start + width] = np.array(texture.eval(si, si.is_valid())).T
+        read = texture.eval if colour else texture.eval_1
+        found[start : start + width] = np.array(mi.Color3f(read(si, si.is_valid()))).T
         covered[start : start + width] = np.array(si.is_valid())
     return filled(found.reshape(n, n, 3), covered.reshape(n, n), (0.5, 0.5, 0.5))
 

@@ -35,6 +35,16 @@ class Written:
     notes: list[str]  #: what is not as it was
 
 
+#: Parameters of BSDFs that are colours; all others that textures may give are one number.
+_COLOURS = (
+    "base_color",
+    "reflectance",
+    "diffuse_reflectance",
+    "specular_reflectance",
+    "specular_transmittance",
+)
+
+
 def write_scene(
     folder: Path,
     scene: ParsedScene,
@@ -112,7 +122,7 @@ def _move_others(
     learned = {QUANTITIES[name].slot for name in baked.learned}
     outer = {part.bsdf for part in parts if part.bsdf is not None}
     inside = {i for bsdf in outer for i in scene.reachable(bsdf)}
-    moved: dict[int, int] = {}
+    moved: dict[tuple[int, bool], int] = {}
     for i in sorted(inside):
         node = scene.state.nodes[i]
         if node.type != mi.ObjectType.BSDF:
@@ -129,15 +139,15 @@ def _move_others(
                 node.props[key] = mi.ScalarColor3d([0.5, 0.5, 1.0])
                 notes.append(f"{baked.atlas.name}: the normal map is left out")
                 continue
-            old = node.props[key].index()
-            if old not in moved:
-                pixels = bake_texture(baked, make_texture(scratch, old))
+            old, colour = node.props[key].index(), key in _COLOURS
+            if (old, colour) not in moved:
+                pixels = bake_texture(baked, make_texture(scratch, old), colour=colour)
                 if (pixels == pixels[..., :1]).all():
                     pixels = pixels[..., 0]
                 file = folder / _TEXTURES / f"{stem}_texture-{len(moved)}.exr"
-                moved[old] = _bitmap(scene, file, pixels)
+                moved[old, colour] = _bitmap(scene, file, pixels)
             props = scene.state.nodes[i].props
-            props[key] = mi.Properties.ResolvedReference(moved[old])
+            props[key] = mi.Properties.ResolvedReference(moved[old, colour])
     return notes
 
 

@@ -179,10 +179,21 @@ def _triangles(placed: PlacedShape, props: mi.Properties) -> Triangles | None:
     elif props.plugin_name() in TESSELLATED:
         matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
         mesh = tessellated(props.plugin_name()).moved(matrix)
-        mesh = mesh.turned() if props.get("flip_normals", False) else mesh
+        mesh = mesh.turned() if _is_turned(shape, props) else mesh
     else:
         return None
     return mesh if placed.to_world is None else mesh.moved(placed.to_world)
+
+
+def _is_turned(shape: mi.Shape, props: mi.Properties) -> bool:
+    """Whether Mitsuba's normals are opposite to those of the shape's transform.
+
+    Of disks the transform itself is turned. Spheres that are mirrored are turned once more.
+    """
+    plugin = props.plugin_name()
+    if plugin == "disk":
+        return False
+    return shape.has_flipped_normals() if plugin == "sphere" else props.get("flip_normals", False)
 
 
 def _of_mesh(mesh: mi.Mesh) -> Triangles:

@@ -7,12 +7,12 @@ them, as imagecodecs has it.
 from __future__ import annotations
 
 import io
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageCms, TiffImagePlugin
+from PIL import ExifTags, Image, ImageCms, TiffImagePlugin
 
 from ..errors import UserError
 from .srgb import from_srgb
@@ -22,6 +22,8 @@ _SAME = 4e-3
 #: Codes of each channel that are compared.
 _COMPARED = 9
 _TIFF = (".tif", ".tiff")
+#: Formats that Pillow may try, by its names.
+_FORMATS = ("PNG", "JPEG")
 #: The place of the colour space in a profile, and that of three colours.
 _SPACE, _RGB = slice(16, 20), b"RGB "
 #: CIE xy of D65 and of the primaries of sRGB, as Little CMS takes them, with Y = 1.
@@ -32,11 +34,17 @@ _PRIMARIES = (0.64, 0.33, 1.0, 0.30, 0.60, 1.0, 0.15, 0.06, 1.0)
 def read_profile(path: Path) -> bytes | None:
     """The colour profile of a PNG, JPEG or TIFF file; None where it has none but that of sRGB.
 
-    Profiles of grey images are not read.
+    Cameras that write Adobe RGB may say so in EXIF alone. Profiles of grey images are not read.
 
     Raises:
         UserError: imagecodecs is missing.
     """
+    about = path.stat()
+    return _profile_of(path, about.st_mtime_ns, about.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _profile_of(path: Path, *_state: int) -> bytes | None:
     data = _embedded(path)
     if data is None or data[_SPACE] != _RGB or _is_srgb(data):
         return None
@@ -83,14 +91,21 @@ def linear_srgb(codes: np.ndarray, profile: bytes) -> np.ndarray:
 
 
 def _embedded(path: Path) -> bytes | None:
-    """The profile in a file, of any colours."""
+    """The profile in a file, of any colours; that of Adobe RGB where EXIF says so."""
     if path.suffix.lower() in _TIFF:
         return _of_tiff(path)
     try:
-        with Image.open(path) as image:
-            return image.info.get("icc_profile") or None
-    except (OSError, ValueError, SyntaxError):
-        return None  # reading the pixels tells why
+        with Image.open(path, formats=_FORMATS) as image:
+            found = image.info.get("icc_profile")
+            return found or (_adobe_rgb() if _says_adobe_rgb(image.getexif()) else None)
+    except Exception:  # decoders of damaged files raise whatever they meet; pixels tell why
+        return None
+
+
+def _says_adobe_rgb(exif: Image.Exif) -> bool:
+    """Whether EXIF has no colour space of its own, and the sign of Adobe RGB beside it."""
+    uncalibrated = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace) == 0xFFFF
+    return uncalibrated and exif.get_ifd(ExifTags.IFD.Interop).get(1) == "R03"
 
 
 def _of_tiff(path: Path) -> bytes | None:
@@ -113,6 +128,11 @@ def _is_srgb(profile: bytes) -> bool:
     codes = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(1, -1, 3)
     difference = linear_srgb(codes, profile) - from_srgb(codes / 65535)
     return bool(np.abs(difference).max() <= _SAME)
+
+
+@cache
+def _adobe_rgb() -> bytes:
+    return _codecs("Adobe RGB").cms_profile("adobergb")
 
 
 @cache

@@ -67,7 +67,7 @@ def read_colmap(model: Path, reading: Reading, faults: Faults) -> Source:
             )
             if reading.has(file, image.name):
                 shots.append(_shot(image, lenses[image.camera_id], file))
-    if not shots and not faults:
+    if not shots and not reading.missing and not faults:
         what = (
             "no photograph of the model exists"
             if reading.missing

@@ -38,8 +38,8 @@ _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _LENSES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 _INSTANT_NGP = (
-    f"{TRANSFORMS} is of instant-ngp, which turns and scales cameras unless colmap2nerf.py is run "
-    "with --keep_colmap_coords: a mesh of COLMAP then does not fit"
+    f"{TRANSFORMS} may be of instant-ngp, whose colmap2nerf.py turns and scales cameras unless it "
+    "is run with --keep_colmap_coords: a mesh of COLMAP does not fit then"
 )
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -276,6 +276,10 @@ def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
     plain["transform_matrix"] = np.eye(4).tolist()
     if "w" not in plain or "h" not in plain:
         plain |= {"w": width, "h": height}
+        middle = number(dict(keys), "cx", where) if "cx" in keys else width / 2
+        if not 1 / 3 < middle / width < 2 / 3:
+            what = f"'cx' is {middle:g}, and the image has {width} pixels across"
+            raise UserError(what, where, "Give 'w' and 'h', the size that the camera is for")
     camera = camera_from_frame(plain, {}, where)
     values = {k: number(dict(keys), k, where) for k in _DISTORTION if k in keys}
     k1, k2, k3, k4, k5, k6, p1, p2 = (values.get(k, 0.0) for k in _DISTORTION)

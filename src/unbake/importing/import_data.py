@@ -19,7 +19,7 @@ from ..config.light import LightConfig
 from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.views import LONGEST_NAME, PIXEL_BYTES, counted_by, read_radiance
-from ..errors import UserError
+from ..errors import UserError, named
 from ..imaging.coded import decode, encode, read_codes
 from ..imaging.pictures import write_exr
 from ..imaging.profiles import linear_srgb, profile_name, read_profile
@@ -41,6 +41,9 @@ from .source import Reading, Shot, Source, image_header, masks_in, same_shape
 
 #: Codes at and above this share of the largest one are taken for clipped: 250 of 255.
 CLIPPED_CODE = 250 / 255
+#: A linear value below zero by more than this is a colour that sRGB lacks, and the share of pixels
+#: with one from which on it is told.
+_BEYOND, _OFTEN = 0.01, 0.01
 #: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
 _RAYS = 64
 #: A camera from which this share of all directions hits the mesh stands in a room.
@@ -98,8 +101,7 @@ def import_data(
         settings.keep_applied_transform,
         settings.leave_out_missing,
     )
-    found = _read_source(source, reading, faults)
-    found = masks_in(found, None if masks is None else Path(masks), faults)
+    found = _found(source, reading, None if masks is None else Path(masks), faults)
     given = [Path(mesh) for mesh in meshes] or ([] if found.mesh is None else [found.mesh])
     if not given:
         faults.add("no mesh was given (--mesh FILE)")
@@ -140,8 +142,7 @@ def import_data(
             | ({"light": "unknown"} if light is None else {})
             | {"frames": frames}
         )
-    notes = (*reading.notes(), *_scaled(found.shots), *pictures.told())
-    found = replace(found, notes=(*found.notes, *notes))
+    found = replace(found, notes=(*found.notes, *pictures.told()))
     for line in _summary(found, splits, seen, parts, told):
         tell(line)
     if pictures.negative:
@@ -156,6 +157,15 @@ def import_data(
 
 
 # ------------------------------------------------------------------------------------------ reading
+
+
+def _found(source: Path, reading: Reading, masks: Path | None, faults: Faults) -> Source:
+    """What the source holds, with masks."""
+    found = _read_source(source, reading, faults)
+    if reading.missing and not found.shots and not faults:
+        faults.add("no photograph of the source exists", found.kind, "--images names their folder")
+    found = masks_in(found, masks, reading, faults)
+    return replace(found, notes=(*found.notes, *reading.notes(), *_scaled(found.shots)))
 
 
 def _read_source(source: Path, reading: Reading, faults: Faults) -> Source:
@@ -262,20 +272,25 @@ class _Pictures:
         transparent: have pixels whose alpha is less than 1.
         negative: have negative radiance.
         profiles: the names of colour profiles that are not those of sRGB.
+        beyond: have such a profile, and colours that sRGB lacks.
     """
 
     with_alpha: set[str] = field(default_factory=set)
     transparent: set[str] = field(default_factory=set)
     negative: set[str] = field(default_factory=set)
     profiles: dict[str, str] = field(default_factory=dict)
+    beyond: set[str] = field(default_factory=set)
 
     def told(self) -> list[str]:
         """What was changed of the colours, for people."""
         count = Counter(self.profiles.values())
-        return [
-            f"colours: {n} photographs have the profile {name}, converted to sRGB"
+        told = [
+            f"colours: photographs with the profile {name}, converted to sRGB: {n}"
             for name, n in sorted(count.items())
         ]
+        if self.beyond:
+            told.append(f"colours that sRGB lacks are cut off in {named(sorted(self.beyond))}")
+        return told
 
     def add(self, shot: Shot, pixels: np.ndarray) -> None:
         """Take a photograph into account: (H, W, 4)."""
@@ -284,6 +299,8 @@ class _Pictures:
         profile = _profile(shot)
         if profile is not None:
             self.profiles[shot.name] = profile_name(profile)
+            if (pixels[..., :3] < -_BEYOND).any(axis=2).mean() > _OFTEN:
+                self.beyond.add(shot.name)
         elif (pixels < 0).any():
             self.negative.add(shot.name)
         if shot.name in self.transparent or image_header(shot.image).channels in (2, 4):
@@ -367,10 +384,10 @@ def _scaled(shots: Sequence[Shot]) -> list[str]:
     changed = [shot for shot in shots if shot.lens.scale != 1]
     if not changed:
         return []
-    every = "" if len(changed) == len(shots) else f"{len(changed)} "
-    sizes = sorted({shot.lens.scale for shot in changed})
-    by = f"{sizes[0]:.3g}" if len(sizes) == 1 else f"{sizes[0]:.3g} to {sizes[-1]:.3g}"
-    return [f"{every}cameras are scaled by {by}, to the size of their photographs"]
+    sizes = sorted(f"{shot.lens.scale:.3g}" for shot in changed)
+    by = " to ".join(dict.fromkeys((sizes[0], sizes[-1])))
+    count = f"{len(changed)} of {len(shots)}"
+    return [f"cameras are scaled by {by}, to the size of their photographs: {count}"]
 
 
 def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:

@@ -60,6 +60,7 @@ class Lens:
         than half of that rounding.
         """
         across, down = width / self.width, height / self.height
+        scale = self.scale * math.sqrt(across * down)
         project = self.project
         if project is None:
             if self.straight:
@@ -68,7 +69,7 @@ class Lens:
             else:
                 focal = (self.fl_x * across, self.fl_y * down)
             middle = self.cx * across, self.cy * down
-            return Lens(width, height, *focal, *middle, scale=self.scale * across)
+            return Lens(width, height, *focal, *middle, scale=scale)
 
         def smaller(points: np.ndarray) -> np.ndarray:
             return project(points) * (across, down)
@@ -81,7 +82,7 @@ class Lens:
             self.cx * across,
             self.cy * down,
             smaller,
-            self.scale * across,
+            scale,
         )
 
     def pixels(self, points: np.ndarray) -> np.ndarray:

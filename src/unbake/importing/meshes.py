@@ -251,16 +251,16 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
 
 def _require_plain(file: Path) -> None:
     """Refuse a glTF file whose numbers are packed: trimesh 5.2 reads some as zeros."""
-    with file.open("rb") as opened:
-        head = opened.read(20)
-        if head[:4] == b"glTF" and len(head) == 20:
-            told = opened.read(int.from_bytes(head[12:16], "little"))
-        else:
-            told = head + opened.read()
     try:
+        with file.open("rb") as opened:
+            head = opened.read(20)
+            if head[:4] == b"glTF" and len(head) == 20:
+                told = opened.read(int.from_bytes(head[12:16], "little"))
+            else:
+                told = head + opened.read()
         top = json.loads(told)
         packed = [_PACKED[name] for name in top.get("extensionsRequired", ()) if name in _PACKED]
-    except (ValueError, TypeError, AttributeError):
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return  # trimesh tells what is wrong with it
     if packed:
         what = f"the mesh is compressed ({', '.join(packed)})"

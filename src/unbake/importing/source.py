@@ -179,15 +179,17 @@ def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Pa
     return path if found is None else checked(os.fspath(found))
 
 
-def masks_in(source: Source, folder: Path | None, faults: Faults) -> Source:
-    """Give photographs the masks of a folder, where they have none.
+def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faults) -> Source:
+    """Give photographs the masks of a folder.
 
     Masks of `a/0001.jpg` are `a/0001.jpg.png`, as COLMAP has them, or `a/0001.png`; or the same
     without folders at the beginning.
 
     Args:
         source: with photographs.
-        folder: None: that of the source, where it has one.
+        folder: comes before masks that the source names; None: the source's own folder, where it
+            has one, for photographs without a mask.
+        reading: whether masks may lie outside of the folder.
         faults: a folder that is none, or has no mask of any photograph, is added to it.
     """
     given = folder is not None
@@ -197,9 +199,13 @@ def masks_in(source: Source, folder: Path | None, faults: Faults) -> Source:
     if not folder.is_dir():
         faults.add("there is no folder of masks", folder)
         return source
-    shots = [
-        shot if shot.mask else replace(shot, mask=_mask_of(shot, folder)) for shot in source.shots
-    ]
+    shots = []
+    for shot in source.shots:
+        mask = None
+        if given or shot.mask is None:
+            with faults.collected(shot.name):
+                mask = _mask_of(shot, folder, reading)
+        shots.append(replace(shot, mask=mask or shot.mask))
     bare = [shot.name for shot in shots if shot.mask is None]
     if len(bare) == len(shots):
         if given:
@@ -210,13 +216,14 @@ def masks_in(source: Source, folder: Path | None, faults: Faults) -> Source:
     return replace(source, shots=tuple(shots), notes=(*source.notes, *note))
 
 
-def _mask_of(shot: Shot, folder: Path) -> Path | None:
+def _mask_of(shot: Shot, folder: Path, reading: Reading) -> Path | None:
     parts = [part for part in PurePosixPath(shot.name).parts if part not in ("/", "..")]
     for first in range(len(parts)):
         end = PurePosixPath(*parts[first:])
-        for name in (f"{end}.png", str(end.with_suffix(".png")), str(end)):
+        for name in (f"{end}.png", str(end.with_suffix(".png"))):
             if (folder / name).is_file():
-                return folder / name
+                outside = reading.allow_outside
+                return inside(folder, name, name, "folder of masks", allow_outside=outside)
     return None
 
 

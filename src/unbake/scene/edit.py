@@ -13,10 +13,11 @@ from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
 from ..transport.optimized import optimized_shapes
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
+from .one_number import one_number
 from .parse import ParsedScene, is_reference, referenced
 
 _NO_MATERIAL = "no material to fit: no surface has a principled, diffuse or roughplastic BSDF"
-_GIVE_ONE = "Give one a principled BSDF: all others, and those that lamps alone have, are known"
+_GIVE_ONE = "Give one a principled BSDF: all others, and those of lamps, are known"
 
 #: Properties of the BSDFs that become `principled`.
 _PROPERTIES = {
@@ -207,12 +208,21 @@ def show_as_albedo(scene: ParsedScene, slot: str, default: float) -> None:
     """Replace each base colour by another parameter, so that an albedo integrator renders it.
 
     Args:
-        slot: the parameter of `principled`.
+        scene: changed in place.
+        slot: the parameter of `principled`, one number.
         default: what stands for it where the scene does not say.
     """
-    for node in scene.principled_nodes():
-        props = node.props
-        props["base_color"] = props.get(slot, default)
+    nodes, plugin = scene.state.nodes, one_number()
+    # By number: a node that is appended moves all others.
+    for number in scene.principled_indices():
+        value = nodes[number].props.get(slot, default)
+        if not isinstance(value, float | int):
+            around = mi.parser.SceneNode()
+            around.type = mi.ObjectType.Texture
+            around.props.set_plugin_name(plugin)
+            around.props["own"] = value
+            value = mi.Properties.ResolvedReference(scene.append(around))
+        nodes[number].props["base_color"] = value
 
 
 def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:

@@ -126,9 +126,17 @@ def trace(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> Hits:
     return Hits(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def unoccluded(scene: mi.Scene, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Whether the segment between two points is free, (n,) bool; glass occludes."""
-    offset = _offset(scene)
+def unoccluded(
+    scene: mi.Scene, starts: np.ndarray, ends: np.ndarray, offset: float | None = None
+) -> np.ndarray:
+    """Whether the segment between two points is free, (n,) bool; glass occludes.
+
+    Args:
+        scene: what stands in the way.
+        starts, ends: (n, 3).
+        offset: how far before its end a segment ends; None: as suits the scene.
+    """
+    offset = _offset(scene) if offset is None else offset
     free = np.empty(len(starts), dtype=bool)
     for i in range(0, len(starts), _CHUNK):
         start, segment = starts[i : i + _CHUNK], (ends - starts)[i : i + _CHUNK]
@@ -152,7 +160,7 @@ def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) ->
         position, normal = (np.tile(a, (count, 1)) for a in (points.position, points.normal))
         side = np.sign(np.einsum("ij,ij->i", ends - position, normal))
         start = position + (offset * side)[:, None] * normal
-        result[row : row + rows] = unoccluded(scene, start, ends).reshape(count, -1)
+        result[row : row + rows] = unoccluded(scene, start, ends, offset).reshape(count, -1)
     return result
 
 
@@ -330,7 +338,7 @@ def _offset(scene: mi.Scene) -> float:
 
 def _connected(scene: mi.Scene, positions: np.ndarray, starts: np.ndarray, seed: int) -> np.ndarray:
     """Whether a chain of free segments connects each position with one of `starts`: (n,) bool."""
-    rng = np.random.default_rng(seed)
+    rng, offset = np.random.default_rng(seed), _offset(scene)
     reached = np.zeros(len(positions), dtype=bool)
     idle = 0
     while idle < 2 and not reached.all():
@@ -339,7 +347,7 @@ def _connected(scene: mi.Scene, positions: np.ndarray, starts: np.ndarray, seed:
         sources = np.concatenate([starts, positions[reached]])
         sources = sources[rng.permutation(len(sources))[:64]]
         ends = np.repeat(positions[remaining], len(sources), axis=0)
-        free = unoccluded(scene, ends, np.tile(sources, (len(remaining), 1)))
+        free = unoccluded(scene, ends, np.tile(sources, (len(remaining), 1)), offset)
         new = remaining[free.reshape(len(remaining), -1).any(axis=1)]
         reached[new] = True
         idle = 0 if len(new) else idle + 1

@@ -13,9 +13,12 @@ import numpy as np
 from ..fields.shapes import met_shapes
 from .triangles import normal_sums, unit
 
+#: Lengths of normals may differ from 1 by this much.
+_OFF = 0.1
+
 
 def repair_normals(scene: mi.Scene) -> int:
-    """Give vertices without a finite normal the mean normal of their triangles, by area.
+    """Give vertices without a normal of length 1 the mean normal of their triangles, by area.
 
     Other normals stay as they are. A vertex that has only triangles without area, which no ray
     hits, gets +z.
@@ -31,7 +34,10 @@ def repair_normals(scene: mi.Scene) -> int:
         if not shape.is_mesh() or not shape.has_vertex_normals():
             continue
         normals = np.array(shape.vertex_normals_buffer(), np.float32).reshape(-1, 3)
-        broken = np.asarray(~np.isfinite(normals).all(1))
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = np.linalg.norm(normals.astype(np.float64), axis=1)
+        # OBJ files with normals for some faces alone leave the others as the memory was.
+        broken = np.asarray(~(np.abs(length - 1) < _OFF))
         if not broken.any():
             continue
         positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)

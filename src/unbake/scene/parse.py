@@ -23,6 +23,7 @@ from .images import IMAGES, check_image
 from .meshes import FORMATS, check_mesh
 from .normals import repair_normals
 from .preflight import check_xml
+from .textures import require_able
 from .transforms import write_nodes
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
@@ -138,27 +139,9 @@ class ParsedScene:
         return [self.state.nodes[i] for i in self.principled_indices()]
 
     def principled_indices(self) -> list[int]:
-        """Their places among the nodes; their places in this list are the numbers of materials.
-
-        BSDFs that lamps alone have are left out, unless there are no others: no photograph tells
-        what a lamp reflects.
-        """
+        """Their places among the nodes; their places in this list are the numbers of materials."""
         nodes = self.state.nodes
-        found = [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
-        lamps = self._of_lamps_alone() if found else frozenset()
-        return [i for i in found if i not in lamps] or found
-
-    def _of_lamps_alone(self) -> frozenset[int]:
-        """The places of nodes that shapes with an emitter refer to, and no others."""
-        nodes, lamps, others = self.state.nodes, set(), set()
-        for place, node in enumerate(nodes):
-            if node.type != mi.ObjectType.Shape:
-                continue
-            own = self.references(place)
-            lit = any(nodes[i].type == mi.ObjectType.Emitter for i in own)
-            for i in own:
-                (lamps if lit else others).update(self.reachable(i))
-        return frozenset(lamps - others)
+        return [i for i, node in enumerate(nodes) if node.props.plugin_name() == "principled"]
 
     def append(self, node: mi.parser.SceneNode) -> int:
         """Append a node and return its number; all handles of other nodes are void after it."""
@@ -216,12 +199,13 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     scene = ParsedScene(path, root, config, state)
     _require_own_plugins(scene)
     _replace_unused(scene)
-    _require_rgb(scene)
     _require_finite(scene)
     _require_round(scene)
     _require_needed(scene)
     _resolve_files(scene, folders)
     scene.media = _leave_out_media(scene)
+    require_able(scene)
+    _require_rgb(scene)
     turn_rectangles(scene)
     return scene
 
@@ -261,7 +245,29 @@ def _leave_out_media(scene: ParsedScene) -> int:
         for key in media:
             del node.props[key]
         count += bool(media)
+    if count:
+        _leave_out_shells(scene)
     return count
+
+
+def _leave_out_shells(scene: ParsedScene) -> None:
+    """Take out shapes that only held a medium: light of points and suns does not pass them."""
+    nodes = scene.state.nodes
+
+    def is_shell(place: int) -> bool:
+        kinds = [nodes[i] for i in scene.references(place)]
+        dark = all(node.type != mi.ObjectType.Emitter for node in kinds)
+        return dark and any(node.props.plugin_name() == "null" for node in kinds)
+
+    shells = [
+        place
+        for place, node in enumerate(nodes)
+        if node.type == mi.ObjectType.Shape and is_shell(place)
+    ]
+    for node in nodes:
+        for key in list(node.props):
+            if is_reference(node.props[key]) and node.props[key].index() in shells:
+                del node.props[key]
 
 
 def _fault(scene: mi.Scene) -> tuple[str, str | None] | None:
@@ -337,7 +343,7 @@ def _replace_unused(scene: ParsedScene) -> None:
 
 def _require_rgb(scene: ParsedScene) -> None:
     """Refuse spectra that Mitsuba does not turn into RGB: it fails when light is computed."""
-    for node in scene.state.nodes:
+    for node in (scene.state.nodes[i] for i in scene.reachable(0)):
         name = node.props.plugin_name()
         if name in _WITHOUT_RGB:
             where = mi.parser.file_location(scene.state, node)

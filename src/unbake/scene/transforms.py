@@ -36,7 +36,8 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
     kept: list[tuple[Any, str, Any]] = []
     marks: dict[int, str] = {}
     try:
-        for node in scene.state.nodes:
+        # Nodes that nothing refers to are not written.
+        for node in (scene.state.nodes[i] for i in scene.reachable(0)):
             for key in list(node.props):
                 value = node.props[key]
                 if node.type == mi.ObjectType.Sensor or not _is_misread(value):

@@ -173,6 +173,8 @@ def make_problem(
     if change is not None:
         change(parsed)
     loaded = parsed.instantiate()
+    if config.learns_materials:
+        edit.require_optimized(loaded, scene)
     emitters.require_emitters(loaded, scene)
     unchanged = loaded if change is None else parse(scene, root).instantiate()
     if emission is not None:

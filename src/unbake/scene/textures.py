@@ -1,0 +1,78 @@
+"""Textures in places where Mitsuba 3.9 cannot use them: it fails when light is computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mitsuba as mi
+
+from ..errors import UserError
+from .meshes import ply_fields
+
+if TYPE_CHECKING:
+    from .parse import ParsedScene
+
+#: BSDFs that bend normals, and the textures whose slopes or vectors they can read.
+_BENDING = ("bumpmap", "normalmap")
+_AREA = ("area", "directionalarea")
+_PATTERNS = ("checkerboard", "mesh_attribute")
+#: The properties of a PLY file that are colours, in either way.
+_COLOURS = ({"red", "green", "blue"}, {"r", "g", "b"})
+
+
+def require_able(scene: ParsedScene) -> None:
+    """Refuse textures and nestings of BSDFs that Mitsuba has no method for, or a wrong one.
+
+    Raises:
+        UserError: names the line.
+    """
+    nodes = scene.state.nodes
+    for place in scene.reachable(0):
+        node = nodes[place]
+        plugin, inner = node.props.plugin_name(), [nodes[i] for i in scene.references(place)]
+        names = [each.props.plugin_name() for each in inner]
+        fault = remedy = None
+        if plugin in _BENDING and (pattern := _first(names, _PATTERNS)):
+            fault, remedy = f"a {plugin} cannot read a {pattern}", "Give a bitmap"
+        elif plugin in _BENDING and "mask" in names:
+            # Its holes let no light pass: Mitsuba asks the outer BSDF, which does not know of them.
+            fault, remedy = f"a {plugin} around a mask", f"Put the {plugin} into the mask"
+        elif plugin in _AREA and (pattern := _first(names, _PATTERNS)):
+            fault, remedy = f"the radiance of a lamp cannot be a {pattern}", "Give a bitmap"
+        elif node.type == mi.ObjectType.Shape and (missing := _missing_colours(scene, place)):
+            fault, remedy = missing, "Write it as PLY with red, green and blue, without alpha"
+        elif plugin == "shapegroup" and _has_vertex_colours(scene, place):
+            fault = "instances of meshes whose vertices have colours have other colours"
+            remedy = "Place the meshes themselves, or give a bitmap"
+        if fault is not None:
+            raise UserError(fault, mi.parser.file_location(scene.state, node), remedy)
+
+
+def _first(names: list[str], wanted: tuple[str, ...]) -> str | None:
+    return next((name for name in names if name in wanted), None)
+
+
+def _missing_colours(scene: ParsedScene, place: int) -> str | None:
+    """What is wrong with the colours that a shape's texture takes of its mesh, which are black."""
+    shape, wanted = scene.state.nodes[place].props, _attributes(scene, place)
+    for element in [kind for kind in ("vertex", "face") if f"{kind}_color" in wanted]:
+        if shape.plugin_name() == "obj":
+            return "the colours of an OBJ file are not read"
+        if shape.plugin_name() == "ply":
+            names = {name.lower() for name in ply_fields(Path(shape["filename"])).get(element, [])}
+            if not any(colours <= names for colours in _COLOURS):
+                return f"the mesh has no {element}_color"
+            if names & {"alpha", "a"}:
+                return f"{element}_color has an alpha, and is not read"
+    return None
+
+
+def _attributes(scene: ParsedScene, place: int) -> set[str]:
+    """The names of mesh attributes that textures of a node read."""
+    found = [scene.state.nodes[i].props for i in scene.reachable(place)]
+    return {str(p.get("name", "")) for p in found if p.plugin_name() == "mesh_attribute"}
+
+
+def _has_vertex_colours(scene: ParsedScene, place: int) -> bool:
+    return any(name.startswith("vertex_") for name in _attributes(scene, place))
