@@ -226,12 +226,17 @@ def test_spectra_without_rgb_are_refused(name, parse):
         parse(BALL.format(DIFFUSE) + light.format(name))
 
 
-def test_a_material_that_lamps_alone_have_is_none_to_fit(parse):
-    own = '<bsdf type="principled" id="own"/><emitter type="area"/>'
-    alone = parse(f'<shape type="sphere">{own}</shape><shape type="cube"/>')
-    assert material_names(alone) == ["own"]
-    with pytest.raises(UserError, match=r"no material to fit.*and those of lamps, are known"):
-        require_optimized(alone.instantiate(), alone.path)
+def test_a_material_that_no_shape_has_is_none_to_fit(parse):
+    """BSDFs that stand in a scene, and that nothing refers to."""
+    unused = '<bsdf type="principled" id="unused"/>'
+    lamp = '<shape type="sphere"><bsdf type="principled"/><emitter type="area"/></shape>'
+    glass = '<shape type="cube"><bsdf type="dielectric"/></shape>'
+    bare = parse(unused + glass)
+    assert material_names(bare) == ["unused"]
+    with pytest.raises(UserError, match=r"no material to fit.*Give one a principled BSDF"):
+        require_optimized(bare.instantiate(), bare.path)
+    furnace = parse(lamp + glass)
+    require_optimized(furnace.instantiate(), furnace.path)
 
 
 def test_spectra_in_parts_that_nothing_uses_do_not_matter(parse):

@@ -9,6 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import UserError, named
+from ..fields.shapes import met_shapes
 from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
 from ..transport.optimized import optimized_shapes
@@ -17,7 +18,7 @@ from .one_number import one_number
 from .parse import ParsedScene, is_reference, referenced
 
 _NO_MATERIAL = "no material to fit: no surface has a principled, diffuse or roughplastic BSDF"
-_GIVE_ONE = "Give one a principled BSDF: all others, and those of lamps, are known"
+_GIVE_ONE = "Give one a principled BSDF: all others are known"
 
 #: Properties of the BSDFs that become `principled`.
 _PROPERTIES = {
@@ -136,13 +137,19 @@ def _alpha(scene: ParsedScene, node: mi.parser.SceneNode) -> float:
 
 
 def require_optimized(scene: mi.Scene, path: Path) -> None:
-    """Raise a `UserError` if no surface of a scene has a material that could be fitted.
+    """Raise a `UserError` if no shape of a scene has a material that could be fitted.
+
+    Those of lamps count where there are no others, as of a furnace.
 
     Args:
         scene: after `to_principled`.
         path: its file.
     """
-    if not optimized_shapes(scene):
+    if optimized_shapes(scene):
+        return
+    bsdfs = [shape.bsdf() for shape in met_shapes(scene) if shape.is_emitter()]
+    nodes = (node for bsdf in bsdfs if bsdf is not None for node in mi.traverse(bsdf).hierarchy)
+    if not any(node.class_name() == "Principled" for node in nodes):
         raise UserError(_NO_MATERIAL, path, _GIVE_ONE)
 
 
