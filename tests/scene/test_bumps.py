@@ -8,7 +8,7 @@ import pytest
 from scene_texts import render
 
 from unbake.imaging.pictures import write_exr
-from unbake.scene.parse import parse
+from unbake.scene.parse import parse, write
 
 SCENE = """<scene version="3.0.0">
   <sensor type="perspective"><float name="fov" value="60"/>
@@ -62,3 +62,15 @@ def test_bumps_still_show(tmp_path):
     bumpy = picture(tmp_path, "cube", "", BUMPS.format(MATTE))
     assert np.isfinite(bumpy).all()
     assert np.abs(bumpy - picture(tmp_path, "cube", "", MATTE)).max() > 0.05
+
+
+def test_copies_of_scenes_are_not_turned(tmp_path):
+    """Each reading would turn them once more."""
+    write_exr(tmp_path / "bump.exr", np.zeros((8, 8)))
+    bsdf = BUMPS.format(MATTE)
+    text = SCENE.format(eye="3,2,2", up="0,1,0", kind="rectangle", transform="", file="", bsdf=bsdf)
+    (tmp_path / "scene.xml").write_text(text)
+    (tmp_path / "copy").mkdir()
+    copied = parse(write(parse(tmp_path / "scene.xml"), tmp_path / "copy"))
+    (wall,) = [n for n in copied.state.nodes if n.props.plugin_name() == "rectangle"]
+    assert "to_world" not in wall.props

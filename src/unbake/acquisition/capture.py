@@ -234,14 +234,13 @@ def _copy_scene(
     changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")
-    edit.material_names(parsed)  # there are some
     original = parse(source, root)
     if light is not None:
         change_light(original, light, allow_outside, lambda line: None)
     edit.to_principled(original)
     scene = original.instantiate()
-    emitters.require_emitters(scene, source)
     edit.require_optimized(scene, source)
+    emitters.require_emitters(scene, source)
     path = write(parsed, folder)
     shutil.rmtree(made, ignore_errors=True)
     return path, scene

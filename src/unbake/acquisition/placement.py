@@ -16,7 +16,7 @@ import numpy as np
 
 from unbake.dataset.camera import Camera, LookAt, spread_rays
 from unbake.errors import UserError
-from unbake.fields.shapes import met_shapes, registry_number
+from unbake.fields.shapes import bsdf_classes, met_shapes, registry_number
 from unbake.scene import free_space
 from unbake.transport.optimized import has_optimized_material
 
@@ -239,9 +239,9 @@ def _is_one_sided(shape: mi.Shape) -> bool:
     """Whether a shape's back is black, and could be fitted were it not."""
     if not has_optimized_material(shape):
         return False
-    params = mi.traverse(shape.bsdf())
-    if any(node.class_name() == "TwoSidedBRDF" for node in params.hierarchy):
+    if "TwoSidedBRDF" in bsdf_classes(shape):
         return False
+    params = mi.traverse(shape.bsdf())
     # Principled BSDFs say that they have a back; without transmission it is black.
     transmitting = [params[key] for key in params.keys() if "spec_trans" in key]  # noqa: SIM118
     return not any(np.max(np.array(value)) > 0 for value in transmitting)

@@ -29,9 +29,7 @@ class Views:
 
     def __init__(self, scene: mi.Scene, cameras: Sequence[Camera]) -> None:
         self._scene, self._cameras = scene, cameras
-        self._offset = max(
-            _OFFSET * free_space.extent(scene)[2], 1e-6 * free_space.bounds(scene)[2]
-        )
+        self._offset = free_space.lift(scene, _OFFSET)
 
     def see(self, p: mi.Point3f, n: mi.Normal3f, two_sided: mi.Bool, active: mi.Bool) -> mi.Bool:
         """Whether any camera sees points.

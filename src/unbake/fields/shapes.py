@@ -25,6 +25,14 @@ def registry_number(shape: mi.Shape) -> int:
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
+def bsdf_classes(shape: mi.Shape) -> frozenset[str]:
+    """The names of Mitsuba's classes of a shape's BSDF and of all that is in it; empty without."""
+    bsdf = shape.bsdf()
+    if bsdf is None:
+        return frozenset()
+    return frozenset(node.class_name() for node in mi.traverse(bsdf).hierarchy)
+
+
 def placed_shapes(scene: mi.Scene) -> list[PlacedShape]:
     """All shapes that rays meet, in the order of `scene.shapes()`, as often as they are placed.
 

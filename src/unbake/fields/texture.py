@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +14,30 @@ from .shapes import met_shapes, registry_number
 
 #: By which the BSDF's parameters tell the number of its material.
 _NUMBER = "material_number"
+
+
+@cache
+def texture_base(variant: str) -> type[mi.Texture]:
+    """A class for textures in Python that vary over surfaces, with values from 0 to 1.
+
+    Args:
+        variant: the one that is active; `mi.Texture` exists only once there is one.
+    """
+
+    class Varying(mi.Texture):
+        def eval_3(self, si, active=True):
+            return self.eval(si, active)
+
+        def mean(self):
+            return mi.Float(0.5)
+
+        def max(self):
+            return 1.0
+
+        def is_spatially_varying(self):
+            return True
+
+    return Varying
 
 
 def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Texture]:
@@ -29,7 +54,7 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
     """
 
     # The class is made here because `mi.Texture` exists only once a variant has been chosen.
-    class FieldTexture(mi.Texture):
+    class FieldTexture(texture_base(mi.variant())):
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.quantity = props["quantity"]
@@ -51,20 +76,8 @@ def material_textures(materials: Materials, number: int = 0) -> dict[str, mi.Tex
             value = self.lookup(si, active)
             return mi.luminance(value) if isinstance(value, mi.Color3f) else value
 
-        def eval_3(self, si, active=True):
-            return self.eval(si, active)
-
         def traverse(self, callback):
             callback.put(_NUMBER, number, mi.ParamFlags.NonDifferentiable)
-
-        def mean(self):
-            return mi.Float(0.5)
-
-        def max(self):
-            return 1.0
-
-        def is_spatially_varying(self):
-            return True
 
         def to_string(self):
             return f"FieldTexture[{self.quantity}]"

@@ -15,7 +15,7 @@ from ..errors import UserError, named, printable
 from ..io import array, number, read_object, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
-from .source import Reading, Shot, Source, find_image, image_header, suited
+from .source import Reading, Shot, Source, ends_of, find_image, image_header, suited
 
 #: The files of a folder with one file a split, and our names of the splits.
 SPLIT_FILES = {
@@ -250,8 +250,7 @@ def _image(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
     if reading.images is None:
         return _named_file(folder, name, reading)
     name = _slashed(name)
-    parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
-    ends = [str(PurePosixPath(*parts[first:])) for first in range(len(parts))] or [name]
+    ends = [str(end) for end in ends_of(name)] or [name]
     outside = reading.allow_outside
     files = [find_image(reading.images, end, "source", allow_outside=outside) for end in ends]
     return name, next((file for file in files if file.is_file()), files[0])

@@ -217,14 +217,18 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
 
 
 def _mask_of(shot: Shot, folder: Path, reading: Reading) -> Path | None:
-    parts = [part for part in PurePosixPath(shot.name).parts if part not in ("/", "..")]
-    for first in range(len(parts)):
-        end = PurePosixPath(*parts[first:])
+    for end in ends_of(shot.name):
         for name in (f"{end}.png", str(end.with_suffix(".png"))):
             if (folder / name).is_file():
                 outside = reading.allow_outside
                 return inside(folder, name, name, "folder of masks", allow_outside=outside)
     return None
+
+
+def ends_of(name: str) -> list[PurePosixPath]:
+    """A path in folders, and the same without folders at its beginning: the longest one first."""
+    parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
+    return [PurePosixPath(*parts[first:]) for first in range(len(parts))]
 
 
 def first_folder(folders: Sequence[Path]) -> Path | None:

@@ -14,7 +14,7 @@ from ..fields.envmap import environment_emitter
 from ..fields.field import Cost, Engine, Field
 from ..fields.materials import Materials
 from ..fields.registry import representation
-from ..fields.texture import material_numbers, material_textures
+from ..fields.texture import material_numbers, material_textures, texture_base
 from ..quantities import QUANTITIES
 from ..scene import edit
 from ..scene.parse import parse
@@ -128,8 +128,7 @@ def _scene(
 def _register() -> None:
     """Make the texture known to Mitsuba."""
 
-    # The class is made here because `mi.Texture` exists only once a variant has been chosen.
-    class WayTexture(mi.Texture):
+    class WayTexture(texture_base(mi.variant())):
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.fitted = props["fitted"]
@@ -144,20 +143,8 @@ def _register() -> None:
             true = self.true.eval_1(si, active)
             return dr.lerp(self.fitted.eval_1(si, active), true, self.tables[WAY])
 
-        def eval_3(self, si, active=True):
-            return self.eval(si, active)
-
         def traverse(self, callback):
             callback.put("fitted", self.fitted, mi.ParamFlags.NonDifferentiable)
-
-        def mean(self):
-            return mi.Float(0.5)
-
-        def max(self):
-            return 1.0
-
-        def is_spatially_varying(self):
-            return True
 
         def to_string(self):
             return f"WayTexture[{self.fitted.quantity}]"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 import numpy as np
 
-from ..fields.shapes import met_shapes
+from ..fields.shapes import bsdf_classes, met_shapes
 
 if TYPE_CHECKING:
     from .parse import ParsedScene
@@ -27,7 +27,7 @@ def turn_rectangles(scene: ParsedScene) -> None:
     """Turn rectangles with a bump map in their own plane, about their middle.
 
     Args:
-        scene: changed in place; to be called once.
+        scene: changed in place, before it is made; to be called once.
     """
     nodes = scene.state.nodes
     for place, node in enumerate(nodes):
@@ -48,20 +48,13 @@ def turn_textures(scene: mi.Scene) -> None:
         scene: changed in place.
     """
     for shape in met_shapes(scene):
-        if not shape.is_mesh() or not shape.has_vertex_texcoords() or not _has_bumps(shape):
+        if not shape.is_mesh() or "BumpMap" not in bsdf_classes(shape):
             continue
         params = mi.traverse(shape)
         if "vertex_texcoords" not in params:
-            continue  # a rectangle
+            continue  # it has none, or is a rectangle
         u, v = np.array(params["vertex_texcoords"], np.float64).reshape(-1, 2).T
         cos, sin = math.cos(_TURN), math.sin(_TURN)
         turned = np.stack([cos * u - sin * v, sin * u + cos * v], 1)
         params["vertex_texcoords"] = turned.astype(np.float32).ravel()
         params.update()
-
-
-def _has_bumps(shape: mi.Shape) -> bool:
-    bsdf = shape.bsdf()
-    if bsdf is None:
-        return False
-    return any(node.class_name() == "BumpMap" for node in mi.traverse(bsdf).hierarchy)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 
 from ..errors import UserError, named
-from ..fields.shapes import met_shapes
+from ..fields.shapes import bsdf_classes, met_shapes
 from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
-from ..transport.optimized import optimized_shapes
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
 from .one_number import one_number
 from .parse import ParsedScene, is_reference, referenced
@@ -145,11 +145,7 @@ def require_optimized(scene: mi.Scene, path: Path) -> None:
         scene: after `to_principled`.
         path: its file.
     """
-    if optimized_shapes(scene):
-        return
-    bsdfs = [shape.bsdf() for shape in met_shapes(scene) if shape.is_emitter()]
-    nodes = (node for bsdf in bsdfs if bsdf is not None for node in mi.traverse(bsdf).hierarchy)
-    if not any(node.class_name() == "Principled" for node in nodes):
+    if not any("Principled" in bsdf_classes(shape) for shape in met_shapes(scene)):
         raise UserError(_NO_MATERIAL, path, _GIVE_ONE)
 
 
@@ -202,13 +198,18 @@ def wrap_textures(
     # By number: a node that is appended moves all others.
     for number, others in zip(scene.principled_indices(), textures, strict=True):
         for slot, other in others.items():
-            around = mi.parser.SceneNode()
-            around.type = mi.ObjectType.Texture
-            around.props.set_plugin_name(plugin)
-            around.props["own"] = nodes[number].props.get(slot, defaults[slot])
-            around.props["fitted"] = other
-            nodes[number].props[slot] = mi.Properties.ResolvedReference(len(nodes))
-            nodes.append(around)
+            own = nodes[number].props.get(slot, defaults[slot])
+            nodes[number].props[slot] = _texture(scene, plugin, own=own, fitted=other)
+
+
+def _texture(scene: ParsedScene, plugin: str, **props: Any) -> mi.Properties.ResolvedReference:
+    """Append a texture with these properties; a reference to it."""
+    node = mi.parser.SceneNode()
+    node.type = mi.ObjectType.Texture
+    node.props.set_plugin_name(plugin)
+    for key, value in props.items():
+        node.props[key] = value
+    return mi.Properties.ResolvedReference(scene.append(node))
 
 
 def show_as_albedo(scene: ParsedScene, slot: str, default: float) -> None:
@@ -224,11 +225,7 @@ def show_as_albedo(scene: ParsedScene, slot: str, default: float) -> None:
     for number in scene.principled_indices():
         value = nodes[number].props.get(slot, default)
         if not isinstance(value, float | int):
-            around = mi.parser.SceneNode()
-            around.type = mi.ObjectType.Texture
-            around.props.set_plugin_name(plugin)
-            around.props["own"] = value
-            value = mi.Properties.ResolvedReference(scene.append(around))
+            value = _texture(scene, plugin, own=value)
         nodes[number].props["base_color"] = value
 
 

@@ -14,6 +14,7 @@ from ..errors import UserError
 from ..fields.envmap import latlong
 from . import free_space
 from .parse import ParsedScene, is_reference, reason, referenced
+from .transforms import matrix_of
 
 #: Plugins that surround the scene.
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
@@ -56,7 +57,7 @@ def placement(props: mi.Properties) -> np.ndarray:
     """Where an emitter stands, and where it looks along +z, (4, 4)."""
     matrix = np.eye(4)
     if "to_world" in props:
-        matrix = np.array(props["to_world"].matrix, np.float64).reshape(4, 4)
+        matrix = matrix_of(props["to_world"])
     elif "position" in props:
         matrix[:3, 3] = np.ravel(np.array(props["position"], np.float64))
     elif "direction" in props:

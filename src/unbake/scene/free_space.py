@@ -136,7 +136,7 @@ def unoccluded(
         starts, ends: (n, 3).
         offset: how far before its end a segment ends; None: as suits the scene.
     """
-    offset = _offset(scene) if offset is None else offset
+    offset = lift(scene, _RAY_OFFSET) if offset is None else offset
     free = np.empty(len(starts), dtype=bool)
     for i in range(0, len(starts), _CHUNK):
         start, segment = starts[i : i + _CHUNK], (ends - starts)[i : i + _CHUNK]
@@ -149,7 +149,7 @@ def unoccluded(
 
 def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) -> np.ndarray:
     """Visibility of surface points (m) from positions (n), from either side: (n, m) bool."""
-    offset = _offset(scene)
+    offset = lift(scene, _RAY_OFFSET)
     result = np.empty((len(positions), len(points.position)), dtype=bool)
     if not result.size:
         return result
@@ -331,14 +331,19 @@ def free_positions(
     return candidates[~inside_geometry(scene, candidates)][:count]
 
 
-def _offset(scene: mi.Scene) -> float:
-    """A distance that a ray on a surface is lifted: more than coordinates are rounded by."""
-    return max(_RAY_OFFSET * extent(scene)[2], 1e-6 * bounds(scene)[2])
+def lift(scene: mi.Scene, share: float) -> float:
+    """A distance that keeps rays off surfaces: more than coordinates are rounded by.
+
+    Args:
+        scene: whose extent it suits.
+        share: of the diagonal of `extent`.
+    """
+    return max(share * extent(scene)[2], 1e-6 * bounds(scene)[2])
 
 
 def _connected(scene: mi.Scene, positions: np.ndarray, starts: np.ndarray, seed: int) -> np.ndarray:
     """Whether a chain of free segments connects each position with one of `starts`: (n,) bool."""
-    rng, offset = np.random.default_rng(seed), _offset(scene)
+    rng, offset = np.random.default_rng(seed), lift(scene, _RAY_OFFSET)
     reached = np.zeros(len(positions), dtype=bool)
     idle = 0
     while idle < 2 and not reached.all():

@@ -6,6 +6,8 @@ from functools import cache
 
 import mitsuba as mi
 
+from ..fields.texture import texture_base
+
 _PLUGIN = "unbake_one_number"
 
 
@@ -21,8 +23,7 @@ def one_number() -> str:
 
 @cache
 def _register(variant: str) -> None:
-    # The class is made here because `mi.Texture` exists only once a variant has been chosen.
-    class OneNumber(mi.Texture):
+    class OneNumber(texture_base(variant)):
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.own = props.get_texture("own")
@@ -33,20 +34,8 @@ def _register(variant: str) -> None:
         def eval_1(self, si, active=True):
             return self.own.eval_1(si, active)
 
-        def eval_3(self, si, active=True):
-            return self.eval(si, active)
-
         def traverse(self, callback):
             callback.put("own", self.own, mi.ParamFlags.NonDifferentiable)
-
-        def mean(self):
-            return mi.Float(0.5)
-
-        def max(self):
-            return 1.0
-
-        def is_spatially_varying(self):
-            return True
 
         def to_string(self):
             return "OneNumber"

@@ -24,7 +24,7 @@ from .meshes import FORMATS, check_mesh
 from .normals import repair_normals
 from .preflight import check_xml
 from .textures import require_able
-from .transforms import write_nodes
+from .transforms import matrix_of, write_nodes
 
 _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
 #: Plugins for spectra and polarised light, and spectra that have no RGB.
@@ -78,6 +78,7 @@ class ParsedScene:
         """
         try:
             self._forget_queries()
+            turn_rectangles(self)
             if merge:
                 mi.parser.transform_merge_equivalent(self.config, self.state)
                 self._merge_meshes()
@@ -206,7 +207,6 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
     scene.media = _leave_out_media(scene)
     require_able(scene)
     _require_rgb(scene)
-    turn_rectangles(scene)
     return scene
 
 
@@ -259,11 +259,11 @@ def _leave_out_shells(scene: ParsedScene) -> None:
         dark = all(node.type != mi.ObjectType.Emitter for node in kinds)
         return dark and any(node.props.plugin_name() == "null" for node in kinds)
 
-    shells = [
+    shells = {
         place
         for place, node in enumerate(nodes)
         if node.type == mi.ObjectType.Shape and is_shell(place)
-    ]
+    }
     for node in nodes:
         for key in list(node.props):
             if is_reference(node.props[key]) and node.props[key].index() in shells:
@@ -397,7 +397,7 @@ def _require_round(scene: ParsedScene) -> None:
         axes = _ROUND.get(node.props.plugin_name())
         if axes is None or "to_world" not in node.props:
             continue
-        matrix = np.array(node.props["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+        matrix = matrix_of(node.props["to_world"])[:3, :3]
         largest, _, least = np.linalg.svd(matrix, compute_uv=False)
         fault = remedy = None
         if least <= 1e-9 * largest:

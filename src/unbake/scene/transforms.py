@@ -45,7 +45,7 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
                 kept.append((node.props, key, value))
                 # Numbers that no scene has as a translation of its own, along x alone.
                 mark = 987_654_000 + len(kept)
-                marks[mark] = " ".join(repr(x) for x in _matrix(value).ravel().tolist())
+                marks[mark] = " ".join(repr(x) for x in matrix_of(value).ravel().tolist())
                 node.props[key] = mi.ScalarTransform4d().translate([mark, 0, 0])
         mi.parser.write_file(scene.state, str(file))
     finally:
@@ -72,11 +72,12 @@ def _is_misread(value: object) -> bool:
     """Whether a property is a transform that Mitsuba would write as another one."""
     if not isinstance(value, (mi.ScalarAffineTransform4d, mi.ScalarProjectiveTransform4d)):
         return False
-    linear = _matrix(value)[:3, :3]
+    linear = matrix_of(value)[:3, :3]
     scales = np.linalg.svd(linear, compute_uv=False)
     usual = _LEAST <= scales[-1] and scales[0] <= _LARGEST
     return not usual or np.linalg.det(linear) < 0
 
 
-def _matrix(value: Any) -> np.ndarray:
+def matrix_of(value: Any) -> np.ndarray:
+    """The matrix of a transform among a node's properties, (4, 4) float64."""
     return np.array(value.matrix, np.float64).reshape(4, 4)

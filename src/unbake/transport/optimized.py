@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..fields.shapes import met_shapes, registry_number
+from ..fields.shapes import bsdf_classes, met_shapes, registry_number
 
 
 def has_optimized_material(shape: mi.Shape) -> bool:
@@ -13,10 +13,7 @@ def has_optimized_material(shape: mi.Shape) -> bool:
     BSDFs that hold others are `twosided`, `mask`, `bumpmap`, `normalmap` and `blendbsdf`. Diffuse
     and rough plastic count only once `scene.edit.to_principled` has changed them.
     """
-    bsdf = shape.bsdf()
-    if bsdf is None or shape.is_emitter():
-        return False
-    return any(node.class_name() == "Principled" for node in mi.traverse(bsdf).hierarchy)
+    return not shape.is_emitter() and "Principled" in bsdf_classes(shape)
 
 
 def optimized_shapes(scene: mi.Scene) -> frozenset[int]:
