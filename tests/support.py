@@ -429,6 +429,7 @@ def planned_sampler(
         bounces=bounces,
         max_depth=max_depth,
         rr_depth=max_depth,
+        planned_gain=1.0,
         read_by_scene=read_by_scene,
     )
     sampler = make_sampler(context)

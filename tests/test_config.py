@@ -25,7 +25,7 @@ from unbake.config import (
 )
 from unbake.config.migration import as_before
 from unbake.errors import UserError
-from unbake.fields.settings import LEAK
+from unbake.fields.settings import LEAK, PieceConfig
 from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
 
@@ -345,19 +345,21 @@ roughness_smoothness = 2.0
 @pytest.mark.parametrize("number", ["", "format = 1\n"], ids=["without number", "with number"])
 def test_settings_of_format_1_mean_the_same_today(number):
     old = from_toml(number + FORMAT_1)
-    assert old == from_toml(FORMAT_2)
+    # What a user gives has the defaults of today, and what a run has those of its time.
+    assert old == from_toml(FORMAT_2 if number else FORMAT_2.replace("format = 2", "format = 4"))
     assert old.materials["albedo"]["neural"] == NetworkConfig(
         dataclasses.replace(preset("paper").materials["albedo"]["neural"].grid, levels=3),
         width=11,
         hidden=1,
         learning_rate=0.5,
+        pieces=PieceConfig(across_slivers=not number),
     )
     assert old.radiance["grid"] == DenseGridConfig(7, 0.625)
     assert from_toml(to_toml(old)) == old
 
 
 def test_keys_that_are_absent_today_are_those_of_the_preset():
-    assert from_toml("format = 3\n") == preset("cpu") != from_toml("format = 2\n")
+    assert from_toml("format = 4\n") == preset("cpu") != from_toml("format = 2\n")
 
 
 def test_the_radiance_field_has_no_pieces():
@@ -366,7 +368,7 @@ def test_the_radiance_field_has_no_pieces():
 
 
 def test_fields_of_earlier_runs_do_not_leak():
-    text = to_toml(preset("cpu")).replace("format = 3", "format = 2")
+    text = to_toml(preset("cpu")).replace("format = 4", "format = 2")
     lines = [line for line in text.splitlines() if not line.startswith("leak = ")]
     found = [from_toml(x).radiance["neural"].leak for x in (text, "\n".join(lines))]
     assert found == [LEAK, 0]
@@ -375,7 +377,7 @@ def test_fields_of_earlier_runs_do_not_leak():
 
 
 def test_a_setting_that_is_no_more_is_passed_over_in_runs_alone():
-    text = to_toml(preset("cpu")).replace("format = 3", "format = 2")
+    text = to_toml(preset("cpu")).replace("format = 4", "format = 2")
     assert "\n[camera]\n" in text
     old = text.replace("\n[camera]\n", "\n[camera]\nsmoothness = 0.25\n")
     assert from_toml(old) == from_toml(text)
@@ -394,8 +396,8 @@ def test_a_file_without_a_format_may_have_keys_of_today():
     ("text", "message"),
     [
         (
-            "format = 4",
-            r"format: was written by a newer unbake \(format 4; .* up to 3\). Update unbake",
+            "format = 5",
+            r"format: was written by a newer unbake \(format 5; .* up to 4\). Update unbake",
         ),
         ("format = true", "format: 'format' is True, not a positive whole number"),
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),

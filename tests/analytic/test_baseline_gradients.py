@@ -63,7 +63,7 @@ def path_traced(method, scene, materials, sampler, ray, rr_depth=DEPTH, depth=DE
         # Without roulette what survives does not depend on φ, so that any widths will do.
         plan = tuple(range(depth - 1))
         if rr_depth < depth:
-            plan = plan_widths(scene_view, ray, sampler.clone(), spp, limits)
+            plan = plan_widths(scene_view, ray, sampler.clone(), spp, limits, 1)
             assert plan[0] < plan[-1], "the wavefront becomes narrower"
         return path_light(scene_view, ray, sampler, spp, limits, plan)
     integrator = path_replay(depth, rr_depth, False)

@@ -117,6 +117,22 @@ def test_triangles_without_area_do_no_harm():
     assert len(set(numbers(pieces, made)[0][:12])) == 6
 
 
+@pytest.mark.parametrize("angle", [0, 20, 90])
+def test_slivers_join_what_meets_at_them_as_an_edge_does(angle):
+    """Meshes of CAD programs have them where a vertex lies on an edge of a neighbour."""
+    up = np.array([(np.cos(np.radians(angle)), 0, np.sin(np.radians(angle)))])
+    seam = np.array([(0, 0, 0), (0, 1, 0), (0, 2, 0)], float)
+    left, right = seam[[0, 2]] - (1, 0, 0), seam + up
+    positions = np.concatenate([seam, left, right]) + np.array((100, 3, 7))
+    walls = [(0, 2, 4), (0, 4, 3), (0, 1, 6), (0, 6, 5), (1, 2, 7), (1, 7, 6)]
+    for sliver in ([(0, 1, 2)], [(0, 1, 2), (0, 1, 1)], [(0, 0, 1), (0, 2, 1), (0, 0, 2)]):
+        made = scene(mesh("wall", positions, np.array(sliver + walls)))
+        pieces = Pieces(made, 100)
+        assert pieces.count == (1 if angle < 40 else 2), sliver
+    (without,) = numbers(Pieces(made := scene(mesh("wall", positions, np.array(walls))), 100), made)
+    assert len(set(without)) == 2, "the sides do not share an edge"
+
+
 def test_rays_meet_the_pieces_of_their_faces():
     ball = {"type": "sphere", "center": [0, 0, 5], "radius": 0.5}
     made = scene(mesh("box", CORNERS, BOX), ball=ball)

@@ -149,7 +149,7 @@ def radiance(problem, method, ray, seed):
         with materials_along_paths(scene_view.materials):
             return path_radiance(replay, scene_view.scene, sampler, ray, problem.read_by_scene())
     limits = PathLimits(DEPTH, DEPTH, hide_emitters=problem.hide_emitters)
-    plan = plan_widths(scene_view, ray, sampler.clone(), 2, limits)
+    plan = plan_widths(scene_view, ray, sampler.clone(), 2, limits, 1)
     return path_light(scene_view, ray, sampler, 2, limits, plan)
 
 

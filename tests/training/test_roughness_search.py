@@ -31,6 +31,7 @@ from unbake.fields.network import Network
 from unbake.quantities import QUANTITIES
 from unbake.ranks import Ranks
 from unbake.training import loop, roughness_search, search_samples
+from unbake.training.checkpoint import Progress
 from unbake.training.piece_variation import expected_albedo
 from unbake.training.problem import make_problem
 from unbake.training.roughness_curves import (
@@ -336,7 +337,7 @@ def test_searches_come_at_their_places_and_steps_hardly_move_roughness(built_in)
     samples = search.search_if_due(0.5, state, 4)
     assert search.made == 1 and not search.due(0.74) and search.due(0.75)
     assert search.rates(rates, 50, 0.5) == {"albedo": 1.0, "roughness": 0.0}
-    assert samples == pytest.approx(SHARE * 4 / 0.5 * SETTINGS.samples_per_step, rel=0.01)
+    assert samples == np.prod(search._size(4, 0.5))
     moved = {k for k, x in state.phi.items() if (np.array(x.array) != before[k]).any()}
     assert moved == {"roughness.pieces.0", "roughness.colours"}
 
@@ -391,7 +392,7 @@ def test_a_search_waits_for_a_state_that_may_stay(cornell, tmp_path, unbake, mon
 
 def test_steps_of_older_runs_move_roughness_as_before():
     text = to_toml(FitConfig())
-    old = text.replace("format = 3", "format = 2")
+    old = text.replace("format = 4", "format = 2")
     kept = "\n".join(x for x in old.splitlines() if not x.startswith("rate_before"))
     found = [from_toml(x).roughness_search.rate_before for x in (text, kept)]
     assert found == [FitConfig().roughness_search.rate_before, 1]
@@ -421,8 +422,7 @@ def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):
     assert search.search_if_due(0.8, state, 8)
     assert 0.1 < factors("albedo").min() < 1
     # As many as the pixels of the search, of which fewer show one piece alone.
-    pixels = SHARE * SETTINGS.samples_per_step * 8 / 0.8 / SETTINGS.roughness_search.spp
-    assert len(shown[0]) == pixels
+    assert len(shown[0]) == search._size(8, 0.8)[0]
 
 
 def test_fits_of_few_samples_do_not_search(built_in):
@@ -454,7 +454,8 @@ def test_a_fit_tells_the_samples_of_its_searches(cornell, tmp_path, unbake):
     assert unbake("fit", cornell, "--settings", settings, "--out", out).status == 0
     of_steps = 20 * 16 * SETTINGS.spp
     told = RunFolder(out).log()[-1]["samples"]
-    assert told == pytest.approx(of_steps * (1 + SEARCH.times * SHARE), rel=0.01)
+    # Both sample as many pixels as two views of 16 x 16 have, eight times each.
+    assert told == of_steps + SEARCH.times * 2 * 16**2 * 8
     assert unbake("evaluate", out).status == 0
     found = json.loads((out / "evaluation" / "metrics.json").read_text())
     assert found["samples"] == told
@@ -475,6 +476,46 @@ def test_searches_are_part_of_the_time_of_a_fit(cornell, tmp_path, unbake, monke
     monkeypatch.setattr(RoughnessSearch, "_search", searched)
     assert unbake("fit", cornell, "--settings", settings, "--out", out).status == 0
     assert RunFolder(out).log()[-1]["seconds"] == 2.0
+
+
+def test_time_of_searches_is_not_that_of_steps(built_in):
+    """Rates fell while nothing was learned: by a third of the whole decay in two searches."""
+    config = replace(SETTINGS, steps=0, seconds=100.0, roughness_search=SEARCH)
+    problem, _, step, _ = started(built_in, config)
+    search = RoughnessSearch(problem, config, step, Ranks())
+
+    def done(**numbers):
+        progress = Progress(step=10_000, samples=10_000 * config.samples_per_step, **numbers)
+        return loop._fraction(config, progress, search)
+
+    # Two searches are to come, with 0.4 of the samples of all steps each.
+    assert SEARCH.share == 0.4 and done(seconds=20.0) == pytest.approx(20 / (100 / 1.8))
+    assert done(seconds=50.0, searches=1, searching=20.0, last_search=20.0) == 0.5
+    assert done(seconds=80.0, searches=2, searching=40.0, last_search=20.0) == 40 / 60
+    assert done(seconds=101.0, searches=2, searching=40.0, last_search=20.0) == 1
+    by_steps = replace(config, steps=20_000, seconds=None)
+    assert loop._fraction(by_steps, Progress(step=10_000, searching=9.0), search) == 0.5
+    short = Progress(step=4, seconds=50.0)
+    assert loop._fraction(config, short, search) == 0.5, "none will be made"
+
+
+def test_no_pixel_counts_several_times(built_in):
+    """The noise of a photograph is the same at each draw: more samples of each pixel help."""
+    problem, _, step, _ = started(built_in)
+    search = RoughnessSearch(problem, SETTINGS, step, Ranks())
+    assert search._size(1000, 1.0) == (step.pixels.photographs.count, 4 * 2)
+    count = 10_000
+    photographs = SimpleNamespace(count=count)
+    search._step = SimpleNamespace(pixels=SimpleNamespace(photographs=photographs))
+    spp, per_step = SETTINGS.roughness_search.spp, SETTINGS.samples_per_step
+
+    def size(pixels):
+        return search._size(1, SHARE * per_step / (pixels * spp))
+
+    assert size(4000) is None
+    assert size(5000) == (5000, spp) and size(19_000) == (count, spp)
+    assert size(25_000) == (count, 2 * spp)
+    assert size(400_000) == (count, 4 * spp)
 
 
 def test_a_fit_without_memory_for_a_search_is_saved(cornell, tmp_path, unbake, monkeypatch):
@@ -504,7 +545,8 @@ def test_ranks_search_together(cornell, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr  # which also tells that their states are equal
     told = RunFolder(out).log()[-1]["samples"]
-    assert told == pytest.approx(20 * 16 * SETTINGS.spp * (1 + SEARCH.times * SHARE), rel=0.01)
+    # Searches sample as many pixels as there are, 512, eight times each.
+    assert told == 20 * 16 * SETTINGS.spp + SEARCH.times * 512 * 8
 
 
 SHARED = """
@@ -568,5 +610,5 @@ def test_older_runs_and_the_papers_settings_do_not_search(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text(text)
     assert read_toml(file).roughness_search == SEARCH
-    file.write_text(text.replace(table, "").replace("format = 3", "format = 2"))
+    file.write_text(text.replace(table, "").replace("format = 4", "format = 2"))
     assert read_toml(file).roughness_search.times == 0

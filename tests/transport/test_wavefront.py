@@ -97,7 +97,7 @@ def test_a_plan_follows_the_light(built_in):
         for albedo in (0.2, 0.9):
             scene_view, _ = view(built_in, name, albedo)
             ray = pixel_rays(built_in_cameras(name, 32), 8, 1)
-            plan = plan_widths(scene_view, ray, seeded(2, dr.width(ray)), 8, LIMITS)
+            plan = plan_widths(scene_view, ray, seeded(2, dr.width(ray)), 8, LIMITS, 1)
             assert len(plan) == DEPTH - 1 and list(plan) == sorted(plan)
             widths = [wavefront._width(level, dr.width(ray)) for level in plan]
             sums[name, albedo] = sum(widths) / dr.width(ray)
@@ -107,12 +107,27 @@ def test_a_plan_follows_the_light(built_in):
     assert sums["still", 0.2] <= sums["still", 0.9] < 1.5
 
 
+def test_a_plan_for_brighter_surfaces_is_that_of_brighter_surfaces(built_in):
+    ray = pixel_rays(built_in_cameras("furnace", 32), 8, 1)
+
+    def plan(albedo, gain):
+        scene_view, _ = view(built_in, "furnace", albedo)
+        return np.array(
+            plan_widths(scene_view, ray, seeded(2, dr.width(ray)), 8, LIMITS, gain), int
+        )
+
+    untrained, planned, bright = plan(0.5, 1), plan(0.5, 1.6), plan(0.8, 1)
+    print(untrained, planned, bright)
+    # Specular light is no brighter with albedo, so that they differ by some widths.
+    assert np.abs(planned - bright).max() <= 2 < (untrained - bright).max()
+
+
 def test_without_roulette_all_paths_of_a_closed_room_are_those_of_bounces(built_in):
     """Nothing is gained there: so nothing is moved, and random numbers are the same."""
     scene_view, _ = view(built_in, "furnace")
     ray = pixel_rays(built_in_cameras("furnace", 8), 8, 1)
     limits = PathLimits(4, 4, hide_emitters=False)
-    plan = plan_widths(scene_view, ray, seeded(2, dr.width(ray)), 8, limits)
+    plan = plan_widths(scene_view, ray, seeded(2, dr.width(ray)), 8, limits, 1)
     assert plan == (0, 0, 0)
     found = path_light(scene_view, ray, seeded(2, dr.width(ray)), 8, limits, plan)
     sample = trace(scene_view, None, ray, seeded(2, dr.width(ray)), Requirements(3))
@@ -127,9 +142,10 @@ def test_without_roulette_all_paths_of_a_closed_room_are_those_of_bounces(built_
 def test_the_image_is_that_of_mitsubas_path(built_in, name, tight):
     scene_view, spp = SceneView.of(mi.load_file(str(built_in(name))), None, 8), 256
     ray = pixel_rays(built_in_cameras(name, 12), spp, 1)
-    plan = TIGHT if tight else plan_widths(scene_view, ray, seeded(5, dr.width(ray)), spp, LIMITS)
+    lanes = dr.width(ray)
+    plan = TIGHT if tight else plan_widths(scene_view, ray, seeded(5, lanes), spp, LIMITS, 1)
     assert any(plan)
-    found = path_light(scene_view, ray, seeded(2, dr.width(ray)), spp, LIMITS, plan)
+    found = path_light(scene_view, ray, seeded(2, lanes), spp, LIMITS, plan)
     theirs = stock_path(scene_view.scene, ray, 3, max_depth=DEPTH)
     assert_same_expectation(found, theirs, spp)
 
@@ -141,7 +157,7 @@ def test_the_gradient_is_that_of_all_bounces(built_in, tight):
     spp, repeats = 64, 12
     ray = pixel_rays(built_in_cameras("cornell", 12), spp, 1)
     lanes = dr.width(ray)
-    plan = TIGHT if tight else plan_widths(scene_view, ray, seeded(5, lanes), spp, LIMITS)
+    plan = TIGHT if tight else plan_widths(scene_view, ray, seeded(5, lanes), spp, LIMITS, 1)
 
     def gradients(follow, seed):
         materials.albedo, materials.roughness = mi.Color3f(0.6), mi.Float(0.4)

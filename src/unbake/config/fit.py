@@ -75,9 +75,14 @@ class PathConfig:
     #: Russian roulette, which goes on with 0.95 at most. With 5, `prb` (Mitsuba 3.9.1) loses the
     #: seventh interaction at the earliest, and `ad-pt` the sixth.
     rr_depth: int = 5
+    #: The wavefront of `ad-pt` is planned, before the first step, for surfaces that reflect so many
+    #: times as much as they do then: untrained albedo is 0.5, that of walls 0.8. Where they reflect
+    #: more than was planned for, fewer paths survive, and count more; where less, lanes stay empty.
+    planned_gain: float = 1.6
 
     def __post_init__(self) -> None:
-        require_ranges(self, {"max_depth": (0, DEEPEST), "rr_depth": (1, DEEPEST)})
+        ranges = {"max_depth": (0, DEEPEST), "rr_depth": (1, DEEPEST), "planned_gain": (1, 10)}
+        require_ranges(self, ranges)
 
     @property
     def chosen_depth(self) -> int:

@@ -9,8 +9,9 @@ from ..errors import UserError
 from ..fields.settings import GridConfig
 from ..formats import check_format
 
-#: Version of the settings file. Until 2, keys that are absent have the values of `_AS_BEFORE`.
-FORMAT = 3
+#: Version of the settings file. Keys that are absent in earlier ones have the values of
+#: `_BEFORE_3` and `_BEFORE_4`.
+FORMAT = 4
 
 #: Where keys of format 1, which knew albedo and roughness alone, are now.
 _MOVED = {
@@ -33,9 +34,17 @@ _MOVED = {
     "regularisation": "regularization",
 }
 _GROUPS = ("grid", "bitmap")
-#: Settings that came later, at their value before: a run of an earlier version goes on as it began.
-#: By the table that they are in, where there is one.
-_AS_BEFORE: dict[str, dict[str, Any]] = {
+_NEURAL_ROUGHNESS = "materials.roughness.neural"
+_NEURAL_ALBEDO = "materials.albedo.neural"
+#: Settings that came after format 3, at their value before; by the table that they are in.
+_BEFORE_4: dict[str, dict[str, Any]] = {
+    "path": {"planned_gain": 1.0},
+    _NEURAL_ALBEDO: {"pieces.across_slivers": False},
+    _NEURAL_ROUGHNESS: {"pieces.across_slivers": False},
+}
+#: Settings that came after format 2, at their value before: a run of an earlier version goes on as
+#: it began. By the table that they are in, where there is one.
+_BEFORE_3: dict[str, dict[str, Any]] = {
     "": {
         "held_aside": 0.0,
         "beta2": 0.999,
@@ -49,8 +58,8 @@ _AS_BEFORE: dict[str, dict[str, Any]] = {
     },
     "radiance.neural": {"leak": 0.0},
     "radiance.triplane": {"leak": 0.0},
-    "materials.albedo.neural": {"pieces.most": 0, "pieces.variation": False},
-    "materials.roughness.neural": {
+    _NEURAL_ALBEDO: {"pieces.most": 0, "pieces.variation": False},
+    _NEURAL_ROUGHNESS: {
         "pieces.most": 0,
         "pieces.colours": 0,
         "pieces.variation": False,
@@ -68,7 +77,7 @@ def as_before(outer: str) -> dict[str, Any]:
     Args:
         outer: the dotted key of the table.
     """
-    return dict(_AS_BEFORE.get(outer, {}))
+    return _BEFORE_4.get(outer, {}) | _BEFORE_3.get(outer, {})
 
 
 def migrated(table: dict[str, Any]) -> dict[str, Any]:
@@ -85,9 +94,11 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
         check_format(table, FORMAT, "format")
         del table["format"]
     # Where unbake wrote the file, all settings are in it but those of later versions.
-    written = version in (1, 2) or (version is None and _OF_RUN <= table.keys())
+    written = version in (1, 2, 3) or (version is None and _OF_RUN <= table.keys())
     found = _moved(table, version) if version in (None, 1) else table
-    for outer, settings in _AS_BEFORE.items() if written else ():
+    later = [_BEFORE_4] if version == 3 else [_BEFORE_4, _BEFORE_3]
+    every = [item for tables in later for item in tables.items()]
+    for outer, settings in every if written else ():
         if outer and not _has(found, outer):
             continue
         for inner, value in settings.items():

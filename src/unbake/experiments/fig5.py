@@ -95,7 +95,7 @@ def _measure(
         spp=spp,
         radiance_spp=0,
         radiance_representation="grid",
-        path=PathConfig(max_depth=PATHS[albedo][0], rr_depth=1),
+        path=PathConfig(max_depth=PATHS[albedo][0], rr_depth=1, planned_gain=1.0),
     )
     cells = {"grid": {"cells": grid}}
     fields = {"materials": dict.fromkeys(shared.quantities, cells), "radiance": cells}

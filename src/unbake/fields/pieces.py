@@ -16,6 +16,8 @@ CREASE = 40.0
 FULL_SHARE = 0.05
 #: The attribute of a mesh's faces by which a hit finds its piece: number, strength, 0.
 ATTRIBUTE = "face_piece"
+#: Triangles whose height is no more than so many roundings of their corners are slivers.
+_SLIVER = 4.0
 _NONE = np.zeros((0, 3, 3), np.float32)
 
 
@@ -31,6 +33,7 @@ class Pieces:
     """The pieces of all surfaces of a scene.
 
     Two triangles that share an edge are of one piece unless the angle between them is a crease.
+    Slivers, whose corners lie on a line, have no angles: what meets at one meets as at an edge.
     What a scene divides into shapes does not matter, nor what materials these have: triangles are
     known by where they are, also in another scene that holds them, such as one that is not merged
     or has other lights. Instances share the pieces of their group, and a shape that is no mesh is a
@@ -43,13 +46,14 @@ class Pieces:
     Args:
         scene: the scene.
         most: the number of numbers, 1 at least.
+        across_slivers: whether what meets at a sliver meets; False: as in earlier versions.
     """
 
-    def __init__(self, scene: mi.Scene, most: int) -> None:
+    def __init__(self, scene: mi.Scene, most: int, *, across_slivers: bool = True) -> None:
         shapes = met_shapes(scene)
         corners = [_corners(shape) for shape in shapes if shape.is_mesh()]
         others = sorted({_extent(shape) for shape in shapes if not shape.is_mesh()})
-        keys, label, areas = _pieces(np.concatenate([_NONE, *corners]))
+        keys, label, areas = _pieces(np.concatenate([_NONE, *corners]), across_slivers)
         areas = np.concatenate([areas, [extent[0] for extent in others]])
         rank = np.empty(len(areas), np.int64)
         rank[np.argsort(-areas, kind="stable")] = np.arange(len(areas))
@@ -138,7 +142,7 @@ def _keys(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return _mixed(*np.sort(of_corners, axis=1).T), of_corners
 
 
-def _pieces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pieces(corners: np.ndarray, across_slivers: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pieces of triangles (m, 3, 3).
 
     Returns:
@@ -167,11 +171,19 @@ def _pieces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     double = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(double, 1e-300)[:, None]
     # By places, not by vertices: those differ where normals or texture coordinates do.
-    one, other = _neighbours([of_corners.ravel().take(corner) for corner in within.T], rank)
+    places = [of_corners.ravel().take(corner) for corner in within.T]
+    one, other = _neighbours(places, rank)
+    sliver = _slivers(np.stack([a, b, c]), double)
+    joined = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    if across_slivers and sliver.any():
+        one, other, joined = _across(sliver, one, other, places, rank)
     # Neighbouring triangles may be turned to opposite sides.
     cosine = np.abs((normals.take(one, 0) * normals.take(other, 0)).sum(1))
     smooth = cosine > np.cos(np.radians(CREASE))
-    label = connected(len(keys), rank[one[smooth]], rank[other[smooth]])
+    one, other = (
+        np.append(pair[smooth], extra) for pair, extra in zip((one, other), joined, strict=True)
+    )
+    label = connected(len(keys), rank[one], rank[other])
     return keys, label, np.bincount(label, double[first] / 2)
 
 
@@ -195,6 +207,71 @@ def _neighbours(corners: list[np.ndarray], rank: np.ndarray) -> tuple[np.ndarray
     several = triangle[crowded]
     triangle[crowded] = several[np.lexsort((rank[several], edge[crowded]))]
     return triangle[:-1][same], triangle[1:][same]
+
+
+def _slivers(corners: np.ndarray, double: np.ndarray) -> np.ndarray:
+    """Whether triangles are as thin as single precision rounds, so that their normals say nothing.
+
+    Args:
+        corners: (3 corners, 3 coordinates, n).
+        double: twice the areas, (n,).
+    """
+    if not len(double):
+        return np.zeros(0, bool)
+    edges = corners - corners[[1, 2, 0]]
+    longest = np.sqrt((edges**2).sum(1).max(0))
+    rounding = np.abs(corners).max((0, 1)) * np.finfo(np.float32).eps
+    return double <= _SLIVER * rounding * longest
+
+
+def _across(
+    sliver: np.ndarray,
+    one: np.ndarray,
+    other: np.ndarray,
+    corners: list[np.ndarray],
+    rank: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Pairs of triangles that share an edge, or a corner at a sliver.
+
+    Slivers may go round a whole floor. So what meets at them shares a corner, too.
+
+    Args:
+        sliver: of each triangle, (n,).
+        one, other: pairs that share an edge.
+        corners: the keys of the three corners, (n,) each.
+        rank: of each triangle, (n,).
+
+    Returns:
+        The pairs without slivers; and pairs that belong together whatever their normals are: of
+        each sliver and what meets there, a neighbour or another sliver.
+    """
+    both = sliver[one] & sliver[other]
+    group = connected(len(sliver), one[both], other[both])  # of slivers that meet
+    mixed = sliver[one] != sliver[other]
+    thin = np.where(sliver[one], one, other)[mixed]
+    beside = np.where(sliver[one], other, one)[mixed]
+    order = np.lexsort((rank[beside], group[thin]))
+    thin, beside = thin[order], beside[order]
+    _, first = np.unique(group[thin], return_index=True)
+    # A sliver is of the piece of one of its neighbours.
+    joined = (
+        np.concatenate([one[both], thin[first]]),
+        np.concatenate([other[both], beside[first]]),
+    )
+    # Those of each corner are pairs in a ring: three of them are all pairs.
+    meeting = np.tile(beside, 3)
+    corner = _mixed(
+        np.tile(group[thin], 3).astype(np.uint64), np.concatenate([c.take(beside) for c in corners])
+    )
+    order = np.lexsort((rank[meeting], corner))
+    meeting, corner = meeting[order], corner[order]
+    first = np.searchsorted(corner, corner)
+    last = np.searchsorted(corner, corner, "right") - 1
+    place = np.arange(len(corner))
+    following = np.where(place == last, first, place + 1)
+    plain = ~(sliver[one] | sliver[other])
+    pairs = np.append(one[plain], meeting), np.append(other[plain], meeting[following])
+    return *pairs, joined
 
 
 def connected(count: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -100,6 +100,8 @@ class PieceConfig:
     #: searches find
     variation: bool = False
     learned: bool = True  #: whether steps change numbers of pieces; False: searches alone do
+    #: Whether what meets at a sliver, a triangle whose corners lie on a line, meets as at an edge
+    across_slivers: bool = True
 
     def __post_init__(self) -> None:
         sizes = {"most": (0, 1 << 20), "brightnesses": (1, 64), "colours": (0, 64)}

@@ -53,6 +53,8 @@ class Progress:
     processes: int = 1  #: that took these first steps together
     #: For how many of its places roughness was searched; None: nobody wrote that down.
     searches: int | None = 0
+    searching: float = 0.0  #: seconds of training that were those of searches, not of steps
+    last_search: float = 0.0  #: of them, those of the last one
     warning: str | None = None  #: what is wrong with a fit that has ended; not part of checkpoints
 
     def counted(self) -> dict[str, Any]:
@@ -88,6 +90,8 @@ def save_checkpoint(
         "untrained": list(progress.untrained),
         "processes": progress.processes,
         "searches": progress.searches,
+        "searching": progress.searching,
+        "last_search": progress.last_search,
         **(about or {}),
         "files": {STATE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
     }
@@ -192,6 +196,8 @@ def _good(path: Path, most: int) -> tuple[dict[str, np.ndarray], Progress, dict[
             tuple(map(float, manifest.get("untrained", ()))),
             int(manifest.get("processes", 1)),
             None if manifest.get("searches") is None else int(manifest["searches"]),
+            float(manifest.get("searching", 0.0)),
+            float(manifest.get("last_search", 0.0)),
         )
         if not all(np.isfinite(array).all() for array in arrays.values()):
             raise _Damaged("a number is not finite")

@@ -276,8 +276,8 @@ class _Training:
 
     @property
     def _fraction(self) -> float:
-        """How much of the fit is done, in [0, 1]."""
-        return _done(self._begun.config, self._begun.progress) / _length(self._begun.config)
+        """How much of the steps is done, in [0, 1]."""
+        return _fraction(self._begun.config, self._begun.progress, self._search)
 
     @property
     def _over(self) -> bool:
@@ -301,6 +301,7 @@ class _Training:
         if not self._watchdog.trusts:
             return  # a state that may be taken back: it comes after that
         state, progress = self._begun.state, self._begun.progress
+        before = progress.seconds
         try:
             samples = self._search.search_if_due(self._fraction, state, progress.step)
         except UserError:  # the state is that of before: a search leaves what it finds at its end
@@ -310,6 +311,8 @@ class _Training:
             progress.samples += samples
             progress.searches = self._search.made
             self._read_clock()
+            progress.last_search = progress.seconds - before
+            progress.searching += progress.last_search
             self._watchdog.keep()
 
     def _measure(self, entry: dict[str, Any], *, scores: bool, errors: bool) -> None:
@@ -402,7 +405,7 @@ def _searches(begun: Begun, ranks: Ranks) -> RoughnessSearch:
     config, progress = begun.config, begun.progress
     search = RoughnessSearch(begun.problem, config, begun.step, ranks)
     # In a longer fit than before, places lie later. Older versions made all in their places.
-    passed = search.passed(_done(config, progress) / (_length(config) or 1))
+    passed = search.passed(_fraction(config, progress, search))
     search.made = passed if progress.searches is None else min(progress.searches, passed)
     return search
 
@@ -423,6 +426,18 @@ def _length(config: FitConfig) -> float:
 def _done(config: FitConfig, progress: Progress) -> float:
     """How much of it is done, in the same unit."""
     return progress.seconds if config.seconds else progress.step
+
+
+def _fraction(config: FitConfig, progress: Progress, search: RoughnessSearch) -> float:
+    """How much of the steps is done, in [0, 1].
+
+    Time that searches take is not theirs: rates would fall while nothing is learned.
+    """
+    if not config.seconds:
+        return progress.step / (config.steps or 1)
+    steps = progress.seconds - progress.searching
+    searching = progress.searching + search.seconds_left(progress, config.seconds)
+    return min(1.0, steps / max(config.seconds - searching, 1e-9))
 
 
 def _is_over(config: FitConfig, progress: Progress) -> bool:

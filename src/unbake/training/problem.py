@@ -309,7 +309,8 @@ def _pieces(scene: mi.Scene, config: FitConfig) -> Pieces | None:
     """The pieces of a scene, if any field has values of them."""
     settings = [s for s in config.material_settings.values() if isinstance(s, NetworkConfig)]
     most = max((s.pieces.most for s in settings), default=0)
-    return Pieces(scene, most) if most else None
+    across = all(s.pieces.across_slivers for s in settings)
+    return Pieces(scene, most, across_slivers=across) if most else None
 
 
 def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list[str]]:

@@ -42,6 +42,7 @@ from ..fields.field import Field, holding
 from ..memory import lacks_memory
 from ..ranks import Ranks
 from ..transport.by_roughness import PLACE, row_type
+from .checkpoint import Progress
 from .gradients import flat_gradients, set_gradients
 from .piece_levels import with_expected_levels
 from .piece_variation import expected_albedo, with_all_variation, with_expected_variation
@@ -55,6 +56,9 @@ from .step import TrainingStep, without_garbage_collection
 _AT_ONCE = 1 << 18
 #: Fewer pixels tell nothing: a fit of some dozen steps does not search.
 _FEWEST = 1 << 12
+#: Samples of a pixel, where there are more of them than photographs have pixels for, are so many
+#: times as many, at most.
+_MOST_REPEATS = 4
 #: Tells the random numbers of searches from those of steps, which start at the same seed.
 _SEED = 0x524F5547
 #: The rate that is left at the end of a descent.
@@ -90,6 +94,19 @@ class RoughnessSearch:
         """How many places of searches lie before a fraction of the fit, or at it."""
         return int((self._places <= done).sum())
 
+    def seconds_left(self, progress: Progress, seconds: float) -> float:
+        """How long the searches that are to come will take, about, of a fit of so many seconds."""
+        left = len(self._places) - (progress.searches or 0)
+        if left <= 0 or not self._size(progress.step, progress.seconds / seconds):
+            return 0.0
+        if progress.last_search:  # they are equally large
+            return left * progress.last_search
+        # As long as steps with as many samples.
+        search = self._config.roughness_search
+        share = search.share / (1 + left * search.share)
+        at_most = search.pixels * search.spp * progress.seconds / max(progress.samples, 1)
+        return left * min(share * seconds, at_most)
+
     def due(self, done: float) -> bool:
         """Whether a search is to be made after a fraction of the fit.
 
@@ -99,19 +116,30 @@ class RoughnessSearch:
 
     def rates(self, rates: dict[str, float], step: int, done: float) -> dict[str, float]:
         """The learning rates of a step, after a fraction of the fit."""
-        if not len(self._places) or not self._pixels(step, done):
+        if not len(self._places) or not self._size(step, done):
             return rates
         search = self._config.roughness_search
         factor = search.rate_between if self.made else search.rate_before
         return rates | {"roughness": rates["roughness"] * factor}
 
-    def _pixels(self, step: int, done: float) -> int:
-        """How many pixels a search samples after a step and a fraction of the fit; 0: none."""
+    def _size(self, step: int, done: float) -> tuple[int, int] | None:
+        """Pixels that a search has after a step and a fraction of the fit, and samples of each.
+
+        None: there is no search.
+
+        The noise of a photograph is the same whenever its pixel is drawn. So there are no more
+        pixels than photographs have, and more samples of each instead.
+        """
         if not done:
-            return 0
+            return None
         search, of_steps = self._config.roughness_search, self._config.samples_per_step
-        pixels = round(search.share * step / done * of_steps / search.spp)
-        return min(pixels, search.pixels) if pixels >= _FEWEST else 0
+        wanted = round(search.share * step / done * of_steps / search.spp)
+        if wanted < _FEWEST:
+            return None
+        wanted = min(wanted, search.pixels)
+        pixels = min(wanted, self._step.pixels.photographs.count)
+        repeats = min(wanted // pixels, _MOST_REPEATS)
+        return pixels, search.spp * 2 ** (repeats.bit_length() - 1)
 
     def search_if_due(self, done: float, state: State, number: int) -> int:
         """Search, if that is due, and leave in the state what was found.
@@ -126,9 +154,10 @@ class RoughnessSearch:
         Raises:
             UserError: there is no memory for it.
         """
-        pixels = self._pixels(number, done) if self.due(done) else 0
-        if not pixels:
+        size = self._size(number, done) if self.due(done) else None
+        if size is None:
             return 0
+        pixels, spp = size
         try:
             with without_garbage_collection():
                 passed = self.passed(done)
@@ -136,7 +165,7 @@ class RoughnessSearch:
                 part = 1 / max(1, passed - 1) if self.made else 1.0
                 last = passed == len(self._places)
                 each = -(-pixels // self._ranks.size)
-                samples = self._search(state, number, each, part, last)
+                samples = self._search(state, number, (each, spp), part, last)
                 self.made = passed
                 return samples
         except (RuntimeError, MemoryError) as error:
@@ -146,11 +175,13 @@ class RoughnessSearch:
             remedy = "Go on with --resume, without this search, or start another run with fewer"
             raise UserError(what, "roughness_search.pixels", remedy) from None
 
-    def _search(self, state: State, number: int, pixels: int, part: float, last: bool) -> int:
+    def _search(
+        self, state: State, number: int, size: tuple[int, int], part: float, last: bool
+    ) -> int:
         """The search after a step.
 
         Args:
-            pixels: of this rank.
+            size: pixels of this rank, and samples of each.
             part: of the way to what is found that is gone.
             last: whether albedo is told how much it varies within pieces, too: later steps that
                 learn it do not get back what is taken from it.
@@ -163,7 +194,8 @@ class RoughnessSearch:
         assert materials is not None and field is not None
         self._step.unite(state)
         self._ranks.announce()  # it takes longer than a step
-        most = max(1, _AT_ONCE // search.spp)
+        pixels, spp = size
+        most = max(1, _AT_ONCE // spp)
         batches = -(-pixels // most)
         each = -(-pixels // batches)
         entropy = [self._config.seed, _SEED, number, self._ranks.rank]
@@ -171,9 +203,7 @@ class RoughnessSearch:
         *seeds, of_places = zip(words[::2], words[1::2], strict=True)
 
         def sample() -> np.ndarray:
-            parts = [
-                self._samples.by_roughness(state, pair, each, search.spp, NODES) for pair in seeds
-            ]
+            parts = [self._samples.by_roughness(state, pair, each, spp, NODES) for pair in seeds]
             return _as_bytes(np.concatenate(parts))
 
         def look() -> np.ndarray:
@@ -201,7 +231,7 @@ class RoughnessSearch:
                 changed |= {f"albedo.{key}": self._of_first(x) for key, x in told.items()}
             state.replace(changed)
         state.publish(self._problem)
-        return batches * each * search.spp * self._ranks.size
+        return batches * each * spp * self._ranks.size
 
     def _of_first(self, array: mi.Float | mi.TensorXf) -> mi.Float | mi.TensorXf:
         """What rank 0 has found: sums of many threads differ in their last bits."""

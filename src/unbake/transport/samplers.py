@@ -46,6 +46,7 @@ class SamplerContext:
         bounces: k, after which the image takes L_θ.
         max_depth: longest path in bounces, plus one, of methods that follow paths to their end.
         rr_depth: bounces of these before Russian roulette.
+        planned_gain: how much more than in the first batch their surfaces may come to reflect.
         read_by_scene: gives the present arrays that the scene's textures and emitters read.
         guide: where bounces look for light beside where BSDFs scatter; None: nowhere else.
     """
@@ -58,6 +59,7 @@ class SamplerContext:
     bounces: int
     max_depth: int
     rr_depth: int
+    planned_gain: float
     read_by_scene: Callable[[], Arrays]
     guide: LightGuide | None = None
 
@@ -246,7 +248,7 @@ class KeptPathSampler(_WholePathSampler):
         if self._plan is None:
             c = self._context
             scene_view = c.scene_view.with_scene(scene)
-            self._plan = plan_widths(scene_view, ray, sampler, c.spp, self._limits)
+            self._plan = plan_widths(scene_view, ray, sampler, c.spp, self._limits, c.planned_gain)
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Radiance of camera samples.

@@ -119,11 +119,25 @@ def path_light(
 
 
 def plan_widths(
-    scene_view: SceneView, ray: mi.Ray3f, sampler: mi.Sampler, spp: int, limits: PathLimits
+    scene_view: SceneView,
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    spp: int,
+    limits: PathLimits,
+    gain: float,
 ) -> Plan:
     """Widths of the wavefront for each bounce, from the paths along these rays.
 
     Roulette that would not narrow it is left out: it would only add noise.
+
+    Args:
+        scene_view: with the materials of the first step.
+        ray: world space rays, `spp` consecutive lanes a pixel.
+        sampler: seeded for as many lanes; it is advanced.
+        spp: samples a pixel, an even number.
+        limits: how far paths are followed.
+        gain: how many times as much as now surfaces may come to reflect, 1 or more. Narrower
+            wavefronts than that would need make gradients of bright rooms noisy.
     """
     lanes = dr.width(ray)
     plan: list[int] = []
@@ -139,7 +153,7 @@ def plan_widths(
 
     with dr.suspend_grad():
         ray = dr.gather(type(ray), ray, _by_halves(lanes, spp)[0])
-        _follow(scene_view, ray, sampler, limits, choose)
+        _follow(scene_view, ray, sampler, limits, choose, gain)
     return tuple(plan)
 
 
@@ -174,11 +188,13 @@ def _follow(
     sampler: mi.Sampler,
     limits: PathLimits,
     choose: Callable[[int, mi.Float], int],
+    gain: float = 1.0,
 ) -> tuple[Vertex, list[_Segment]]:
     """Follow paths to their end.
 
     Args:
         choose: gives the width for a bounce (from 1), from the probabilities to survive until then.
+        gain: what a bounce reflects counts so many times in these probabilities.
     """
     x = x1 = find_vertex(
         scene_view, ray, mi.Bool(True), sampler, hide_emitters=limits.hide_emitters
@@ -189,7 +205,7 @@ def _follow(
         alive = x.valid & (dr.max(β) > 0)
         likely = mi.Float(1)
         if number > limits.rr_depth:
-            likely = dr.minimum(_FAVOUR * dr.max(β), _MOST_LIKELY)
+            likely = dr.minimum(_FAVOUR * dr.max(β) * gain ** (number - 1), _MOST_LIKELY)
         survival = dr.select(alive, likely, 0)
         width = choose(number, survival)
         survivors = None
