@@ -3,6 +3,7 @@
 import json
 import struct
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
@@ -260,3 +261,35 @@ def test_meshes_of_ns_export_are_taken_back(captured, tmp_path):
         file.write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1} | wrong))
         with pytest.raises(ImportFaults, match=told):
             import_data(tmp_path / "nerf", tmp_path / "none", given, **more)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb", "ply"])
+def test_texture_coordinates_are_those_that_mitsuba_reads_of_an_obj_file(suffix, tmp_path):
+    """Textures of an export are shown on the user's own mesh, so that they may not be mirrored."""
+    corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 3], [0, 0, 3]], float)
+    uv = np.array([[0.1, 0.2], [0.7, 0.2], [0.7, 0.9], [0.1, 0.9]])
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"vt {u} {v}" for u, v in uv]
+    (tmp_path / "wall.obj").write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 1/1 3/3 4/4"]))
+    file = tmp_path / f"wall.{suffix}"
+    if suffix != "obj":
+        visual = trimesh.visual.TextureVisuals(uv=uv)
+        mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], visual=visual, process=False)
+        mesh.export(file)
+    scene = write_scene(parts_of(file), tmp_path / "scene", environment=True)
+    (written,) = (scene.parent / "meshes").glob("*.ply")
+
+    def by_corner(kind, path):
+        params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
+        places = np.array(params["vertex_positions"]).reshape(-1, 3)
+        found = np.array(params["vertex_texcoords"]).reshape(-1, 2)
+        return {tuple(np.round(p).astype(int)): u for p, u in zip(places, found, strict=True)}
+
+    theirs, ours = by_corner("obj", tmp_path / "wall.obj"), by_corner("ply", written)
+    # glTF has the same frame here: nothing is turned unless that is asked for.
+    if suffix == "glb":
+        ours = {
+            (x, -z, y) if (x, -z, y) in theirs else (x, y, z): u for (x, y, z), u in ours.items()
+        }
+    assert ours.keys() == theirs.keys()
+    for corner, found in ours.items():
+        np.testing.assert_allclose(found, theirs[corner], atol=1e-6)

@@ -53,7 +53,7 @@ class Part:
         positions: (n, 3) float64, in the frame of the file.
         faces: (m, 3) indices.
         normals: (n, 3) of unit length as the file has them; None: facets.
-        uv: (n, 2), v upwards; None where the file has none.
+        uv: (n, 2), v upwards, as in OBJ and most PLY files; None where the file has none.
     """
 
     name: str
@@ -71,8 +71,9 @@ class Part:
         return replace(self, positions=self.positions @ linear.T + matrix[:3, 3], normals=normals)
 
     def write(self, file: Path) -> None:
-        """Write it as binary PLY."""
-        write_mesh(file, self.positions, self.faces, self.normals, self.uv)
+        """Write it as binary PLY for Mitsuba, to which v = 0 is the first row of an image."""
+        uv = None if self.uv is None else self.uv * (1, -1) + (0, 1)
+        write_mesh(file, self.positions, self.faces, self.normals, uv)
 
 
 def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:

@@ -24,7 +24,7 @@ def mesh_of(
         positions: (n, 3).
         faces: (m, 3) indices.
         normals: (n, 3) of unit length; None: facets.
-        uv: (n, 2), v upwards; None: there are none.
+        uv: (n, 2), v downwards: 0 is the first row of an image; None: there are none.
         name: its id.
     """
     mesh = mi.Mesh(
