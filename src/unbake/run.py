@@ -21,7 +21,7 @@ from .evaluation import evaluate, rendering, renderings
 from .evaluation.settings import EvaluationSettings, RenderSettings
 from .exports.bake import Baker
 from .exports.export import DEFAULT_FORMATS, export
-from .exports.observed import Views
+from .exports.observed import Views, training_views
 from .exports.parts import Part, read_parts
 from .exports.unwrap import Placed
 from .fields.materials import Materials
@@ -192,8 +192,7 @@ class Run:
             what = f"the mesh {printable(mesh)!r} has no texture coordinates"
             remedy = "`export` unwraps it; `material_along` takes rays"
             raise UserError(what, self.dataset.scene, remedy)
-        problem = self.recovered.problem
-        baker = Baker(materials, {}, Views(problem.scene_view.scene, self.recovered.cameras))
+        baker = Baker(materials, {}, self._views)
         values, hit, seen = baker.at(Placed(part, part.triangles, part.triangles.uv), at)
         return values | {"on_mesh": hit, "observed": seen}
 
@@ -333,6 +332,11 @@ class Run:
         """The parts of the scene as its author gave them, by their names."""
         dataset, pieces = self.dataset, self.recovered.problem.pieces
         return {part.name: part for part in read_parts(dataset.scene, dataset.root, pieces).parts}
+
+    @cached_property
+    def _views(self) -> Views:
+        """What the training views see of the scene."""
+        return training_views(self.recovered)
 
     @property
     def _materials(self) -> Materials:

@@ -12,6 +12,7 @@ import pytest
 from unbake.acquisition.decimate import decimated
 from unbake.acquisition.degrade import degrade, displacement, response
 from unbake.acquisition.settings import DegradeSettings, Response
+from unbake.dataset.lighting import true_emission
 from unbake.dataset.views import Dataset, SensorNoise, read_masked
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import require_true_materials
@@ -19,6 +20,7 @@ from unbake.evaluation.placing import told_of_place
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.imaging.srgb import from_srgb, to_srgb
 from unbake.io import read_json
+from unbake.scene.emitters import named_emitters
 from unbake.scene.parse import parse
 
 
@@ -157,6 +159,14 @@ def test_meshes_are_displaced_by_smooth_noise(cornell, degraded):
     assert 0.5 < np.sqrt((moved**2).sum(1).mean()) / 0.02 < 2
     near = displacement(points + 1e-4, DegradeSettings(displace=0.01), 2.0)
     assert np.abs(near - moved).max() < 2e-3
+
+
+def test_lamps_of_changed_meshes_keep_the_names_of_their_true_strengths(cornell, degraded):
+    dataset, truth = degraded(displace=0.01)
+    names = [emitter.name for emitter in named_emitters(parse(dataset.scene))]
+    assert names == [emitter.name for emitter in named_emitters(parse(Dataset.load(cornell).scene))]
+    assert names and set(names) == set(true_emission(dataset.folder))
+    assert any(file.endswith(f"/{names[0]}.ply") for file in truth["displaced"]["meshes"])
 
 
 def test_a_mesh_that_cannot_be_written_is_told_and_nothing_is_left(cornell, tmp_path, monkeypatch):
@@ -327,7 +337,8 @@ def test_changed_meshes_are_written_once(cornell, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     dataset = degrade(cornell, "worse", DegradeSettings(displace=0.01), tell=lambda line: None)
     truth = json.loads((tmp_path / "worse" / "degraded.json").read_text())
-    meshes = {file.name for file in (tmp_path / "worse" / "scene").rglob("changed-*.ply")}
+    folder = dataset.scene.resolve().parent
+    meshes = {file.relative_to(folder).as_posix() for file in folder.rglob("changed-*/*.ply")}
     assert meshes == set(truth["displaced"]["meshes"]) and meshes
     text = (tmp_path / dataset.scene).read_text()
     assert all(name in text for name in meshes)

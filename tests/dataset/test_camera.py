@@ -8,7 +8,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unbake.dataset.camera import Camera, LookAt, read_cameras, write_camera_file
+from unbake.dataset.camera import (
+    Camera,
+    LookAt,
+    read_cameras,
+    read_named_cameras,
+    write_camera_file,
+)
 from unbake.errors import UserError
 
 ORIGIN, TARGET, UP = (1.0, -2.0, 3.0), (-0.5, 0.25, 1.0), (0.0, 0.3, 1.0)
@@ -287,6 +293,51 @@ def test_all_broken_cameras_of_a_file_are_told_at_once(tmp_path):
     for number, what in ((0, "field of view"), (2, "not an object"), (3, "unknown split")):
         assert re.search(f"camera {number}: [^;]*{what}", told)
     assert told.endswith("; and 2 more") and "camera 1:" not in told
+
+
+def test_cameras_have_the_names_of_their_file(tmp_path):
+    file = tmp_path / "cameras.json"
+    entries = [
+        {**ENTRY, "split": "heldout", "name": "left"},
+        {**FRAME, "file_path": ".\\images\\IMG_7.JPG"},
+        ENTRY,
+        {**ENTRY, "split": "heldout"},
+        {**ENTRY, "name": "b.1", "file_path": "images/other.png"},
+    ]
+    file.write_text(json.dumps({"cameras": entries}))
+    found = read_named_cameras(file, 8, 8)
+    assert [(name, split) for name, split, _ in found] == [
+        ("left", "heldout"),
+        ("IMG_7", "train"),
+        ("train_001", "train"),
+        ("heldout_001", "heldout"),
+        ("b.1", "train"),
+    ]
+    for (_, split, camera), (other, same) in zip(found, read_cameras(file, 8, 8), strict=True):
+        assert split == other and np.array_equal(camera.to_world, same.to_world)
+
+
+def test_names_that_pictures_cannot_have_are_told_at_once(tmp_path):
+    file = tmp_path / "cameras.json"
+    names = ["a/b", "c", "c\\d", "e\n", "c", "f", "f", "f"]
+    file.write_text(json.dumps([{**ENTRY, "name": name} for name in names]))
+    assert len(read_cameras(file, 8, 8)) == len(names)
+    with pytest.raises(UserError) as caught:
+        read_named_cameras(file, 8, 8)
+    told = str(caught.value)
+    assert all(repr(name) in told for name in ("a/b", "c\\d", "e\n"))
+    assert "have the same name: 'c', 'f'" in told and str(file) in told
+    file.write_text(json.dumps([{**ENTRY, "name": 3}, ENTRY, {**ENTRY, "name": ""}]))
+    with pytest.raises(UserError, match=r"camera 0: 'name' is not a text.*camera 2: 'name' is not"):
+        read_named_cameras(file, 8, 8)
+
+
+def test_files_of_one_name_in_several_folders_are_numbered(tmp_path):
+    file = tmp_path / "cameras.json"
+    files = ["left/1.png", "right\\1.png", "right/2.png"]
+    file.write_text(json.dumps([{**ENTRY, "file_path": name} for name in files]))
+    found = [name for name, _, _ in read_named_cameras(file, 8, 8)]
+    assert found == ["train_000", "train_001", "train_002"]
 
 
 def test_a_missing_camera_file_is_named(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from unittest.mock import patch
 
 import mitsuba as mi
@@ -11,7 +12,14 @@ import pytest
 from unbake import memory
 from unbake.dataset.camera import Camera
 from unbake.dataset.fingerprint import fingerprint
-from unbake.dataset.views import Dataset, View, check_cameras, read_image, read_photograph
+from unbake.dataset.views import (
+    Dataset,
+    View,
+    check_cameras,
+    fitted_pixels,
+    read_image,
+    read_photograph,
+)
 from unbake.errors import UserError
 
 WIDTH, HEIGHT = 6, 4
@@ -376,6 +384,28 @@ def test_a_data_set_of_code_values_and_masks_is_saved_and_loaded(folder):
     assert (again.encoding, again.mask) == ("srgb", folder / "mask.png") and view.mask is None
     assert np.array_equal(read_photograph(again)[..., 3], mask / 255)
     assert Dataset.load(folder).views[0].mask is None
+
+
+def test_photographs_are_read_for_fitted_pixels_only_where_their_alpha_counts(folder, monkeypatch):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[1:3, 2] = 0
+    mi.Bitmap(mask).write(str(folder / "mask.png"))
+    write_exr(folder / "images" / "opaque.exr", picture(0, channels=3))
+    view = Dataset.load(folder).views[0]
+    masked = replace(view, mask=folder / "mask.png")
+    covered = picture(0)[..., 3] > 0
+    assert 0 < covered.mean() < 1
+    assert np.array_equal(fitted_pixels(view, "hidden"), covered)
+    assert np.array_equal(fitted_pixels(masked, "hidden"), covered & (mask > 0))
+
+    def read(*words):
+        raise AssertionError("the photograph is read")
+
+    monkeypatch.setattr("unbake.dataset.views.read_image", read)
+    assert np.array_equal(fitted_pixels(masked, "visible"), mask > 0)
+    assert fitted_pixels(view, "visible") is None
+    opaque = replace(view, image=folder / "images" / "opaque.exr")
+    assert fitted_pixels(opaque, "hidden") is None
 
 
 def test_the_fingerprint_knows_masks(folder):

@@ -28,13 +28,13 @@ from unbake.exports.bake import WANTED
 from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
 from unbake.exports.mitsuba import write_scene
-from unbake.exports.observed import Views, filled
+from unbake.exports.observed import Views, filled, training_views
 from unbake.exports.parts import parsed_principled, read_parts
 from unbake.exports.tessellate import Triangles
 from unbake.exports.textures import file_names
 from unbake.exports.unwrap import make_atlases, unique_share
 from unbake.imaging.metrics import psnr
-from unbake.imaging.pictures import read_exr, tonemap, write_exr
+from unbake.imaging.pictures import read_exr, tonemap, write_exr, write_png
 from unbake.scene.triangles import write_mesh
 from unbake.training.loop import fit
 from unbake.training.recovered import Recovered, load_run
@@ -696,6 +696,14 @@ def test_what_no_view_saw_is_filled_and_marked(exported, tmp_path, monkeypatch):
     assert (albedo[unseen == 255] <= seen.max(0) + 1e-5).all()
 
 
+@pytest.mark.parametrize(("learned", "told"), [(["albedo"], ", and is filled in"), ([], "")])
+def test_only_what_was_learned_is_told_to_be_filled_in(learned, told):
+    manifest = {"materials": [], "near": {}, "unobserved_share": 0.25, "notes": []}
+    lines = []
+    exporting._report(manifest | {"learned": learned}, lines.append)
+    assert lines == [f"25.0 % of the surface was seen by no training view{told}"]
+
+
 def test_recovered_strengths_are_numbers_of_the_scene(data, tmp_path, monkeypatch):
     config = replace(tiny_fields("grid"), method="direct", unknown="emission", steps=0)
     fit(data, tmp_path / "run", config)
@@ -747,6 +755,61 @@ def test_other_textures_of_unwrapped_materials_move_along(mixed, tmp_path, monke
     assert np.ptp(truth) > 0.5 and (np.abs(found - truth) < 0.01).mean() > 0.95
     assert written.sensors(), "one is added where there is none"
     assert '"metallic" value="0.25"' in (tmp_path / "out/mitsuba/scene.xml").read_text()
+
+
+LIGHT = """<emitter type="area"><texture type="bitmap" name="radiance">
+    <string name="filename" value="picture.exr"/><boolean name="raw" value="true"/>
+  </texture></emitter>"""
+#: A floor, and two screens of its paint: the second one shows a half of the picture twice.
+SCREENS = f"""<scene version="3.0.0">
+  <bsdf type="diffuse" id="paint"/>
+  <shape type="rectangle" id="floor"><ref id="paint"/>
+    <transform name="to_world"><scale value="2"/><translate z="-1"/></transform></shape>
+  <shape type="rectangle" id="screen"><ref id="paint"/>{LIGHT}
+    <transform name="to_world"><scale value="0.5"/><translate x="-0.6"/></transform></shape>
+  <shape type="ply" id="folded"><string name="filename" value="folded.ply"/>
+    <ref id="paint"/>{LIGHT}</shape></scene>"""
+
+
+def test_screens_keep_their_pictures_though_others_share_their_material(tmp_path, monkeypatch):
+    folder, rng = tmp_path / "scene", np.random.default_rng(5)
+    write_exr(folder / "picture.exr", rng.uniform(0.5, 4, (4, 4, 3)))
+    corners = np.array([(0.1, -0.5, 0), (1.1, -0.5, 0), (1.1, 0.5, 0), (0.1, 0.5, 0)])
+    uv = np.array([(0, 0), (1, 0), (1, 1), (1, 0)])
+    write_mesh(folder / "folded.ply", corners, np.array([(0, 1, 2), (0, 2, 3)]), uv=uv)
+    (folder / "scene.xml").write_text(SCREENS)
+    data = grey_data(folder / "scene.xml", tmp_path / "data")
+    fit(data, tmp_path / "run", replace(tiny_fields("grid"), method="direct", steps=0))
+    recovered = load_run(tmp_path / "run")
+    materials = recovered.problem.materials
+    materials.assign(random_values(materials, 1))
+    monkeypatch.setattr(exporting, "load_run", lambda *_, **__: recovered)
+    as_if_seen(monkeypatch)
+    options = {"texels": 100.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba"], **options)
+    (paint,) = manifest["materials"]
+    assert paint["name"] == "paint" and paint["parts"] == ["floor"]
+    assert paint["area"] == pytest.approx(16)
+    written = mi.load_file(str(tmp_path / "out" / "mitsuba" / "scene.xml"), optimize=False)
+    original = parsed_principled(data / "scene.xml", data).instantiate(merge=False)
+    places = {
+        "floor": ((-1.9, 0.6), (1.9, 1.9), 0.0),
+        "screen": ((-1.1, -0.5), (-0.1, 0.5), 1e-3),
+        "folded": ((0.1, -0.5), (1.1, 0.5), 0.1),
+    }
+    for name, (low, high, most) in places.items():
+        x = np.ascontiguousarray(rng.uniform(low, high, (1000, 2)).T, np.float32)
+        ray = mi.Ray3f(mi.Point3f(*x, 1), mi.Vector3f(0, 0, -1))
+        a, b = original.ray_intersect(ray), written.ray_intersect(ray)
+        truth, found = (
+            np.array(si.emitter(scene).eval(si)) for si, scene in ((a, original), (b, written))
+        )
+        assert np.ptp(truth) > 0.5 or name == "floor"
+        assert (np.abs(found - truth).max(0) <= most).mean() > 0.97, name
+        albedo = material_at(recovered, np.array(a.p).T)["albedo"]
+        shown = np.array(b.bsdf().eval_diffuse_reflectance(b)).T
+        assert np.ptp(albedo) > 0.1, name
+        assert (np.abs(shown - albedo).max(1) < 0.02).mean() > 0.95, name
 
 
 def test_bitmaps_are_looked_up_in_the_coordinates_of_the_scene(mixed, tmp_path, monkeypatch):
@@ -884,6 +947,56 @@ def test_views_see_what_is_in_front_of_them(mixed):
     views = Views(scene, [above])
     assert np.array(views.see(p, up, one, both)).tolist() == [False, True, False, False]
     assert np.array(views.see(p, up, both, both)).tolist() == [False, True, False, True]
+
+
+def test_views_see_nothing_in_pixels_that_do_not_count(mixed):
+    """One floor point left and one right of the middle, and masks of either half."""
+    scene = parsed_principled(mixed, mixed.parent).instantiate()
+    above = LookAt((-0.7, 0.2, 3.0), (-0.7, 0.2, 0.0), (0, 1, 0), 50.0).camera(8, 8)
+    p = mi.Point3f(np.array([(-1.3, 0.2, 0), (0.1, 0.2, 0)], np.float32).T.copy())
+    up, both = mi.Normal3f(0, 0, mi.Float([1, 1])), dr.ones(mi.Bool, 2)
+    right, asked = np.zeros((8, 8), bool), []
+    right[:, 4:] = True
+    for counted, expected in (
+        (None, [True, True]),
+        (right, [False, True]),
+        (~right, [True, False]),
+        (np.zeros((8, 8), bool), [False, False]),
+    ):
+        images = [None, counted]
+
+        def count(number, images=images):
+            asked.append(number)
+            return images[number]
+
+        # The first camera looks away, and its image is not asked for.
+        away = above.moved(np.array([0.0, 3.0, 0.0]), np.zeros(3))
+        views = Views(scene, [away, above], count)
+        for _ in range(2):
+            assert np.array(views.see(p, up, ~both, both)).tolist() == expected
+    assert asked == [1] * 4
+
+
+def test_what_is_masked_in_all_photographs_is_unobserved(exported, tmp_path):
+    """And so is what none shows in front of a hidden background."""
+    recovered, dataset = exported.recovered, exported.recovered.dataset
+    write_exr(tmp_path / "clear.exr", np.zeros((16, 16, 4), np.float32))
+    write_png(tmp_path / "mask.png", np.zeros((16, 16), np.uint8))
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1, 1, 9)] * 2))
+    p = mi.Point3f(np.stack([x, y, 0 * x]).astype(np.float32))
+    up, both = mi.Normal3f(0, 0, mi.Float(np.ones(81, np.float32))), dr.ones(mi.Bool, 81)
+
+    def seen(background, **changes):
+        views = tuple(replace(view, **changes) for view in dataset.views)
+        data = replace(dataset, views=views, background=background)
+        found = training_views(replace(recovered, dataset=data)).see(p, up, ~both, both)
+        return np.array(found)
+
+    assert seen("visible").mean() > 0.3
+    assert np.array_equal(seen("hidden"), seen("visible"))
+    assert np.array_equal(seen("visible", image=tmp_path / "clear.exr"), seen("visible"))
+    assert not seen("hidden", image=tmp_path / "clear.exr").any()
+    assert not seen("visible", mask=tmp_path / "mask.png").any()
 
 
 def test_filling_keeps_what_is_known_and_takes_the_rest_from_it():

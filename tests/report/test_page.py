@@ -175,6 +175,21 @@ def test_skipped_steps_and_what_was_noted_of_a_fit_are_told(made, tmp_path: Path
     assert EVIL not in text
 
 
+@pytest.mark.parametrize("steps", [0, 200])
+def test_a_run_that_went_on_after_its_evaluation_is_told(made, tmp_path: Path, steps):
+    run = made[1][0]
+    _edit(run, lambda m: m.update(steps=steps))
+    (run / "log.jsonl").write_text("")
+    assert "evaluated after" not in write_report(made[1], tmp_path / "before.html").read_text()
+    (run / "log.jsonl").write_text(json.dumps({"step": 8000, "seconds": 9.0}) + "\n")
+    told = f"evaluated after {steps} of 8 000 steps"
+    text = _words(write_report(made[1], tmp_path / "killed.html").read_text())
+    assert text.count(told) == 1 and "unbake evaluate" not in text  # nothing else was saved
+    (run / "checkpoints" / "step-000008000").mkdir(parents=True)
+    text = _words(write_report(made[1], tmp_path / "saved.html").read_text())
+    assert f"{told}; run `unbake evaluate ours` again" in text
+
+
 @pytest.mark.parametrize("why", ["nothing learned", "worse than untrained"])
 def test_a_run_that_learned_nothing_is_marked(made, tmp_path: Path, why):
     """In the table, and at each of its pictures, which may be plain white."""
@@ -258,6 +273,26 @@ def test_errors_of_renderings_are_of_pixels_that_count(known, tmp_path: Path, mo
     if known:
         expected &= _truth(0)["mask"] > 0
     assert (painted[0] == expected).all() and 0 < expected.sum() < expected.size
+
+
+def test_clipped_photographs_are_compared_as_renderings_are(made, tmp_path: Path, monkeypatch):
+    data, (run, _) = made
+    frames = json.loads((data / "transforms.json").read_text())["frames"]
+    _edit_data(data, frames=[frame | {"clipped": 0.5} for frame in frames])
+    for index, (name, split) in enumerate(_names()):
+        limited = np.minimum(_truth(index)["render"], 0.5)
+        assert (_truth(index)["render"] > 0.6).any()
+        _save(run / "evaluation" / split / f"{name}_render.exr", limited)
+    painted, paint = [], display.painted
+
+    def kept(values, scale, mask):
+        painted.append(values)
+        return paint(values, scale, mask)
+
+    monkeypatch.setattr(display, "painted", kept)
+    write_report([run], tmp_path / "page.html")
+    np.testing.assert_allclose(painted[0], 0, atol=1e-6)
+    assert np.max(painted[1]) > 0  # of albedo, which nothing clips
 
 
 def test_photographs_without_truth_are_shown_as_recovered(tmp_path: Path):
@@ -669,6 +704,48 @@ def test_exported_textures_are_sheets(made, tmp_path: Path):
     assert shown[1] == pictures.png_data_uri(np.eye(8, dtype=np.uint8) * 255)
 
 
+def test_what_was_made_of_another_state_of_a_run_is_told(made, tmp_path: Path):
+    run = made[1][0]
+    folder = _exported(_relit(tmp_path / "made", run), run)
+    for steps, sections in ((200, 0), (100, 1)):
+        for name in ("render.json", "export.json"):
+            _edit_json(folder / name, run={"folder": str(run.resolve()), "steps": steps})
+        page = tmp_path / f"{steps}.html"
+        text = write_report(made[1], page, exported=[folder], relit=[folder]).read_text()
+        for section in ("relit", "textures"):
+            assert _section(text, section).count("made after 100 steps") == sections
+
+
+def test_the_mean_of_relit_pictures_is_of_those_that_have_a_score(made, tmp_path: Path):
+    folder = _relit(tmp_path / "relit", made[1][0])
+    _edit_json(folder / "render.json", scored={"render_psnr": 5})
+    text = write_report(made[1], tmp_path / "report.html", relit=[folder]).read_text()
+    assert "32.50 dB, mean of 5 views; SSIM" in _section(text, "relit")
+
+
+def test_pictures_keep_their_shape(made, tmp_path: Path):
+    """Also where pictures side by side have several; only empty boxes need one of the page."""
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    (style,) = re.findall(r"\.zoom img,\.box\{(.*?)\}", text)
+    assert "aspect-ratio:auto var(--aspect)" in style.split(";")
+    (style,) = re.findall(r"\.layer img\{(.*?)\}", text)
+    assert "object-fit:contain" in style.split(";")
+
+
+def test_large_pictures_of_outliers_are_averaged_down(made, tmp_path: Path):
+    run = made[1][0]
+    large = np.zeros((900, 1350, 3), np.uint8)
+    large[:, :675] = 255
+    pictures.write_png(run / "evaluation" / "train" / "train_000_outliers.png", large)
+    images = [{"name": "train_000", "share": 0.5}]
+    _edit(
+        run, lambda m: m.update(outliers={"share": 0.5, "images": images, "shown": ["train_000"]})
+    )
+    text = _section(write_report([run], tmp_path / "report.html").read_text(), "outliers")
+    (shown,) = re.findall(r'src="(.*?)"', text)
+    assert shown == pictures.png_data_uri(large[::3, ::3])
+
+
 def test_folders_of_runs_that_were_moved_are_known_by_name(made, tmp_path: Path):
     folder = _relit(tmp_path / "relit", tmp_path / "elsewhere" / "ours")
     text = write_report(made[1], tmp_path / "report.html", relit=[folder]).read_text()
@@ -793,7 +870,10 @@ def _remove(path: str) -> Callable[[Path, list[Path]], None]:
         (_remove("runs/ours/evaluation/heldout/heldout_001_albedo.exr"), r"heldout_001_albedo"),
         (_remove("room/images/heldout_001.exr"), r"heldout_001\.exr.*the image does not exist"),
         (_remove("room/transforms.json"), r"room: no transforms\.json"),
-        (lambda data, runs: data.rename(data.with_name("moved")), "data .* gone .*room"),
+        (
+            lambda data, runs: data.rename(data.with_name("moved")),
+            r"data .* gone .*room.*fit DATA --out \S*ours --resume; then unbake evaluate \S*ours",
+        ),
         (lambda data, runs: _edit(runs[1], lambda m: m.update(data="/")), "other data"),
         (lambda data, runs: _edit(runs[1], lambda m: m.pop("per_view")), "`per_view`"),
         (

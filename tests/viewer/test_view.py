@@ -23,6 +23,7 @@ from unbake import cli
 from unbake.config import to_toml
 from unbake.errors import UserError
 from unbake.exports.parts import read_parts
+from unbake.imaging.pictures import MAGMA
 from unbake.io import write_text
 from unbake.training.checkpoint import Progress, save_checkpoint
 from unbake.training.recovered import open_run
@@ -123,6 +124,19 @@ def test_a_run_shows_what_was_recovered_and_its_error(run):
     photograph, rendering = (p.pixels.astype(float) for p in first[:2])
     assert np.corrcoef(photograph.ravel(), rendering.ravel())[0, 1] > 0.8
     assert viewed.log()["step"] == "60"
+
+
+def test_errors_of_clipped_photographs_are_of_what_they_can_show(run):
+    file = run.parent / "data" / "transforms.json"
+    transforms = json.loads(file.read_text())
+    for frame in transforms["frames"]:
+        frame["clipped"] = 1e-4  # nearly all of it is brighter
+    file.write_text(json.dumps(transforms))
+    viewed = ViewedRun(run)
+    assert viewed.follow()
+    (photograph, _, error), _ = viewed.pictures(viewed.dataset.heldout[0], "albedo")
+    assert photograph.pixels.mean() > 5
+    np.testing.assert_array_equal(error.pixels, np.broadcast_to(MAGMA[0], error.pixels.shape))
 
 
 def test_the_end_of_a_log_is_told():

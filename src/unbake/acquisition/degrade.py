@@ -322,8 +322,8 @@ def _change_meshes(
     """Move the vertices of all meshes by smooth noise, and leave out some.
 
     Returns:
-        The files it wrote, and whether meshes have lost coordinates or colours that textures of
-        the scene may look into.
+        The files it wrote, in the scene's folder, and whether meshes have lost coordinates or
+        colours that textures of the scene may look into.
     """
     files, bare = [], False
     textured = any(node.props.plugin_name() in _LOOKED_INTO for node in parsed.state.nodes)
@@ -346,14 +346,16 @@ def _change_meshes(
             params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
             params.update()
             dr.eval(params["vertex_positions"])
-        file = folder.scene / "meshes" / f"changed-{number}.ply"
+        # The name of the file stays, as shapes and lamps without an id are named after it.
+        name = f"{Path(node.props['filename']).stem}.ply"
+        file = folder.scene / "meshes" / f"changed-{number}" / name
         save_mesh(file, mesh)
         for key in ("shape_index", "flip_tex_coords", "to_world"):
             if key in node.props:
                 del node.props[key]
         node.props.set_plugin_name("ply")
         node.props["filename"] = str(file.resolve())
-        files.append(file.name)
+        files.append(file.relative_to(folder.scene).as_posix())
     return files, bare
 
 

@@ -70,8 +70,8 @@ def evaluate(
         values = {k: v for k, v in metrics[split].items() if k != "views"}
         if not metrics["quantities"]:  # of known materials there are no scores
             values = {k: v for k, v in values.items() if v is not None}
-        shown = _scores(values)
-        say(f"{split} ({metrics[split]['views']} views): {shown}")
+        views, scored = metrics[split]["views"], metrics.get("scored", {}).get(split, {})
+        say(f"{split} ({views} views): {_scores(values, views, scored)}")
         if split == "heldout":
             for line in told:
                 say(f"  {line}")
@@ -233,8 +233,8 @@ def relight(
     made = run_relight(run, out, chosen, settings, **places, allow_outside=allow_outside, tell=say)
     if made["mean"] is not None:
         scores = {k: v for k, v in made["mean"].items() if k != "views"}
-        shown = _scores(scores)
-        say(f"mean over {made['mean']['views']} views: {shown}")
+        views, scored = made["mean"]["views"], made.get("scored", {})
+        say(f"mean over {views} views: {_scores(scores, views, scored)}")
     say(f"wrote {out}: {len(made['frames'])} pictures, render.json")
 
 
@@ -265,11 +265,16 @@ def view(
     return signals.status()
 
 
-def _scores(values: Mapping[str, float | None]) -> str:
-    """Scores by their keys in a line; all but SSIM and FLIP are in dB."""
+def _scores(values: Mapping[str, float | None], views: int, scored: Mapping[str, int]) -> str:
+    """Means over views by their keys in a line; all but SSIM and FLIP are in dB.
+
+    Args:
+        scored: how many views have a score, where not all have it.
+    """
     plain = ("render_ssim", "render_flip")
     told = {k: None if v is None else f"{v:.3f}" if k in plain else f"{v:.2f} dB"
             for k, v in values.items()}  # fmt: skip
+    told |= {k: f"{told[k]} ({n} of {views} views)" for k, n in scored.items() if k in told}
     return ", ".join(f"{key} {value or '—'}" for key, value in told.items())
 
 

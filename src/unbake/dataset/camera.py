@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar, final
 
 import mitsuba as mi
@@ -14,7 +15,7 @@ import numpy as np
 
 from unbake.dataset.data_folder import TRANSFORMS
 from unbake.errors import UserError, collected, raise_together
-from unbake.io import array, integer, number, read_json, write_text
+from unbake.io import array, integer, number, read_json, text, write_text
 
 SPLITS = ("train", "heldout")
 Placed = TypeVar("Placed")
@@ -384,8 +385,8 @@ def read_cameras(
     """Read (split, camera) pairs from a camera file or a nerfstudio `transforms.json`.
 
     A camera file is `{"cameras": [{"name", "split", "origin", "target", "up", "fov"}]}` or the
-    list alone; `split` is "train" where it is missing. Horizontal fields of view stay as in the
-    file (see `Camera.rescaled`).
+    list alone; `split` is "train" where it is missing, and `name` may be missing, too (see
+    `read_named_cameras`). Horizontal fields of view stay as in the file (see `Camera.rescaled`).
 
     Args:
         path: the file.
@@ -396,6 +397,71 @@ def read_cameras(
         UserError: the file is missing or not JSON, or entries lack a key or are no valid cameras:
             it tells of several.
     """
+    found = _read_entries(path, width, height, keep_size)
+    return [(split, camera) for _, split, camera in found]
+
+
+def read_named_cameras(
+    path: Path, width: int, height: int, *, keep_size: bool = False
+) -> list[tuple[str, str, Camera]]:
+    """Read cameras with the names that their pictures get; arguments as of `read_cameras`.
+
+    That is the `name` of an entry; else the name of its file (`file_path`) without the suffix,
+    unless files in several folders have the same; else its split and number, as of
+    `named_by_split`.
+
+    Returns:
+        Name, split and camera, in the order of the file.
+
+    Raises:
+        UserError: as of `read_cameras`; or names cannot be those of files, or are not unique: it
+            tells all of them.
+    """
+    found = _read_entries(path, width, height, keep_size)
+    numbered = named_by_split((split, camera) for _, split, camera in found)
+    told: list[str | None] = []
+    stems: list[str] = []
+    faults: list[UserError] = []
+    for index, (entry, _, _) in enumerate(found):
+        with collected(faults):
+            told.append(_told(entry, "name", f"{path}: camera {index}"))
+            # As written on any system.
+            file = _told(entry, "file_path", f"{path}: camera {index}") or ""
+            stems.append(PurePosixPath(file.replace("\\", "/")).stem)
+    raise_together(faults)
+    if max(Counter(filter(None, stems)).values(), default=0) > 1:
+        stems = [""] * len(stems)
+    names = [
+        name or stem or number
+        for name, stem, (number, _, _) in zip(told, stems, numbered, strict=True)
+    ]
+    _require_names_of_files(names, path)
+    return [(name, split, camera) for name, (_, split, camera) in zip(names, found, strict=True)]
+
+
+def _told(entry: dict[str, Any], key: str, where: str) -> str | None:
+    """A text of an entry of a camera file; None if it is not there."""
+    return None if entry.get(key) is None else text(entry, key, where)
+
+
+def _require_names_of_files(names: Sequence[str], path: Path) -> None:
+    """Refuse names of cameras that pictures cannot have, and those that several have."""
+    faults = []
+    wrong = [name for name in names if not name.isprintable() or "/" in name or "\\" in name]
+    if wrong:
+        what = f"names of cameras that pictures cannot have: {', '.join(map(repr, wrong))}"
+        faults.append(UserError(what, path, "Leave out slashes and control characters"))
+    doubled = [name for name, count in Counter(names).items() if count > 1]
+    if doubled:
+        what = f"several cameras have the same name: {', '.join(map(repr, doubled))}"
+        faults.append(UserError(what, path, "Give each camera a 'name' of its own"))
+    raise_together(faults, most=None)
+
+
+def _read_entries(
+    path: Path, width: int, height: int, keep_size: bool
+) -> list[tuple[dict[str, Any], str, Camera]]:
+    """The entries of a camera file with their splits and cameras; see `read_cameras`."""
     content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
         entries = content["frames"]
@@ -415,7 +481,8 @@ def read_cameras(
                 camera = camera_from_frame(entry, top, where, (width, height))
             else:
                 camera = _camera_from_entry(entry, where, width, height)
-            cameras.append((split, camera if keep_size else camera.rescaled(width, height)))
+            camera = camera if keep_size else camera.rescaled(width, height)
+            cameras.append((entry, split, camera))
     raise_together(faults)
     return cameras
 

@@ -33,6 +33,8 @@ ENCODINGS = ("linear", "srgb")
 
 _LDR_SUFFIXES = (*CODED_SUFFIXES, ".bmp", ".tga", ".webp", ".gif", ".ppm")
 _MOST_CHANNELS = 4
+#: Suffixes of images that cannot hold alpha.
+_OPAQUE = (".jpg", ".jpeg", ".hdr", ".rgbe", ".pfm")
 _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 #: Memory in bytes that takes part in decoding a pixel, blurring it included.
 PIXEL_BYTES = 100
@@ -360,11 +362,23 @@ def read_masked(view: View, clip_negative: bool = False) -> tuple[np.ndarray, np
     width, height = view.camera.width, view.camera.height
     pixels = read_image(view.image, width, height, clip_negative, view.encoding)
     pixels = pixels.reshape(height, width, 4)
-    if view.mask is None:
-        return pixels, None
-    _check_header(view.mask, width, height, "srgb")
-    codes = read_codes(view.mask, _REPLACE)
-    return pixels, counted_by(codes)
+    return pixels, _read_mask(view)
+
+
+def fitted_pixels(view: View, background: str) -> np.ndarray | None:
+    """Which pixels of a view's photograph are fitted, (H, W) bool, as `fitted` says; None: all.
+
+    The photograph is read only where its alpha may say so.
+
+    Raises:
+        UserError: as in `read_photograph`, but for negative pixels.
+    """
+    counted: np.ndarray | None
+    if background == "hidden" and _may_be_transparent(view.image):
+        counted = fitted(*read_masked(view, clip_negative=True), background)
+    else:
+        counted = _read_mask(view)
+    return None if counted is None or counted.all() else counted
 
 
 def fitted(pixels: np.ndarray, mask: np.ndarray | None, background: str) -> np.ndarray:
@@ -399,6 +413,26 @@ def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
     touching = free_space.trace(scene, *spread_rays([*cameras.values()], 16)).distance < near
     nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
     return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]
+
+
+def _read_mask(view: View) -> np.ndarray | None:
+    """Whether pixels count by the mask of a view, (H, W) bool; None where it has none."""
+    if view.mask is None:
+        return None
+    _check_header(view.mask, view.camera.width, view.camera.height, "srgb")
+    return counted_by(read_codes(view.mask, _REPLACE))
+
+
+def _may_be_transparent(image: Path) -> bool:
+    """Whether an image may have transparent pixels, which are not read for that."""
+    suffix = image.suffix.lower()
+    if suffix in _OPAQUE:
+        return False
+    try:
+        # Files of code values may name a colour that is transparent.
+        return suffix in CODED_SUFFIXES or read_header(image).channels in (2, 4)
+    except (HeaderError, OSError):
+        return True  # reading it tells what is wrong
 
 
 def _read_views(

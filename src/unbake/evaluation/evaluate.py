@@ -15,7 +15,7 @@ from ..dataset.lighting import ROWS, true_environment
 from ..dataset.spread import evenly
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
-from ..imaging.metrics import HIGHEST, mean_psnr, psnr
+from ..imaging.metrics import HIGHEST, psnr
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
 from ..quantities import QUANTITIES
 from ..scene import edit
@@ -35,9 +35,11 @@ from .renderings import (
     METRICS,
     counted_pixels,
     exposure_of,
+    mean_scores,
     render_camera,
     render_psnr,
     render_scores,
+    scored_views,
 )
 from .settings import EvaluationSettings
 from .yardsticks import find_yardsticks, seen_materials
@@ -169,8 +171,7 @@ def _evaluate(
         "seconds": round(recovered.progress.seconds, 2),
         "convergence": _convergence(recovered, folder),
         "warm_start": None if origin.warm_start is None else asdict(origin.warm_start),
-        "heldout": _summary(rows, "heldout"),
-        "train": _summary(rows, "train"),
+        **_summaries(rows),
         **measures,
         **recovered_lighting,
         "display_exposure": exposure,
@@ -403,10 +404,14 @@ def _convergence(recovered: Recovered, folder: RunFolder) -> dict | None:
     return None if found is None else asdict(found)
 
 
-def _summary(rows: list[dict], split: str) -> dict:
-    chosen = [row for row in rows if row["split"] == split]
+def _summaries(rows: list[dict]) -> dict[str, Any]:
+    """Means of each split, and of how many views they are where that is not all."""
     keys = [key for key in rows[0] if key not in ("name", "split")]
-    return {"views": len(chosen)} | {k: mean_psnr(row[k] for row in chosen) for k in keys}
+    splits = {name: [r for r in rows if r["split"] == name] for name in ("heldout", "train")}
+    scored = {name: scored_views(chosen, keys) for name, chosen in splits.items()}
+    scored = {name: found for name, found in scored.items() if found}
+    means = {name: mean_scores(chosen, keys) for name, chosen in splits.items()}
+    return means | ({"scored": scored} if scored else {})
 
 
 def _db(value: float | None) -> str:

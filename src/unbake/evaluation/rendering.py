@@ -20,11 +20,10 @@ import numpy as np
 from ..acquisition.new_light import change_light
 from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, frame_name, frame_of, named_by_split, read_cameras
+from ..dataset.camera import Camera, frame_name, frame_of, read_named_cameras
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError, collected, printable, raise_together
 from ..fields.domain import Domain
-from ..imaging.metrics import mean_psnr
 from ..imaging.pictures import tonemap, write_exr, write_png
 from ..io import filled_folder, require_new_folder, write_json
 from ..memory import require_memory
@@ -36,7 +35,15 @@ from ..training.validation import GroundTruth
 from ..version import VERSION
 from . import renderings
 from .evaluate import DEFINITIONS, description
-from .renderings import METRICS, counted_pixels, exposure_of, render_camera, render_scores
+from .renderings import (
+    METRICS,
+    counted_pixels,
+    exposure_of,
+    mean_scores,
+    render_camera,
+    render_scores,
+    scored_views,
+)
 from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
 from .turntable import axis_of, up_of
 from .turntable import turntable as make_turntable
@@ -272,7 +279,8 @@ def _render(
             "settings": asdict(settings),
             "variant": mi.variant(),
             "truth": None if cameras.truth is None else os.fspath(cameras.truth.folder),
-            "mean": _means(frames) if compared else None,
+            "mean": mean_scores(frames, METRICS) if compared else None,
+            **_scored(frames if compared else ()),
             "display_exposure": exposure if compared else None,
             "frames": frames,
             "definitions": {
@@ -299,10 +307,10 @@ def _shots(
     first = dataset.train[0].camera
     width, height = picture_size(first, settings)
     if cameras.file is not None:
-        found = read_cameras(cameras.file, first.width, first.height, keep_size=True)
+        found = read_named_cameras(cameras.file, first.width, first.height, keep_size=True)
         shots = [
             _Shot(name, camera.rescaled(*picture_size(camera, settings)), split)
-            for name, split, camera in named_by_split(found)
+            for name, split, camera in found
         ]
         return shots, {"kind": "file", "file": os.fspath(cameras.file)}
     if cameras.turntable is not None:
@@ -383,9 +391,10 @@ def _frame(shot: _Shot) -> dict[str, Any]:
     return {"name": shot.name, "file_path": f"{shot.name}.exr", **frame_of(shot.camera), **split}
 
 
-def _means(frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    scores = {key: mean_psnr(frame[key] for frame in frames) for key in METRICS}
-    return {"views": len(frames)} | scores
+def _scored(frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Of how many pictures means are; empty where they are of all."""
+    found = scored_views(frames, METRICS)
+    return {"scored": found} if found else {}
 
 
 def _tell_progress(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
 from ..imaging import perceptual
-from ..imaging.metrics import psnr
+from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import encoded, fitting_exposure, sample
 from ..training.validation import GroundTruth, MaterialBuffers
 from ..transport.render import render_radiance
@@ -28,6 +29,8 @@ DEFINITIONS = {
     "render_flip": "LDR-FLIP of the same pictures at 67 pixels a degree: how visible the "
     "difference is, from 0, not at all, to 1; mean over unmasked pixels, then over views",
     "display_exposure": "stops: the 95th percentile of the photographs' radiance becomes about 0.8",
+    "scored": "how many views a mean is of, where it is not of all `views`: in the others no pixel "
+    "counts, or the truth is not known",
 }
 
 
@@ -108,6 +111,22 @@ def render_scores(
 def render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> float:
     """The score `render_psnr` alone; arguments as of `render_scores`."""
     return psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)
+
+
+def mean_scores(rows: Sequence[Mapping[str, Any]], keys: Iterable[str]) -> dict[str, Any]:
+    """The number of `views`, and the mean of each score over those that have it.
+
+    Args:
+        rows: a view each, with all keys.
+        keys: of the scores.
+    """
+    return {"views": len(rows)} | {key: mean_psnr(row[key] for row in rows) for key in keys}
+
+
+def scored_views(rows: Sequence[Mapping[str, Any]], keys: Iterable[str]) -> dict[str, int]:
+    """How many views have a score, of scores that some have and others lack; see `mean_scores`."""
+    counts = {key: sum(row[key] is not None for row in rows) for key in keys}
+    return {key: count for key, count in counts.items() if 0 < count < len(rows)}
 
 
 def exposure_of(photographs: Iterable[np.ndarray]) -> float:

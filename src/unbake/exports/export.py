@@ -37,7 +37,7 @@ from .constants import TEXTURED, material_constants
 from .gltf import write_glb
 from .lights import Light, environment_picture, read_lights
 from .mitsuba import write_scene
-from .observed import Views
+from .observed import training_views
 from .parts import Part, Parts, parsed_principled, read_parts
 from .textures import COLOUR_SPACES, file_names, write_mask, write_textures
 from .unwrap import LARGEST, UNIQUE, make_atlases
@@ -73,9 +73,9 @@ _CONVENTIONS = {
     "near": "by quantity, the share of the surface seen by training views where the texture "
     "differs from the recovered field by 2/255 at most, albedo as sRGB",
     "unobserved": "a picture for each material, in its texture coordinates: white where no "
-    "training view saw the surface; values there are filled from those around it "
-    "that were seen, or the quantity's default where a material has none; what is seen in mirrors "
-    "or through glass alone counts as not seen",
+    "training view saw the surface; what was learned is filled in there from values around it that "
+    "were seen, or is the quantity's default where a material has none, and all else is the "
+    "scene's own; what is seen in mirrors or through glass alone counts as not seen",
 }
 
 
@@ -165,7 +165,7 @@ def _export(
     with _Bar(console) as bar:
         atlases = make_atlases(found.scene, wanted, density, bar.unwraps)
         bar.total(sum(atlas.resolution**2 for atlas in atlases))
-        baker = Baker(problem.materials, own, Views(scene, cameras))
+        baker = Baker(problem.materials, own, training_views(recovered))
         baked = []
         for atlas in atlases:
             bar.bakes(atlas.name)
@@ -381,7 +381,8 @@ def _report(manifest: dict[str, Any], tell: Callable[[str], None]) -> None:
         least = 100 * min(manifest["near"].values())
         tell(f"{least:.1f} % of the surface seen is within 2/255 of the recovered fields")
     share = 100 * manifest["unobserved_share"]
-    tell(f"{share:.1f} % of the surface was seen by no training view, and is filled in")
+    filled = ", and is filled in" if manifest["learned"] else ""
+    tell(f"{share:.1f} % of the surface was seen by no training view{filled}")
     for note in manifest["notes"]:
         tell(f"note: {note}")
 

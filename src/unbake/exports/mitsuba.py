@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -35,13 +35,14 @@ class Written:
     notes: list[str]  #: what is not as it was
 
 
-#: Parameters of BSDFs that are colours; all others that textures may give are one number.
+#: Parameters of BSDFs and lamps that are colours; all others that textures may give are one number.
 _COLOURS = (
     "base_color",
     "reflectance",
     "diffuse_reflectance",
     "specular_reflectance",
     "specular_transmittance",
+    "radiance",
 )
 
 
@@ -75,17 +76,18 @@ def write_scene(
     """
     folder = folder.resolve()
     notes: list[str] = []
-    stems = file_names([one.atlas.name for one in baked])
-    for stem, one in zip(stems, baked, strict=True):
-        _replace_textures(folder, stem, one, scene)
-        if one.atlas.method != "own":
-            notes += _move_others(folder, stem, one, scene, scratch)
-    placed = {id(p.part): p.triangles for one in baked for p in one.atlas.placed}
-    names = _replace_shapes(folder, scene, parts, placed)
     for light in lights:
         if light.recovered:
             props = scene.state.nodes[light.node].props
             props[STRENGTHS[light.plugin]] = mi.ScalarColor3d(list(light.strength or (0, 0, 0)))
+    stems = file_names([one.atlas.name for one in baked])
+    copies = _own_bsdfs(scene, baked)
+    for stem, one, copied in zip(stems, baked, copies, strict=True):
+        _replace_textures(folder, stem, one, scene, copied)
+        if one.atlas.method != "own":
+            notes += _move_others(folder, stem, one, scene, scratch, copied)
+    placed = {id(p.part): p.triangles for one in baked for p in one.atlas.placed}
+    names = _replace_shapes(folder, scene, parts, placed)
     if environment is not None:
         _replace_environment(folder, scene, environment)
     notes += _require_sensor(scene, camera)
@@ -98,21 +100,77 @@ def write_scene(
 # ----------------------------------------------------------------------------------------- textures
 
 
-def _replace_textures(folder: Path, stem: str, baked: Baked, scene: ParsedScene) -> None:
-    """Give the BSDFs of a material its baked textures; what was not learned stays as it is."""
+def _own_bsdfs(scene: ParsedScene, baked: Sequence[Baked]) -> list[dict[int, int]]:
+    """Give parts copies of BSDFs that another atlas has already, as lamps have those of walls.
+
+    Returns:
+        For each of `baked` the nodes of its own BSDFs, by those that they are copies of.
+    """
+    used: set[int] = set()
+    found = []
+    for one in baked:
+        shared = not used.isdisjoint(one.atlas.materials)
+        used.update(one.atlas.materials)
+        found.append(_copied_bsdfs(scene, one) if shared else {})
+    return found
+
+
+def _copied_bsdfs(scene: ParsedScene, baked: Baked) -> dict[int, int]:
+    """Copy the BSDFs of an atlas, and have its parts refer to the copies."""
+    parts = [placed.part for placed in baked.atlas.placed]
+    inside = {i for p in parts if p.bsdf is not None for i in scene.reachable(p.bsdf)}
+    nodes = scene.state.nodes
+    chosen = sorted(i for i in inside if nodes[i].type == mi.ObjectType.BSDF)
+    copies = {old: len(nodes) + place for place, old in enumerate(chosen)}
+    for old, new in copies.items():
+        node = mi.parser.SceneNode()
+        node.type = mi.ObjectType.BSDF
+        node.props = mi.Properties(scene.state.nodes[old].props)
+        if node.props.id():
+            node.props.set_id(f"{node.props.id()} {new}")
+        _refer_to(node.props, copies)
+        scene.append(node)
+    for part in parts:
+        _refer_to(scene.state.nodes[part.node].props, copies)
+    return copies
+
+
+def _refer_to(props: mi.Properties, copies: Mapping[int, int]) -> None:
+    """Have references to nodes become references to their copies."""
+    for key in list(props):
+        if is_reference(props[key]) and props[key].index() in copies:
+            props[key] = mi.Properties.ResolvedReference(copies[props[key].index()])
+
+
+def _replace_textures(
+    folder: Path, stem: str, baked: Baked, scene: ParsedScene, copies: Mapping[int, int]
+) -> None:
+    """Give the BSDFs of a material its baked textures; what was not learned stays as it is.
+
+    Args:
+        copies: nodes of the BSDFs that stand for others in this atlas.
+    """
     nodes = scene.principled_indices()
     for name in baked.learned:
         values = baked.values[name]
         texture = _bitmap(scene, folder / _TEXTURES / f"{stem}_{name}.exr", as_image(values))
         for number in baked.atlas.materials:
-            props = scene.state.nodes[nodes[number]].props
+            props = scene.state.nodes[copies.get(nodes[number], nodes[number])].props
             props[QUANTITIES[name].slot] = mi.Properties.ResolvedReference(texture)
 
 
 def _move_others(
-    folder: Path, stem: str, baked: Baked, scene: ParsedScene, scratch: ParsedScene
+    folder: Path,
+    stem: str,
+    baked: Baked,
+    scene: ParsedScene,
+    scratch: ParsedScene,
+    copies: Mapping[int, int],
 ) -> list[str]:
-    """Bring the other textures of a material's BSDFs into the coordinates of its atlas.
+    """Bring the other textures of a material's BSDFs and lamps into the coordinates of its atlas.
+
+    Args:
+        copies: as of `_replace_textures`.
 
     Returns:
         What is not as it was.
@@ -120,12 +178,13 @@ def _move_others(
     notes = []
     parts = [placed.part for placed in baked.atlas.placed]
     learned = {QUANTITIES[name].slot for name in baked.learned}
-    outer = {part.bsdf for part in parts if part.bsdf is not None}
+    outer = {copies.get(part.bsdf, part.bsdf) for part in parts if part.bsdf is not None}
     inside = {i for bsdf in outer for i in scene.reachable(bsdf)}
+    inside |= {part.emitter for part in parts if part.emitter is not None}
     moved: dict[tuple[int, bool], int] = {}
     for i in sorted(inside):
         node = scene.state.nodes[i]
-        if node.type != mi.ObjectType.BSDF:
+        if node.type not in (mi.ObjectType.BSDF, mi.ObjectType.Emitter):
             continue
         plugin = node.props.plugin_name()
         for key in list(node.props):

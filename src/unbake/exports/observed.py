@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..dataset.camera import Camera
+from ..dataset.views import fitted_pixels
+from ..fields.arrays import from_numpy
 from ..scene import free_space
+from ..training.recovered import Recovered
 
 #: How far from a point a ray towards it ends, as a fraction of the diagonal of its extent.
 _OFFSET = 2e-4
@@ -25,10 +28,20 @@ class Views:
     Args:
         scene: what stands in the way.
         cameras: those that a fit learned from.
+        counted: tells by the number of a camera which pixels of its image count, (height, width)
+            bool, or None where all do. It is asked once, when the camera first sees something.
+            None: all pixels of all images count.
     """
 
-    def __init__(self, scene: mi.Scene, cameras: Sequence[Camera]) -> None:
-        self._scene, self._cameras = scene, cameras
+    def __init__(
+        self,
+        scene: mi.Scene,
+        cameras: Sequence[Camera],
+        counted: Callable[[int], np.ndarray | None] | None = None,
+    ) -> None:
+        self._scene, self._cameras, self._counted = scene, cameras, counted
+        # A bit for each pixel, by camera; None where all count.
+        self._bits: dict[int, np.ndarray | None] = {}
         self._offset = free_space.lift(scene, _OFFSET)
 
     def see(self, p: mi.Point3f, n: mi.Normal3f, two_sided: mi.Bool, active: mi.Bool) -> mi.Bool:
@@ -42,19 +55,20 @@ class Views:
         """
         seen = dr.zeros(mi.Bool, dr.width(p))
         dr.eval(p, n, two_sided, active)
-        for camera in self._cameras:
-            seen |= self._sees(camera, p, n, two_sided, active & ~seen)
+        for number in range(len(self._cameras)):
+            seen |= self._sees(number, p, n, two_sided, active & ~seen)
             dr.eval(seen)
         return seen
 
     def _sees(
         self,
-        camera: Camera,
+        number: int,
         p: mi.Point3f,
         n: mi.Normal3f,
         two_sided: mi.Bool,
         active: mi.Bool,
     ) -> mi.Bool:
+        camera = self._cameras[number]
         # All numbers come as arrays, so that one kernel serves all cameras.
         origin = _opaque(camera.origin)
         right, up, back = (_opaque(camera.to_world[:3, k]) for k in range(3))
@@ -78,7 +92,47 @@ class Views:
         tried = active & inside & facing & (distance > self._offset)
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(d))
         ray.maxt = dr.maximum(distance - dr.opaque(mi.Float, self._offset), 0)
-        return tried & ~self._scene.ray_test(ray, tried)
+        return self._counting(number, film, tried & ~self._scene.ray_test(ray, tried))
+
+    def _counting(self, number: int, film: mi.Point2f, seen: mi.Bool) -> mi.Bool:
+        """Of the points that a camera sees, those in pixels that count.
+
+        Args:
+            number: of the camera.
+            film: where the points are in its image, in pixels.
+            seen: points that it sees.
+        """
+        if self._counted is None or (number in self._bits and self._bits[number] is None):
+            return seen
+        dr.eval(film, seen)
+        lanes = np.flatnonzero(np.array(seen))
+        if not len(lanes):
+            return seen
+        if number not in self._bits:
+            counted = self._counted(number)
+            self._bits[number] = None if counted is None else np.packbits(counted)
+        bits = self._bits[number]
+        if bits is None:
+            return seen
+        column, row = (np.array(x)[lanes].astype(np.int64) for x in film)
+        pixel = row * self._cameras[number].width + column
+        counts = np.zeros(dr.width(seen), np.uint32)
+        counts[lanes] = (bits[pixel >> 3] >> (7 - (pixel & 7))) & 1
+        return from_numpy(mi.UInt32, counts) > 0
+
+
+def training_views(recovered: Recovered) -> Views:
+    """What the training views of a run see, in pixels that it was fitted to.
+
+    Photographs and masks are read once points are asked for, and only those that may say that a
+    pixel does not count.
+    """
+    dataset = recovered.dataset
+
+    def counted(number: int) -> np.ndarray | None:
+        return fitted_pixels(dataset.train[number], dataset.background)
+
+    return Views(recovered.problem.scene_view.scene, recovered.cameras, counted)
 
 
 def _opaque(vector: np.ndarray) -> mi.Vector3f:

@@ -66,7 +66,10 @@ def make_atlases(
     texels: float,
     advance: Callable[[str], object] = lambda name: None,
 ) -> list[Atlas]:
-    """An atlas for each material that parts have.
+    """An atlas for each material that parts have, those of lamps last.
+
+    Lamps have atlases of their own, whatever material they share: what a fit optimizes is not told
+    of them. One that shows a picture has an atlas alone, in which its own coordinates can stay.
 
     Args:
         scene: the nodes that the parts are of.
@@ -77,7 +80,7 @@ def make_atlases(
     Raises:
         UserError: a material's parts cannot be unwrapped.
     """
-    groups = _groups([part for part in parts if part.materials])
+    groups = _groups(scene, [part for part in parts if part.materials])
     names = _material_names(scene, groups)
     atlases = []
     for name, group in zip(names, groups, strict=True):
@@ -86,23 +89,32 @@ def make_atlases(
     return atlases
 
 
-def _groups(parts: Sequence[Part]) -> list[list[Part]]:
-    """Parts that share a material, also through others: a BSDF may hold several materials."""
-    first: dict[int, int] = {}
+def _groups(scene: ParsedScene, parts: Sequence[Part]) -> list[list[Part]]:
+    """Parts of a kind that share a material, also through others: a BSDF may hold several."""
+    first: dict[tuple[int, int], tuple[int, int]] = {}
 
-    def root(number: int) -> int:
-        while first.setdefault(number, number) != number:
-            number = first[number]
-        return number
+    def root(key: tuple[int, int]) -> tuple[int, int]:
+        while first.setdefault(key, key) != key:
+            key = first[key]
+        return key
 
-    for part in parts:
+    ordered = sorted(((_kind(scene, part), part) for part in parts), key=lambda pair: pair[0])
+    for kind, part in ordered:
         for number in part.materials:
-            low, high = sorted((root(part.materials[0]), root(number)))
+            low, high = sorted((root((kind, part.materials[0])), root((kind, number))))
             first[high] = low
-    found: dict[int, list[Part]] = {}
-    for part in parts:
-        found.setdefault(root(part.materials[0]), []).append(part)
+    found: dict[tuple[int, int], list[Part]] = {}
+    for kind, part in ordered:
+        found.setdefault(root((kind, part.materials[0])), []).append(part)
     return list(found.values())
+
+
+def _kind(scene: ParsedScene, part: Part) -> int:
+    """0 of surfaces that emit no light, 1 of lamps, and a number alone of each with a picture."""
+    if part.emitter is None:
+        return 0
+    kinds = {scene.state.nodes[i].type for i in scene.references(part.emitter)}
+    return 2 + part.emitter if mi.ObjectType.Texture in kinds else 1
 
 
 def _material_names(scene: ParsedScene, groups: list[list[Part]]) -> list[str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from unbake.imaging import pictures
 from unbake.report import display
 from unbake.report.runs import EvaluatedRun
@@ -24,7 +26,8 @@ def outlier_section(runs: list[EvaluatedRun]) -> list[dict[str, Any]] | None:
         figures = []
         for name in told["shown"]:
             file = display.evaluated(run, run.folder.picture("train", name, "outliers", ".png"))
-            picture = pictures.png_data_uri(pictures.read_png(file))
+            small = pictures.shrink(pictures.read_png(file), display.LONGEST_SIDE)
+            picture = pictures.png_data_uri(np.round(small).astype(np.uint8))
             figures.append({"name": name, "picture": picture, "share": _percent(shares.get(name))})
         found.append({"label": run.label, "share": _percent(told["share"]), "figures": figures})
     return found or None

@@ -121,11 +121,13 @@ def _recovered(run: EvaluatedRun, view: ShownView, quantity: str) -> Path | None
 def _references(view: ShownView) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """The truth of each quantity, (H, W, 3), and the pixels whose errors count, (H, W) bool.
 
-    Those of renderings are not masked, and show what is unknown where the data set tells that.
+    Photographs are not masked, and show what is unknown where the data set tells that. From the
+    value on at which they are clipped they are limited, as renderings are.
     """
     photograph = read_photograph(view.source, clip_negative=True)
     maps = {name: read_view(path, view.source) for name, path in view.source.truth.items()}
     known = {name: pixels[..., 3] >= 0.5 for name, pixels in maps.items()}
     counted = np.logical_and.reduce([photograph[..., 3] >= 0.5, *known.values()])
     found = {name: (pixels[..., :3], known[name]) for name, pixels in maps.items()}
-    return {"render": (photograph[..., :3], counted)} | found
+    limited = view.source.readable(photograph[..., :3])
+    return {"render": (limited, counted)} | found

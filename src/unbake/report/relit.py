@@ -19,6 +19,7 @@ from unbake.imaging import pictures
 from unbake.io import read_object
 from unbake.report import display
 from unbake.report.runs import EvaluatedRun, made_of
+from unbake.report.wording import made_after
 
 #: Pictures of a folder that are shown, evenly spaced, and pixels along their longer side.
 MOST, LONGEST = 6, 320
@@ -60,7 +61,8 @@ def relit_sections(
             key = (light, json.dumps(told, sort_keys=True), truth, exposure, *names)
             if key not in strips:
                 strips[key] = _strip(light, truth, exposure, names, allow_outside)
-            strips[key]["rows"].append(_row(folder, manifest, number, strips[key]))
+            row = _row(folder, manifest, runs[number], strips[key])
+            strips[key]["rows"].append({"run": number} | row)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             raise UserError("cannot be read", file, "Make the pictures again") from None
     return [strip for _, strip in sorted(strips.items(), key=lambda item: item[0][0])]
@@ -100,8 +102,10 @@ def _strip(
     }
 
 
-def _row(folder: Path, manifest: dict[str, Any], run: int, strip: dict[str, Any]) -> dict[str, Any]:
-    """A run's pictures and scores; sets the shape of the strip's pictures."""
+def _row(
+    folder: Path, manifest: dict[str, Any], run: EvaluatedRun, strip: dict[str, Any]
+) -> dict[str, Any]:
+    """A run's pictures, and what is told of them; sets the shape of the strip's pictures."""
     frames = {str(frame["name"]): frame for frame in manifest["frames"]}
     cells = []
     for name in strip["names"]:
@@ -112,8 +116,11 @@ def _row(folder: Path, manifest: dict[str, Any], run: int, strip: dict[str, Any]
         cells.append({"picture": _picture(image, strip["exposure"]), "number": number})
     mean = manifest.get("mean") or {}
     psnr = display.number(mean.get("render_psnr"))
-    told = "" if psnr is None else f"{display.decibels(psnr)} dB, mean of {mean.get('views')} views"
-    return {"run": run, "cells": cells, "mean": told, "similar": display.similar(mean)}
+    told = [display.similar(mean), made_after(manifest, run)]
+    if psnr is not None:
+        views = (manifest.get("scored") or {}).get("render_psnr", mean.get("views"))
+        told.insert(0, f"{display.decibels(psnr)} dB, mean of {views} views")
+    return {"cells": cells, "told": "; ".join(filter(None, told))}
 
 
 def _picture(image: np.ndarray, exposure: float) -> str:

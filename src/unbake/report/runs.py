@@ -32,6 +32,7 @@ class EvaluatedRun:
     metrics: dict[str, Any]
     config: dict[str, Any]
     log: list[dict[str, Any]]
+    taken: int  #: steps that the log tells of; more than were evaluated where the fit went on
 
     @property
     def untrained(self) -> bool:
@@ -104,8 +105,10 @@ def read_run(path: Path, label: str) -> EvaluatedRun:
     if metrics.get("unknown") == "emission" and not emitters:
         raise UserError("`emission` has no light", metrics_file, evaluate)
     settings = dict(flattened(folder.settings_table()))
-    log = [] if metrics.get("steps") == 0 else folder.log()
-    return EvaluatedRun(folder, label, metrics, settings, log)
+    untrained = metrics.get("steps") == 0
+    log = [] if untrained and not folder.log_file.is_file() else folder.log()
+    taken = int(log[-1].get("step", 0)) if log else 0
+    return EvaluatedRun(folder, label, metrics, settings, [] if untrained else log, taken)
 
 
 def made_of(manifest: dict[str, Any], where: Path, runs: list[EvaluatedRun]) -> int:
@@ -146,10 +149,12 @@ def data_folder(runs: list[EvaluatedRun]) -> Path:
                 "Write one report for each data set",
             )
     if not folders[0].is_dir():
+        first = runs[0].folder.path
         raise UserError(
             f"the data this run was evaluated on is gone ({folders[0]})",
-            runs[0].folder.path,
-            f"Put it back, or run `unbake evaluate {runs[0].folder.path}` on its new place",
+            first,
+            f"Put it back, or tell where it is now: unbake fit DATA --out {first} --resume; then "
+            f"unbake evaluate {first}",
         )
     return folders[0]
 

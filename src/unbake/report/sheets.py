@@ -15,6 +15,7 @@ from unbake.imaging import pictures
 from unbake.io import read_object
 from unbake.quantities import QUANTITIES
 from unbake.report.runs import EvaluatedRun, made_of
+from unbake.report.wording import made_after
 
 #: Materials of an export that are shown, the largest ones, and pixels along the edge of a sheet.
 MOST, EDGE = 12, 256
@@ -51,6 +52,7 @@ def _section(folder: Path, runs: list[EvaluatedRun]) -> dict[str, Any]:
             "more": len(rows) - len(materials),
             "texels": float(manifest.get("texels_per_unit") or 0),
             "unobserved": float(manifest.get("unobserved_share") or 0),
+            "made": made_after(manifest, runs[number]),
         }
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         raise UserError("cannot be read", file, "Export the run again") from None

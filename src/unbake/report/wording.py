@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from unbake.fields.registry import representation, representations
@@ -44,7 +44,33 @@ def nothing_learned(run: EvaluatedRun) -> str | None:
 
 def details(run: EvaluatedRun) -> list[tuple[str, str, str]]:
     """What is to be known of a run, in a few words each: text, symbol and subscript."""
-    return [*_described(run), *((text, "", "") for text in [*_trend(run), *_warnings(run)])]
+    more = [*_outdated(run), *_trend(run), *_warnings(run)]
+    return [*_described(run), *((text, "", "") for text in more)]
+
+
+def made_after(manifest: Mapping[str, Any], run: EvaluatedRun) -> str:
+    """After how many steps of a run something was made; empty where those were evaluated, too.
+
+    Args:
+        manifest: of an export or of pictures; see `made_of`.
+        run: that it was made of.
+    """
+    steps, evaluated = display.number(manifest["run"].get("steps")), run.metrics.get("steps")
+    if steps is None or evaluated is None or steps == evaluated:
+        return ""
+    return f"made after {display.count(steps)} steps"
+
+
+def _outdated(run: EvaluatedRun) -> list[str]:
+    """That the fit went on after it was evaluated, and what to do where that was saved."""
+    steps = run.metrics.get("steps")
+    if steps is None or run.taken <= steps:
+        return []
+    told = f"evaluated after {display.count(steps)} of {display.count(run.taken)} steps"
+    written = run.folder.written_checkpoints()
+    if not written or written[0] == run.folder.checkpoint(int(steps)):
+        return [told]
+    return [f"{told}; run `unbake evaluate {run.label}` again"]
 
 
 def _trend(run: EvaluatedRun) -> list[str]:
@@ -69,7 +95,8 @@ def _trend(run: EvaluatedRun) -> list[str]:
 def _warnings(run: EvaluatedRun) -> list[str]:
     """Steps that were skipped, and what a fit's watchdog noted."""
     skipped = sum(line.get("skipped", 0) for line in run.log)
-    told = [f"{display.count(skipped)} of {display.count(run.metrics.get('steps'))} steps skipped"]
+    steps = max(run.taken, run.metrics.get("steps") or 0)
+    told = [f"{display.count(skipped)} of {display.count(steps)} steps skipped"]
     return [*(told if skipped else []), *(line["note"] for line in run.log if "note" in line)]
 
 

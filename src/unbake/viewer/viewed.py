@@ -317,7 +317,8 @@ class ViewedRun(ViewedData):
         dimmed = cameras.dimmed(replace(view, camera=camera), image)
         image = cameras.photographed(view, dimmed, cameras.gain(view, dimmed, photograph))
         gain = 2.0**exposure
-        error = absolute_error(image.clip(0, 1 / gain), photograph.clip(0, 1 / gain)) * gain
+        compared = view.readable(photograph)
+        error = absolute_error(image.clip(0, 1 / gain), compared.clip(0, 1 / gain)) * gain
         first.append(Picture(how, tonemap(image, exposure)))
         first.append(Picture(_error_to("radiance"), false_colour(error, SCALES["radiance"])))
         name = choice.removesuffix(_ERROR)
