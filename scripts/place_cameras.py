@@ -28,7 +28,7 @@ def main() -> None:
 
     parsed = parse(args.scene)
     to_principled(parsed)
-    scene = parsed.instantiate()
+    scene = parsed.instantiate(merge=False)
     placed = place(scene, args.views, args.held_out, seed=args.seed)
     train = [look.camera(64, 64) for split, look in placed if split == "train"]
     write_camera_file(args.out, placed)

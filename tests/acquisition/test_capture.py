@@ -175,6 +175,32 @@ def test_samples_become_as_many_as_fill_a_grid(tmp_path, told, capfd):
     assert "WARN" not in "".join(capfd.readouterr())  # of Mitsuba, with codes of colours
 
 
+def test_the_noise_that_is_told_is_that_between_captures(tmp_path, told):
+    def image(seed, tell):
+        settings = replace(SMALL, views=1, held_out=0, resolution=16, seed=seed)
+        data = capture("cornell", tmp_path / str(seed), settings, tell=tell)
+        return read_exr(data.views[0].image)[..., :3] @ [0.2126, 0.7152, 0.0722]
+
+    images = np.array([image(seed, told.append if seed == 0 else str) for seed in range(10)])
+    found = np.median(images.std(0, ddof=1) / images.mean(0))
+    (line,) = [line for line in told if "noise" in line]
+    said = float(line.split("pixel is ")[1].split(" %")[0]) / 100
+    print(line, found)
+    # What independent samples would have; grids have less.
+    assert found < said < 1.6 * found
+
+
+def test_noise_that_hides_materials_is_warned_of(told):
+    module._tell_noise(float("nan"), 1, told.append)
+    module._tell_noise(0.5, 64, told.append)
+    module._tell_noise(2.1, 64, told.append)
+    assert told == [
+        "the noise of a pixel is 50 % of its light (median)",
+        "warning: the noise of a pixel is 210 % of its light (median). "
+        "--spp 1200 would bring it to 50 %",
+    ]
+
+
 def test_what_a_killed_capture_has_left_is_told(tmp_path, told):
     left, other = tmp_path / f".data.{'a' * 16}.partial", tmp_path / ".data.mine.partial"
     for folder in (left, other):
@@ -262,3 +288,44 @@ def test_a_half_opaque_leaf_is_half_as_bright_as_an_opaque_one(tmp_path):
     opaque, half = images
     assert opaque[..., :3].min() > 0.05
     np.testing.assert_allclose(half.mean((0, 1)), opaque.mean((0, 1)) / 2, rtol=0.02)
+
+
+def test_the_truth_of_a_blend_is_that_of_the_part_to_fit(tmp_path):
+    """It was the mean with what Mitsuba tells of the other: white metal, black glass."""
+    blend = '<bsdf type="blendbsdf"><float name="weight" value="0.2"/>{}</bsdf>'
+    rough = '<bsdf type="principled"><rgb name="base_color" value="0.6 0.3 0.1"/>'
+    rough += '<float name="roughness" value="0.7"/></bsdf>'
+    for number, known in enumerate(("roughconductor", "dielectric")):
+        for order in (1, -1):
+            sides = "".join([rough, f'<bsdf type="{known}"/>'][::order])
+            wall = f'<shape type="rectangle">{blend.format(sides)}</shape>'
+            text = f'<scene version="3.0.0"><emitter type="constant"/>{wall}</scene>'
+            (tmp_path / "scene.xml").write_text(text)
+            out, cameras = tmp_path / f"{number} {order}", front(tmp_path)
+            found = capture(
+                str(tmp_path / "scene.xml"), out, TINY, cameras=cameras, tell=lambda line: None
+            )
+            albedo, roughness = (read_exr(found.views[0].truth[q]) for q in ("albedo", "roughness"))
+            np.testing.assert_allclose(albedo, np.full((4, 4, 4), [0.6, 0.3, 0.1, 1]), atol=1e-3)
+            np.testing.assert_allclose(roughness[..., :3], 0.7, atol=1e-3)
+
+
+ON_A_GROUND = """<scene version="3.0.0">
+  <emitter type="constant"/>
+  <sensor type="perspective"><transform name="to_world">
+    <lookat origin="0, 3, 8" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
+  <bsdf type="diffuse" id="grey"/>
+  <shape type="cube">{0}</shape>
+  <shape type="cube">{0}<transform name="to_world">
+    <scale x="20" y="0.005" z="20"/><translate y="-1.005"/></transform></shape>
+</scene>
+"""
+
+
+@pytest.mark.parametrize("bsdf", ['<ref id="grey"/>', ""], ids=["one", "none"])
+def test_a_ground_of_the_object_s_own_material_does_not_move_its_cameras(bsdf, tmp_path):
+    """Mitsuba merges meshes of one BSDF, and the object was a few pixels wide."""
+    (tmp_path / "scene.xml").write_text(ON_A_GROUND.format(bsdf))
+    found = capture(tmp_path / "scene.xml", tmp_path / "data", TINY, tell=lambda line: None)
+    assert found.background == "hidden" and found.coverage > 0.3
+    assert max(np.linalg.norm(view.camera.origin) for view in found.views) < 10

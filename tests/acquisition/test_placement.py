@@ -12,6 +12,7 @@ from unbake.acquisition.placement import (
     is_room,
     place_object,
     place_room,
+    view_counts,
 )
 from unbake.dataset.camera import Camera
 from unbake.dataset.views import check_cameras
@@ -135,6 +136,38 @@ def test_rooms_are_told_from_objects(room, ball):
     assert not is_room(scene(box=box((0, 0, 0), 1.0), sensor=sensor((0, 3, 5), (0, 0, 0))))
 
 
+SKY = {"type": "constant"}
+GLOW = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+
+
+@pytest.mark.parametrize("bsdf", [MATTE, MATTE["bsdf"]], ids=["two-sided", "one-sided"])
+def test_a_closed_box_is_a_room_only_if_there_is_light_in_it(bsdf):
+    """Nothing but the light tells a cube that is an object from one that is a room."""
+    thing = box((0, 0, 0), 1.0) | {"bsdf": bsdf}
+    inward = thing | {"flip_normals": True}
+    assert not is_room(scene(thing=thing, sky=SKY))
+    assert not is_room(scene(thing=inward, sky=SKY))
+    assert is_room(scene(thing=inward, lamp=on_emitter((0.2, 0.3, 0))))
+    assert is_room(scene(furnace=inward | {"light": GLOW}))
+
+
+def test_black_backs_of_materials_to_fit_tell_the_inside_of_an_object():
+    """Principled BSDFs say that they have a back, which is black all the same."""
+    for bsdf, inside in ((MATTE, False), (MATTE["bsdf"], True), ({"type": "diffuse"}, True)):
+        thing = scene(thing=box((0, 0, 0), 1.0) | {"bsdf": bsdf})
+        assert free_space.inside_geometry(thing, np.zeros((1, 3))).tolist() == [inside]
+
+
+@pytest.mark.parametrize("ground", [False, True])
+def test_a_lamp_around_everything_is_a_sky(ground):
+    dome = {"type": "sphere", "radius": 50.0, "flip_normals": True, "light": GLOW}
+    shapes = {"thing": box((0, 0, 0), 1.0), "dome": dome}
+    shapes |= {"ground": lawn(-1, 30)} if ground else {}
+    assert not is_room(scene(**shapes, sensor=sensor((0, 2, 6), (0, 0, 0))))
+    camera = Camera.look_at((0, 2, 6), (0, 0, 0), (0, 1, 0), 60.0, 8, 8)
+    assert not is_room(scene(**shapes), [camera])
+
+
 def test_a_box_without_its_front_is_a_room_seen_from_outside():
     shapes = walls()
     del shapes["wall2"]
@@ -154,6 +187,52 @@ def test_up_is_the_axis_that_the_sensor_stands_on(up):
 
 def test_up_is_y_without_a_sensor():
     assert free_space.up_axis(scene(ball={"type": "sphere"})).tolist() == [0, 1, 0]
+
+
+def square(half, z=0):
+    """A square whose normal is the z axis."""
+    to_world = mi.ScalarTransform4f().translate([0, 0, z]).scale(half)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": MATTE}
+
+
+@pytest.mark.parametrize(
+    ("origin", "up"),
+    [
+        ((0, -1, 2), (0, 0, 1)),
+        ((1, 0, 3), (0, 0, 1)),
+        ((0, 0, 5), (0, 1, 0)),
+        ((0, 0, 5), (1, 2, 0)),
+    ],
+    ids=["steep", "steeper", "straight", "straight and turned"],
+)
+def test_a_camera_that_looks_down_on_a_ground_has_its_normal_for_up(origin, up):
+    """Pitched by more than 45 degrees, the axis nearest to its own y axis is level."""
+    ball = {"type": "sphere", "center": [0, 0, 1], "bsdf": MATTE}
+    look = sensor(origin, (0, 0, 0), up)
+    assert free_space.up_axis(scene(ball=ball, ground=square(5), sensor=look)).tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    "origin", [(0, 0, 4), (0, -1.5, 4), (0, 2, 4)], ids=["level", "upwards", "downwards"]
+)
+def test_a_wall_in_front_of_a_camera_is_no_ground(origin):
+    ball = {"type": "sphere", "center": [0, -0.5, 0], "radius": 0.5, "bsdf": MATTE}
+    shapes = {"wall": walls()["wall0"], "floor": lawn(-1, 1), "ball": ball}
+    look = sensor(origin, (0, 0, 0))
+    studio = scene(**shapes, sensor=look)
+    assert free_space.up_axis(studio).tolist() == [0, 1, 0]
+    house = scene(front=square(1, z=1), rest=box((0, 0, 0), 0.99), sensor=look)
+    assert free_space.up_axis(house).tolist() == [0, 1, 0]
+
+
+def test_up_is_told_by_a_camera_and_not_by_a_light_meter():
+    to_world = mi.ScalarTransform4f().look_at([3, 0, 0], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    meter = {"type": "radiancemeter", "to_world": to_world, "film": film}
+    camera = sensor((2, 3, 1), (0, 0, 0), (0, 0, 1))
+    both = scene(ball={"type": "sphere"}, meter=meter, sensor=camera)
+    assert len(both.sensors()) == 2
+    assert free_space.up_axis(both).tolist() == [0, 0, 1]
 
 
 def test_an_object_is_seen_from_the_upper_hemisphere(ball):
@@ -336,3 +415,52 @@ def test_backs_of_one_sided_materials_are_told():
     assert share(matte, back) == 1 and share(matte, front) == 0
     assert share(MATTE, back) == 0
     assert share({"type": "roughconductor"}, back) == 0, "that is known"
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_cameras_of_an_object_stand_in_front_of_its_backdrop(flipped):
+    """A spiral has half of its cameras behind it, where they see its back."""
+    ball = {"type": "sphere", "bsdf": MATTE}
+    to_world = mi.ScalarTransform4f().translate([0, 0, -2]).scale([4, 3, 1])
+    drop = {"type": "rectangle", "to_world": to_world, "bsdf": MATTE, "flip_normals": flipped}
+    placed = place_object(scene(ball=ball, drop=drop, sensor=sensor((0, 1, 9), (0, 0, 0))), 12, 4)
+    assert [split for split, _ in placed] == ["train"] * 12 + ["heldout"] * 4
+    eyes = np.array([look_at.origin for _, look_at in placed])
+    assert (eyes[:, 2] > -2).all() and len(np.unique(eyes, axis=0)) == 16
+    away = np.linalg.norm(eyes - placed[0][1].target, axis=1)
+    assert np.allclose(away, away[0])
+    height = eyes[:, 1] / away
+    assert (eyes[:, 0] > 2).any() and (eyes[:, 0] < -2).any()
+    assert height.min() < 0.3 and height.max() > 0.7
+    # Nothing tells the front without a sensor.
+    untold = place_object(scene(ball=ball, drop=drop), 12, 4)
+    assert any(look_at.origin[2] < -2 for _, look_at in untold)
+
+
+THINGS = {
+    "ball": {"type": "sphere", "bsdf": MATTE},
+    "one-sided cube": {"type": "cube", "bsdf": MATTE["bsdf"]},
+    "cup": {"type": "cylinder", "p0": [0, -1, 0], "p1": [0, 1, 0], "bsdf": MATTE},
+}
+
+
+@pytest.mark.parametrize("name", THINGS)
+@pytest.mark.parametrize("eye", [(0, 3, 4), (3, 1, 5), (2, 4, -1)])
+def test_an_object_that_can_be_seen_all_round_keeps_its_cameras(name, eye):
+    """Its sensor sees one side of it, and inner sides of a cup."""
+    thing = THINGS[name]
+    seen = place_object(scene(thing=thing, sensor=sensor(eye, (0, 0, 0))), 20, 4)
+    assert seen == place_object(scene(thing=thing), 20, 4)
+
+
+def test_a_large_floor_does_not_count_in_the_coverage_of_an_object():
+    """It was 3 % of a hundred metres of floor."""
+    ball = {"type": "sphere", "center": [0, 1, 0], "bsdf": MATTE}
+    look = sensor((0, 2, 6), (0, 1, 0))
+    stage = scene(ball=ball, floor=lawn(0, 50), sensor=look)
+    cameras = [look_at.camera(32, 32) for _, look_at in place_object(stage, 12, 0)]
+    assert coverage(stage, cameras, 4000) > 0.8
+    assert (view_counts(stage, cameras, 4000) > 0).mean() > 0.8
+    # A floor that is all there is counts.
+    above = Camera.look_at((0, 4, 0.1), (0, 0, 0), (0, 1, 0), 60.0, 32, 32)
+    assert coverage(scene(floor=lawn(0, 1), sensor=look), [above], 2000) > 0.95

@@ -9,7 +9,7 @@ import pytest
 from scene_texts import BALL, DIFFUSE, PRINCIPLED, ROUGHPLASTIC, WRAPPERS, render
 
 from unbake.errors import UserError
-from unbake.fields.shapes import met_shapes
+from unbake.fields.shapes import bsdf_classes, met_shapes
 from unbake.fields.texture import material_textures
 from unbake.imaging.pictures import write_exr
 from unbake.scene import edit
@@ -160,3 +160,26 @@ def test_roughness_is_shown_in_place_of_albedo(parse):
     parsed = parse(BALL.format(content) + BALL.format('<bsdf type="principled"/>'))
     edit.show_as_albedo(parsed, "roughness", 0.5)
     assert [n.props["base_color"] for n in parsed.principled_nodes()] == [pytest.approx(0.3), 0.5]
+
+
+def blended(first, second):
+    return f'<bsdf type="blendbsdf"><float name="weight" value="0.2"/>{first}{second}</bsdf>'
+
+
+def test_the_part_to_fit_fills_blends_with_a_part_that_is_known(parse):
+    metal, matte = '<bsdf type="roughconductor"/>', '<bsdf type="principled"/>'
+    bumpy = WRAPPERS["bumpmap"].format(matte)
+    shapes = [
+        blended(metal, matte),
+        blended(bumpy, metal),
+        WRAPPERS["twosided"].format(blended(metal, blended(matte, matte))),
+        blended(matte, matte),
+        blended(metal, metal),
+    ]
+    parsed = parse("".join(BALL.format(shape) for shape in shapes))
+    assert edit.fill_blends(parsed) == 3 and edit.fill_blends(parsed) == 0
+    scene = parsed.instantiate(merge=False)
+    metals = ["RoughConductor" in bsdf_classes(shape) for shape in scene.shapes()]
+    assert sorted(metals) == [False] * 4 + [True]
+    bumps = ["BumpMap" in bsdf_classes(shape) for shape in scene.shapes()]
+    assert sorted(bumps) == [False] * 4 + [True]

@@ -1,9 +1,9 @@
-"""Textures where Mitsuba cannot use them, or reads them in another way than one would think."""
+"""What Mitsuba or a fit cannot use is refused; other textures are read as Mitsuba reads them."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from scene_texts import BALL
+from scene_texts import BALL, WRAPPERS
 
 from unbake.errors import UserError
 from unbake.scene.edit import show_as_albedo
@@ -38,6 +38,57 @@ MATTE = '<bsdf type="diffuse"/>'
 def test_what_mitsuba_cannot_read_is_refused_with_its_line(shape, fault, parse):
     with pytest.raises(UserError, match=rf"scene.xml \(line.*{fault}"):
         parse(BALL.format(shape))
+
+
+METAL = '<bsdf type="roughconductor"/>'
+BOTH = '<bsdf type="twosided">{}{}</bsdf>'
+BLEND = '<bsdf type="blendbsdf"><float name="weight" value="0.2"/>{}{}</bsdf>'
+
+
+@pytest.mark.parametrize(
+    "sides",
+    [(MATTE, METAL), ('<bsdf type="principled"/>', MATTE), (METAL, BLEND.format(MATTE, METAL))],
+    ids=["one to fit", "two to fit", "in a blend"],
+)
+def test_two_sides_of_unlike_materials_are_refused_with_their_line(sides, parse):
+    """One material was fitted to both."""
+    both = BOTH.format(*sides)
+    with pytest.raises(UserError, match=r"scene.xml \(line.*the two sides .*shape of its own"):
+        parse(BALL.format(both))
+    parse(both.replace("<bsdf", '<bsdf id="unused"', 1) + BALL.format(MATTE))
+
+
+def test_two_sides_may_be_known_or_alike(parse):
+    shared = '<bsdf type="diffuse" id="matte"/>'
+    alike = BOTH.format('<ref name="front" id="matte"/>', '<ref name="back" id="matte"/>')
+    known = BOTH.format(METAL, '<bsdf type="conductor"/>')
+    scene = parse(shared + BALL.format(alike) + BALL.format(known))
+    assert len(scene.instantiate(merge=False).shapes()) == 2
+
+
+OPEN = {
+    "null": '<bsdf type="null"/>',
+    "thin": '<bsdf type="thindielectric"/>',
+    "mask": f'<bsdf type="mask">{MATTE}</bsdf>',
+}
+
+
+@pytest.mark.parametrize("name", OPEN)
+@pytest.mark.parametrize("around", WRAPPERS)
+def test_blends_that_let_light_pass_are_refused_with_their_line(around, name, parse):
+    """No light that bounces find arrived at them, and fits were too bright."""
+    for blend in (BLEND.format(MATTE, OPEN[name]), BLEND.format(OPEN[name], METAL)):
+        shape = BALL.format(WRAPPERS[around].format(blend))
+        with pytest.raises(UserError, match=r"scene.xml \(line.*a blend with a BSDF that .*a mask"):
+            parse(shape)
+        with pytest.raises(UserError, match="a blend with a BSDF that lets light pass"):
+            parse(f'<shape type="shapegroup" id="group">{shape}</shape>')
+
+
+def test_blends_that_no_shape_has_and_masks_around_blends_are_taken(parse):
+    unused = BLEND.format(MATTE, OPEN["null"]).replace("<bsdf", '<bsdf id="unused"', 1)
+    masked = f'<bsdf type="mask">{BLEND.format(MATTE, METAL)}</bsdf>'
+    assert parse(unused + BALL.format(masked)).instantiate()
 
 
 def test_colours_of_vertices_are_refused_in_instances_alone(parse):

@@ -220,6 +220,15 @@ def test_the_command_writes_the_folder_and_fits_eighty_columns(unbake, tmp_path,
     assert again.status == 2 and "not empty" in again.err
 
 
+def test_pictures_of_a_solve_have_the_names_of_a_camera_file(tmp_path):
+    camera = {"name": "corner", "origin": [0.9, 0.9, 0.9], "target": [0, 0, 0], "up": [0, 0, 1]}
+    (tmp_path / "cameras.json").write_text(json.dumps([camera | {"fov": 75}]))
+    settings = SolveSettings(steps=3, batch=64, views=1, resolution=8, spp=4, final_spp=4,
+                             reference_spp=0, radiance=SMALL)  # fmt: skip
+    made = solve("furnace", tmp_path / "out", settings, cameras=tmp_path / "cameras.json")
+    assert made["views"] == ["corner"] and (tmp_path / "out" / "corner-rhs.exr").is_file()
+
+
 def test_a_solve_that_is_stopped_keeps_all_that_was_learned(tmp_path, monkeypatch):
     """A signal comes while the clock waits for the steps, far from a measurement."""
     taken, sent = [], []

@@ -1,4 +1,4 @@
-"""Light of emitters: what cut-outs let pass is that of Mitsuba's volumetric path tracer."""
+"""Light of emitters: what cut-outs and panes let pass is that of Mitsuba's `volpath`."""
 
 import mitsuba as mi
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from support import assert_same_expectation, pixel_rays, stock_path
 
 from unbake.dataset.camera import Camera
-from unbake.transport.emitter_sampling import has_cut_outs, lights_pierce
+from unbake.transport.emitter_sampling import has_cut_outs, lets_pass, lights_pierce
 from unbake.transport.light_by_depth import light_by_depth
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.render import path_integrator
@@ -34,10 +34,13 @@ LIGHTS = {
 }
 
 
-def scene_of(*lights, opacity=0.3, count=2):
-    """A floor under some cut-outs and lights, and rays of a camera beside them."""
+def scene_of(*lights, opacity=0.3, count=2, leaf=None):
+    """A floor under some leaves (cut-outs) and lights, and rays of a camera beside them."""
     material = {"type": "twosided", "bsdf": {"type": "principled", "roughness": 0.5}}
-    leaf = {"type": "mask", "opacity": opacity, "bsdf": material} if opacity < 1 else material
+    if leaf is None:
+        leaf = material
+        if opacity < 1:
+            leaf = {"type": "mask", "opacity": opacity, "bsdf": material}
     content = {"type": "scene", "floor": {"type": "rectangle", "bsdf": material}}
     for number in range(count):
         place = mi.ScalarTransform4f().translate([0.1, 0, 0.5 + 0.3 * number]).scale(0.5)
@@ -69,6 +72,49 @@ def test_what_is_opaque_hides_them():
     ours = path_traced(view, ray, 2, max_depth=4, rr_depth=5, hide_emitters=False)
     assert_same_expectation(ours, theirs, 1024)
     assert has_cut_outs(scene_of("lamp")[0]) and not lights_pierce(scene_of("lamp")[0])
+
+
+@pytest.mark.parametrize("pane", ["thindielectric", "null"])
+@pytest.mark.parametrize("lights", [["point"], ["directional"], ["spot", "sky"]], ids=" ".join)
+def test_lights_shine_through_panes(lights, pane):
+    """They left rooms behind windows dark, in photographs and fits."""
+    scene, ray = scene_of(*lights, leaf={"type": pane})
+    assert lights_pierce(scene) and path_integrator(scene) == "volpath"
+    assert lets_pass(scene) and not has_cut_outs(scene)
+    theirs = stock_path(scene, ray, 3, max_depth=16, integrator="volpath")
+    view = SceneView.of(scene, None, 16)
+    ours = path_traced(view, ray, 2, max_depth=16, rr_depth=5, hide_emitters=False)
+    assert_same_expectation(ours, theirs, 1024)
+
+
+@pytest.mark.parametrize("pane", ["thindielectric", "null"])
+def test_a_sun_behind_a_window_lights_what_is_before_it(pane):
+    """By the share that passes the pane, which does not scatter; both of its sides are alike."""
+    window = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 1]).scale(9)}
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse"}}
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
+    ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 0.5), mi.Vector3f(0, 0, -1))
+    light = {}
+    for name in (None, pane, "turned"):
+        shapes = {"floor": floor, "sun": sun}
+        if name is not None:
+            turned = {"flip_normals": name == "turned"}
+            shapes["window"] = window | turned | {"bsdf": {"type": pane}}
+        scene = mi.load_dict({"type": "scene", **shapes})
+        view = SceneView.of(scene, None, 8)
+        found = path_traced(view, ray, 2, max_depth=2, rr_depth=5, hide_emitters=False)
+        light[name] = np.array(found).mean()
+        volumetric = np.array(stock_path(scene, ray, 3, max_depth=2, integrator="volpath")).mean()
+        assert light[name] == pytest.approx(volumetric, rel=1e-4) and light[name] > 0.1
+    once = ((1.5046 - 1.000277) / (1.5046 + 1.000277)) ** 2
+    share = 1 - 2 * once / (1 + once) if pane == "thindielectric" else 1
+    assert light[pane] == pytest.approx(share * light[None], rel=1e-3)
+    assert light["turned"] == pytest.approx(light[pane], rel=1e-4)
+
+
+def test_rays_meet_skies_and_lamps_behind_panes():
+    scene, _ = scene_of("sky", "lamp", leaf={"type": "thindielectric"})
+    assert lets_pass(scene) and not lights_pierce(scene) and path_integrator(scene) == "path"
 
 
 def test_the_depth_of_light_counts_what_passes():

@@ -8,6 +8,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -26,7 +27,7 @@ from ..imaging.pictures import write_exr
 from ..io import is_locked, locked, removed_with_parents, require_file, require_utf8
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
-from ..scene.parse import parse, write
+from ..scene.parse import ParsedScene, parse, write
 from ..signals import cleaned_up
 from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
@@ -38,6 +39,8 @@ from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
 #: Samples a pixel of the truth images, which are noisy at edges only.
 TRUTH_SAMPLES = 16
+#: From so much noise on, in parts of a pixel's light, more samples are recommended.
+_NOISY = 0.5
 
 _KIND = "data folder"
 #: How the names of unfinished captures end.
@@ -139,30 +142,22 @@ def _capture(
     allow_outside: bool,
     tell: Callable[[str], None],
 ) -> Dataset:
-    path, scene = _copy_scene(name, data.scene, light, allow_outside, tell)
-    posed = posed_cameras(name, scene, settings, camera_file)
-    if not any(split == "train" for split, _ in posed):
-        remedy = "Ask for at least one with --views"
-        raise UserError("no training view", where=camera_file, remedy=remedy)
-    counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
-    trained = [c for split, c in posed if split == "train"]
-    seen = coverage(scene, trained, own=camera_file is None)
-    tell(
-        f"{counts['train']} training and {counts['heldout']} held-out views; the training views "
-        f"see {100 * seen:.0f} % of the surface"
-    )
-    black = black_share(scene, [camera for _, camera in posed])
-    if black > BLACK:
-        tell(f"warning: {100 * black:.0f} % {BLACK_BACKS}. {TURN_THEM}")
-    # Cameras of a file may stand elsewhere than the scene's own sensors.
-    room = is_room(scene, () if camera_file is None else [c for _, c in posed])
+    written = data.scene.with_name("made")
+    file = write_scene(name, written) if name in SCENES else Path(name)
+    source = _Source(file, light, allow_outside)
+    path, apart = _copy_scene(source, data.scene, tell)
+    posed, seen, room = _choose_views(name, apart, settings, camera_file, tell)
+    del apart  # while two scenes live, kernels have the shapes of both
+    scene = source.instance()
+    shutil.rmtree(written, ignore_errors=True)
     rays = CameraRays.of([c for _, c in posed])
     # Stratified samples have a third less variance than independent ones at the same cost.
     spp = samples_of_grid(settings.spp)
     if spp != settings.spp:
         tell(f"{spp} samples per pixel instead of {settings.spp}: they fill a grid")
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    rgb, alpha = photographs(scene, rays, settings, sampler, room, tell)
+    rgb, alpha, noise = photographs(scene, rays, settings, sampler, room, tell)
+    _tell_noise(noise, spp, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
     shares = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
@@ -202,6 +197,37 @@ def _capture(
     )
 
 
+def _choose_views(
+    name: str,
+    scene: mi.Scene,
+    settings: CaptureSettings,
+    camera_file: Path | None,
+    tell: Callable[[str], None],
+) -> tuple[list[tuple[str, Camera]], float, bool]:
+    """The cameras and their splits, and what is told of them.
+
+    Returns:
+        Cameras; the share of the surface that training views see; whether they stand in a room.
+    """
+    posed = posed_cameras(name, scene, settings, camera_file)
+    if not any(split == "train" for split, _ in posed):
+        remedy = "Ask for at least one with --views"
+        raise UserError("no training view", where=camera_file, remedy=remedy)
+    counts = {split: sum(s == split for s, _ in posed) for split in ("train", "heldout")}
+    trained = [c for split, c in posed if split == "train"]
+    seen = coverage(scene, trained, own=camera_file is None)
+    tell(
+        f"{counts['train']} training and {counts['heldout']} held-out views; the training views "
+        f"see {100 * seen:.0f} % of the surface"
+    )
+    black = black_share(scene, [camera for _, camera in posed])
+    if black > BLACK:
+        tell(f"warning: {100 * black:.0f} % {BLACK_BACKS}. {TURN_THEM}")
+    # Cameras of a file may stand elsewhere than the scene's own sensors.
+    room = is_room(scene, () if camera_file is None else [c for _, c in posed])
+    return posed, seen, room
+
+
 def samples_of_grid(count: int) -> int:
     """The samples of the grid, nearly a square, that has so many or a few more.
 
@@ -211,39 +237,48 @@ def samples_of_grid(count: int) -> int:
     return rows * -(-count // rows)
 
 
+@dataclass(frozen=True)
+class _Source:
+    """The scene to be captured, read anew for each use; errors name the user's file."""
+
+    file: Path
+    light: LightConfig | None
+    allow_outside: bool
+
+    def parsed(self, tell: Callable[[str], None]) -> ParsedScene:
+        """The scene under the light of the photographs."""
+        root = Path(self.file.resolve().anchor) if self.allow_outside else None
+        parsed = parse(self.file, root)
+        if self.light is not None:
+            change_light(parsed, self.light, self.allow_outside, tell)
+        return parsed
+
+    def instance(self, *, merge: bool = True) -> mi.Scene:
+        """The same with opaque BSDFs turned into `principled`."""
+        parsed = self.parsed(lambda line: None)
+        edit.to_principled(parsed)
+        return parsed.instantiate(merge=merge)
+
+
 def _copy_scene(
-    name: str,
-    folder: Path,
-    light: LightConfig | None,
-    allow_outside: bool,
-    tell: Callable[[str], None],
+    source: _Source, folder: Path, tell: Callable[[str], None]
 ) -> tuple[Path, mi.Scene]:
     """Write the scene and its files into the folder, opaque BSDFs turned into `principled`.
 
-    The scene that is returned comes from the original, so that errors name the user's file.
+    Returns:
+        The file that was written, and the scene with its meshes apart.
     """
     folder.mkdir(parents=True)
-    made = folder.with_name("made")
-    source = write_scene(name, made) if name in SCENES else Path(name)
-    root = Path(source.resolve().anchor) if allow_outside else None
-    parsed = parse(source, root)
-    if light is not None:
-        change_light(parsed, light, allow_outside, tell)
+    parsed = source.parsed(tell)
     if parsed.media:
         tell(f"participating media are left out: {parsed.media}")
     changed = edit.to_principled(parsed)
     if changed:
         tell(f"{changed} BSDFs made principled")
-    original = parse(source, root)
-    if light is not None:
-        change_light(original, light, allow_outside, lambda line: None)
-    edit.to_principled(original)
-    scene = original.instantiate()
-    edit.require_optimized(scene, source)
-    emitters.require_emitters(scene, source)
-    path = write(parsed, folder)
-    shutil.rmtree(made, ignore_errors=True)
-    return path, scene
+    scene = source.instance(merge=False)
+    edit.require_optimized(scene, source.file)
+    emitters.require_emitters(scene, source.file)
+    return write(parsed, folder), scene
 
 
 def posed_cameras(
@@ -253,7 +288,7 @@ def posed_cameras(
 
     Args:
         name: of the scene, a file or a built-in one.
-        scene: the same.
+        scene: the same. Shapes tell its ground from what stands on it: merged meshes may hide it.
         settings: how many, and the size of their images.
         file: a camera file; None: the built-in scene's own cameras, or automatic placement.
 
@@ -279,7 +314,7 @@ def photographs(
     sampler: mi.Sampler,
     room: bool,
     tell: Callable[[str], None],
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Path trace all pixels of all views with Mitsuba.
 
     Args:
@@ -291,7 +326,9 @@ def photographs(
         tell: called with lines of progress.
 
     Returns:
-        Linear RGB (pixels, 3) and alpha (pixels,), float32.
+        Linear RGB (pixels, 3) and alpha (pixels,), float32; and the noise of a pixel: the standard
+        error of its luminance in parts of that, median of the pixels with light. It is NaN where
+        there is none, and where a pixel has one sample. Stratified samples have somewhat less.
 
     Raises:
         UserError: pixels are not finite.
@@ -308,21 +345,46 @@ def photographs(
     sampler.set_samples_per_wavefront(spp)
     rgb = np.zeros((rays.pixels, 3), np.float32)
     alpha = np.zeros(rays.pixels, np.float32)
+    noise = np.full(rays.pixels, np.nan, np.float32)
     told = 0.0
     for part, ray, seed in parts_of(rays.through, rays.pixels, spp, settings.seed):
         sampler.seed(dr.opaque(mi.UInt32, seed), dr.width(ray))
         radiance, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))
-        channels = [*radiance, dr.select(valid, mi.Float(1), 0)]
+        light = mi.luminance(radiance)
+        channels = [*radiance, dr.select(valid, mi.Float(1), 0), light, light**2]
         dr.eval(channels)
         means = [np.array(dr.block_sum(c, spp)) / spp for c in channels]
         rgb[part], alpha[part] = np.stack(means[:3], -1), means[3]
+        noise[part] = _relative_error(means[4], means[5], spp)
         if part.stop / rays.pixels - told >= 0.25 or part.stop == rays.pixels:
             told = part.stop / rays.pixels
             tell(f"rendered {100 * told:.0f} % of the pixels")
     if not np.isfinite(rgb).all():
         count = int((~np.isfinite(rgb).all(1)).sum())
         raise UserError(f"{count} rendered pixels are not finite", None, "Check the scene's values")
-    return rgb, np.minimum(alpha, 1)
+    lit = noise[np.isfinite(noise)]
+    return rgb, np.minimum(alpha, 1), float(np.median(lit)) if lit.size else math.nan
+
+
+def _relative_error(light: np.ndarray, squares: np.ndarray, spp: int) -> np.ndarray:
+    """The standard error of means of `spp` values, in parts of the mean; NaN where that is 0."""
+    if spp == 1:
+        return np.full_like(light, np.nan)
+    variance = np.maximum(squares - light**2, 0) / (spp - 1)
+    return np.divide(np.sqrt(variance), light, out=np.full_like(light, np.nan), where=light > 0)
+
+
+def _tell_noise(noise: float, spp: int, tell: Callable[[str], None]) -> None:
+    """Say how noisy photographs are, and warn if no fit can see roughness in them."""
+    if math.isnan(noise):
+        return
+    what = f"the noise of a pixel is {100 * noise:.0f} % of its light (median)"
+    if noise > _NOISY:
+        more = spp * (noise / _NOISY) ** 2
+        digits = 10 ** max(math.floor(math.log10(more)) - 1, 0)
+        samples = math.ceil(more / digits) * digits
+        what = f"warning: {what}. --spp {samples} would bring it to {100 * _NOISY:.0f} %"
+    tell(what)
 
 
 def light_of_views(
@@ -365,10 +427,11 @@ def _truth(
     specular = 32  # for cut-outs (null interactions): pixels behind mirrors are masked out
     pictures, mask = {}, np.zeros(0)
     for name, quantity in QUANTITIES.items():
-        shown = scene
+        parsed, shown = parse(path), scene
+        blended = edit.fill_blends(parsed)
         if name != "albedo":
-            parsed = parse(path)
             edit.show_as_albedo(parsed, quantity.slot, quantity.default)
+        if blended or name != "albedo":
             shown = parsed.instantiate()
         values, mask = render_materials(
             SceneView.of(shown, None, specular), rays.through, rays.pixels, TRUTH_SAMPLES, seed=1

@@ -16,9 +16,8 @@ import numpy as np
 
 from unbake.dataset.camera import Camera, LookAt, spread_rays
 from unbake.errors import UserError
-from unbake.fields.shapes import bsdf_classes, met_shapes, registry_number
 from unbake.scene import free_space
-from unbake.transport.optimized import has_optimized_material
+from unbake.transport.optimized import one_sided_shapes
 
 # Sampling of candidate views: positions and surface points, directions and rays of each view.
 _POSITIONS = 240
@@ -32,6 +31,10 @@ _OVEREXPOSED = 30.0
 # One close view at normal incidence takes two thirds of a surface's value, 1 - exp(-1.1).
 _VALUE = 1.1
 _FREE_POSITIONS = 512
+#: How many times as many cameras as are wanted spirals around an object have, at most.
+_DENSEST = 16
+#: Surface points that tell what these cameras see, and cameras that are tested at once.
+_SEEN, _EYES = 500, 1024
 #: Rays along an edge of an image that look for backs; from this share of them on it is told.
 _BACKS, BLACK = 16, 0.01
 BLACK_BACKS = "of the pixels see backs of one-sided materials, which are black"
@@ -68,14 +71,16 @@ def is_room(scene: mi.Scene, cameras: Sequence[Camera] = ()) -> bool:
     """Whether the scene encloses its cameras (a room) or they stand around it (an object).
 
     A room has surfaces in 75 % of all directions, on average over the space that the cameras see;
-    without cameras, over the part of the bounding box outside closed objects.
+    without cameras, over the part of the bounding box outside closed objects that light reaches.
 
     Args:
+        scene: shapes tell its ground from what stands on it: merged meshes may hide it.
         cameras: that take the photographs; without any, the scene's own sensors stand for them.
     """
+    told = bool(cameras or scene.sensors())
     if cameras:
         probes = _probes(scene, cameras, 0)
-    elif scene.sensors():
+    elif told:
         probes = free_space.sensor_probes(scene, 0)
     else:
         low, high, _ = free_space.extent(scene)
@@ -83,7 +88,10 @@ def is_room(scene: mi.Scene, cameras: Sequence[Camera] = ()) -> bool:
     probes = probes[~free_space.inside_geometry(scene, probes)]
     if len(probes) == 0:
         return False
-    return bool(free_space.enclosure(scene, probes).mean() >= free_space.ROOM_ENCLOSURE)
+    enclosed = free_space.enclosure(scene, probes)
+    if not told and scene.emitters() and enclosed.mean() >= free_space.ROOM_ENCLOSURE:
+        enclosed = enclosed[free_space.is_lit(scene, probes)]
+    return bool(len(enclosed) and enclosed.mean() >= free_space.ROOM_ENCLOSURE)
 
 
 def _probes(scene: mi.Scene, cameras: Sequence[Camera], seed: int) -> np.ndarray:
@@ -160,6 +168,9 @@ def place_object(
     All have the same distance, at which the object just fits into the square images. A level
     ground plane that is larger than everything else does not count as part of the object.
 
+    Cameras that would see little but backs of what the scene's own sensors see, such as those
+    behind a backdrop, are left out: the others come from a denser spiral.
+
     Args:
         scene: the object.
         views: number of training views.
@@ -180,17 +191,12 @@ def place_object(
     low, high = _object_box(scene)
     centre, radius = _sphere(low, high)
     count = views + held_out
-    # Views from the horizon show least; at the pole the up direction is degenerate.
-    height = 0.08 + 0.87 * (np.arange(count) + 0.5) / count
-    turn = 2 * math.pi * np.random.default_rng(seed).random()
-    angle = turn + np.arange(count) * math.pi * (3 - math.sqrt(5))
-    side, front = _horizon(up)
-    level = np.sqrt(1 - height**2)[:, None]
-    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * front
-    outward = level * around + height[:, None] * up
     # Of a large floor nearly all points would lie far away from the object.
-    points = free_space.sample_surface(scene, _POINTS, 0, within=(low, high)).position - centre
-    eyes = centre + _fitting_distance(points, radius, outward, up, fov) * outward
+    points = free_space.sample_surface(scene, _POINTS, 0, within=(low, high))
+    farthest = radius * math.hypot(1, 1 / _reach(fov))
+    outward = _outward(scene, points, centre, farthest, up, count, seed)
+    distance = _fitting_distance(points.position - centre, radius, outward, up, fov)
+    eyes = centre + distance * outward
     middle = ((np.arange(held_out) + 0.5) * count / max(held_out, 1)).astype(int)
     tests = set(middle.tolist())
     train = [i for i in range(count) if i not in tests]
@@ -205,7 +211,8 @@ def coverage(
 ) -> float:
     """The fraction of the reachable surface area that at least one camera sees, in [0, 1].
 
-    Only surfaces whose material is optimized count (no emitters, mirrors or glass). A point is
+    Only surfaces whose material is optimized count (no emitters, mirrors or glass), and around an
+    object only those of the object, without a ground that is larger than all else. A point is
     reachable if a given camera sees it, or one of 512 other positions: in a room, positions in free
     space (`free_space.free_positions`); around an object, positions on the sphere of twice its
     radius, including below it. Backs of walls and insides of furniture are not reachable.
@@ -216,12 +223,13 @@ def coverage(
         samples: number of surface points tested, uniform by area.
         own: the scene's own sensors tell whether it is a room, and not these cameras.
     """
-    points = free_space.sample_surface(scene, samples, 1)
+    room = is_room(scene, () if own else cameras)
+    points = _counted(scene, samples, room)
     seen = np.zeros(len(points.position), dtype=bool)
     for camera in cameras:
         framed = np.flatnonzero(~seen & (camera.pixel_of(points.position) >= 0))
         seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
-    reachable = _reachable(scene, points, seen, () if own else cameras)
+    reachable = _reachable(scene, points, seen, () if own else cameras, room)
     return float(seen.sum() / max(reachable.sum(), 1))
 
 
@@ -231,20 +239,7 @@ def black_share(scene: mi.Scene, cameras: Sequence[Camera]) -> float:
     They are black. Materials that are known do not count.
     """
     hits = free_space.trace(scene, *spread_rays(cameras, _BACKS))
-    one_sided = [registry_number(shape) for shape in met_shapes(scene) if _is_one_sided(shape)]
-    return float((hits.back & np.isin(hits.shape, one_sided)).mean())
-
-
-def _is_one_sided(shape: mi.Shape) -> bool:
-    """Whether a shape's back is black, and could be fitted were it not."""
-    if not has_optimized_material(shape):
-        return False
-    if "TwoSidedBRDF" in bsdf_classes(shape):
-        return False
-    params = mi.traverse(shape.bsdf())
-    # Principled BSDFs say that they have a back; without transmission it is black.
-    transmitting = [params[key] for key in params.keys() if "spec_trans" in key]  # noqa: SIM118
-    return not any(np.max(np.array(value)) > 0 for value in transmitting)
+    return float((hits.back & np.isin(hits.shape, list(one_sided_shapes(scene)))).mean())
 
 
 def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000) -> np.ndarray:
@@ -256,13 +251,23 @@ def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000)
         samples: number of surface points tested, uniform by area; those that are reachable, as in
             `coverage`, are counted.
     """
-    points = free_space.sample_surface(scene, samples, 1)
+    room = is_room(scene, cameras)
+    points = _counted(scene, samples, room)
     counts = np.zeros(len(points.position), dtype=int)
     for camera in cameras:
         framed = np.flatnonzero(camera.pixel_of(points.position) >= 0)
         shown = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
         counts[framed] += shown
-    return counts[_reachable(scene, points, counts > 0, cameras)]
+    return counts[_reachable(scene, points, counts > 0, cameras, room)]
+
+
+def _counted(scene: mi.Scene, samples: int, room: bool) -> free_space.SurfacePoints:
+    """Points on the surface of a room, or of an object without its ground if that leaves any."""
+    if not room:
+        points = free_space.sample_surface(scene, samples, 1, within=_object_box(scene))
+        if len(points.position):
+            return points
+    return free_space.sample_surface(scene, samples, 1)
 
 
 def _reachable(
@@ -270,10 +275,11 @@ def _reachable(
     points: free_space.SurfacePoints,
     seen: np.ndarray,
     cameras: Sequence[Camera],
+    room: bool,
 ) -> np.ndarray:
     """Points that were seen, or that one of the standpoints sees."""
     reachable = seen.copy()
-    positions = _standpoints(scene, cameras)
+    positions = _standpoints(scene, cameras, room)
     # Most points are seen from the first few positions: the others are tested from ever more.
     first, count = 0, 1
     while first < len(positions) and not reachable.all():
@@ -421,8 +427,8 @@ def _axes(forwards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return right, np.cross(right, forwards)
 
 
-def _standpoints(scene: mi.Scene, cameras: Sequence[Camera]) -> np.ndarray:
-    if is_room(scene, cameras):
+def _standpoints(scene: mi.Scene, cameras: Sequence[Camera], room: bool) -> np.ndarray:
+    if room:
         probes = _probes(scene, cameras, 1) if cameras else None
         return free_space.free_positions(scene, _FREE_POSITIONS, 1, probes)
     centre, radius = _sphere(*_object_box(scene))
@@ -442,6 +448,80 @@ def _sphere(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
     return 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
 
 
+def _outward(
+    scene: mi.Scene,
+    points: free_space.SurfacePoints,
+    centre: np.ndarray,
+    distance: float,
+    up: np.ndarray,
+    count: int,
+    seed: int,
+) -> np.ndarray:
+    """Directions (count, 3) from the centre of an object to cameras, lower ones first.
+
+    They are those of a spiral, or evenly spread ones of a denser spiral where cameras of the first
+    one would stand behind things (`_sees_fronts`).
+    """
+    density = 1
+    while density <= _DENSEST:
+        spiral = _spiral(density * count, up, seed)
+        chosen = np.flatnonzero(_sees_fronts(scene, centre + distance * spiral, points))
+        if len(chosen) >= count:
+            return spiral[chosen[((np.arange(count) + 0.5) * len(chosen) / count).astype(int)]]
+        density *= 2
+    return _spiral(count, up, seed)
+
+
+def _spiral(count: int, up: np.ndarray, seed: int) -> np.ndarray:
+    """Directions (count, 3) of a Fibonacci spiral on the upper hemisphere."""
+    # Views from the horizon show least; at the pole the up direction is degenerate.
+    height = 0.08 + 0.87 * (np.arange(count) + 0.5) / count
+    turn = 2 * math.pi * np.random.default_rng(seed).random()
+    angle = turn + np.arange(count) * math.pi * (3 - math.sqrt(5))
+    side, front = _horizon(up)
+    level = np.sqrt(1 - height**2)[:, None]
+    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * front
+    return level * around + height[:, None] * up
+
+
+def _sees_fronts(scene: mi.Scene, eyes: np.ndarray, points: free_space.SurfacePoints) -> np.ndarray:
+    """Whether eyes (n, 3) see more than the backs of what the scene's own sensors see: (n,) bool.
+
+    What stands behind a backdrop sees little else. Without sensors, all do.
+    """
+    sensors = free_space.sensor_eyes(scene)
+    points = _subset(points, np.arange(0, len(points.position), len(points.position) // _SEEN or 1))
+    if not len(sensors) or not len(points.position):
+        return np.ones(len(eyes), dtype=bool)
+    wanted = _seen_sides(scene, sensors, points)
+    shares = []
+    for block in np.array_split(eyes, -(-len(eyes) // _EYES)):
+        shown = free_space.visibility(scene, block, points)
+        back = shown & (_sides(block, points) * wanted < 0)
+        shares.append([back.mean(axis=1), (shown & ~back).mean(axis=1)])
+    backs, others = np.concatenate(shares, axis=1)
+    return (backs <= others) | (others >= 0.5 * others.max())
+
+
+def _seen_sides(
+    scene: mi.Scene, sensors: np.ndarray, points: free_space.SurfacePoints
+) -> np.ndarray:
+    """The side of points that sensors (n, 3) see: 1 in front, -1 behind, else 0, (points,).
+
+    It is 0, too, on shapes whose both sides they see: a cup is no wall before which things stand.
+    """
+    shown, side = free_space.visibility(scene, sensors, points), _sides(sensors, points)
+    front, back = ((shown & (sign * side > 0)).any(axis=0).astype(int) for sign in (1, -1))
+    fronts, backs = (np.bincount(points.surface, weights=seen) for seen in (front, back))
+    both = np.minimum(fronts, backs) > 0.1 * (fronts + backs)
+    return np.where(both[points.surface], 0, front - back)
+
+
+def _sides(eyes: np.ndarray, points: free_space.SurfacePoints) -> np.ndarray:
+    """On which side of points (m) eyes (n, 3) are: 1 in front, -1 behind, (n, m)."""
+    return np.sign(eyes @ points.normal.T - (points.position * points.normal).sum(axis=1))
+
+
 def _fitting_distance(
     points: np.ndarray, radius: float, outward: np.ndarray, up: np.ndarray, fov: float
 ) -> float:
@@ -450,8 +530,12 @@ def _fitting_distance(
         return radius / math.sin(math.radians(fov) / 2)
     right, above = _axes(-outward, up)
     sides = np.maximum(np.abs(right @ points.T), np.abs(above @ points.T))
-    margin = 0.92 * math.tan(math.radians(fov) / 2)
-    return float((sides / margin + outward @ points.T).max())
+    return float((sides / _reach(fov) + outward @ points.T).max())
+
+
+def _reach(fov: float) -> float:
+    """How far from the axis of an image things may be, in their depth, to lie within a margin."""
+    return 0.92 * math.tan(math.radians(fov) / 2)
 
 
 def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -467,7 +551,9 @@ def _look_at(candidates: _Candidates, view: int, up: np.ndarray, fov: float) -> 
 
 
 def _subset(points: free_space.SurfacePoints, chosen: np.ndarray) -> free_space.SurfacePoints:
-    return free_space.SurfacePoints(points.position[chosen], points.normal[chosen])
+    return free_space.SurfacePoints(
+        points.position[chosen], points.normal[chosen], points.surface[chosen]
+    )
 
 
 def _triple(vector: np.ndarray) -> tuple[float, float, float]:

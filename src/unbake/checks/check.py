@@ -171,7 +171,7 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
     with collected(faults):
         parsed = parse(dataset.scene, dataset.root)
         edit.to_principled(parsed)
-        result.scene = scene = parsed.instantiate()
+        result.scene = scene = parsed.instantiate(merge=False)
         with collected(faults):
             edit.require_optimized(scene, dataset.scene)
         if dataset.light == "known":

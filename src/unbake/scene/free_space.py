@@ -6,6 +6,7 @@ Positions, normals and directions are (n, 3) float64 arrays in world space.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -14,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.shapes import placed_shapes, registry_number
-from ..transport.optimized import has_optimized_material
+from ..transport.optimized import has_optimized_material, one_sided_shapes
 from ..transport.render import path_integrator
 
 # Fractions of the diagonal of `extent`.
@@ -22,6 +23,10 @@ CLEARANCE = 0.03
 CONTACT = 1e-3
 SMALL_OBJECT = 0.15
 _RAY_OFFSET = 1e-4
+#: Thickness of flat shapes, as a fraction of their largest extent.
+_FLAT = 0.01
+#: Up to which sine above or below the horizon a camera looks level, and from which on up.
+_LEVEL, _UPWARDS = 0.01, 0.1
 
 # A room may have windows or lack a wall: the open front of a box takes a sixth of the directions.
 ROOM_ENCLOSURE = 0.75
@@ -41,17 +46,18 @@ class Hits:
 
     distance: np.ndarray  #: (n,) world units, infinite where nothing was hit
     back: np.ndarray  #: (n,) bool: a back face, by the geometric normal
-    black: np.ndarray  #: (n,) bool: a back face of a one-sided BSDF, which reflects nothing
+    black: np.ndarray  #: (n,) bool: a back face of a BSDF that has none, which reflects nothing
     shape: np.ndarray  #: (n,) number of the shape in Dr.Jit's registry; 0 where nothing was hit
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on surfaces whose material is optimized, (n, 3) each: positions and unit normals."""
+    """Points on surfaces whose material is optimized."""
 
-    position: np.ndarray
-    normal: np.ndarray
+    position: np.ndarray  #: (n, 3)
+    normal: np.ndarray  #: (n, 3), unit vectors
+    surface: np.ndarray  #: (n,) which shape, or instance of one, has them: numbers from 0
 
 
 def bounds(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray, float]:
@@ -75,11 +81,9 @@ def extent(scene: mi.Scene, *, lamps: bool = True) -> tuple[np.ndarray, np.ndarr
     kept = shapes if lamps else [shape for shape in shapes if not shape.is_emitter()]
     if not kept:
         return bounds(scene)
-    found = [(*box.min, *box.max) for box in (shape.bbox() for shape in kept)]
-    corners = np.array(found, dtype=np.float64).reshape(-1, 2, 3)
-    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    corners = _corners(kept)
     extents = np.ptp(corners, axis=1)
-    level = extents @ np.abs(up_axis(scene)) < 0.01 * extents.max(axis=1)
+    level = extents @ np.abs(up_axis(scene)) < _FLAT * extents.max(axis=1)
     rest = corners[~level]
     if len(rest):
         size = np.ptp(rest.reshape(-1, 3), axis=0).max()
@@ -92,20 +96,54 @@ def extent(scene: mi.Scene, *, lamps: bool = True) -> tuple[np.ndarray, np.ndarr
 
 
 def up_axis(scene: mi.Scene) -> np.ndarray:
-    """The scene's up direction (3,), a signed coordinate axis.
+    """The scene's up direction (3,), a signed coordinate axis; y without a sensor.
 
-    Of the axes perpendicular to the x axis of the first sensor, the one nearest to its y axis; y
-    without a sensor.
+    Of the axes perpendicular to the x axis of the first camera, the one nearest to its y axis. Two
+    are perpendicular where the x axis is a coordinate axis, too. A camera that would look level or
+    up then may as well look down, steeply or straight: where there is a ground decides.
     """
-    if not scene.sensors():
-        return np.array([0.0, 1.0, 0.0])
-    matrix = _matrix(scene.sensors()[0])
-    perpendicular = np.abs(matrix[0:3, 0]) < 0.17
-    nearness = np.abs(matrix[0:3, 1]) + perpendicular
-    axis = int(np.argmax(nearness))
-    up = np.zeros(3)
-    up[axis] = math.copysign(1.0, matrix[axis, 1])
+    up, sensors = np.zeros(3), scene.sensors()
+    if not sensors:
+        up[1] = 1.0
+        return up
+    camera = next(filter(_is_camera, sensors), sensors[0])
+    right, above, ahead = _matrix(camera)[:3, :3].T
+    # The y axis of a camera that looks straight down does not tell up from down.
+    signs = np.copysign(1.0, np.where(np.abs(above) > 1e-3, above, -ahead))
+    level = np.abs(right) < 0.17
+    axis = int(np.argmax(np.abs(above) + level))
+    slope = signs[axis] * ahead[axis]
+    if level.sum() == 2 and (abs(slope) < _LEVEL or slope > _UPWARDS):
+        other = int(np.argmax(level & (np.arange(3) != axis)))
+        if _has_ground(scene, other, signs[other]) and not _has_ground(scene, axis, signs[axis]):
+            axis = other
+    up[axis] = signs[axis]
     return up
+
+
+def _has_ground(scene: mi.Scene, axis: int, sign: float) -> bool:
+    """Whether all that is not a lamp stands on a flat shape, up being an axis of this sign."""
+    corners = _corners(shape for shape in scene.shapes() if not shape.is_emitter())
+    if not len(corners):
+        return False
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    extents, size = np.ptp(corners, axis=1), high - low
+    flat = extents[:, axis] < _FLAT * extents.max(axis=1)
+    wide = (np.delete(extents, axis, 1) > 0.9 * np.delete(size, axis)).all(axis=1)
+    rise = corners[:, 1, axis] - low[axis] if sign > 0 else high[axis] - corners[:, 0, axis]
+    return bool((flat & wide & (rise < 0.2 * size[axis])).any())
+
+
+def _corners(shapes: Iterable[mi.Shape]) -> np.ndarray:
+    """Lower and upper corners of shapes, (n, 2, 3), of those that are finite."""
+    found = [(*box.min, *box.max) for box in (shape.bbox() for shape in shapes)]
+    corners = np.array(found, dtype=np.float64).reshape(-1, 2, 3)
+    return corners[np.isfinite(corners).all(axis=(1, 2))]
+
+
+def _is_camera(sensor: mi.Sensor) -> bool:
+    """Whether a sensor is a perspective camera: the pose of others may say nothing."""
+    return "x_fov" in mi.traverse(sensor)
 
 
 def sphere_directions(count: int) -> np.ndarray:
@@ -173,10 +211,27 @@ def outgoing_radiance(
     """
     segment = points - eyes
     length = np.maximum(np.linalg.norm(segment, axis=1, keepdims=True), 1e-12)
+    return _incoming_radiance(scene, eyes, segment / length, seed, depth)
+
+
+def is_lit(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
+    """Whether light arrives at positions (n, 3), straight or from surfaces around: (n,) bool.
+
+    It must come from two of 64 directions: a little may leak through the edges of a closed box.
+    """
+    rays = _spheres(positions, sphere_directions(_DIRECTIONS))
+    light = _incoming_radiance(scene, *rays, seed=0, depth=6)
+    return (light.reshape(len(positions), -1) > 0).sum(axis=1) >= 2
+
+
+def _incoming_radiance(
+    scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, seed: int, depth: int
+) -> np.ndarray:
+    """Radiance along rays (n, 3), towards their origins: (n,), as `outgoing_radiance`."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, len(eyes))
+    sampler.seed(seed, len(origins))
     integrator = mi.load_dict({"type": path_integrator(scene), "max_depth": depth})
-    ray = mi.RayDifferential3f(as_ray(eyes, segment / length))
+    ray = mi.RayDifferential3f(as_ray(origins, directions))
     colour, _, _ = integrator.sample(scene, sampler, ray)
     return np.array(colour, dtype=np.float64).mean(axis=0)
 
@@ -210,7 +265,7 @@ def sample_surface(
         surfaces = [s for s in surfaces if (s.corners >= low).all() and (s.corners <= high).all()]
     share = np.array([surface.area for surface in surfaces]) ** power
     if share.sum() == 0:
-        return SurfacePoints(np.empty((0, 3)), np.empty((0, 3)))
+        return SurfacePoints(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, dtype=int))
     chosen = np.sort(rng.choice(len(surfaces), size=count, p=share / share.sum()))
     uv = mi.Point2f(rng.random((2, count)).astype(np.float32))
     numbers = np.array([surface.number for surface in surfaces], np.uint32)[chosen]
@@ -224,7 +279,7 @@ def sample_surface(
         position[here] = surfaces[i].moved(position[here])
         turned = surfaces[i].turned(normal[here])
         normal[here] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    return SurfacePoints(position, normal)
+    return SurfacePoints(position, normal, chosen)
 
 
 def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
@@ -242,16 +297,23 @@ def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
       because an object on the floor often has no bottom face.
     """
     result = np.zeros(len(positions), dtype=bool)
+    one_sided = list(one_sided_shapes(scene))
     for start in range(0, len(positions), 1024):
-        result[start : start + 1024] = _enclosed(scene, positions[start : start + 1024])
+        part = slice(start, start + 1024)
+        result[part] = _enclosed(scene, positions[part], one_sided)
     probes = sensor_probes(scene, 0)
     if result.any() and len(probes):
         result &= ~_connected(scene, positions, probes, 0)
     return result
 
 
-def _enclosed(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
-    """The tests of `inside_geometry` that need one position only."""
+def _enclosed(scene: mi.Scene, positions: np.ndarray, one_sided: list[int]) -> np.ndarray:
+    """The tests of `inside_geometry` that need one position only.
+
+    Args:
+        scene: around the positions, (n, 3).
+        one_sided: numbers of the shapes whose backs are black although their BSDFs have one.
+    """
     low, high, diagonal = extent(scene)
     directions = sphere_directions(256)
     hits = _trace_spheres(scene, positions, directions)
@@ -261,15 +323,52 @@ def _enclosed(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
     # A flat scene has no volume, so its box gets a minimal thickness.
     filled = np.prod(reach / np.maximum(high - low, 1e-6 * diagonal), axis=1)
     small = distance.max(axis=1) < SMALL_OBJECT * diagonal
-    black = hits.black.mean(axis=1) >= 0.75
+    black = (hits.black | (hits.back & np.isin(hits.shape, one_sided))).mean(axis=1) >= 0.75
     backs = hits.back.mean(axis=1) >= 0.75
     return enclosed & (small | black | (backs & (filled < 0.5)))
 
 
 def enclosure(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
-    """The fraction of directions from positions (n, 3) that hit a surface: (n,) in [0, 1]."""
-    hits = _trace_spheres(scene, positions, sphere_directions(_DIRECTIONS))
-    return np.isfinite(hits.distance).mean(axis=1)
+    """The fraction of directions from positions (n, 3) that hit a surface: (n,) in [0, 1].
+
+    A lamp around everything, such as a dome, stands for the sky and is no surface here.
+    """
+    return _enclosure(scene, _trace_spheres(scene, positions, sphere_directions(_DIRECTIONS)))
+
+
+def _enclosure(scene: mi.Scene, hits: Hits) -> np.ndarray:
+    """The same of hits (n, directions)."""
+    met = np.isfinite(hits.distance) & ~np.isin(hits.shape, _skies(scene, hits.shape))
+    return met.mean(axis=1)
+
+
+def _skies(scene: mi.Scene, met: np.ndarray) -> list[int]:
+    """The numbers of lamps that are around everything else.
+
+    They take more than half of all directions, or a quarter where all that is no lamp lies in their
+    box: a ground takes the lower half. Where there are lamps alone, as in a furnace, none is a sky.
+
+    Args:
+        scene: with lamps.
+        met: numbers of the shapes that rays in all directions hit.
+    """
+    shapes = scene.shapes()
+    lamps = [shape for shape in shapes if shape.is_emitter()]
+    if len(lamps) == len(shapes):
+        return []
+    skies = []
+    for lamp in lamps:
+        number = registry_number(lamp)
+        taken = np.count_nonzero(met == number) / max(met.size, 1)
+        if taken > 0.5 or (taken > 0.25 and _is_around(lamp, *extent(scene, lamps=False)[:2])):
+            skies.append(number)
+    return skies
+
+
+def _is_around(shape: mi.Shape, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether the box of a shape holds another one, but for rounding."""
+    slack = 1e-3 * np.linalg.norm(high - low)
+    return any((a <= low + slack).all() and (high - slack <= b).all() for a, b in _corners([shape]))
 
 
 def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
@@ -284,6 +383,18 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
         ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
         probes.append(probes_along(scene, as_rows(ray.o), as_rows(ray.d), rng))
     return np.concatenate(probes)
+
+
+def sensor_eyes(scene: mi.Scene) -> np.ndarray:
+    """Where the scene's own sensors stand, (n, 3); perspective cameras alone, if there are any."""
+    sensors = scene.sensors()
+    sensors = sensors[:: max(1, len(sensors) // PROBES)]
+    middle = mi.Point2f(0.5)
+    found = [np.empty((0, 3))]
+    for sensor in list(filter(_is_camera, sensors)) or sensors:
+        ray, _ = sensor.sample_ray(0.0, 0.5, middle, middle)
+        found.append(as_rows(ray.o))
+    return np.concatenate(found)
 
 
 def probes_along(
@@ -323,7 +434,7 @@ def free_positions(
     candidates = low + (high - low) * _quasi_random(max(4 * count, 4096), seed)
     hits = _trace_spheres(scene, candidates, sphere_directions(_DIRECTIONS))
     free = hits.distance.min(axis=1) > CLEARANCE * diagonal
-    free &= np.isfinite(hits.distance).mean(axis=1) >= ROOM_ENCLOSURE
+    free &= _enclosure(scene, hits) >= ROOM_ENCLOSURE
     candidates = candidates[free]
     probes = sensor_probes(scene, seed) if probes is None else probes
     if len(probes):
@@ -369,11 +480,16 @@ def _quasi_random(count: int, seed: int) -> np.ndarray:
 
 def _trace_spheres(scene: mi.Scene, positions: np.ndarray, directions: np.ndarray) -> Hits:
     """Hits of all directions from all positions, each field (positions, directions)."""
-    origins = np.repeat(positions, len(directions), axis=0)
-    hits = trace(scene, origins, np.tile(directions, (len(positions), 1)))
+    hits = trace(scene, *_spheres(positions, directions))
     shape = (len(positions), len(directions))
     found = (hits.distance, hits.back, hits.black, hits.shape)
     return Hits(*(values.reshape(shape) for values in found))
+
+
+def _spheres(positions: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of rays in all directions from all positions."""
+    origins = np.repeat(positions, len(directions), axis=0)
+    return origins, np.tile(directions, (len(positions), 1))
 
 
 def _trace(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:

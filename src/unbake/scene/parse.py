@@ -251,7 +251,7 @@ def _leave_out_media(scene: ParsedScene) -> int:
 
 
 def _leave_out_shells(scene: ParsedScene) -> None:
-    """Take out shapes that only held a medium: light of points and suns does not pass them."""
+    """Take out shapes that only held a medium: without it they are nothing."""
     nodes = scene.state.nodes
 
     def is_shell(place: int) -> bool:

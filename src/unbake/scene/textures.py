@@ -1,4 +1,4 @@
-"""Textures in places where Mitsuba 3.9 cannot use them: it fails when light is computed."""
+"""What Mitsuba 3.9 or a fit cannot use: textures in some places, BSDFs in some others."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ _AREA = ("area", "directionalarea")
 _PATTERNS = ("checkerboard", "mesh_attribute")
 #: The properties of a PLY file that are colours, in either way.
 _COLOURS = ({"red", "green", "blue"}, {"r", "g", "b"})
+#: BSDFs that let light pass as it is.
+_OPEN = ("mask", "null", "thindielectric")
+#: Those that are fitted: `principled`, and what `edit.to_principled` turns into it.
+_FITTED = ("diffuse", "principled", "roughplastic")
 
 
 def require_able(scene: ParsedScene) -> None:
-    """Refuse textures and nestings of BSDFs that Mitsuba has no method for, or a wrong one.
+    """Refuse textures and nestings of BSDFs that Mitsuba or a fit has no right method for.
 
     Raises:
         UserError: names the line.
@@ -45,12 +49,43 @@ def require_able(scene: ParsedScene) -> None:
         elif plugin == "shapegroup" and _has_vertex_colours(scene, place):
             fault = "instances of meshes whose vertices have colours have other colours"
             remedy = "Place the meshes themselves, or give a bitmap"
+        elif plugin == "twosided" and _has_unlike_sides(scene, place) and _is_worn(scene, place):
+            # Fields know places, and not sides.
+            fault = "the two sides have different BSDFs, and a fit gives both one material"
+            remedy = "Give each side a shape of its own, a little apart"
+        elif plugin == "blendbsdf" and _lets_pass(scene, place) and _is_worn(scene, place):
+            # Bounces choose random numbers by which a mask stops a ray. A blend may let it pass.
+            fault = "a blend with a BSDF that lets light pass"
+            remedy = "Use a mask, whose opacity is the other one's share"
         if fault is not None:
             raise UserError(fault, mi.parser.file_location(scene.state, node), remedy)
 
 
 def _first(names: list[str], wanted: tuple[str, ...]) -> str | None:
     return next((name for name in names if name in wanted), None)
+
+
+def _has_unlike_sides(scene: ParsedScene, place: int) -> bool:
+    """Whether a `twosided` has two different BSDFs, at least one of which is to be fitted."""
+    nodes = scene.state.nodes
+    sides = {i for i in scene.references(place) if nodes[i].type == mi.ObjectType.BSDF}
+    if len(sides) < 2:
+        return False
+    found = {nodes[i].props.plugin_name() for side in sides for i in scene.reachable(side)}
+    return not found.isdisjoint(_FITTED)
+
+
+def _lets_pass(scene: ParsedScene, place: int) -> bool:
+    """Whether a BSDF, or one in it, lets light pass as it is."""
+    nodes = scene.state.nodes
+    return any(nodes[i].props.plugin_name() in _OPEN for i in scene.reachable(place))
+
+
+def _is_worn(scene: ParsedScene, place: int) -> bool:
+    """Whether a shape has this BSDF, or one around it."""
+    nodes = scene.state.nodes
+    shapes = [i for i in scene.reachable(0) if nodes[i].type == mi.ObjectType.Shape]
+    return any(place in scene.reachable(shape) for shape in shapes)
 
 
 def _missing_colours(scene: ParsedScene, place: int) -> str | None:

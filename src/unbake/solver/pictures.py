@@ -90,7 +90,7 @@ def path_traced_halves(
         if scene_view.materials is None:
             sampler = mi.load_dict({"type": "independent", "sample_count": spp})
             how = CaptureSettings(**depths, seed=seed)
-            rgb, _ = photographs(
+            rgb, _, _ = photographs(
                 scene_view.scene, rays, how, sampler, room,
                 lambda line, part=part: tell(f"{part} half: {line}"),
             )  # fmt: skip

@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,15 @@ from ..acquisition.new_light import change_light
 from ..acquisition.placement import is_room
 from ..acquisition.settings import CaptureSettings
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, named_by_split, read_cameras
+from ..dataset.camera import Camera, named_by_split, read_named_cameras
 from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.grid_sizes import USUAL, sized
 from ..fields.radiance import make_radiance
 from ..io import require_new_folder
 from ..scene import emitters
-from ..scene.parse import parse
+from ..scene.edit import to_principled
+from ..scene.parse import ParsedScene, parse
 from ..signals import cleaned_up
 from ..training.grid_sizes import surface_seen
 from ..training.recovered import Recovered, load_run
@@ -170,18 +172,45 @@ def _known_scene(
     with cleaned_up(lambda: shutil.rmtree(made, ignore_errors=True)):
         path = write_scene(name, made) if name in SCENES else Path(name)
         root = Path(path.resolve().anchor) if allow_outside else None
-        parsed = parse(path, root)
-        if light is not None:
-            change_light(parsed, light, allow_outside, tell)
-        scene = parsed.instantiate()
-    emitters.require_emitters(scene, Path(name))
-    wanted = CaptureSettings(settings.views, 0, settings.resolution, seed=settings.seed)
-    posed = posed_cameras(name, scene, wanted, None if cameras is None else Path(cameras))
+
+        def parsed(tell: Callable[[str], None]) -> ParsedScene:
+            scene = parse(path, root)
+            if light is not None:
+                change_light(scene, light, allow_outside, tell)
+            return scene
+
+        posed, room = _posed(name, parsed(tell), settings, cameras)
+        scene = parsed(lambda line: None).instantiate()
     view = SceneView.of(scene, None, settings.max_specular)
     points = SurfacePoints.of(scene, settings.seed)
     told = {"scene": name, "run": None, "light": None if light is None else light.told()}
-    given = [] if cameras is None else [camera for _, camera in posed]
-    return Known(view, _named(posed), is_room(scene, given), points, told)
+    return Known(view, posed, room, points, told)
+
+
+def _posed(
+    name: str, parsed: ParsedScene, settings: SolveSettings, cameras: Path | str | None
+) -> tuple[dict[str, Camera], bool]:
+    """The cameras by the names of their pictures, and whether they stand in a room.
+
+    Args:
+        name: of the scene.
+        parsed: the scene. It is used up: cameras are placed to see materials that could be fitted,
+            and by shapes that are not merged.
+        settings: how many cameras, and the size of their pictures.
+        cameras: a camera file; None: the built-in scene's own cameras, or automatic placement.
+    """
+    if cameras is None:
+        with suppress(UserError):  # what cannot be fitted can be solved all the same
+            to_principled(parsed)
+    scene = parsed.instantiate(merge=False)
+    emitters.require_emitters(scene, Path(name))
+    size = settings.resolution
+    if cameras is None:
+        wanted = CaptureSettings(settings.views, 0, size, seed=settings.seed)
+        posed = named_by_split(posed_cameras(name, scene, wanted, None))
+        return _named(posed), is_room(scene)
+    posed = read_named_cameras(Path(cameras), size, size)
+    return _named(posed), is_room(scene, [camera for *_, camera in posed])
 
 
 def _views(recovered: Recovered, cameras: Path | str | None) -> dict[str, Camera]:
@@ -190,9 +219,9 @@ def _views(recovered: Recovered, cameras: Path | str | None) -> dict[str, Camera
     if cameras is None:
         return {v.name: recovered.camera(v) for v in dataset.heldout or dataset.views}
     first = dataset.train[0].camera
-    return _named(read_cameras(Path(cameras), first.width, first.height, keep_size=True))
+    return _named(read_named_cameras(Path(cameras), first.width, first.height, keep_size=True))
 
 
-def _named(posed: list[tuple[str, Camera]]) -> dict[str, Camera]:
+def _named(posed: list[tuple[str, str, Camera]]) -> dict[str, Camera]:
     """Cameras by the names of their pictures."""
-    return {name: camera for name, _, camera in named_by_split(posed)}
+    return {name: camera for name, _, camera in posed}

@@ -1,4 +1,4 @@
-"""Light of a sampled emitter, and what cut-outs let pass of it."""
+"""Light of a sampled emitter, and what cut-outs and thin panes let pass of it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,23 @@ _MOST_PASSED = 64
 def has_cut_outs(scene: mi.Scene) -> bool:
     """Whether any surface scatters and lets rays pass as they are."""
     wanted = int(mi.BSDFFlags.Null), int(mi.BSDFFlags.Smooth)
-    flags = [int(shape.bsdf().flags()) for shape in met_shapes(scene) if shape.bsdf() is not None]
-    return any(all(f & one for one in wanted) for f in flags)
+    return any(all(f & one for one in wanted) for f in _flags(scene))
+
+
+def lets_pass(scene: mi.Scene) -> bool:
+    """Whether any surface lets rays pass as they are: cut-outs, thin panes, `null`."""
+    return any(f & int(mi.BSDFFlags.Null) for f in _flags(scene))
 
 
 def lights_pierce(scene: mi.Scene) -> bool:
-    """Whether there are both cut-outs and lights without size: points, spots, directions."""
+    """Whether lights without size (points, spots, directions) shine through any surface."""
     delta = int(mi.EmitterFlags.Delta)
-    return any(int(e.flags()) & delta for e in scene.emitters()) and has_cut_outs(scene)
+    return any(int(e.flags()) & delta for e in scene.emitters()) and lets_pass(scene)
+
+
+def _flags(scene: mi.Scene) -> list[int]:
+    """What the BSDFs of all surfaces can do, as bits of `BSDFFlags`."""
+    return [int(shape.bsdf().flags()) for shape in met_shapes(scene) if shape.bsdf() is not None]
 
 
 def sample_emitter(
@@ -29,9 +38,9 @@ def sample_emitter(
 ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
     """An emitter in sight of a point, as `mi.Scene.sample_emitter_direction` samples it.
 
-    Mitsuba takes a cut-out for opaque then. Light of areas and of the environment that passes it is
-    met by rays that do. No ray meets a light without size: its light is multiplied by what
-    surfaces on the way let pass, as in `volpath`.
+    Mitsuba takes cut-outs and panes for opaque then. Light of areas and of the environment that
+    passes them is met by rays that do. No ray meets a light without size: its light is multiplied
+    by what surfaces on the way let pass, as in `volpath`.
 
     Args:
         sample: uniform in [0, 1)².

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..fields.materials import carrying, read_carried
 from ..fields.radiance import RadianceField
-from .emitter_sampling import has_cut_outs
+from .emitter_sampling import has_cut_outs, lights_pierce
 from .operator import attach_material
 from .path_sample import Requirements, rhs, trace
 from .path_tracer import path_traced
@@ -128,12 +128,13 @@ def render_materials(
 
 
 def path_integrator(scene: mi.Scene) -> str:
-    """The name of Mitsuba's path tracer for a scene: `path`, or `volpath` if it has cut-outs.
+    """The name of Mitsuba's path tracer for a scene: `path`, or `volpath` where `path` is wrong.
 
     Where a cut-out's opacity is a fraction, `path` of Mitsuba 3.9.1 multiplies the light of emitter
-    sampling by it twice: a leaf of opacity 0.5 is half as bright as it should be.
+    sampling by it twice: a leaf of opacity 0.5 is half as bright as it should be. Lights without
+    size do not shine through thin panes in it, as no ray meets them.
     """
-    return "volpath" if has_cut_outs(scene) else "path"
+    return "volpath" if has_cut_outs(scene) or lights_pierce(scene) else "path"
 
 
 def parts_of(
