@@ -41,7 +41,7 @@ import unbake  # noqa: E402
 from unbake.dataset.camera import Camera  # noqa: E402
 from unbake.dataset.pixels import CameraRays  # noqa: E402
 from unbake.exports.bake import NEAR  # noqa: E402
-from unbake.exports.observed import Views  # noqa: E402
+from unbake.exports.observed import training_views  # noqa: E402
 from unbake.imaging.metrics import psnr  # noqa: E402
 from unbake.imaging.pictures import encoded, tonemap, write_png  # noqa: E402
 from unbake.io import read_object, write_json  # noqa: E402
@@ -204,7 +204,7 @@ class Points:
         self.d = -normal.astype(np.float32)
         self.fields = run.material_along(self.o, self.d)
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f(self.o.T), mi.Vector3f(self.d.T)))
-        views = Views(scene, run.cameras("train"))
+        views = training_views(run.recovered)
         sides = mi.Bool(np.concatenate(two_sided))
         seen = views.see(mi.Point3f(si.p), mi.Normal3f(normal.T), sides, si.is_valid())
         self.counted = self.fields["seen"] & np.array(seen) & self.on_surface(np.array(si.t))

@@ -949,6 +949,27 @@ def test_views_see_what_is_in_front_of_them(mixed):
     assert np.array(views.see(p, up, both, both)).tolist() == [False, True, False, True]
 
 
+@pytest.mark.parametrize("opacity", [0.2, 0.8])
+@pytest.mark.parametrize("hidden", [True, False])
+def test_views_see_through_holes_and_lamps_that_images_do_not_show(opacity, hidden):
+    """A leaf hangs above the left point of a floor, and a lamp above the right one."""
+
+    def square(x, z, **more):
+        place = mi.ScalarTransform4f().translate([x, 0, z]).scale(0.4)
+        return {"type": "rectangle", "to_world": place} | more
+
+    leaf = {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse"}}
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
+    shapes = [floor, square(-0.5, 0.5, bsdf=leaf), square(0.5, 0.5, emitter=lamp)]
+    scene = mi.load_dict({"type": "scene"} | {f"shape{i}": s for i, s in enumerate(shapes)})
+    above = LookAt((0, 0, 30), (0, 0, 0), (0, 1, 0), 10.0).camera(8, 8)
+    p = mi.Point3f(np.array([(-0.5, 0, 0), (0.5, 0, 0), (0, 1.5, 0)], np.float32).T.copy())
+    up, both = mi.Normal3f(0, 0, mi.Float([1, 1, 1])), dr.ones(mi.Bool, 3)
+    seen = np.array(Views(scene, [above], hide_emitters=hidden).see(p, up, ~both, both))
+    assert seen.tolist() == [opacity < 0.5, hidden, True]
+
+
 def test_views_see_nothing_in_pixels_that_do_not_count(mixed):
     """One floor point left and one right of the middle, and masks of either half."""
     scene = parsed_principled(mixed, mixed.parent).instantiate()

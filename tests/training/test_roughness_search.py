@@ -41,6 +41,7 @@ from unbake.training.roughness_curves import (
     losses_by_roughness,
     points,
     precision,
+    squared_errors,
 )
 from unbake.training.roughness_search import RoughnessSearch, descend
 from unbake.training.run_folder import RunFolder
@@ -298,6 +299,17 @@ def test_pieces_of_which_photographs_tell_little_are_like_the_others():
     assert apart(1e-4) < 0.05 < apart(1e-4, piece_spread=1e3, brightness_spread=1e3)
 
 
+@pytest.mark.parametrize(("albedo", "largest"), [(0.1, 3.0), (0.8, 1.25), (0.99, 1.05)])
+def test_albedo_is_1_at_most_whatever_light_is_to_be_explained(albedo, largest):
+    rows = made_up()
+    rows["albedo"] = albedo
+    rows["plain"], rows["plain2"], rows["mixed"] = 0, 0, 0
+    rows["target"] = 3 * rows["coloured"][:, 0]  # the same at all nodes
+    found = losses_by_roughness(rows, np.zeros(len(rows), int))
+    wanted = squared_errors(rows, np.full((1, 1, 3), largest))
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4)
+
+
 def test_errors_have_the_variance_1_however_bright_pixels_are():
     rows = made_up(count=40_000, true=(0.24, 0.24))
     rng = np.random.default_rng(3)
@@ -484,22 +496,46 @@ def test_time_of_searches_is_not_that_of_steps(built_in):
     problem, _, step, _ = started(built_in, config)
     search = RoughnessSearch(problem, config, step, Ranks())
 
-    def done(**numbers):
+    def done(made=0, **numbers):
+        search.made = made
         progress = Progress(step=10_000, samples=10_000 * config.samples_per_step, **numbers)
         return loop._fraction(config, progress, search)
 
-    # Two searches are to come, with 0.4 of the samples of all steps each.
-    assert SEARCH.share == 0.4 and done(seconds=20.0) == pytest.approx(20 / (100 / 1.8))
-    assert done(seconds=50.0, searches=1, searching=20.0, last_search=20.0) == 0.5
-    assert done(seconds=80.0, searches=2, searching=40.0, last_search=20.0) == 40 / 60
-    assert done(seconds=101.0, searches=2, searching=40.0, last_search=20.0) == 1
+    # Two searches are to come, with 0.4 of the samples of all steps each, where photographs have
+    # so many pixels.
+    photographs = SimpleNamespace(count=10**9)
+    search._step = SimpleNamespace(pixels=SimpleNamespace(photographs=photographs))
+    assert SEARCH.share == 0.4 and done(seconds=20.0) == pytest.approx(20 / (100 / 1.8), rel=1e-3)
+    assert done(1, seconds=50.0, searching=20.0, last_search=20.0) == 0.5
+    assert done(2, seconds=80.0, searching=40.0, last_search=20.0) == 40 / 60
+    assert done(2, seconds=101.0, searching=40.0, last_search=20.0) == 1
+    # One that does not fit is not waited for.
+    assert done(1, seconds=70.0, searching=40.0, last_search=40.0) == 30 / 60
+    search._step = step
+    count, spp = step.pixels.photographs.count, 4 * SEARCH.spp
+    each = count * spp * 20 / (10_000 * config.samples_per_step)
+    assert done(seconds=20.0) == pytest.approx(20 / (100 - 2 * each)), "all pixels there are"
     by_steps = replace(config, steps=20_000, seconds=None)
     assert loop._fraction(by_steps, Progress(step=10_000, searching=9.0), search) == 0.5
     short = Progress(step=4, seconds=50.0)
     assert loop._fraction(config, short, search) == 0.5, "none will be made"
 
 
-def test_no_pixel_counts_several_times(built_in):
+def test_a_fit_that_goes_on_makes_no_search_again_unless_it_is_longer(built_in):
+    """The first search was quicker than was reckoned, so that less than its place is done."""
+    config = replace(SETTINGS, steps=0, seconds=100.0)
+    problem, _, step, _ = started(built_in, config)
+    begun = SimpleNamespace(config=config, problem=problem, step=step)
+    for length, made in ((100.0, 1), (50.0, 0)):
+        begun.progress = Progress(
+            step=20, seconds=35.0, samples=10**6, searches=1, searching=5.0, last_search=5.0,
+            length=length,
+        )  # fmt: skip
+        assert loop._searches(begun, Ranks()).made == made
+        assert begun.progress.searches == made and begun.progress.length == 100
+
+
+def test_searches_draw_no_more_pixels_than_photographs_have(built_in):
     """The noise of a photograph is the same at each draw: more samples of each pixel help."""
     problem, _, step, _ = started(built_in)
     search = RoughnessSearch(problem, SETTINGS, step, Ranks())

@@ -104,7 +104,7 @@ def degrade(
         raise UserError(what, dataset.folder, "Degrade photographs that were rendered")
     cameras, diagonal = [view.camera for view in dataset.views], 0.0
     if settings.pose_jitter or settings.displace:
-        scene = parse(dataset.scene, dataset.root).instantiate()
+        scene = parse(dataset.scene, dataset.root).instantiate(merge=False)
         diagonal = free_space.extent(scene)[2]
         cameras = _moved(scene, cameras, settings)
     # Once more: the nodes of a scene that was instantiated cannot be written.

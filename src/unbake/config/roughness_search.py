@@ -15,11 +15,13 @@ class RoughnessSearchConfig:
     """
 
     times: int = 2  #: searches, evenly from `first` to `last`; 0: none
-    first: float = 0.4  #: fraction of the fit after which the first one comes
+    first: float = 0.4  #: fraction of the steps, or of their time, after which the first one comes
     last: float = 0.75  #: and the last one; the rest is left for albedo to follow
     share: float = 0.4  #: camera samples of each one, of those that all steps of the fit take
-    pixels: int = 1 << 19  #: that are sampled, at most
-    spp: int = 64  #: camera samples of each pixel
+    pixels: int = 1 << 19  #: that are sampled, at most, and no more than photographs have
+    #: Camera samples of each pixel; up to four times as many where photographs have fewer pixels
+    #: than are wanted
+    spp: int = 64
     cells: int = 4  #: along an edge of the scene's cube, in each of which albedo has its own factor
     colours: int = 6  #: along each channel of albedo, the same
     steps: int = 300  #: of Adam, on what was sampled

@@ -75,7 +75,8 @@ _CONVENTIONS = {
     "unobserved": "a picture for each material, in its texture coordinates: white where no "
     "training view saw the surface; what was learned is filled in there from values around it that "
     "were seen, or is the quantity's default where a material has none, and all else is the "
-    "scene's own; what is seen in mirrors or through glass alone counts as not seen",
+    "scene's own; what is seen in mirrors, through glass or in pixels that are not fitted alone "
+    "counts as not seen",
 }
 
 
@@ -340,11 +341,12 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
             notes.append(f"{atlas.name}: {overlap:.1f} % of its surface shares texels")
         if one.learned and not one.observed.any():
             notes.append(f"{atlas.name}: no training view saw it, its textures are the defaults")
-    far = [one.atlas.name for one in baked if one.atlas.is_optimized and not one.is_near]
+    shown = [one for one in baked if one.atlas.is_optimized]
+    far = [one.atlas.name for one in shown if not one.is_near]
     if far:
         notes.append(
             f"less than {100 * WANTED:.0f} % of the surface is within 2/255 of the fields in "
-            f"{len(far)} of {len(baked)} materials ({named(far)}); {remedy}"
+            f"{len(far)} of {len(shown)} materials ({named(far)}); {remedy}"
         )
     varying = [light.name for light in lights if light.strength is None]
     if varying:

@@ -55,6 +55,7 @@ class Progress:
     searches: int | None = 0
     searching: float = 0.0  #: seconds of training that were those of searches, not of steps
     last_search: float = 0.0  #: of them, those of the last one
+    length: float = 0.0  #: of the fit that `searches` is of, in seconds or steps
     warning: str | None = None  #: what is wrong with a fit that has ended; not part of checkpoints
 
     def counted(self) -> dict[str, Any]:
@@ -92,6 +93,7 @@ def save_checkpoint(
         "searches": progress.searches,
         "searching": progress.searching,
         "last_search": progress.last_search,
+        "length": progress.length,
         **(about or {}),
         "files": {STATE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
     }
@@ -198,6 +200,7 @@ def _good(path: Path, most: int) -> tuple[dict[str, np.ndarray], Progress, dict[
             None if manifest.get("searches") is None else int(manifest["searches"]),
             float(manifest.get("searching", 0.0)),
             float(manifest.get("last_search", 0.0)),
+            float(manifest.get("length", 0.0)),
         )
         if not all(np.isfinite(array).all() for array in arrays.values()):
             raise _Damaged("a number is not finite")

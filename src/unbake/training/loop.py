@@ -301,7 +301,9 @@ class _Training:
         if not self._watchdog.trusts:
             return  # a state that may be taken back: it comes after that
         state, progress = self._begun.state, self._begun.progress
-        before = progress.seconds
+        before, seconds = progress.seconds, self._begun.config.seconds
+        if seconds and progress.last_search > seconds - before:
+            return  # there is no time for another one
         try:
             samples = self._search.search_if_due(self._fraction, state, progress.step)
         except UserError:  # the state is that of before: a search leaves what it finds at its end
@@ -404,9 +406,14 @@ def _searches(begun: Begun, ranks: Ranks) -> RoughnessSearch:
     """The searches of a fit, some of which may have been made before."""
     config, progress = begun.config, begun.progress
     search = RoughnessSearch(begun.problem, config, begun.step, ranks)
-    # In a longer fit than before, places lie later. Older versions made all in their places.
+    search.made = progress.searches or 0
     passed = search.passed(_fraction(config, progress, search))
-    search.made = passed if progress.searches is None else min(progress.searches, passed)
+    if progress.searches is None:  # older versions made all in their places
+        search.made = passed
+    elif _length(config) > progress.length:  # in a longer fit than before, places lie later
+        search.made = min(search.made, passed)
+        progress.last_search = 0.0  # that of a shorter fit
+    progress.searches, progress.length = search.made, _length(config)
     return search
 
 

@@ -24,8 +24,9 @@ _CAUTION = 1e-3
 _BRIGHTNESSES = 32
 #: The squared error of a pixel is no less, in units of its variance.
 _LEAST = -1.0
-#: Factors of albedo are no larger.
-_LARGEST_FACTOR = 4.0
+#: Factors of albedo are no larger, and no larger than brings the mean of a group to 1; by the
+#: second one albedo may always rise.
+_LARGEST_FACTOR, _RISE = 4.0, 1.05
 #: Less albedo than this is not told from it.
 _BLACK = 1e-3
 
@@ -222,7 +223,8 @@ def groups(rows: np.ndarray, cells: int, colours: int) -> np.ndarray:
 def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
     """The squared errors of pixels at each node, with the best albedo for it.
 
-    In each group and channel the factor of the albedo is the one with the smallest sum of errors.
+    In each group and channel the factor of the albedo is the one with the smallest sum of errors,
+    as far as steps could reach it: albedo is 1 at most.
 
     Args:
         rows: of `row_type`.
@@ -246,7 +248,9 @@ def losses_by_roughness(rows: np.ndarray, group: np.ndarray) -> np.ndarray:
     known = sums(square * rows["coloured2"])
     caution = _CAUTION * np.maximum(known.mean(0, keepdims=True), 0) + 1e-30
     factor = (wanted + caution) / np.maximum(known + caution, caution)
-    return squared_errors(rows, np.clip(factor, 0, _LARGEST_FACTOR)[group])
+    albedo = np.maximum(sums(rows["albedo"]) / np.bincount(group, minlength=count)[:, None], 1e-3)
+    largest = np.clip(1 / albedo, _RISE, _LARGEST_FACTOR)[:, None]
+    return squared_errors(rows, np.clip(factor, 0, largest)[group])
 
 
 def squared_errors(rows: np.ndarray | dict[str, np.ndarray], factor: np.ndarray) -> np.ndarray:

@@ -96,16 +96,19 @@ class RoughnessSearch:
 
     def seconds_left(self, progress: Progress, seconds: float) -> float:
         """How long the searches that are to come will take, about, of a fit of so many seconds."""
-        left = len(self._places) - (progress.searches or 0)
-        if left <= 0 or not self._size(progress.step, progress.seconds / seconds):
+        left, rest = len(self._places) - self.made, seconds - progress.searching
+        if left <= 0 or rest <= 0:
             return 0.0
         if progress.last_search:  # they are equally large
-            return left * progress.last_search
+            fitting = int(max(seconds - progress.seconds, 0) / progress.last_search)
+            return min(left, fitting) * progress.last_search
+        steps = progress.seconds - progress.searching
+        done = steps / rest * (1 + left * self._config.roughness_search.share)
+        size = self._size(progress.step, done)
+        if size is None:
+            return 0.0
         # As long as steps with as many samples.
-        search = self._config.roughness_search
-        share = search.share / (1 + left * search.share)
-        at_most = search.pixels * search.spp * progress.seconds / max(progress.samples, 1)
-        return left * min(share * seconds, at_most)
+        return left * size[0] * size[1] * progress.seconds / max(progress.samples, 1)
 
     def due(self, done: float) -> bool:
         """Whether a search is to be made after a fraction of the fit.

@@ -8,18 +8,18 @@ import mitsuba as mi
 from ..fields.shapes import met_shapes
 
 #: Surfaces that a shadow ray passes; it ends in black at the next one.
-_MOST_PASSED = 64
+MOST_PASSED = 64
 
 
 def has_cut_outs(scene: mi.Scene) -> bool:
     """Whether any surface scatters and lets rays pass as they are."""
     wanted = int(mi.BSDFFlags.Null), int(mi.BSDFFlags.Smooth)
-    return any(all(f & one for one in wanted) for f in _flags(scene))
+    return any(all(f & one for one in wanted) for f in bsdf_flags(scene))
 
 
 def lets_pass(scene: mi.Scene) -> bool:
     """Whether any surface lets rays pass as they are: cut-outs, thin panes, `null`."""
-    return any(f & int(mi.BSDFFlags.Null) for f in _flags(scene))
+    return any(f & int(mi.BSDFFlags.Null) for f in bsdf_flags(scene))
 
 
 def lights_pierce(scene: mi.Scene) -> bool:
@@ -28,7 +28,7 @@ def lights_pierce(scene: mi.Scene) -> bool:
     return any(int(e.flags()) & delta for e in scene.emitters()) and lets_pass(scene)
 
 
-def _flags(scene: mi.Scene) -> list[int]:
+def bsdf_flags(scene: mi.Scene) -> list[int]:
     """What the BSDFs of all surfaces can do, as bits of `BSDFFlags`."""
     return [int(shape.bsdf().flags()) for shape in met_shapes(scene) if shape.bsdf() is not None]
 
@@ -70,7 +70,7 @@ def _passed(
         hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         met = active & hit.is_valid()
         bsdf = hit.bsdf()
-        passes = met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (count < _MOST_PASSED)
+        passes = met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (count < MOST_PASSED)
         through = dr.select(passes, bsdf.eval_null_transmission(hit, passes), 0)
         share = dr.select(met, share * through, share)
         ray = dr.select(passes, hit.spawn_ray_to(target), ray)

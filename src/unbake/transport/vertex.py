@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..fields.materials import Materials, carrying
 from ..fields.shapes import met_shapes, registry_number
-from .emitter_sampling import lights_pierce
+from .emitter_sampling import bsdf_flags, lets_pass, lights_pierce
 from .optimized import optimized_shapes
 
 
@@ -28,7 +28,7 @@ class SceneView:
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
         has_holes: whether any lets rays pass as they are: cut-outs, thin panes (found by `of`).
         has_area_emitters: whether any surface of the scene emits light (found by `of`).
-        pierced: whether lights without size shine through cut-outs (found by `of`).
+        pierced: whether lights without size shine through any surface (found by `of`).
         optimized: numbers of the shapes whose material is optimized (found by `of`).
     """
 
@@ -44,11 +44,9 @@ class SceneView:
     @staticmethod
     def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> SceneView:
         """The view of a scene; looks at every BSDF once, also at those inside of instances."""
-        shapes = met_shapes(scene)
-        flags = [int(shape.bsdf().flags()) for shape in shapes if shape.bsdf() is not None]
-        holes = any(f & int(mi.BSDFFlags.Null) for f in flags)
-        chains = holes or any(not f & int(mi.BSDFFlags.Smooth) for f in flags)
-        area_emitters = any(shape.emitter() is not None for shape in shapes)
+        holes, smooth = lets_pass(scene), int(mi.BSDFFlags.Smooth)
+        chains = holes or any(not flags & smooth for flags in bsdf_flags(scene))
+        area_emitters = any(shape.emitter() is not None for shape in met_shapes(scene))
         found = chains, holes, area_emitters, lights_pierce(scene)
         return SceneView(scene, materials, max_specular, *found, optimized_shapes(scene))
 

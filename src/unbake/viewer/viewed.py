@@ -77,7 +77,8 @@ class ViewedData:
         self.dataset = dataset
         self._scene = scene
         parts = read_parts(dataset.scene, dataset.root, pieces).parts
-        views = Views(scene, [view.camera for view in dataset.train])
+        cameras, hidden = [view.camera for view in dataset.train], dataset.background == "hidden"
+        views = Views(scene, cameras, hide_emitters=hidden)
         self.surface: Surface = make_surface(parts, views)
         self._numbers = sorted({p.materials[0] for p in parts if p.is_optimized})
         self._own = self._own_textures()
