@@ -37,13 +37,14 @@ backend.activate()
 
 from views import of_size  # noqa: E402
 
+from unbake.acquisition.new_light import axis_of  # noqa: E402
 from unbake.config.light import LightConfig  # noqa: E402
+from unbake.dataset.camera import up_of  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402
 from unbake.errors import UserError  # noqa: E402
 from unbake.evaluation.evaluate import evaluate  # noqa: E402
 from unbake.evaluation.rendering import relight  # noqa: E402
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings  # noqa: E402
-from unbake.evaluation.turntable import axis_of, up_of  # noqa: E402
 from unbake.experiments.commands import unbake  # noqa: E402
 from unbake.experiments.seeds import across_seeds  # noqa: E402
 from unbake.imaging.pictures import (  # noqa: E402

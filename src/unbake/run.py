@@ -250,7 +250,7 @@ class Run:
         texels: float | None = None,
         tell: Callable[[str], None] = print,
     ) -> dict[str, Any]:
-        """Write textures, glTF or a scene for Mitsuba; see `unbake.export`.
+        """Write textures, glTF, OpenUSD or a scene for Mitsuba; see `unbake.export`.
 
         Args:
             formats: one, or several.

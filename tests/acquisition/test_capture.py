@@ -9,6 +9,7 @@ import pytest
 from unbake.acquisition import capture as module
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
+from unbake.config.light import LightConfig
 from unbake.dataset.camera import LookAt, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
@@ -118,6 +119,17 @@ def test_bitmap_textures_are_the_truth_pixel_by_pixel(tmp_path):
     assert np.allclose(roughness[1::3, 1::3, 0], rough, atol=1e-3)
     names = {p.name for p in (data.scene.parent).rglob("*") if p.is_file()}
     assert names == {"scene.xml", "paint.exr", "rough.exr"}
+
+
+def test_a_sky_that_lies_on_its_side_is_told(tmp_path, told):
+    write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3)))
+    (tmp_path / "scene.xml").write_text(OBJECT)
+    words = {"cameras": front(tmp_path, 6.0), "tell": told.append}
+    for axis in ("+y", "+z"):
+        light = LightConfig(envmap=tmp_path / "sky.exr", envmap_up=axis)
+        capture(tmp_path / "scene.xml", tmp_path / axis, SMALL, light=light, **words)
+    (line,) = [line for line in told if "the map's first row" in line]
+    assert "lies at +z, while the cameras' up is +y: --envmap-up +y turns it" in line
 
 
 def test_a_capture_is_the_same_twice_and_another_with_another_seed(tmp_path):

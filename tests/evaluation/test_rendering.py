@@ -16,13 +16,13 @@ from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.backend import CUDA_VARIANT
 from unbake.config.light import LightConfig
-from unbake.dataset.camera import LookAt, read_cameras, write_camera_file
+from unbake.dataset.camera import LookAt, read_cameras, up_of, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.rendering import relight, render
 from unbake.evaluation.renderings import METRICS, render_camera, told_unit
 from unbake.evaluation.settings import RenderSettings
-from unbake.evaluation.turntable import turntable, up_of
+from unbake.evaluation.turntable import turntable
 from unbake.imaging.metrics import psnr
 from unbake.imaging.pictures import read_exr, tonemap, write_exr, write_png
 from unbake.scene import relight as relighting

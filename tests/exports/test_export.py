@@ -679,6 +679,26 @@ def test_the_environment_is_where_mitsuba_looks_for_it(exported):
         np.testing.assert_allclose(picture[texel], truth, rtol=0.1)
 
 
+def test_an_environment_that_was_known_is_taken_along(with_metallic, tmp_path, monkeypatch):
+    from pxr import Usd, UsdLux
+
+    with_metallic.use(monkeypatch)
+    out, words = tmp_path / "out", {"texels": 2.0, "tell": lambda line: None}
+    formats = ["gltf", "mitsuba", "usd"]
+    manifest = exporting.export(with_metallic.run, out, formats, **words)
+    (file,) = out.glob("environment.*")
+    np.testing.assert_allclose(read_exr(file), 0.5, rtol=1e-3)
+    assert manifest["environment"] == file.name
+    stage = Usd.Stage.Open(str(out / "usd" / "scene.usdc"))
+    (dome,) = (p for p in stage.Traverse() if p.IsA(UsdLux.DomeLight))
+    found = UsdLux.DomeLight(dome).GetTextureFileAttr().Get().resolvedPath
+    assert Path(found).resolve() == file.resolve()
+    text = (out / "mitsuba" / "scene.xml").read_text()
+    assert 'type="constant"' in text and 'type="envmap"' not in text
+    (note,) = [note for note in manifest["notes"] if file.name in note]
+    assert note.startswith("scene.glb has no environment, as glTF has none")
+
+
 def test_what_no_view_saw_is_filled_and_marked(exported, tmp_path, monkeypatch):
     exported.use(monkeypatch)
     lines = []

@@ -498,6 +498,16 @@ def test_known_lights_take_the_place_of_the_unknown_environment(
         import_data(nerfstudio, "other", [tmp_path / "none.ply"], light=light, tell=quiet)
 
 
+def test_a_sky_that_lies_on_its_side_is_told(nerfstudio, meshes, tmp_path):
+    told = []
+    write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3)))
+    for axis in ("+y", "+z"):
+        light = LightConfig(envmap=tmp_path / "sky.exr", envmap_up=axis)
+        import_data(nerfstudio, tmp_path / axis, meshes, light=light, tell=told.append)
+    (line,) = [line for line in told if "the map's first row" in line]
+    assert "lies at +y, while the cameras' up is +z: --envmap-up +z turns it" in line
+
+
 # ------------------------------------------------------------------------------------------- faults
 
 

@@ -208,6 +208,19 @@ def test_a_run_that_learned_nothing_is_marked(made, tmp_path: Path, why):
     assert text.count(marked) == 1 + shown
 
 
+def test_an_albedo_that_is_right_but_for_its_scale_is_not_marked(made, tmp_path: Path):
+    run, first = made[1][0], {"albedo_psnr": 60.0, "roughness_psnr": 60.0}
+    found = {"ceiling": None, "constant": first, "untrained": first}
+    _optimize_environment(run, 0.05)
+    _edit(run, lambda m: m.update(yardsticks=found))
+    _edit(run, lambda m: m["definitions"].update(albedo_psnr_aligned="after scaling"))
+    for decibels, marked in ((59.0, True), (61.0, False)):
+        aligned = {"albedo_psnr_aligned": decibels}
+        _edit(run, lambda m, a=aligned: [m[split].update(a) for split in ("heldout", "train")])
+        text = write_report(made[1], tmp_path / f"{decibels}.html").read_text()
+        assert ("worse than untrained" in text) == marked
+
+
 def test_whether_a_fit_was_still_improving_is_told(made, tmp_path: Path):
     metrics = made[1][0] / "evaluation" / "metrics.json"
     found = {"trend": "improving", "change": -0.031, "noise": 0.004, "share": 0.25}

@@ -73,6 +73,16 @@ def test_a_scene_without_environment_has_none_to_fit(parse_lit):
         emitters.environment_latlong(parsed.instantiate(), 4)
 
 
+@pytest.mark.parametrize("kind", SKIES)
+def test_lights_besides_an_environment_are_counted_unless_they_are_black(kind, parse_lit):
+    black = LAMP.replace("4 5 6", "0 0 0").replace('id="lamp"', 'id="off"')
+    alone, lit = parse_lit(SKIES[kind] + black), parse_lit(SKIES[kind] + black + LAMP)
+    assert emitters.lights_besides(alone, emitters.ENVIRONMENTS) == 0
+    assert emitters.lights_besides(lit, emitters.ENVIRONMENTS) == 1
+    assert emitters.lights_besides(lit, tuple(emitters.STRENGTHS)) == (kind != "constant")
+    assert emitters.fits_environment(lit) == (kind == "constant")
+
+
 def test_lights_are_told_by_name_and_strength(parse_lit):
     found = emitters.named_emitters(parse_lit("".join(LIGHTS.values())))
     assert len(found) == len(LIGHTS)

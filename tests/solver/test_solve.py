@@ -25,6 +25,7 @@ from unbake.imaging.pictures import read_exr, write_exr
 from unbake.io import read_object
 from unbake.scene.geometry import differing, probe
 from unbake.solver import learn
+from unbake.solver import solve as solving
 from unbake.solver.lit import matching_scale
 from unbake.solver.pictures import debiased_relative_mse, relative_mse
 from unbake.solver.points import SurfacePoints
@@ -312,6 +313,16 @@ def test_the_field_of_a_run_is_learned_on_under_another_light(tuned, run, cornel
     photograph = read_exr(Dataset.load(cornell).heldout[0].image)[..., :3]
     assert seen["rhs"].mean() == pytest.approx(seen["reference"].mean(), rel=0.2)
     assert seen["reference"].mean() > 3 * photograph.mean()
+
+
+def test_a_sky_that_lies_on_its_side_is_told(run, sky, tmp_path, monkeypatch):
+    monkeypatch.setattr(solving, "learn", lambda *words: {})
+    lines = []
+    for axis in ("+y", "+z"):
+        light = LightConfig(envmap=sky, envmap_up=axis)
+        fine_tune(run, tmp_path / axis, SETTINGS, light=light, tell=lines.append)
+    (line,) = [line for line in lines if "the map's first row" in line]
+    assert "lies at +y, while the cameras' up is +z: --envmap-up +z turns it" in line
 
 
 def test_a_field_is_brightened_until_both_sides_have_the_same_mean(solved, built_in):

@@ -15,6 +15,7 @@ from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training import plausibility
 from unbake.training.fresh_fit import begin_fit
 from unbake.training.plausibility import data_warnings
+from unbake.training.problem import make_problem
 from unbake.training.run_folder import RunFolder
 
 
@@ -75,6 +76,31 @@ def test_a_placeholder_that_is_taken_for_the_light_is_told(sky):
     (line,) = told(sky, update(TINY_FIT, {"unknown": "materials"}))
     assert line.startswith("the data set says that its light is unknown, and what stands for it")
     assert told(sky) == told(sky, update(TINY_FIT, {"unknown": "lighting"})) == []
+
+
+SKIES = {
+    "constant": '<emitter type="constant"/>',
+    "envmap": '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>',
+}
+
+
+@pytest.mark.parametrize(("kind", "doubted"), [("constant", False), ("envmap", True)])
+def test_a_placeholder_whose_strength_is_fitted_is_not_doubted(kind, doubted, tmp_path):
+    scene, lamp = tmp_path / "scene.xml", '<emitter type="point"/>'
+    write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3)))
+    scene.write_text(f'<scene version="3.0.0"><shape type="sphere"/>{lamp}{SKIES[kind]}</scene>')
+    dataset = Dataset(tmp_path, scene, "visible", (), {}, None, light="unknown")
+    problem = make_problem(scene, "visible", update(TINY_FIT, {"unknown": "emission"}), 0.5)
+    assert (plausibility._placeholder(dataset, problem) is not None) == doubted
+
+
+@pytest.mark.parametrize(("unknown", "open_"), [("emission", True), ("materials", False)])
+def test_a_white_balance_that_unknown_light_leaves_open_is_told(unknown, open_, cornell):
+    camera = {"white_balance": "common"}
+    lines = told(cornell, update(TINY_FIT, {"unknown": unknown, "camera": camera}))
+    assert [line.split(":")[0] for line in lines] == open_ * [
+        "the white balance of all photographs and the colour of unknown light cannot be told apart"
+    ]
 
 
 def test_light_that_is_unknown_is_recovered_unless_the_user_says_otherwise(

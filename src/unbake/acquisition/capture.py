@@ -33,7 +33,7 @@ from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
-from .new_light import change_light
+from .new_light import change_light, tell_tilt
 from .placement import BLACK, BLACK_BACKS, TURN_THEM, black_share, coverage, is_room, place
 from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
@@ -147,6 +147,7 @@ def _capture(
     source = _Source(file, light, allow_outside)
     path, apart = _copy_scene(source, data.scene, tell)
     posed, seen, room = _choose_views(name, apart, settings, camera_file, tell)
+    tell_tilt(light, [c for split, c in posed if split == "train"], tell)
     del apart  # while two scenes live, kernels have the shapes of both
     scene = source.instance()
     shutil.rmtree(written, ignore_errors=True)

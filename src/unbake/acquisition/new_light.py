@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ..config.light import LightConfig
+import numpy as np
+
+from ..config.light import Axis, LightConfig
+from ..dataset.camera import Camera, up_of
 from ..scene import relight
 from ..scene.parse import ParsedScene
+
+#: Cosine below which an environment map that stands beside the cameras' upward direction is told.
+_UPRIGHT = 0.7
 
 
 def change_light(
@@ -40,3 +47,25 @@ def put_light(
     if light.lights is not None:
         for line in relight.put_lights(scene, Path(light.lights), light.root(allow_outside)):
             tell(line)
+
+
+def tell_tilt(
+    light: LightConfig | None, cameras: Sequence[Camera], tell: Callable[[str], None]
+) -> None:
+    """Tell of an environment map whose sky is not where cameras, one at least, have up."""
+    if light is None or light.envmap is None:
+        return
+    up = up_of(cameras)
+    wanted = axis_of(up)
+    if up @ np.array(light.up) >= _UPRIGHT or wanted == light.envmap_up:
+        return
+    tell(
+        f"the map's first row lies at {light.envmap_up}, while the cameras' up is {wanted}: "
+        f"--envmap-up {wanted} turns it"
+    )
+
+
+def axis_of(up: np.ndarray) -> Axis:
+    """The world axis that is nearest to a direction (3,), with its sign."""
+    axis = int(np.argmax(np.abs(up)))
+    return typing.get_args(Axis)[2 * axis + int(up[axis] < 0)]

@@ -27,7 +27,13 @@ class CaptureSettings:
     """
 
     #: Without a camera file.
-    views: Annotated[int, Flag("Views to learn from. Cameras are placed automatically")] = 24
+    views: Annotated[
+        int,
+        Flag(
+            "Views to learn from. Cameras are placed automatically, or are those of the built-in "
+            "scene"
+        ),
+    ] = 24
     #: Without a camera file.
     held_out: Annotated[int, Flag("Further views that are kept apart, to judge results by")] = 4
     #: Of the cameras of a file, too: their horizontal fields of view stay.

@@ -80,7 +80,7 @@ def fit(
     network that stands for all further light, breaks the rendering equation, at the first point
     that a camera sees; extra: the same one bounce further. These two keep the noise of one sample
     and need not fall. lhs: the photographs against L seen directly. In the end the error on pixels
-    that were held aside tells whether a longer fit would be better.
+    that were held aside tells whether the fit was still improving.
 
     Args:
         data: Folder of the data set, with its transforms.json.
@@ -228,7 +228,7 @@ def compare(
 
     Fields, batches, seed and length are the same for all. Learning rates, estimator, warm-up and
     Adam's beta2 are each method's own, unless the settings give them. Methods with a radiance field
-    also search for roughness.
+    also search for roughness, where it is neural.
 
     Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. OUT/untrained has
     the fields before the first step: a method is worth what it adds to these. Where the data set

@@ -227,7 +227,7 @@ class FitConfig:
     bounces: Annotated[
         int,
         Flag(
-            "Differentiable bounces of ours before the radiance field is asked; 0: 2 where "
+            "Differentiable bounces of ours and no-prior before the radiance field; 0: 2 where "
             "photographs hide the background, else 1"
         ),
     ] = 0

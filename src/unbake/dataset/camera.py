@@ -324,6 +324,24 @@ def spread_rays(cameras: Sequence[Camera], along: int) -> tuple[np.ndarray, np.n
     return np.concatenate(origins), np.concatenate(directions)
 
 
+def up_of(cameras: Sequence[Camera]) -> np.ndarray:
+    """The upward direction (3,), a unit vector, of photographs that were taken level.
+
+    It is perpendicular to the cameras' horizontal axes, if these differ; else the mean of their
+    vertical ones.
+    """
+    right = np.array([camera.to_world[:3, 0] for camera in cameras])
+    mean = np.mean([camera.to_world[:3, 1] for camera in cameras], axis=0)
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    up = vectors[:, 0]
+    # Two horizontal directions and a vertical one that none has.
+    if values[1] < 0.05 or values[0] > 0.3 * values[1] or abs(up @ mean) < 0.1:
+        up = mean
+    length = np.linalg.norm(up)
+    up = cameras[0].to_world[:3, 1] if length < 1e-3 else up / length
+    return up if up @ mean >= 0 else -up
+
+
 @final
 @dataclass(frozen=True)
 class LookAt:

@@ -62,7 +62,8 @@ DEFINITIONS = {
     "estimator with two passes, both count",
     "data_changed": "parts of the data set that differ from those that the run was fit to",
     "mask": "pixels all of whose samples see an optimized material: emitters, mirrors, glass "
-    "and background are left out; without truth images every foreground pixel counts",
+    "and background are left out; without truth images every pixel of a photograph counts that is "
+    "not masked or transparent",
 }
 
 

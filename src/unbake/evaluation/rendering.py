@@ -17,7 +17,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..acquisition.new_light import change_light
+from ..acquisition.new_light import change_light, tell_tilt
 from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
 from ..dataset.camera import Camera, frame_name, frame_of, read_named_cameras
@@ -45,14 +45,11 @@ from .renderings import (
     scored_views,
 )
 from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
-from .turntable import axis_of, up_of
 from .turntable import turntable as make_turntable
 from .yardsticks import seen_materials
 
 #: Memory in bytes that a pixel of a picture takes, its copies included.
 _PIXEL_BYTES = 64
-#: Cosine below which an environment map that stands beside the cameras' upward direction is told.
-_UPRIGHT = 0.7
 #: Of scenes that are not the same: how far bounding boxes differ, as a part of their extent.
 _ANOTHER = 0.1
 
@@ -240,8 +237,7 @@ def _render(
     light: LightConfig | None,
     tell: Callable[[str], None],
 ) -> dict[str, Any]:
-    if light is not None and light.envmap is not None:
-        _tell_tilt(light, recovered.dataset, tell)
+    tell_tilt(light, [view.camera for view in recovered.dataset.train], tell)
     shots, placed = _shots(recovered, settings, cameras, tell)
     largest = max(shot.camera.width * shot.camera.height for shot in shots)
     require_memory(_PIXEL_BYTES * largest, "a picture needs", "Lower --width and --height")
@@ -406,15 +402,3 @@ def _tell_progress(
         tell(f"{frame['name']}: {'—' if value is None else f'render {value:.1f} dB'}")
     elif (number + 1) * 4 // count > number * 4 // count:
         tell(f"rendered {number + 1} of {count} pictures")
-
-
-def _tell_tilt(light: LightConfig, dataset: Dataset, tell: Callable[[str], None]) -> None:
-    """Tell of a map whose sky is not where the cameras have up."""
-    up = up_of([view.camera for view in dataset.train])
-    if up @ np.array(light.up) >= _UPRIGHT:
-        return
-    wanted = axis_of(up)
-    tell(
-        f"the map's first row lies at {light.envmap_up}, while the cameras' up is {wanted}: "
-        f"--envmap-up {wanted} turns it"
-    )

@@ -79,7 +79,8 @@ def counted_pixels(
     Args:
         photograph: (H, W, 4), with alpha, which is 0 where it is masked.
         seen: the recovered materials; None where they are known.
-        truth: the true ones; None where they are not known: every foreground pixel counts.
+        truth: the true ones; None where they are not known: every pixel counts that
+            is not masked or transparent.
     """
     if truth is None:
         return photograph[..., 3] >= 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -11,8 +10,7 @@ from typing import Literal
 import mitsuba as mi
 import numpy as np
 
-from ..config.light import Axis
-from ..dataset.camera import Camera
+from ..dataset.camera import Camera, up_of
 from ..errors import UserError
 from ..scene import free_space
 
@@ -99,30 +97,6 @@ def turntable(
         for a in angles
     ]
     return Turntable(made, "pan", eye, 0.0, up)
-
-
-def axis_of(up: np.ndarray) -> Axis:
-    """The world axis that is nearest to a direction (3,), with its sign."""
-    axis = int(np.argmax(np.abs(up)))
-    return typing.get_args(Axis)[2 * axis + int(up[axis] < 0)]
-
-
-def up_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """The upward direction (3,), a unit vector, of photographs that were taken level.
-
-    It is perpendicular to the cameras' horizontal axes, if these differ; else the mean of their
-    vertical ones.
-    """
-    right = np.array([camera.to_world[:3, 0] for camera in cameras])
-    mean = np.mean([camera.to_world[:3, 1] for camera in cameras], axis=0)
-    values, vectors = np.linalg.eigh(right.T @ right / len(right))
-    up = vectors[:, 0]
-    # Two horizontal directions and a vertical one that none has.
-    if values[1] < 0.05 or values[0] > 0.3 * values[1] or abs(up @ mean) < 0.1:
-        up = mean
-    length = np.linalg.norm(up)
-    up = cameras[0].to_world[:3, 1] if length < 1e-3 else up / length
-    return up if up @ mean >= 0 else -up
 
 
 def _looked_at(scene: mi.Scene, cameras: Sequence[Camera]) -> np.ndarray:

@@ -7,6 +7,7 @@ DIR/
   unobserved/             masks of what no view saw, where no textures are written
   mitsuba/scene.xml       the scene for Mitsuba, with its own meshes and textures
   usd/scene.usdc          the scene as OpenUSD, with its own textures
+  environment.exr         the environment, recovered or that of the scene
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from .textures import COLOUR_SPACES, file_names, write_mask, write_textures
 from .unwrap import LARGEST, UNIQUE, make_atlases
 from .usd import require_usd, write_usd
 
-#: The recovered environment, beside `export.json`.
+#: The environment, recovered or of the scene, beside `export.json`.
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
@@ -251,12 +252,17 @@ def _write(
         write_exr(out / _ENVIRONMENT, environment)
     if "gltf" in formats:
         write_glb(out / "scene.glb", found.scene, found.parts, shown, lights)
+        if environment is not None:
+            what = "scene.glb has no environment, as glTF has none"
+            notes.append(f"{what}: it is {_ENVIRONMENT}")
     if "usd" in formats:
         (out / "usd").mkdir()
         beside = None if environment is None else f"../{_ENVIRONMENT}"
         write_usd(out / "usd", found.scene, found.parts, shown, lights, beside, _up(dataset))
     if "mitsuba" in formats:
         (out / "mitsuba").mkdir()
+        # The scene's own stays as it is.
+        recovered_environment = None if recovered.problem.environment is None else environment
         scene = write_scene(
             out / "mitsuba",
             parsed_principled(dataset.scene, dataset.root),
@@ -264,7 +270,7 @@ def _write(
             found.parts,
             baked,
             lights,
-            environment,
+            recovered_environment,
             recovered.camera(dataset.train[0]),
         )
         notes += scene.notes

@@ -7,11 +7,17 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from ..scene.emitters import ENVIRONMENTS, emitter_nodes, named_emitters, placement
+from ..scene.emitters import (
+    ENVIRONMENTS,
+    emitter_nodes,
+    environment_latlong,
+    named_emitters,
+    placement,
+)
 from ..scene.parse import ParsedScene
 from ..training.problem import Problem
 
-#: Rows of the picture of a recovered environment, at least.
+#: Rows of the picture of an environment, at least.
 ROWS = 256
 
 
@@ -68,10 +74,14 @@ def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
 
 
 def environment_picture(problem: Problem) -> np.ndarray | None:
-    """The recovered environment as Mitsuba's `envmap` reads it; None where none was recovered."""
-    if problem.environment is None:
-        return None
-    return problem.environment.to_latlong(max(ROWS, 2 * problem.environment.resolution))
+    """The environment as Mitsuba's `envmap` reads it; None where there is none.
+
+    It is the recovered one, or else the scene's own.
+    """
+    if problem.environment is not None:
+        return problem.environment.to_latlong(max(ROWS, 2 * problem.environment.resolution))
+    scene = problem.scene_view.scene
+    return None if scene.environment() is None else environment_latlong(scene, ROWS)
 
 
 def _cone(props: mi.Properties) -> tuple[float, float]:

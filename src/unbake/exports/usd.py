@@ -71,7 +71,7 @@ def write_usd(
         parts: all of them; those that no fit optimizes get materials without textures.
         baked: textures of the others.
         lights: those without extent are written as such, area lights as emission of their parts.
-        environment: path of the recovered environment's file from the folder; None: there is none.
+        environment: path of the environment's file from the folder; None: there is none.
         up: "Y" or "Z".
     """
     from pxr import Usd, UsdGeom, UsdLux

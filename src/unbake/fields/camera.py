@@ -14,7 +14,7 @@ Photographs alone leave some of it open, which conventions decide:
 - All exposures times a number is all radiance divided by it. The exposure of the first training
   view is as the data set tells, and so is its white balance where each image has one of its own.
 - A white balance that all images share is told from the colour of albedo by interreflection, and
-  by lights that are seen, alone.
+  by lights that are seen, alone, and only where lights are known: else it is their colour.
 - v is 1 at the centre, and f(0) = 0. f(P) = P at the middle of the code values of an 8-bit file,
   which is where cameras put a surface of 18 % (ISO 12232: code 118 of 255). Photographs have most
   of their pixels around there; where white is, 1, few of them say anything.

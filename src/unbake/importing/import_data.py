@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from ..acquisition.new_light import put_light
+from ..acquisition.new_light import put_light, tell_tilt
 from ..config.light import LightConfig
 from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
@@ -120,7 +120,7 @@ def import_data(
     faults.require_none(source)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
-        file, scene = _write_scene(data, parts, light, allow_outside, tell)
+        file, scene = _write_scene(data, parts, found.shots, light, allow_outside, tell)
         seen = _shares_seen(scene, found.shots)
         dark = light is None and _enclosed(scene, found.shots)
         background = settings.background
@@ -408,6 +408,7 @@ def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:
 def _write_scene(
     data: DataFolder,
     parts: Sequence[Part],
+    shots: Sequence[Shot],
     light: LightConfig | None,
     allow_outside: bool,
     tell: Callable[[str], None],
@@ -417,6 +418,7 @@ def _write_scene(
     if light is not None:
         parsed = parse(file)
         put_light(parsed, light, allow_outside, tell)
+        tell_tilt(light, [shot.lens.camera(shot.to_world) for shot in shots], tell)
         file = write(parsed, data.scene.resolve())
     return file, parse(file).instantiate()
 

@@ -26,8 +26,8 @@ OPTIMIZED = {
 def nothing_learned(run: EvaluatedRun) -> str | None:
     """Why a run is no result, in a few words; None if it is one.
 
-    Its fit noted that nothing was learned, or each material of held-out views scores below that of
-    the untrained fields.
+    Its fit noted that nothing was learned, or each material of held-out views, albedo once aligned
+    where it has been, scores below that of the untrained fields.
     """
     if run.untrained:
         return None
@@ -36,7 +36,12 @@ def nothing_learned(run: EvaluatedRun) -> str | None:
     before = (run.metrics.get("yardsticks") or {}).get("untrained") or {}
     found = run.metrics.get("heldout") or {}
     keys = [f"{name}_psnr" for name in QUANTITIES]
-    pairs = [(display.number(found.get(key)), display.number(before.get(key))) for key in keys]
+    scores = {key: display.number(found.get(key)) for key in keys}
+    # Photographs may tell albedo and lighting but for a common scale.
+    aligned = display.number(found.get("albedo_psnr_aligned"))
+    if aligned is not None:
+        scores["albedo_psnr"] = aligned
+    pairs = [(scores[key], display.number(before.get(key))) for key in keys]
     known = [(score, first) for score, first in pairs if score is not None and first is not None]
     below = known and all(score < first for score, first in known)
     return "worse than untrained" if below else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,6 +51,21 @@ def named_emitters(scene: ParsedScene) -> list[NamedEmitter]:
 def emitter_nodes(scene: ParsedScene) -> list[int]:
     """Indices of the nodes that are emitters of `STRENGTHS`, in the order of `named_emitters`."""
     return [i for i, n in enumerate(scene.state.nodes) if n.props.plugin_name() in STRENGTHS]
+
+
+def fits_environment(scene: ParsedScene) -> bool:
+    """Whether the environment is among the emitters whose strength can be optimized."""
+    nodes = scene.state.nodes
+    return any(nodes[i].props.plugin_name() in ENVIRONMENTS for i in emitter_nodes(scene))
+
+
+def lights_besides(scene: ParsedScene, plugins: Collection[str]) -> int:
+    """The number of emitters that are of none of these plugins, and not black."""
+    pairs = zip(emitter_nodes(scene), named_emitters(scene), strict=True)
+    black = {i for i, named in pairs if named.strength == (0.0, 0.0, 0.0)}
+    nodes = {i: scene.state.nodes[i] for i in scene.reachable(0) if i not in black}
+    found = [n.props.plugin_name() for n in nodes.values() if n.type == mi.ObjectType.Emitter]
+    return sum(name not in plugins for name in found)
 
 
 def placement(props: mi.Properties) -> np.ndarray:

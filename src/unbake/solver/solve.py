@@ -15,7 +15,7 @@ from rich.console import Console
 
 from ..acquisition.built_in import SCENES, write_scene
 from ..acquisition.capture import posed_cameras, require_scene
-from ..acquisition.new_light import change_light
+from ..acquisition.new_light import change_light, tell_tilt
 from ..acquisition.placement import is_room
 from ..acquisition.settings import CaptureSettings
 from ..config.light import LightConfig
@@ -135,6 +135,7 @@ def fine_tune(
     if light is not None:
         change = partial(change_light, light=light, allow_outside=allow_outside, tell=tell)
     recovered = load_run(run, allow_outside=allow_outside, change=change)
+    tell_tilt(light, [view.camera for view in recovered.dataset.train], tell)
     problem, config = recovered.problem, recovered.config
     radiance = problem.radiance
     if radiance is None:
@@ -180,6 +181,7 @@ def _known_scene(
             return scene
 
         posed, room = _posed(name, parsed(tell), settings, cameras)
+        tell_tilt(light, list(posed.values()), tell)
         scene = parsed(lambda line: None).instantiate()
     view = SceneView.of(scene, None, settings.max_specular)
     points = SurfacePoints.of(scene, settings.seed)

@@ -319,7 +319,7 @@ class Convergence:
         part = "the last quarter" if abs(self.share - LAST) < 0.05 else f"the last {self.share:.0%}"
         sizes = f"{100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
         word, advice = {
-            "improving": ("still improving", "a longer fit would be better: --quality high"),
+            "improving": ("still improving", "a longer fit may be better: --quality high"),
             "plateau": (
                 "at a plateau",
                 "a longer fit explains photographs no better; materials may still gain",

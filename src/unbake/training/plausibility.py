@@ -14,6 +14,8 @@ from ..dataset.quick_check import quick_findings
 from ..dataset.views import Dataset, check_cameras
 from ..errors import UserError
 from ..fields.arrays import from_numpy
+from ..scene.emitters import ENVIRONMENTS, STRENGTHS, fits_environment, lights_besides
+from ..scene.parse import parse
 from ..transport.render import RayGenerator, render_radiance
 from .problem import Problem
 
@@ -58,10 +60,10 @@ def data_warnings(
         fitted = problem.camera is not None and problem.camera.has_exposures
         found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
         units = None if found else _other_units(pixels, problem)
-    light = _placeholder(dataset, problem)
+    light, colour = _placeholder(dataset, problem), _open_colour(dataset, problem)
     hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
     noise = noise_at_black(pixels.photographs.noise)
-    told = (*found, units, light, hot_pixels, noise and str(noise))
+    told = (*found, units, light, colour, hot_pixels, noise and str(noise))
     return [line for line in told if line]
 
 
@@ -69,9 +71,26 @@ def _placeholder(dataset: Dataset, problem: Problem) -> str | None:
     """A line if an environment that only stands for the unknown light is taken for the true one."""
     if dataset.light == "known" or problem.environment is not None:
         return None
+    if problem.emission is not None and fits_environment(parse(dataset.scene, dataset.root)):
+        return None
     return (
         "the data set says that its light is unknown, and what stands for it in the scene is taken "
         "for the true light. Leave out --unknown, and lighting is recovered with the materials"
+    )
+
+
+def _open_colour(dataset: Dataset, problem: Problem) -> str | None:
+    """A line if one white balance of all photographs is fitted, and no light is known."""
+    if problem.camera is None or problem.camera.white_balance != "common":
+        return None
+    if problem.environment is None and problem.emission is None:
+        return None
+    fitted = ENVIRONMENTS if problem.emission is None else tuple(STRENGTHS)
+    if lights_besides(parse(dataset.scene, dataset.root), fitted):
+        return None
+    return (
+        "the white balance of all photographs and the colour of unknown light cannot be told "
+        "apart: leave out --white-balance"
     )
 
 
