@@ -6,7 +6,7 @@
 The fits of a seed follow each other, and the file is written after each fit. With --go-on, fits
 that it has already are kept: those of the first seeds, of each data set, method and settings.
 Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over held-out views, with those of
-the untrained fields; seconds are those of training.
+the untrained fields and of the best constants; seconds are those of training.
 """
 
 from __future__ import annotations
@@ -127,7 +127,9 @@ def fit(
         metrics = json.loads(RunFolder(run).metrics_file.read_text(encoding="utf-8"))
     scores = {key: metrics["heldout"][key] for key in SCORES}
     untrained = metrics["yardsticks"]["untrained"]
-    scores |= {f"untrained_{key}": untrained[key] for key in SCORES if key in untrained}
+    constant = metrics["yardsticks"].get("constant", {})
+    for name, found in (("untrained", untrained), ("constant", constant)):
+        scores |= {f"{name}_{key}": found[key] for key in SCORES if key in found}
     return scores | {key: metrics[key] for key in LENGTH}
 
 
