@@ -545,12 +545,12 @@ def context(facts: Facts) -> dict[str, Any]:
     """What templates call."""
     public = (name for name in dir(facts) if not name.startswith("_"))
     # It needs Mitsuba, whose variant is chosen by now.
-    from unbake.config import PathConfig
+    from unbake.config.fit import GAIN_OF_ROOMS
     from unbake.exports.bake import WANTED
     from unbake.training.path_depth import SHARE
 
     settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
     settings |= {"score_window": WINDOW, "near_wanted": WANTED}
-    settings["planned_gain"] = PathConfig().planned_gain
+    settings["planned_gain"] = GAIN_OF_ROOMS
     functions = {"sooner": sooner}
     return {name: getattr(facts, name) for name in public} | functions | settings

@@ -146,7 +146,7 @@ def test_grey_fields_that_nobody_beats_are_told(written):
     readme, page = (
         " ".join(written[ROOT / p].split()) for p in ("README.md", "docs/comparison.md")
     )
-    assert f"come nearer still there ({grey:.1f} dB over" in readme
+    assert f"untrained grey fields score higher ({grey:.1f} dB over" in readme
     assert f"renderings of the untrained fields have {grey:.1f} dB" in page
 
 

@@ -190,6 +190,28 @@ def test_a_scenes_environment_is_its_picture(sky):
     assert np.abs(found - np.roll(sky, 1, 0)).mean() > 0.02 * sky.mean()
 
 
+def test_nothing_of_a_small_sun_is_lost():
+    """Of fine maps every other row was missed, and of Mitsuba's sun a tenth."""
+    rows = 1024
+    fine = np.zeros((rows, 2 * rows, 3), np.float32)
+    fine[301, 777] = 5000.0
+    scene = {"type": "scene", "sky": {"type": "envmap", "bitmap": mi.Bitmap(fine)}}
+    found = emitters.environment_latlong(mi.load_dict(scene), 32)
+    whole = 5000 * np.pi**2 / (rows - 1) / rows * np.sin(np.pi * 301 / (rows - 1))
+    solid = np.pi**2 / 31 / 32 * np.sin(np.pi * np.arange(32) / 31)
+    assert (found * solid[:, None, None]).sum((0, 1)) == pytest.approx([whole] * 3, rel=0.05)
+
+    sun = {"type": "sunsky", "sky_scale": 0.0, "sun_direction": [0.3, 0.2, 0.5]}
+    images = [emitters.environment_latlong(mi.load_dict({"type": "scene", "sky": sun}), h)
+              for h in (64, 128)]  # fmt: skip
+    energies = []
+    for image in images:
+        h = len(image)
+        solid = np.pi**2 / (h - 1) / h * np.sin(np.pi * np.arange(h) / (h - 1))
+        energies.append((image * solid[:, None, None]).sum())
+    assert energies[0] == pytest.approx(energies[1], rel=0.03)
+
+
 # --------------------------------------------------------------------------------------- lights
 
 

@@ -7,9 +7,9 @@ import pytest
 from support import TINY_FIT
 
 from unbake.comparison.method_variant import MethodVariant
-from unbake.config import FitConfig, from_toml, preset, read_toml, to_toml
+from unbake.config import FitConfig, PathConfig, from_toml, preset, read_toml, to_toml
 from unbake.config import method_defaults as module
-from unbake.config.fit import UNKNOWNS
+from unbake.config.fit import GAIN_OF_ROOMS, UNKNOWNS
 from unbake.config.method_defaults import MethodDefaults
 from unbake.dataset.scene_kind import scene_kind
 from unbake.dataset.views import Dataset
@@ -106,6 +106,12 @@ def test_objects_have_two_bounces_before_the_radiance_field_and_rooms_one():
     started = defaults("direct", "object")
     other = with_method_defaults(MethodVariant.of("ours").settings(started), "object")
     assert other.bounces == 2
+
+
+def test_rooms_are_planned_brighter_than_they_begin_and_objects_as_they_are():
+    assert defaults("ad-pt").path.planned_gain == GAIN_OF_ROOMS > 1
+    assert defaults("ad-pt", "object").path.planned_gain == 1
+    assert defaults("ad-pt", path=PathConfig(planned_gain=2.5)).path.planned_gain == 2.5
 
 
 def test_what_a_user_says_stays(table):

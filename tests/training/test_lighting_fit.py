@@ -81,6 +81,26 @@ def test_the_strength_of_a_lamp_is_found(photographs, method):
     assert light.emission_error < 0.05
 
 
+def test_a_lamp_that_no_photograph_depends_on_is_told(tmp_path, tiny, unbake):
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0">
+          <sensor type="perspective"><transform name="to_world">
+            <lookat origin="0,-5,6" target="0,0,0" up="0,0,1"/></transform></sensor>
+          <shape type="rectangle"><transform name="to_world"><scale value="3"/></transform></shape>
+          <shape type="cube"><transform name="to_world"><scale value="0.4"/>
+            <translate z="0.5"/></transform></shape>
+          <emitter type="point" id="inside"><point name="position" value="0,0,0.5"/></emitter>
+          <emitter type="point" id="outside"><point name="position" value="0,0,4"/></emitter>
+        </scene>"""
+    )
+    small = CaptureSettings(views=2, held_out=1, resolution=12, spp=4, max_depth=4)
+    capture(tmp_path / "scene.xml", tmp_path / "data", small, tell=lambda line: None)
+    words = ["--settings", tiny, "--unknown", "emission", "--steps", 20]
+    outcome = unbake("fit", tmp_path / "data", "--out", tmp_path / "run", *words)
+    said = " ".join(outcome.out.split())
+    assert outcome.status == 0 and "depends on the strength of point light 1, along" in said, outcome
+
+
 @pytest.mark.parametrize("size", [1.0, 0.01, 100.0])
 def test_points_begin_as_bright_as_the_size_of_the_scene_asks_for(size, tmp_path):
     """In a room of any size, so that a surface has about the mean radiance of photographs."""

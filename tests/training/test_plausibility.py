@@ -94,6 +94,22 @@ def test_a_placeholder_whose_strength_is_fitted_is_not_doubted(kind, doubted, tm
     assert (plausibility._placeholder(dataset, problem) is not None) == doubted
 
 
+def test_lamps_with_pictures_are_told_where_their_strength_is_fitted(tmp_path):
+    scene = tmp_path / "scene.xml"
+    write_exr(tmp_path / "screen.exr", np.ones((8, 16, 3)))
+    picture = '<texture type="bitmap" name="radiance"><string name="filename" value="screen.exr"/>'
+    scene.write_text(
+        f"""<scene version="3.0.0"><shape type="sphere"/><emitter type="point"/>
+        <shape type="rectangle" id="screen"><emitter type="area">{picture}</texture></emitter>
+        </shape></scene>"""
+    )
+    dataset = Dataset(tmp_path, scene, "visible", (), {}, None)
+    for unknown in ("emission", "materials"):
+        problem = make_problem(scene, "visible", update(TINY_FIT, {"unknown": unknown}), 0.5)
+        line = plausibility._pictures(dataset, problem)
+        assert line is None if unknown == "materials" else line.endswith("spectra of screen")
+
+
 @pytest.mark.parametrize(("unknown", "open_"), [("emission", True), ("materials", False)])
 def test_a_white_balance_that_unknown_light_leaves_open_is_told(unknown, open_, cornell):
     camera = {"white_balance": "common"}

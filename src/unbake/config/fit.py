@@ -78,11 +78,12 @@ class PathConfig:
     #: The wavefront of `ad-pt` is planned, before the first step, for surfaces that reflect so many
     #: times as much as they do then: untrained albedo is 0.5, that of walls 0.8. Where they reflect
     #: more than was planned for, fewer paths survive, and count more; where less, lanes stay empty.
-    planned_gain: float = 1.6
+    #: 0: `GAIN_OF_ROOMS` in rooms; around objects, where hardly any path is long, 1.
+    planned_gain: float = 0.0
 
     def __post_init__(self) -> None:
-        ranges = {"max_depth": (0, DEEPEST), "rr_depth": (1, DEEPEST), "planned_gain": (1, 10)}
-        require_ranges(self, ranges)
+        require_ranges(self, {"max_depth": (0, DEEPEST), "rr_depth": (1, DEEPEST)})
+        require_ranges(self, {"planned_gain": (1 if self.planned_gain else 0, 10)})
 
     @property
     def chosen_depth(self) -> int:
@@ -156,6 +157,8 @@ UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
 #: Mean radiance below which photographs are dim: the darkest of the published scenes has more.
 DIM = 0.08
+#: How many times as much as untrained ones the surfaces of rooms are planned to reflect.
+GAIN_OF_ROOMS = 1.6
 
 #: Schedule of methods for which no other one was found best.
 OWN_FINAL_RATE, OWN_WARM_UP = 0.05, 100

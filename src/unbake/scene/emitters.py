@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,8 @@ STRENGTHS = {
 }
 
 
+#: Rows of directions in which an environment is looked at: with a sun, and at most.
+_SUN_ROWS, _MOST_ROWS = 4096, 8192
 #: In which surfaces are looked for from a point or a spot.
 _DIRECTIONS = 256
 
@@ -140,7 +143,20 @@ def environment_latlong(scene: mi.Scene, height: int) -> np.ndarray:
         si.wi = -d
         return environment.eval(si)
 
-    return latlong(radiance, height, max(1, min(16, 1024 // height)))
+    return latlong(radiance, height, _samples_along(environment, height))
+
+
+def _samples_along(environment: mi.Emitter, height: int) -> int:
+    """Directions along an edge of a pixel of an image that miss no pixel of the environment.
+
+    The sun is half a degree wide, and carries most of the light of its sky.
+    """
+    params = mi.traverse(environment)
+    usual = max(1, min(16, 1024 // height))
+    if any(key.endswith("sun_scale") for key in params.keys()):  # noqa: SIM118
+        return max(usual, math.ceil(_SUN_ROWS / height))
+    rows = params["data"].shape[0] if "data" in params else 0
+    return max(usual, min(math.ceil(rows / height), math.ceil(_MOST_ROWS / height)))
 
 
 def require_emitters(scene: mi.Scene, path: Path) -> None:

@@ -291,7 +291,7 @@ def _context(problem: Problem, config: FitConfig) -> SamplerContext:
         bounces=config.chosen_bounces,
         max_depth=config.path.chosen_depth,
         rr_depth=config.path.rr_depth,
-        planned_gain=config.path.planned_gain,
+        planned_gain=config.path.planned_gain or 1.0,
         read_by_scene=problem.read_by_scene,
         guide=problem.guide,
     )

@@ -9,6 +9,7 @@ from ..config import FitConfig
 from ..config.fit import (
     BOUNCES_OF_OBJECTS,
     FORGETFUL_BETA2,
+    GAIN_OF_ROOMS,
     LEAST_SLOPE,
     OWN_BETA2,
     OWN_FINAL_RATE,
@@ -101,6 +102,7 @@ def with_method_defaults(config: FitConfig, kind: SceneKind) -> FitConfig:
     return replace(
         config,
         bounces=config.bounces or own_bounces(config, kind),
+        path=replace(config.path, planned_gain=config.path.planned_gain or own_gain(kind)),
         rate_factors=factors,
         estimator=estimator,
         final_learning_rate=_first_known(
@@ -116,6 +118,11 @@ def own_bounces(config: FitConfig, kind: SceneKind) -> int:
     """The differentiable bounces of a method where the settings leave them open."""
     takes = METHODS[config.method].takes_bounces
     return BOUNCES_OF_OBJECTS if takes and kind == "object" else 1
+
+
+def own_gain(kind: SceneKind) -> float:
+    """The gain that wavefronts are planned for where the settings leave it open."""
+    return GAIN_OF_ROOMS if kind == "room" else 1.0
 
 
 def own_warm_up(config: FitConfig) -> int:

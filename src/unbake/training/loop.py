@@ -376,8 +376,21 @@ class _Training:
             monitor, at = self._monitor, (progress.step, progress.seconds)
             monitor.note(*at, progress.warning, verdict=True)
             return
-        for line in self._errors.told():
+        for line in [*self._unreached(), *self._errors.told()]:
             self._monitor.say(line)
+
+    def _unreached(self) -> list[str]:
+        """A line if no photograph depends on the strength of a lamp, which is where it began."""
+        begun = self._begun
+        if begun.problem.emission is None or not begun.progress.step:
+            return []
+        names = [begun.problem.emitter_names[i] for i in begun.state.unreached("emission.log", 3)]
+        if not names:
+            return []
+        return [
+            f"warning: no photograph depends on the strength of {', '.join(names)}, along the "
+            "bounces of this method: it is where it began. Try more --bounces, or --method prb"
+        ]
 
     def _show(self) -> list[UserError]:
         """Show a preview, or return why it cannot be written; nothing without a lock."""

@@ -14,7 +14,13 @@ from ..dataset.quick_check import quick_findings
 from ..dataset.views import Dataset, check_cameras
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..scene.emitters import ENVIRONMENTS, STRENGTHS, fits_environment, lights_besides
+from ..scene.emitters import (
+    ENVIRONMENTS,
+    STRENGTHS,
+    fits_environment,
+    lights_besides,
+    named_emitters,
+)
 from ..scene.parse import parse
 from ..transport.render import RayGenerator, render_radiance
 from .problem import Problem
@@ -63,7 +69,8 @@ def data_warnings(
     light, colour = _placeholder(dataset, problem), _open_colour(dataset, problem)
     hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
     noise = noise_at_black(pixels.photographs.noise)
-    told = (*found, units, light, colour, hot_pixels, noise and str(noise))
+    told = (*found, units, light, colour, _pictures(dataset, problem), hot_pixels)
+    told = (*told, noise and str(noise))
     return [line for line in told if line]
 
 
@@ -91,6 +98,20 @@ def _open_colour(dataset: Dataset, problem: Problem) -> str | None:
     return (
         "the white balance of all photographs and the colour of unknown light cannot be told "
         "apart: leave out --white-balance"
+    )
+
+
+def _pictures(dataset: Dataset, problem: Problem) -> str | None:
+    """A line if lamps whose strength is fitted have no strength that is one colour."""
+    if problem.emission is None:
+        return None
+    known = named_emitters(parse(dataset.scene, dataset.root))
+    names = [emitter.name for emitter in known if emitter.strength is None]
+    if not names:
+        return None
+    return (
+        "a fit finds one colour and strength for each lamp, and nothing of the pictures or "
+        f"spectra of {', '.join(names)}"
     )
 
 

@@ -138,6 +138,16 @@ class State:
         moments = [extra[2] for _, _, _, extra in self.phi.state.values()]
         return any(dr.any(moment.array != 0)[0] for moment in moments)
 
+    def unreached(self, key: str, width: int) -> np.ndarray:
+        """Numbers of the rows of an unknown that no gradient has reached, as Adam's moments tell.
+
+        Args:
+            key: of a parameter.
+            width: entries of a row.
+        """
+        _, _, _, extra = self.phi.state[key]
+        return np.flatnonzero((np.array(extra[2].array).reshape(-1, width) == 0).all(axis=1))
+
     def broken(self) -> list[str]:
         """Names of the parameters that are not finite, or whose moments in Adam are not."""
         good = {}
