@@ -274,18 +274,12 @@ def test_errors_of_renderings_are_of_pixels_that_count(known, tmp_path: Path, mo
         frame["mask_path"] = "mask.png"
     (data / "transforms.json").write_text(json.dumps(transforms))
     run = _make_run(tmp_path / "run", data, "ours", 0.01, known=known)
-    painted, paint = [], display.painted
-
-    def kept(values, scale, mask):
-        painted.append(mask)
-        return paint(values, scale, mask)
-
-    monkeypatch.setattr(display, "painted", kept)
+    painted = _painted(monkeypatch)
     write_report([run], tmp_path / "page.html")
     expected = half[..., 0] > 0
     if known:
         expected &= _truth(0)["mask"] > 0
-    assert (painted[0] == expected).all() and 0 < expected.sum() < expected.size
+    assert (painted[0][1] == expected).all() and 0 < expected.sum() < expected.size
 
 
 def test_clipped_photographs_are_compared_as_renderings_are(made, tmp_path: Path, monkeypatch):
@@ -296,16 +290,10 @@ def test_clipped_photographs_are_compared_as_renderings_are(made, tmp_path: Path
         limited = np.minimum(_truth(index)["render"], 0.5)
         assert (_truth(index)["render"] > 0.6).any()
         _save(run / "evaluation" / split / f"{name}_render.exr", limited)
-    painted, paint = [], display.painted
-
-    def kept(values, scale, mask):
-        painted.append(values)
-        return paint(values, scale, mask)
-
-    monkeypatch.setattr(display, "painted", kept)
+    painted = _painted(monkeypatch)
     write_report([run], tmp_path / "page.html")
-    np.testing.assert_allclose(painted[0], 0, atol=1e-6)
-    assert np.max(painted[1]) > 0  # of albedo, which nothing clips
+    np.testing.assert_allclose(painted[0][0], 0, atol=1e-6)
+    assert np.max(painted[1][0]) > 0  # of albedo, which nothing clips
 
 
 def test_photographs_without_truth_are_shown_as_recovered(tmp_path: Path):
@@ -861,6 +849,18 @@ def _edit(run: Path, change: Callable[[dict], object]) -> None:
 
 def _edit_json(file: Path, **changes: object) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+def _painted(monkeypatch) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Gets the values and the mask of each error picture that is painted from now on."""
+    painted, paint = [], display.painted
+
+    def kept(values, scale, mask):
+        painted.append((values, mask))
+        return paint(values, scale, mask)
+
+    monkeypatch.setattr(display, "painted", kept)
+    return painted
 
 
 def _edit_data(data: Path, **changes: object) -> None:

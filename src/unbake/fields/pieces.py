@@ -173,9 +173,8 @@ def _pieces(corners: np.ndarray, across_slivers: bool) -> tuple[np.ndarray, np.n
     # By places, not by vertices: those differ where normals or texture coordinates do.
     places = [of_corners.ravel().take(corner) for corner in within.T]
     one, other = _neighbours(places, rank)
-    sliver = _slivers(np.stack([a, b, c]), double)
     joined = np.zeros(0, np.int64), np.zeros(0, np.int64)
-    if across_slivers and sliver.any():
+    if across_slivers and (sliver := _slivers(np.stack([a, b, c]), double)).any():
         one, other, joined = _across(sliver, one, other, places, rank)
     # Neighbouring triangles may be turned to opposite sides.
     cosine = np.abs((normals.take(one, 0) * normals.take(other, 0)).sum(1))

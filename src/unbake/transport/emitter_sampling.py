@@ -24,8 +24,12 @@ def lets_pass(scene: mi.Scene) -> bool:
 
 def lights_pierce(scene: mi.Scene) -> bool:
     """Whether lights without size (points, spots, directions) shine through any surface."""
-    delta = int(mi.EmitterFlags.Delta)
-    return any(int(e.flags()) & delta for e in scene.emitters()) and lets_pass(scene)
+    return has_lights_without_size(scene) and lets_pass(scene)
+
+
+def has_lights_without_size(scene: mi.Scene) -> bool:
+    """Whether there are points, spots or directions, which no ray meets."""
+    return any(int(e.flags()) & int(mi.EmitterFlags.Delta) for e in scene.emitters())
 
 
 def bsdf_flags(scene: mi.Scene) -> list[int]:

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..fields.materials import Materials, carrying
 from ..fields.shapes import met_shapes, registry_number
-from .emitter_sampling import bsdf_flags, lets_pass, lights_pierce
+from .emitter_sampling import bsdf_flags, has_lights_without_size, lets_pass
 from .optimized import optimized_shapes
 
 
@@ -43,11 +43,11 @@ class SceneView:
 
     @staticmethod
     def of(scene: mi.Scene, materials: Materials | None, max_specular: int) -> SceneView:
-        """The view of a scene; looks at every BSDF once, also at those inside of instances."""
+        """The view of a scene; looks at every BSDF, also at those inside of instances."""
         holes, smooth = lets_pass(scene), int(mi.BSDFFlags.Smooth)
         chains = holes or any(not flags & smooth for flags in bsdf_flags(scene))
         area_emitters = any(shape.emitter() is not None for shape in met_shapes(scene))
-        found = chains, holes, area_emitters, lights_pierce(scene)
+        found = chains, holes, area_emitters, holes and has_lights_without_size(scene)
         return SceneView(scene, materials, max_specular, *found, optimized_shapes(scene))
 
     def with_scene(self, scene: mi.Scene) -> SceneView:
