@@ -51,7 +51,7 @@ def train(data: Path, steps: int) -> list[float]:
     """The sum of the losses, step by step."""
     dataset, config = unbake.Dataset.load(data), unbake.preset("cpu")
     pixels = unbake.training_pixels(dataset, clip_negative=False, smoothed=False)
-    scale = pixels.photographs.mean
+    scale = pixels.photographs.level
     problem = unbake.make_problem(dataset.scene, dataset.background, config, scale)
     phi = mi.ad.Adam(5e-3, problem.parameters(), mask_updates=True)
     theta = mi.ad.Adam(1e-2, problem.radiance.parameters(), mask_updates=True)

@@ -8,6 +8,7 @@ from typing import get_args
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 from unbake.acquisition.decimate import decimated
 from unbake.acquisition.degrade import degrade, displacement, response
@@ -319,6 +320,27 @@ def test_a_jpeg_has_a_mask_where_the_background_is_hidden(cornell, tmp_path):
     assert (read[:4] == 0).all()
     shown = (view.exposure * pixels[4, :, :3]).clip(max=0.5)
     np.testing.assert_allclose(read[4, :, :3], shown, atol=0.01)
+
+
+def test_white_is_told_by_pixels_that_count(cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data")
+    content = json.loads((data / "transforms.json").read_text())
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[:4] = 0
+    (data / "masks").mkdir()
+    Image.fromarray(mask).save(data / "masks" / "upper.png")
+    brightest = []
+    for frame in content["frames"]:
+        frame["mask_path"] = "masks/upper.png"
+        pixels = read_exr(data / frame["file_path"])
+        pixels[:4, :, :3] = 500
+        write_exr(data / frame["file_path"], pixels)
+        if frame["split"] == "train":
+            brightest.append(pixels[4:, :, :3].max())
+    (data / "transforms.json").write_text(json.dumps(content))
+    degrade(data, tmp_path / "out", DegradeSettings(clip=0.0), tell=lambda line: None)
+    gain = read_json(tmp_path / "out" / "degraded.json")["gain"]
+    assert gain == pytest.approx(1 / max(brightest), rel=1e-5)
 
 
 @pytest.mark.parametrize("told", [{"clipped": 1.0}, {"noise": {"shot": 0.01, "read": 0.0}}])

@@ -9,6 +9,7 @@ from PIL import Image
 
 from unbake.checks.check import check_data
 from unbake.checks.pictures import PictureFacts, blurred, percentage, picture_facts
+from unbake.checks.told import told_rows
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
 from unbake.dataset.mistakes import OPENCV, all_mistakes
@@ -237,6 +238,22 @@ def test_masks_that_leave_nothing_are_told(some, background, spoilt, unbake, tmp
     assert unbake("data", "check", data.folder).status == (0 if some else 2)
 
 
+def test_masked_pixels_say_nothing_of_poses(spoilt, monkeypatch):
+    """Where the background is visible, too: a fit does not learn from them either."""
+    data, given = spoilt("cornell"), []
+    mask = np.zeros((40, 40), np.uint8)
+    mask[:, :20] = 255
+    (data.folder / "masks").mkdir()
+    Image.fromarray(mask).save(data.folder / "masks" / "half.png")
+    for frame in data.frames:
+        frame["mask_path"] = "masks/half.png"
+    monkeypatch.setattr(
+        "unbake.checks.check.pose_problems", lambda *words, **_: given.append(words[2]) or []
+    )
+    check_data(data.save())
+    assert given[0].count == len(given[0].table) // 2
+
+
 def test_a_bracket_that_clips_has_the_exposures_that_it_tells(spoilt):
     """Most surfaces of the long photographs are at the limit."""
     data = spoilt("cornell")
@@ -412,6 +429,27 @@ def test_clipped_black_blurred_and_double_photographs_are_told(spoilt):
         "train_002 and train_003": "the photographs are the same, and their poses not",
         "train_004 and train_005": "two photographs have the same pose",
     }
+
+
+def test_pairs_of_duplicates_are_counted(spoilt):
+    data = spoilt("cornell")
+    for frame in data.frames[1:4]:
+        frame["transform_matrix"] = data.frames[0]["transform_matrix"]
+    result = check_data(data.save())
+    assert len([f for f in result.findings if f.check == "duplicates"]) == 1
+    assert {row: told for row, _, told in told_rows(result)}["duplicates"] == "6 pairs"
+
+
+def test_photographs_without_light_are_an_error(spoilt):
+    data = spoilt("cornell")
+    for frame in data.frames:
+        data.picture(frame, lambda p: p * [0, 0, 0, 1])
+    (held,) = (f for f in data.content["frames"] if f["split"] == "heldout")
+    data.picture(held, lambda p: p * [0, 0, 0, 1])
+    findings = found(data.save())
+    (black,) = (f for f in findings if f.check == "black")
+    assert (black.level, black.what) == ("error", "all photographs are black")
+    assert not [f for f in findings if f.check == "duplicates"]
 
 
 def test_a_photograph_that_is_blurred_is_named():

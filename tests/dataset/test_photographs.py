@@ -161,6 +161,28 @@ def weights(found, epsilon=0.001):
     return [np.array(w)[0] for w in pair]
 
 
+@pytest.mark.parametrize("lamp", [0.5, 1.9, 50.0, 5e6])
+def test_a_lamp_in_view_does_not_decide_the_level(lamp):
+    """It is as bright as ten times the median at most; black background tells no median."""
+    image = np.random.default_rng(5).uniform(0.1, 0.3, (32, 32))
+    image[:20] = 0
+    image[31, :8] = 0
+    rest = image.sum()
+    image[31, :8] = lamp
+    found = one_view(image, np.ones((32, 32)), foreground_only=False)
+    most = 10 * np.median(image[image > 0])
+    assert found.mean == pytest.approx((rest + 8 * lamp) / 1024, rel=1e-5)
+    assert found.level == pytest.approx((rest + 8 * min(lamp, most)) / 1024, rel=1e-5)
+    assert lamp > most or found.level == found.mean
+
+
+def test_the_level_knows_the_mask():
+    image, alpha = np.full((16, 16), 0.2), np.ones((16, 16))
+    image[:, 8:], alpha[:, 8:] = 30, 0
+    assert one_view(image, alpha, foreground_only=True).level == pytest.approx(0.2)
+    assert one_view(np.zeros((4, 4)), np.ones((4, 4)), foreground_only=False).level == 0
+
+
 def test_the_blur_stays_within_the_foreground():
     """Across the edge of a disc, and of a single pixel, it would mix in the black background."""
     y, x = np.mgrid[:16, :16]

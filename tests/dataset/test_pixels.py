@@ -1,5 +1,6 @@
 """Batches: rays go through the right pixels, which come with their own targets, evenly drawn."""
 
+import tracemalloc
 from dataclasses import replace
 
 import drjit as dr
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 
 from unbake.dataset.camera import Camera
-from unbake.dataset.pixels import CameraRays, PixelSource, crop_edges, largest_crop
+from unbake.dataset.decoding import fill, stretch
+from unbake.dataset.photographs import Photographs
+from unbake.dataset.pixels import CameraRays, PixelSource, _Places, crop_edges, largest_crop
 from unbake.errors import UserError
 
 SIZES = [(5, 3), (4, 4), (1, 7), (6, 2)]
@@ -374,3 +377,72 @@ def test_the_seed_decides_what_is_held_aside(large):
     assert plain.holding_aside(0.02, 0) is plain and plain.holding_aside(0.0, 0) is plain
     same = plain.draw(9, 50).read()[0], large().holding_aside(0.0, 1).draw(9, 50).read()[0]
     assert np.array_equal(*same)
+
+
+# ------------------------------------------------------------------------------ memory of many
+
+#: Pixels along an edge of a view of many, and bytes that are next to nothing beside these.
+MANY, LITTLE = 1024, 50_000
+
+
+def with_peak(work):
+    """What some work comes to, and the memory in bytes that it takes at most."""
+    tracemalloc.start()
+    try:
+        return work(), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.fixture
+def many():
+    """Three views of a million pixels, of which every second one counts, and none of the middle."""
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 50, MANY, MANY)
+    chosen = np.arange(0, 3 * MANY**2, 2, dtype=np.uint32)
+    chosen = chosen[(chosen < MANY**2) | (chosen >= 2 * MANY**2)]
+    table = np.zeros((3 * MANY**2, 3), np.float32)
+    return PixelSource(CameraRays.of([camera] * 3), Photographs(table, chosen, 0.0))
+
+
+def test_numbers_are_looked_for_without_a_copy_of_all(many):
+    found = many.photographs
+    numbers = np.array([0, 1, MANY**2, 2 * MANY**2, 3 * MANY**2 - 1])
+    counts, peak = with_peak(lambda: found.own_counts(numbers))
+    assert counts.tolist() == [True, False, False, True, False] and peak < LITTLE
+    part, peak = with_peak(lambda: stretch(found.chosen, MANY**2, 3 * MANY**2))
+    assert part == slice(MANY**2 // 2, MANY**2) and peak < LITTLE
+    views, peak = with_peak(lambda: many._seen_views)
+    assert views.tolist() == [0, 2] and peak < LITTLE
+
+
+def test_stretches_of_numbers_may_be_empty_or_end_beyond_32_bits():
+    numbers = np.array([3, 5, 2**32 - 2], np.uint32)
+    assert stretch(numbers, 4, 1 << 40) == slice(1, 3) and stretch(numbers, 6, 9) == slice(2, 2)
+    assert stretch(numbers[:0], 0, 9) == slice(0, 0)
+
+
+def test_pixels_that_count_are_marked_part_by_part(many):
+    counted, peak = with_peak(lambda: many._counted)
+    assert np.array_equal(np.flatnonzero(counted), many.photographs.chosen)
+    assert peak < 1.5 * len(counted)
+
+
+def test_places_of_crops_are_kept_as_bits(many):
+    inside = np.random.default_rng(3).random((37, 53)) < 0.3
+    inside[5] = inside[-1] = False
+    places = _Places.of(inside)
+    kept = [places[number] for number in range(len(places))]
+    assert kept == list(map(tuple, np.argwhere(inside).tolist()))
+    of_view = many._places(0, 16)
+    assert len(of_view) == (MANY - 3) ** 2 and of_view.bits.nbytes + of_view.ends.nbytes < MANY**2
+
+
+def test_numbers_of_pixels_to_train_on_take_eight_bytes_each_while_they_are_read():
+    edge, views = 64, 64
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 50, edge, edge)
+    image = (camera, np.zeros((edge**2, 3), np.float32), np.ones(edge**2, bool), None)
+    table = np.zeros((views * edge**2, 3), np.float32)
+    made, peak = with_peak(lambda: fill(table, [image] * views, True))
+    assert made.chosen.dtype == np.uint32
+    assert np.array_equal(made.chosen, np.arange(len(table)))
+    assert peak < 9.5 * len(table)

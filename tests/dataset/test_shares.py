@@ -169,6 +169,25 @@ def test_pixels_of_any_view_can_be_looked_up(dataset):
 
 
 @pytest.mark.parametrize("background", ["hidden", "visible"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_whether_pixels_of_any_view_count_can_be_looked_up(dataset, background, masked):
+    made = dataset(background, masked)
+    whole = Photographs.load(made, False)
+    numbers = np.random.default_rng(2).permutation(len(whole.table))
+    expected = np.ones(len(numbers), bool)
+    if whole.chosen is not None:
+        expected = np.isin(numbers, whole.chosen)
+    assert expected.all() == (background == "visible" and not masked)
+
+    def counts(ranks):
+        return Photographs.load(made, False, ranks=ranks).counts(numbers)
+
+    for found in (whole.counts(numbers), *on_ranks(5, counts)):
+        assert found.dtype == bool
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("background", ["hidden", "visible"])
 def test_small_views_are_made_by_those_that_hold_them(dataset, background):
     made = dataset(background)
 

@@ -20,12 +20,14 @@ from support import interrupt_at, last_state, one_thread_from_first_step, tiny_f
 from unbake import cli
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
-from unbake.config import read_toml
+from unbake.config import FitConfig, read_toml
+from unbake.dataset import photographs
 from unbake.errors import UserError
 from unbake.fields.registry import representations
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.quantities import QUANTITIES
 from unbake.training import loop
+from unbake.training.recovered import load_run
 from unbake.training.run_folder import RunFolder
 from unbake.transport.methods import METHODS
 
@@ -248,8 +250,13 @@ def test_a_resumed_fit_keeps_its_settings(words, fit):
     assert outcome.err == f"error: {words[0]}: cannot be given together with --resume\n"
 
 
-def test_a_resumed_fit_keeps_its_photographs(unbake, fit, cornell, tmp_path):
+@pytest.mark.parametrize("version", ["0.1", "now"])
+def test_a_resumed_fit_keeps_its_photographs(version, unbake, fit, cornell, tmp_path):
+    """Version 0.1 knew of photographs nothing but their mean."""
     assert fit("--steps", 1).status == 0
+    if version == "0.1":
+        run = RunFolder(tmp_path / "run")
+        run.write_origin(dataclasses.replace(run.origin(), fingerprint={}, level=None))
     other = shutil.copytree(cornell, tmp_path / "other")
     image = other / "images" / "train_000.exr"
     write_exr(image, read_exr(image) * [2, 2, 2, 1])
@@ -257,6 +264,24 @@ def test_a_resumed_fit_keeps_its_photographs(unbake, fit, cornell, tmp_path):
     assert outcome.status == 2
     assert "other: this is not the data set that the run" in outcome.err
     assert "was started with: other photographs. Give" in outcome.err
+
+
+@pytest.mark.parametrize("level", [0.7, None])
+def test_a_resumed_fit_keeps_the_level_of_its_photographs(level, fit, tmp_path, monkeypatch):
+    """Runs of earlier versions have none: theirs is the mean radiance, lamps and all."""
+    monkeypatch.setattr(photographs, "LAMP", 0.5)
+    assert fit("--steps", 1, method="ours").status == 0
+    run, epsilons = RunFolder(tmp_path / "run"), []
+    begun = run.origin()
+    assert 0 < begun.level < 0.9 * begun.mean_radiance
+    assert load_run(run.path).problem.radiance.scale == begun.level
+    run.write_origin(dataclasses.replace(begun, level=level))
+    monkeypatch.setattr(FitConfig, "epsilon", lambda _, mean: epsilons.append(mean) or 1e-3)
+    assert fit("--resume", "--steps", 2).status == 0
+    wanted = begun.mean_radiance if level is None else level
+    assert set(epsilons) == {wanted}
+    assert run.origin().level == level
+    assert load_run(run.path).problem.radiance.scale == wanted
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip"])

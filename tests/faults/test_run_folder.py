@@ -428,7 +428,7 @@ def test_a_damaged_evaluation_is_a_page_or_one_line(fit, run, unbake):
         {"data": {"a": 1}}, {"data": ""}, {"data": "a\0b"}, {"mean_radiance": "1"},
         {"mean_radiance": True}, {"mean_radiance": 0}, {"mean_radiance": int("9" * 400)},
         {"mean_radiance": float("nan")}, {"clip_negative": 1}, {"run": 5}, {"fingerprint": []},
-        {"fingerprint": {"scene": 1}},
+        {"fingerprint": {"scene": 1}}, {"level": 0}, {"level": "1"}, {"level": float("inf")},
     ],
 )  # fmt: skip
 def test_an_origin_with_wrong_types_is_one_line(change, run):

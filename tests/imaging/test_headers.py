@@ -51,6 +51,17 @@ def test_an_exr_of_a_kilobyte_holds_no_gigapixels(written, size):
     refused(file, f"bytes cannot hold {size + 1} x {size + 1} pixels")
 
 
+@pytest.mark.parametrize("shown", [(0, 0, 11, 3), (1, 0, 5, 3), (-2, 0, 5, 3)])
+def test_an_exr_that_is_not_its_whole_picture_says_so(written, shown):
+    file = written("exr", 4, 6, 3)
+    assert read_header(file).whole
+    data = bytearray(file.read_bytes())
+    at = data.index(b"displayWindow\0box2i\0") + len(b"displayWindow\0box2i\0") + 4
+    struct.pack_into("<4i", data, at, *shown)
+    file.write_bytes(data)
+    assert read_header(file) == ImageHeader(6, 4, 3, whole=False)
+
+
 @pytest.mark.parametrize(
     ("suffix", "old", "new"),
     [

@@ -214,6 +214,20 @@ def test_cameras_that_see_all_around_are_refused(captured, meshes, tmp_path):
             import_data(project, tmp_path / "data", meshes, tell=quiet)
 
 
+def test_photographs_are_looked_for_within_the_project(tmp_path):
+    """Not beside it, where those of other projects may be."""
+    usual = [".", "sparse", "sparse/0", "sparse/3", "colmap/sparse/0", "dense/sparse", "model"]
+    project = tmp_path / "project"
+    models = [project / name for name in (*usual, "another")]
+    (tmp_path / "images").mkdir()
+    for model in models:
+        model.mkdir(parents=True, exist_ok=True)
+        assert colmap._folder_of_images(model) is None
+    (project / "images").mkdir()
+    found = [colmap._folder_of_images(model) for model in models]
+    assert found == [project.resolve() / "images"] * len(usual) + [None]
+
+
 def test_a_project_that_has_no_model_is_none(tmp_path):
     assert find_model(tmp_path) is None
 

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -244,7 +245,44 @@ def test_every_eighth_view_is_held_out(captured, nerfstudio, meshes, tmp_path):
     assert Dataset.load(tmp_path / "b").heldout == ()
 
 
+def test_photographs_of_one_pose_are_held_out_together(captured, meshes, tmp_path):
+    """As those of a bracket; where all have one pose, none is."""
+    source, frames = tmp_path / "source", []
+    rng = np.random.default_rng(0)
+    for view in captured.views:
+        for end in "abc":
+            save(codes(view), source / "images" / f"{view.name}-{end}.png")
+            pose = view.camera.to_world + np.pad(rng.normal(0, 1e-10, (3, 4)), ((0, 1), (0, 0)))
+            frame = {"file_path": f"images/{view.name}-{end}.png"}
+            frames.append(frame | {"transform_matrix": pose.tolist()})
+    top = intrinsics(captured.views[0].camera)
+    write_json(source / "transforms.json", top | {"frames": frames})
+    settings = ImportSettings(holdout=2)
+    import_data(source, tmp_path / "data", meshes, settings, tell=quiet)
+    names = sorted(view.name for view in captured.views)
+    held = {view.name for view in Dataset.load(tmp_path / "data").heldout}
+    assert held == {f"{name}-{end}" for name in names[::2] for end in "abc"}
+    write_json(source / "transforms.json", top | {"frames": frames[:3]})
+    import_data(source, tmp_path / "one", meshes, settings, tell=quiet)
+    assert len(Dataset.load(tmp_path / "one").train) == 3
+
+
 # ------------------------------------------------------------------------------------- photographs
+
+
+def test_a_part_of_a_picture_is_a_fault(captured, nerfstudio, meshes, tmp_path):
+    """Focal length and centre of its camera are those of the whole, as of a render region."""
+    file = nerfstudio / "images" / "part.exr"
+    write_exr(file, read_photograph(captured.views[1])[..., :3])
+    change(nerfstudio, without_lists)
+    change(nerfstudio, set_frame("file_path", "images/part.exr"))
+    import_data(nerfstudio, tmp_path / "whole", meshes, tell=quiet)
+    window = b"displayWindow\0box2i\0" + struct.pack("<i", 16)
+    head, rest = file.read_bytes().split(window)
+    file.write_bytes(head + window + struct.pack("<4i", 0, 0, 31, 31) + rest[16:])
+    what = "not the whole picture: its data window is not its display window: images/part.exr"
+    with pytest.raises(ImportFaults, match=what):
+        import_data(nerfstudio, tmp_path / "part", meshes, tell=quiet)
 
 
 def test_masked_pixels_are_neither_drawn_nor_scored(captured, nerfstudio, meshes, tmp_path):

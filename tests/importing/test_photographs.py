@@ -167,7 +167,7 @@ def test_names_that_windows_wrote_are_found(captured, meshes, tmp_path):
 # -------------------------------------------------------------------------------------------- masks
 
 
-@pytest.mark.parametrize("named", ["{}.png", "{stem}.png"], ids=["COLMAP", "stem"])
+@pytest.mark.parametrize("named", ["{}.png", "{stem}.png", "{}.PNG", "{stem}.PNG"])
 def test_masks_beside_the_images_of_colmap_are_taken(named, project, meshes, tmp_path):
     files = sorted((project / "images").iterdir())
     mask = np.full((16, 16), 255, np.uint8)
@@ -180,6 +180,15 @@ def test_masks_beside_the_images_of_colmap_are_taken(named, project, meshes, tmp
     assert read_masked(first)[1].all()
     for view in others:
         assert np.array_equal(read_masked(view)[1], mask > 0)
+
+
+def test_a_folder_of_masks_that_suit_no_photograph_is_told(project, meshes, tmp_path):
+    save(np.zeros((16, 16), np.uint8), project / "masks" / "mask_0.png")
+    data, told = imported(project, tmp_path / "data", meshes)
+    assert all(view.mask is None for view in data.views)
+    name = sorted(file.name for file in (project / "images").iterdir())[0]
+    line = f"no photograph has a mask in the folder masks. They are named as {name}.png"
+    assert line in told
 
 
 def test_masks_of_the_size_of_the_whole_photograph_suit_a_smaller_one(project, meshes, tmp_path):

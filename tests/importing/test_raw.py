@@ -11,7 +11,7 @@ from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
 from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
-from unbake.importing.raw import CLIPPED, raw_balance, raw_told, read_raw
+from unbake.importing.raw import CLIPPED, raw_balances, raw_told, read_raw
 from unbake.importing.settings import ImportSettings
 
 pytest.importorskip("rawpy", reason="camera RAW needs rawpy")
@@ -23,6 +23,10 @@ NEUTRAL = (0.5, 1.0, 0.625)
 PRIVATE, EXIF_DIRECTORY, RATIONAL, SHORT, LONG = 65000, 34665, 5, 3, 4
 #: Of XYZ to the colours of a sensor that sees some green in all that is blue, and white as grey.
 SEES = ((0.9, -0.3, -0.1), (-0.5, 1.3, 0.2), (-0.1, 0.4, 0.6))
+#: The same of another sensor, whose red is weaker and whose blue is stronger.
+SEES_LESS_RED = ((0.6, -0.1, -0.1), (-0.4, 1.2, 0.2), (-0.1, 0.2, 0.9))
+#: Linear sRGB to XYZ (IEC 61966-2-1).
+TO_XYZ = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))
 
 
 def write_dng(file, light, iso=None, chosen=NEUTRAL, sees=None):
@@ -88,7 +92,7 @@ def test_light_comes_back(tmp_path):
     light = grey(0.4, 0.2, 0.1).copy()
     light[:, 16:] = 0.8
     write_dng(tmp_path / "a.dng", light)
-    balance = raw_balance(tmp_path / "a.dng")
+    balance, _ = raw_balances(tmp_path / "a.dng")
     assert np.array(balance[:3]) * NEUTRAL == pytest.approx(balance[1], rel=1e-3)
     found = read_raw(tmp_path / "a.dng", balance)
     assert found.dtype == np.float32 and found.shape == (SIZE, SIZE, 3)
@@ -104,7 +108,7 @@ def test_mixtures_of_clipped_and_other_colours_are_told(tmp_path):
     light[:, 8:16] = (0.6, 1.5, 0.6)
     light[:, 16:24] = 1.5  # beyond white in all
     write_dng(tmp_path / "a.dng", light, sees=SEES)
-    balance = raw_balance(tmp_path / "a.dng")
+    balance, _ = raw_balances(tmp_path / "a.dng")
     told, found = raw_told(tmp_path / "a.dng", balance), read_raw(tmp_path / "a.dng", balance)
     write_dng(tmp_path / "b.dng", light / 3, sees=SEES)
     true = 3 * read_raw(tmp_path / "b.dng", balance)
@@ -174,6 +178,22 @@ def test_photographs_have_one_white_balance(project, meshes, tmp_path):
         pixels = read_photograph(view)[..., :3]
         assert pixels == pytest.approx(grey(0.4, 0.2, 0.1), abs=1e-3)
     assert any("white balance: cameras chose several" in line for line in told)
+
+
+def test_another_sensor_has_the_white_balance_in_its_own_factors(project, meshes, tmp_path):
+    """Photographs of two cameras in daylight, which sees the second one with less red."""
+    colour = np.array([0.4, 0.2, 0.1])
+    for number, sees in enumerate((SEES, SEES_LESS_RED, SEES)):
+        sensor = np.array(sees) @ np.array(TO_XYZ)
+        white = sensor.sum(1)
+        seen, chosen = sensor @ colour / white.max(), white / white.max()
+        file = project / "jpg" / f"{number}.DNG"
+        write_dng(file, grey(*seen / NEUTRAL), 100, chosen, sees)
+    told = []
+    import_data(project, tmp_path / "data", meshes, ImportSettings(holdout=0), tell=told.append)
+    for view in Dataset.load(tmp_path / "data").views:
+        assert read_photograph(view)[..., :3] == pytest.approx(grey(*colour), abs=5e-3)
+    assert any("white balance: sensors differ" in line for line in told)
 
 
 def test_damaged_camera_raw_is_a_fault(project, meshes, tmp_path):

@@ -57,6 +57,7 @@ def test_the_mean_over_processes_is_the_gradient_of_all_pixels(uneven):
     whole = pixels_of(uneven, config, clip_negative=False)
     parts = on_ranks(2, lambda ranks: pixels_of(uneven, config, clip_negative=False, ranks=ranks))
     assert [part.weight(crops=False) for part in parts] == [1.6, 0.4]
+    assert {part.photographs.level for part in parts} == {whole.photographs.level}
     found = []
     for rank, pixels in ((0, whole), (0, parts[0]), (1, parts[1])):
         problem, ranks = problem_of(uneven, config, 0.2), Noting(rank)

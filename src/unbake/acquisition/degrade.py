@@ -26,7 +26,7 @@ from PIL import Image
 from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
-from ..dataset.views import TRUE_MATERIALS, Dataset, SensorNoise, View, read_masked
+from ..dataset.views import TRUE_MATERIALS, Dataset, SensorNoise, View, fitted, read_masked
 from ..errors import UserError
 from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..imaging.srgb import from_srgb, to_srgb
@@ -190,16 +190,16 @@ def _random(settings: DegradeSettings, *which: int) -> np.random.Generator:
 
 
 def _gain(dataset: Dataset, settings: DegradeSettings) -> float:
-    """The factor that puts white at 1; 1 where nothing is clipped."""
+    """The factor that puts white at 1, by pixels that count; 1 where nothing is clipped."""
     if settings.white is None:
         return 1.0
-    hidden = dataset.background == "hidden"
-    brightest = []
+    found = []
     for view in dataset.train:
-        pixels = read_masked(view)[0].reshape(-1, 4)
-        kept = pixels[pixels[:, 3] > 0] if hidden else pixels
-        brightest.append(kept[:, :3].max(axis=1) / view.exposure)
-    white = float(np.quantile(np.concatenate(brightest), 1 - settings.white))
+        pixels, mask = read_masked(view)
+        kept = pixels[fitted(pixels, mask, dataset.background)]
+        found.append(kept[:, :3].max(axis=1) / view.exposure)
+    brightest = np.concatenate(found)
+    white = float(np.quantile(brightest, 1 - settings.white)) if len(brightest) else 0.0
     return 1 / white if white > 0 else 1.0
 
 

@@ -43,6 +43,7 @@ from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
 from ..errors import UserError, collected, named, printable
 from ..scene import edit, emitters, free_space
 from ..scene.parse import parse
+from ..scene.values import require_attributes, value_faults
 from .pictures import PictureFacts, blurred, percentage, picture_facts
 
 #: Share of the pixels of surfaces that may be clipped, of one view and of all; and of one view
@@ -96,6 +97,7 @@ class DataCheck:
         exposures: of the views, relative to each other; None where there is no scene.
         light: whether it turns with the cameras; None where it cannot be told.
         coverage: shares of the reachable surface that 0, 1, 2 and more training views see.
+        duplicates: pairs of views that are told as such.
     """
 
     folder: Path
@@ -107,6 +109,7 @@ class DataCheck:
     exposures: Exposures | None = None
     light: TurningLight | None = None
     coverage: tuple[float, float, float, float] | None = None
+    duplicates: int = 0
 
     @property
     def usable(self) -> bool:
@@ -171,7 +174,10 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
     with collected(faults):
         parsed = parse(dataset.scene, dataset.root)
         edit.to_principled(parsed)
+        faults += value_faults(parsed)
         result.scene = scene = parsed.instantiate(merge=False)
+        with collected(faults):
+            require_attributes(scene, dataset.scene)
         with collected(faults):
             edit.require_optimized(scene, dataset.scene)
         if dataset.light == "known":
@@ -206,7 +212,7 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
     if any(finding.check == "alignment" for finding in result.findings):
         return  # with such poses, what views share and see is something else
     _check_light(result)
-    result.coverage = _coverage(scene, train)
+    result.coverage = _coverage(scene, train, hidden=dataset.background == "hidden")
     if result.coverage is not None and result.coverage[0] > _UNSEEN:
         what = f"{100 * result.coverage[0]:.0f} % of the surface is seen by no training view"
         remedy = "What no photograph shows is guessed: take more, or accept that"
@@ -305,7 +311,8 @@ def _pose_problems(
     rgb = np.concatenate([v.small.rgb.reshape(-1, 3) for v in train])
     alpha = np.concatenate([v.small.alpha.ravel() > 0.5 for v in train])
     cameras = [v.camera for v in views]
-    small = Photographs.of(cameras, rgb, alpha, foreground_only=hidden, smoothed=False)
+    # Alpha says what counts: masked pixels do not, where the background is visible, too.
+    small = Photographs.of(cameras, rgb, alpha, foreground_only=True, smoothed=False)
     return pose_problems(scene, views, small, folder, hidden=hidden)
 
 
@@ -336,6 +343,8 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
         for j, other in enumerate(result.views[:i]):
             pair = f"{printable(other.view.name)} and {printable(one.view.name)}"
             if one.facts.digest == other.facts.digest:
+                if one.facts.black == 1:  # which is told as such
+                    continue
                 what = "the photographs are the same" + (
                     "" if posed[j] else ", and their poses not"
                 )
@@ -351,6 +360,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
                 remedy = "Correct the pose of one, or leave one out"
                 remedy = "Give all of a bracket the same 'split'" if bracket else remedy
                 pairs.setdefault((what, remedy), []).append(pair)
+    result.duplicates = sum(map(len, pairs.values()))
     for (what, remedy), names in pairs.items():
         result.warn("duplicates", what, named(names), remedy)
 
@@ -360,6 +370,10 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
 
 def _check_pictures(result: DataCheck) -> None:
     views = result.views
+    if all(view.facts.black == 1 for view in views):
+        remedy = "Check the lights, the cameras and the exposures that they were made with"
+        result.add(Finding("error", "black", "all photographs are black", None, remedy))
+        return
     _share(
         result,
         "clipped",
@@ -417,9 +431,9 @@ def _check_light(result: DataCheck) -> None:
 
 
 def _coverage(
-    scene: mi.Scene, train: list[CheckedView]
+    scene: mi.Scene, train: list[CheckedView], *, hidden: bool
 ) -> tuple[float, float, float, float] | None:
-    counts = view_counts(scene, [v.view.camera for v in train])
+    counts = view_counts(scene, [v.view.camera for v in train], hide_emitters=hidden)
     if not len(counts):
         return None
     none, one, two = (float((counts == n).mean()) for n in range(3))

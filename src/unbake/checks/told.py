@@ -36,7 +36,7 @@ def told_rows(result: DataCheck) -> list[tuple[str, str, str]]:
         "pixels": _pixels(result),
         "blur": _blur(result),
         "coverage": _coverage(result),
-        "duplicates": f"{_count(result, 'duplicates')} pairs" if result.views else None,
+        "duplicates": _duplicates(result),
     }
     rows = []
     for row, checks in _ROWS.items():
@@ -47,10 +47,6 @@ def told_rows(result: DataCheck) -> list[tuple[str, str, str]]:
             verdict = "ok" if told is not None else "—"
         rows.append((row, verdict, _UNKNOWN if told is None else told))
     return rows
-
-
-def _count(result: DataCheck, check: str) -> int:
-    return sum(finding.check == check for finding in result.findings)
 
 
 def _files(result: DataCheck) -> str | None:
@@ -114,7 +110,7 @@ def _pixels(result: DataCheck) -> str | None:
 def _blur(result: DataCheck) -> str | None:
     if sum(v.facts.detail is not None for v in result.views) < 4:
         return None
-    soft = _count(result, "blur")
+    soft = any(finding.check == "blur" for finding in result.findings)
     return "some views are less sharp" if soft else "all views are alike"
 
 
@@ -123,3 +119,9 @@ def _coverage(result: DataCheck) -> str | None:
         return None
     none, one, two, more = (f"{100 * share:.0f}" for share in result.coverage)
     return f"unseen {none} %, by 1 view {one} %, by 2 views {two} %, by more {more} %"
+
+
+def _duplicates(result: DataCheck) -> str | None:
+    if not result.views:
+        return None
+    return f"{result.duplicates} pair{'s' * (result.duplicates != 1)}"

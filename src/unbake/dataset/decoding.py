@@ -65,7 +65,7 @@ class Decoded:
         """Some of these views, with these pixels and names."""
         chosen, totals = self.chosen, self.totals
         if chosen is not None:
-            chosen = chosen[slice(*np.searchsorted(chosen, (pixels.start, pixels.stop)))]
+            chosen = chosen[stretch(chosen, pixels.start, pixels.stop)]
         hot_pixels = [found for found in totals.hot_pixels if found["view"] in names]
         totals = Totals(totals.sums[views], totals.counts[views], hot_pixels)
         return Decoded(self.table[pixels], chosen, totals)
@@ -153,6 +153,19 @@ def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
     return pixels
 
 
+def stretch(chosen: np.ndarray, start: int, stop: int) -> slice:
+    """Where the numbers from one to another lie among those of pixels to train on.
+
+    Numbers of 64 bits would be compared with a copy of all of them.
+
+    Args:
+        chosen: numbers of pixels in rising order.
+        start, stop: numbers of pixels, or of all.
+    """
+    ends = np.minimum((start, stop), np.iinfo(chosen.dtype).max).astype(chosen.dtype)
+    return slice(*np.searchsorted(chosen, ends).tolist())
+
+
 def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0) -> Decoded:
     """Put images into a table one after the other; blurred, too, if it has room for that.
 
@@ -171,9 +184,9 @@ def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0)
         sums.append(float((rgb[counted] if some else rgb).sum(dtype=np.float64)))
         counts.append(int(counted.sum()) if some else len(rgb))
         if some:
-            seen.append(first + start + np.flatnonzero(counted))
+            seen.append((first + start + np.flatnonzero(counted)).astype(np.uint32))
         start = stop
-    chosen = np.concatenate(seen).astype(np.uint32) if some else None
+    chosen = np.concatenate(seen) if some else None
     return Decoded(table, chosen, Totals(sums, counts, []))
 
 

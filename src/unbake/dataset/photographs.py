@@ -31,6 +31,10 @@ from .views import PIXEL_BYTES, Dataset, SensorNoise
 IN_MEMORY = 512 << 20
 #: Pixels are numbered in 32 bits.
 MOST_PIXELS = (1 << 32) - 1
+#: Of the median, what a pixel adds to the level of photographs at most: lamps have far more.
+LAMP = 10.0
+#: Pixels, at most, that tell the level.
+_LEVEL_PIXELS = 1 << 16
 
 
 @final
@@ -54,6 +58,9 @@ class Photographs:
         noise: that was clipped at black, found and corrected where nobody tells it; None: none was.
         share: what this process holds; None: all.
         masked: whether pixels are masked, and not only background.
+        level: mean radiance of the same pixels where no pixel has more than `LAMP` times the
+            median. A lamp in view, a few pixels, may be most of the mean. That is the level of
+            lamps then, and not of what they light.
 
     Paper: Sec. 5.4.
     """
@@ -65,6 +72,7 @@ class Photographs:
     noise: SensorNoise | None = None
     share: Share | None = None
     masked: bool = False
+    level: float = 0.0
 
     @property
     def count(self) -> int:
@@ -103,6 +111,21 @@ class Photographs:
         if self.share is None:
             return self.own_numbers(places)
         return self.share.looked_up(places, self.share.first_places, self.own_numbers)
+
+    def own_counts(self, numbers: np.ndarray) -> np.ndarray:
+        """Whether pixels that this process holds are among those to train on, (n,) bool."""
+        if self.chosen is None or not len(self.chosen):
+            return np.full(len(numbers), self.chosen is None)
+        # Numbers of another type would be compared with a copy of all that are chosen.
+        numbers = numbers.astype(self.chosen.dtype)
+        places = np.searchsorted(self.chosen, numbers)
+        return self.chosen[np.minimum(places, len(self.chosen) - 1)] == numbers
+
+    def counts(self, numbers: np.ndarray) -> np.ndarray:
+        """The same of pixels of any view; all processes ask for the same."""
+        if self.share is None or self.chosen is None:
+            return self.own_counts(numbers)
+        return self.share.looked_up(numbers, self.share.first_pixels, self.own_counts)
 
     def radiance(self, numbers: np.ndarray) -> np.ndarray:
         """Linear RGB of pixels of any view, shape (n, 3); all processes ask for the same."""
@@ -148,7 +171,7 @@ class Photographs:
             (camera, pixels[:, :3], (pixels[:, 3] > 0) | (not foreground_only), None)
             for camera, pixels in zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
         ]
-        return _made(fill(table, images, foreground_only))
+        return _with_level(_made(fill(table, images, foreground_only)))
 
     @staticmethod
     def load(
@@ -187,11 +210,11 @@ class Photographs:
         found = ranks.together(lambda: _loaded(plan, ranks.rank, ranks.here), math.inf)
         masked = any(view.mask is not None for view in dataset.train)
         if ranks.size == 1:
-            return replace(_made(found, noise), masked=masked)
+            return _with_level(replace(_made(found, noise), masked=masked))
         every = [Totals(**own) for own in ranks.gather(asdict(found.totals))]
         counts = np.concatenate([totals.counts for totals in every])
         share = Share(ranks, plan.first_views, np.array(plan.sizes), counts)
-        return replace(_made(found, noise, every, share), masked=masked)
+        return _with_level(replace(_made(found, noise, every, share), masked=masked))
 
 
 def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
@@ -240,6 +263,17 @@ def _made(
     hot_pixels = tuple(HotPixels(**found) for totals in every for found in totals.hot_pixels)
     mean = total / max(3 * count, 1)
     return Photographs(decoded.table, decoded.chosen, mean, hot_pixels, noise, share)
+
+
+def _with_level(photographs: Photographs) -> Photographs:
+    """The same with their level; all processes that hold some call this together."""
+    count, level = photographs.count, photographs.mean
+    places = np.linspace(0, count - 1, min(count, _LEVEL_PIXELS)).astype(np.int64)
+    values = photographs.radiance(photographs.numbers(places)).mean(axis=1, dtype=np.float64)
+    lit = values[values > 0]
+    if len(lit) and lit.max() > (most := LAMP * np.median(lit)):
+        level = float(np.minimum(values, most).mean())
+    return replace(photographs, level=level if level > 0 else photographs.mean)
 
 
 def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import UserError
 from ..fields.arrays import from_numpy, read_small
 from .camera import Camera
+from .decoding import stretch
 from .photographs import Photographs
 
 #: Pixels that are held aside, at least (or none are) and at most: enough to see an error change by
@@ -24,6 +25,8 @@ FEWEST_HELD, MOST_HELD = 64, 4096
 HELD_GROUPS = 16
 #: Tells their random numbers from those of steps, which start at the same seed.
 _HELD = 0x48454C44
+#: Numbers of pixels that are looked at at once: places in arrays take 64 bits each.
+_AT_ONCE = 1 << 16
 
 
 @dataclass
@@ -229,6 +232,34 @@ class RayBatch:
     slopes: tuple[mi.Color3f, mi.Color3f] | None = None  # of `target`, a pixel across and down
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Places in a picture, row by row: a bit for each that there could be.
+
+    Args:
+        bits: of each row.
+        ends: how many places there are up to the end of each row.
+    """
+
+    bits: np.ndarray
+    ends: np.ndarray
+
+    @staticmethod
+    def of(inside: np.ndarray) -> _Places:
+        """The places that are true, (rows, columns) bool."""
+        return _Places(np.packbits(inside, axis=1), np.cumsum(inside.sum(axis=1)))
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def __getitem__(self, number: int) -> tuple[int, int]:
+        """The row and the column of a place."""
+        row = int(np.searchsorted(self.ends, number, "right"))
+        columns = np.flatnonzero(np.unpackbits(self.bits[row]))
+        return row, int(columns[number - int(self.ends[row])])  # counted from the last one
+
+
 #: Places of pixels along an axis of their images, how many there are, and the step of numbers.
 _Axis: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | int]
 
@@ -288,6 +319,10 @@ class PixelSource:
         rng = np.random.default_rng([seed, _HELD])
         places = rng.choice(self.photographs.count, count, replace=False, shuffle=False)
         return replace(self, held=np.sort(places))
+
+    def at_level(self, level: float) -> PixelSource:
+        """The same pixels where the photographs have the level that a run has begun with."""
+        return replace(self, photographs=replace(self.photographs, level=level))
 
     def held_aside(self) -> PixelBatch | None:
         """The pixels that are never drawn, of all views; None if there are none.
@@ -354,14 +389,14 @@ class PixelSource:
         across = width - columns + 1
         places = self._places(view, count)
         if places is None:
-            place = int(rng.integers(across * (height - rows + 1)))
+            top, left = divmod(int(rng.integers(across * (height - rows + 1))), across)
         else:
-            place = int(places[rng.integers(len(places))])
+            top, left = places[int(rng.integers(len(places)))]
         row, column = np.divmod(np.arange(count), columns)
-        numbers = first + (place // across + row) * width + place % across + column
+        numbers = first + (top + row) * width + left + column
         out = np.zeros(count, bool)
         if self.photographs.masked:
-            out |= ~self._chosen(numbers)
+            out |= ~self.photographs.own_counts(numbers)
         if self.held is not None:
             out |= np.isin(numbers, self.photographs.own_numbers(self._own_held))
         if out.all():
@@ -369,14 +404,6 @@ class PixelSource:
         if out.any():
             numbers[out] = rng.choice(numbers[~out], int(out.sum()))
         return self.of_numbers(numbers)
-
-    def _chosen(self, numbers: np.ndarray) -> np.ndarray:
-        """Whether pixels that this process holds are among those to train on, (n,) bool."""
-        chosen = self.photographs.chosen
-        if chosen is None or not len(chosen):
-            return np.full(len(numbers), chosen is None)
-        places = np.searchsorted(chosen, numbers)
-        return chosen[np.minimum(places, len(chosen) - 1)] == numbers
 
     def place(self, number: int) -> tuple[int, int, int]:
         """The view of a pixel, from 0, and its column and row in it."""
@@ -486,7 +513,8 @@ class PixelSource:
         if found.chosen is None:
             return None
         counted = np.zeros(len(found.pixels), bool)
-        counted[found.chosen - found.pixels.start] = True
+        for first in range(0, len(found.chosen), _AT_ONCE):
+            counted[found.chosen[first : first + _AT_ONCE] - found.pixels.start] = True
         return counted
 
     def views_of(self, numbers: np.ndarray) -> np.ndarray:
@@ -508,30 +536,31 @@ class PixelSource:
         if found.chosen is None:
             first, last = self.views_of(np.array([found.pixels.start, found.pixels.stop - 1]))
             return np.arange(first, last + 1)
-        return np.unique(self.views_of(found.chosen))
+        ends = np.array(self.rays._first).astype(found.chosen.dtype)
+        return np.flatnonzero(np.diff(np.searchsorted(found.chosen, ends)))
 
     @cached_property
-    def _found(self) -> dict[tuple[int, int], np.ndarray]:
+    def _found(self) -> dict[tuple[int, int], _Places]:
         return {}
 
-    def _places(self, view: int, pixels: int) -> np.ndarray | None:
-        """Where a crop of a view may lie, row by row; None: anywhere."""
+    def _places(self, view: int, pixels: int) -> _Places | None:
+        """Where a crop of a view may lie; None: anywhere."""
         chosen = self.photographs.chosen
         if chosen is None:
             return None
         if (view, pixels) not in self._found:
             first, width, height = self._layout[view]
             rows, columns = _crop_in(width, height, pixels)
-            start, stop = np.searchsorted(chosen, [first, first + width * height])
+            own = chosen[stretch(chosen, first, first + width * height)]
             mask = np.zeros((height + 1, width + 1), np.int64)
             inner = np.zeros(height * width, np.int64)
-            inner[chosen[start:stop].astype(int) - first] = 1
+            inner[own.astype(int) - first] = 1
             mask[1:, 1:] = inner.reshape(height, width)
             sums = mask.cumsum(0).cumsum(1)
             count = sums[rows:, columns:] - sums[:-rows, columns:] - sums[rows:, :-columns]
             count += sums[:-rows, :-columns]
             least = min((pixels + 1) // 2, count.max())
-            self._found[view, pixels] = np.flatnonzero(count >= least).astype(np.uint32)
+            self._found[view, pixels] = _Places.of(count >= least)
         return self._found[view, pixels]
 
 

@@ -61,6 +61,8 @@ def pose_problems(
     sky = not hidden and scene.environment() is not None
     if not hidden and not sky:
         numbers = numbers[(photographs.radiance(numbers) > 0).any(axis=1)]
+        if not len(numbers):  # all are black
+            return []
     seen = _seen(scene, cameras, numbers)
     share = float(seen.mean()) if len(seen) else 1.0
     if share < (_DOUBTFUL_WITH_SKY if sky else _DOUBTFUL):

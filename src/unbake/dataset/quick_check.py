@@ -9,6 +9,7 @@ import numpy as np
 
 from .agreement import exposures, shared_points, turning_light
 from .alignment import FEWEST_VIEWS, SHORTEST_SIDE, alignment
+from .decoding import stretch
 from .findings import Finding, light_that_turns, misaligned, unequal_exposures
 from .photographs import Photographs
 from .small_views import SmallView, seen_by, small_camera, small_view
@@ -87,8 +88,8 @@ def _small_view(view: View, photographs: Photographs, start: int, stop: int) -> 
     """
     first, alpha = photographs.pixels.start, None
     if photographs.chosen is not None:
-        inside = slice(*np.searchsorted(photographs.chosen, (start, stop)))
+        inside = photographs.chosen[stretch(photographs.chosen, start, stop)]
         alpha = np.zeros(stop - start, np.float32)
-        alpha[photographs.chosen[inside].astype(np.int64) - start] = 1
+        alpha[inside.astype(np.int64) - start] = 1
     rgb = np.array(photographs.table[start - first : stop - first, :3])
     return small_view(view.name, view.camera, rgb, alpha, limit=view.limit)

@@ -25,7 +25,7 @@ class RadianceField:
 
     Args:
         function: `OUTPUTS` without bounds, of a position and `EXTRA` further inputs.
-        scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the mean of the photographs is a good
+        scale: radiance of the untrained field, W·sr⁻¹·m⁻²; the level of the photographs is a good
             one.
 
     Paper: Sec. 3.1, 5.3.

@@ -36,13 +36,15 @@ _TIFF_NUMBERS = {1: "B", 3: "H", 4: "I"}
 class ImageHeader:
     """Size of a picture in pixels, number of its channels, and bits of a code value.
 
-    `bits` is None where values are floating point, as they are in HDR images.
+    `bits` is None where values are floating point, as they are in HDR images. `whole` is false
+    where OpenEXR tells of another picture, of which these pixels are a part or go beyond it.
     """
 
     width: int
     height: int
     channels: int
     bits: int | None = None
+    whole: bool = True
 
 
 class HeaderError(ValueError):
@@ -69,7 +71,7 @@ def _read_exr(file: BinaryIO, size: int) -> ImageHeader:
         (version,) = struct.unpack_from("<I", head, 4)
         if version & _EXR_DEEP:
             raise HeaderError("it holds deep pixels")
-        window = channels = None
+        window = shown = channels = None
         for _ in range(_ATTRIBUTES):
             name = _exr_name(file)
             if not name:
@@ -81,6 +83,8 @@ def _read_exr(file: BinaryIO, size: int) -> ImageHeader:
                 raise HeaderError("it is cut off")
             if (name, kind, length) == (b"dataWindow", b"box2i", 16):
                 window = struct.unpack("<4i", file.read(16))
+            elif (name, kind, length) == (b"displayWindow", b"box2i", 16):
+                shown = struct.unpack("<4i", file.read(16))
             elif (name, kind) == (b"channels", b"chlist"):
                 channels = _exr_channels(file.read(min(length, _CHANNELS)))
             file.seek(after)
@@ -89,7 +93,8 @@ def _read_exr(file: BinaryIO, size: int) -> ImageHeader:
     if window is None or channels is None:
         raise HeaderError("its header lacks a size or channels")
     left, top, right, bottom = window
-    found = ImageHeader(right - left + 1, bottom - top + 1, channels)
+    whole = shown in (None, window)
+    found = ImageHeader(right - left + 1, bottom - top + 1, channels, whole=whole)
     blocks = 1 if version & _EXR_TILED else -(-found.height // _BLOCK_LINES)
     if size < blocks * _BLOCK_BYTES:
         raise HeaderError(f"{size} bytes cannot hold {found.width} x {found.height} pixels")

@@ -41,7 +41,7 @@ def read_colmap(model: Path, reading: Reading, faults: Faults) -> Source:
     Args:
         model: the folder of `cameras`, `images` and `points3D`, `.bin` or `.txt`.
         reading: without a folder of images, that is the first `images` beside the model or in one
-            of the folders above it. Masks lie in `masks` beside it.
+            of the folders above it, up to that of its project. Masks lie in `masks` beside it.
         faults: all that is wrong is added to it.
 
     Raises:
@@ -160,5 +160,12 @@ def _lens(camera: Any) -> Lens:
 
 def _folder_of_images(model: Path) -> Path | None:
     model = model.resolve()
-    above = (model, *model.parents[:3])
+    above = (model, *model.parents[: _depth(model)])
     return first_folder([folder / name for folder in above for name in _IMAGES])
+
+
+def _depth(model: Path) -> int:
+    """How many folders above that of a model its project is; 0 where its place is no usual one."""
+    end = PurePosixPath(*model.parts[1:-1], "0" if model.name.isdecimal() else model.name)
+    layouts = [PurePosixPath(name).parts for name in _MODELS]
+    return max(len(parts) for parts in layouts if end.parts[len(end.parts) - len(parts) :] == parts)

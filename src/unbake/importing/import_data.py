@@ -34,7 +34,7 @@ from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import Lens
 from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
 from .raw import CLIPPED as CLIPPED_RAW
-from .raw import raw_balance, raw_told, read_raw
+from .raw import for_sensor, raw_balances, raw_told, read_raw
 from .rooms import is_room, read_room
 from .settings import ImportSettings
 from .source import Reading, Shot, Source, image_header, masks_in, same_shape
@@ -46,6 +46,8 @@ CLIPPED_CODE = 250 / 255
 _BEYOND, _OFTEN = 0.01, 0.01
 #: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
 _RAYS = 64
+#: Poses are the same but for this in their axes, and this part of the largest coordinate.
+_SAME = 1e-6
 #: A camera from which this share of all directions hits the mesh stands in a room.
 _ENCLOSED = 0.95
 _KNOWN = (
@@ -203,18 +205,28 @@ def _placed(
 
 
 def _balanced(source: Source) -> Source:
-    """All camera RAW in the white balance of the first one: cameras choose one for each."""
-    balances = {}
+    """All camera RAW in the white balance of the first one: cameras choose one for each.
+
+    Its factors are of the sensor. Those of another one are as much larger as they are for daylight.
+    """
+    balances, daylight = {}, {}
     for shot in source.shots:
         if shot.raw:
             with contextlib.suppress(UserError):  # that it cannot be read is told elsewhere
-                balances[shot.name] = raw_balance(shot.image)
+                balances[shot.name], daylight[shot.name] = raw_balances(shot.image)
     if not balances:
         return source
-    first, differ = next(iter(balances.values())), len(set(balances.values())) > 1
-    shots = [replace(shot, balance=first) if shot.raw else shot for shot in source.shots]
+    name, first = next(iter(balances.items()))
+    shots = list(source.shots)
+    for number, shot in enumerate(shots):
+        if shot.raw and first is not None:
+            own = for_sensor(first, daylight[name], daylight.get(shot.name))
+            shots[number] = replace(shot, balance=own)
     note = "white balance: cameras chose several, all photographs have that of the first"
-    return replace(source, shots=tuple(shots), notes=(*source.notes, *([note] if differ else ())))
+    notes = [note] if len(set(balances.values())) > 1 else []
+    if len(set(daylight.values()) - {None}) > 1:
+        notes.append("white balance: sensors differ, each has it in factors of its own")
+    return replace(source, shots=tuple(shots), notes=(*source.notes, *notes))
 
 
 def _check_light(light: LightConfig | None, allow_outside: bool, faults: Faults) -> None:
@@ -391,15 +403,36 @@ def _scaled(shots: Sequence[Shot]) -> list[str]:
 
 
 def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:
-    """Splits by name: the source's own, else every n-th photograph by name is held out."""
+    """Splits by name: the source's own, else every n-th photograph by name is held out.
+
+    Those of one pose, as of a bracket, count as one.
+    """
     own = {shot.name: shot.split for shot in shots if shot.split is not None}
     if own:
         return {shot.name: own.get(shot.name, "train") for shot in shots}
-    ordered = sorted(shot.name for shot in shots)
-    held = set(ordered[::holdout] if holdout and len(ordered) > 1 else ())
-    if len(held) == len(ordered):
-        held = set(ordered[:1])
-    return {name: "heldout" if name in held else "train" for name in ordered}
+    posed = _of_one_pose(shots)
+    held = posed[::holdout] if holdout and len(posed) > 1 else []
+    if len(held) == len(posed):
+        held = posed[:1]
+    aside = {name for names in held for name in names}
+    return {shot.name: "heldout" if shot.name in aside else "train" for shot in shots}
+
+
+def _of_one_pose(shots: Sequence[Shot]) -> list[list[str]]:
+    """The names of photographs that have the same pose, in the order of the first of each."""
+    farthest = max((float(np.abs(shot.to_world[:3, 3]).max()) for shot in shots), default=0.0)
+    tolerance = _SAME * np.array([1, 1, 1, farthest])
+    poses = np.empty((len(shots), 3, 4))
+    groups: list[list[str]] = []
+    for shot in sorted(shots, key=lambda shot: shot.name):
+        apart = np.abs(poses[: len(groups)] - shot.to_world[:3])
+        same = np.flatnonzero((apart <= tolerance).all(axis=(1, 2)))
+        if len(same):
+            groups[same[0]].append(shot.name)
+        else:
+            poses[len(groups)] = shot.to_world[:3]
+            groups.append([shot.name])
+    return groups
 
 
 # ------------------------------------------------------------------------------------------ writing

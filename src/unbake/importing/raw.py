@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ def read_raw(
 
     Args:
         path: the file.
-        balance: as from `raw_balance`; None: that of daylight, as LibRaw knows it of the camera.
+        balance: as from `raw_balances`; None: that of daylight, as LibRaw knows it of the camera.
         size: width and height of the camera's photograph; what the RAW file has beyond it is cut
             off, where the file says, else alike on both sides. None: all of it.
 
@@ -108,10 +108,34 @@ def _as_it_is(balance: Balance | None) -> dict[str, Any]:
     }
 
 
-def raw_balance(path: Path) -> Balance | None:
-    """The white balance that the camera chose; None where it is not told; errors as there."""
+def raw_balances(path: Path) -> tuple[Balance | None, Balance | None]:
+    """The white balance that the camera chose, and that of daylight, as LibRaw knows it.
+
+    They are None where they are not known; errors as there.
+    """
     with _opened(path) as raw:
-        red, green, blue, green_2 = map(float, raw.camera_whitebalance)
+        return _balance(raw.camera_whitebalance), _balance(raw.daylight_whitebalance)
+
+
+def for_sensor(balance: Balance, daylight: Balance | None, other: Balance | None) -> Balance:
+    """A white balance in the factors of another sensor, which sees the same light otherwise.
+
+    Args:
+        balance: of a sensor.
+        daylight: of the same sensor; None: it is not known, and both are taken for alike.
+        other: that of the other one.
+    """
+    if daylight is None or other is None or daylight == other:
+        return balance
+    red, green, blue, green_2 = (
+        value * theirs / ours for value, ours, theirs in zip(balance, daylight, other, strict=True)
+    )
+    return red, green, blue, green_2
+
+
+def _balance(factors: Sequence[float]) -> Balance | None:
+    """Factors as LibRaw tells them, of which the fourth may be 0; None where the others are."""
+    red, green, blue, green_2 = map(float, factors)
     known = all(0 < value < math.inf for value in (red, green, blue))
     return (red, green, blue, green_2 or green) if known else None
 

@@ -17,7 +17,7 @@ class ImportSettings:
         UserError: a number is out of range.
     """
 
-    #: By the order of names, from the first.
+    #: By the order of names, from the first; views of one pose are one.
     holdout: Annotated[
         int,
         Flag("Hold out every Nth view where the source has no splits; 0 holds out none"),

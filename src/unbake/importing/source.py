@@ -21,6 +21,8 @@ from .raw import Balance, is_cut, is_raw, raw_header
 
 #: Suffixes that are tried where the name of an image has none: radiance before code values.
 _TRIED = tuple(s for suffix in (".exr", *CODED_SUFFIXES) for s in (suffix, suffix.upper()))
+#: Suffixes of masks.
+_MASKS = (".png", ".PNG")
 #: Difference of the factors of width and height that rounding may cause, at most.
 _ROUNDED = 0.02
 #: The tag of EXIF.
@@ -136,7 +138,8 @@ def image_header(path: Path) -> ImageHeader:
     """The header of a photograph or mask.
 
     Raises:
-        UserError: it does not exist, is damaged, or of a format that is not read.
+        UserError: it does not exist, is damaged, of a format that is not read, or not the whole
+            picture, which cameras are for.
     """
     require_file(path, "image")
     if is_raw(path):
@@ -145,11 +148,15 @@ def image_header(path: Path) -> ImageHeader:
         told = "the image is of a format that is not read (PNG, JPEG, TIFF, EXR, camera RAW)"
         raise UserError(told, path)
     try:
-        return read_header(path)
+        header = read_header(path)
     except HeaderError as error:
         raise UserError(f"the image cannot be read ({error})", path) from None
     except OSError as error:
         raise UserError(f"the image cannot be read ({error.strerror})", path) from None
+    if not header.whole:
+        what = "the image is not the whole picture: its data window is not its display window"
+        raise UserError(what, path, "Write it whole: without crop, border region or overscan")
+    return header
 
 
 def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Path:
@@ -183,7 +190,7 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
     """Give photographs the masks of a folder.
 
     Masks of `a/0001.jpg` are `a/0001.jpg.png`, as COLMAP has them, or `a/0001.png`; or the same
-    without folders at the beginning.
+    without folders at the beginning. A folder of the source's own that has none of them is told.
 
     Args:
         source: with photographs.
@@ -208,9 +215,11 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
         shots.append(replace(shot, mask=mask or shot.mask))
     bare = [shot.name for shot in shots if shot.mask is None]
     if len(bare) == len(shots):
-        if given:
-            remedy = f"They are named as {PurePosixPath(bare[0]).name}.png"
-            faults.add("no photograph has a mask in the folder", folder, remedy)
+        what, named_as = "no photograph has a mask in the folder", PurePosixPath(bare[0]).name
+        remedy = f"They are named as {named_as}.png"
+        if not given:
+            return replace(source, notes=(*source.notes, f"{what} {folder.name}. {remedy}"))
+        faults.add(what, folder, remedy)
         return source
     note = (f"{len(bare)} photographs have no mask: {named(bare)}",) if bare else ()
     return replace(source, shots=tuple(shots), notes=(*source.notes, *note))
@@ -218,7 +227,7 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
 
 def _mask_of(shot: Shot, folder: Path, reading: Reading) -> Path | None:
     for end in ends_of(shot.name):
-        for name in (f"{end}.png", str(end.with_suffix(".png"))):
+        for name in (f"{stem}{case}" for stem in (end, end.with_suffix("")) for case in _MASKS):
             if (folder / name).is_file():
                 outside = reading.allow_outside
                 return inside(folder, name, name, "folder of masks", allow_outside=outside)

@@ -135,11 +135,13 @@ def bench_gradients(
     recovered = load_run(run, allow_outside=allow_outside)
     dataset = recovered.dataset
     require_true_materials(dataset)
-    data_changed = changed(RunFolder(run).origin().fingerprint, fingerprint(dataset))
+    origin = RunFolder(run).origin()
+    data_changed = changed(origin.fingerprint, fingerprint(dataset))
     if data_changed:
         told = f"warning: other {', '.join(data_changed)} than the run was fit to"
         console.print(told, style="yellow", soft_wrap=True)
     pixels = pixels_of(dataset, config, clip_negative=recovered.clip_negative)
+    pixels = pixels.at_level(origin.photographs_level)
     problem = towards_truth(recovered)
     assert problem.materials is not None
     step = TrainingStep(problem, pixels, config)

@@ -69,7 +69,7 @@ class BatchLoss:
             raise ValueError("the loss is relative to smoothed photographs, which were not made")
         self._problem, self._config, self._rank = problem, config, rank
         self.pixels = pixels
-        self.epsilon = config.epsilon(pixels.photographs.mean)
+        self.epsilon = config.epsilon(pixels.photographs.level)
         self.path_sampler = make_sampler(_context(problem, config))
         self._exposures = None
         if problem.camera is not None and problem.camera.has_response:

@@ -111,6 +111,7 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     origin = Origin(
         data=str(asked.data.resolve()),
         mean_radiance=pixels.photographs.mean,
+        level=pixels.photographs.level,
         clip_negative=clip_negative,
         run=uuid.uuid4().hex if before is None else before.run,
         fingerprint=files,
@@ -118,9 +119,10 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     )
     if before is not None:
         _require_same_data(asked.folder, before, origin)
-        kept = {"warm_start": before.warm_start, "machines": before.machines}
-        origin = dataclasses.replace(origin, **kept)
-    problem = problem_of(dataset, config, origin.mean_radiance)
+        kept = ("mean_radiance", "level", "warm_start", "machines")
+        origin = dataclasses.replace(origin, **{name: getattr(before, name) for name in kept})
+        pixels = pixels.at_level(origin.photographs_level)
+    problem = problem_of(dataset, config, origin.photographs_level)
     untold = begin_cameras(problem, dataset, pixels)
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
@@ -214,8 +216,10 @@ def _require_same_input(config: FitConfig, dataset: Dataset, ranks: Ranks) -> di
 def _require_same_data(run: RunFolder, before: Origin, now: Origin) -> None:
     """Refuse another data set than that of the run; its folder may have moved."""
     differing = changed(before.fingerprint, now.fingerprint)
-    if not math.isclose(before.mean_radiance, now.mean_radiance, rel_tol=1e-4):
-        differing = differing or ["photographs"]
+    # Other versions may decode the same files a little differently.
+    known = "photographs" in before.fingerprint
+    if not (known or math.isclose(before.mean_radiance, now.mean_radiance, rel_tol=1e-4)):
+        differing = ["photographs", *differing]
     if differing:
         what = "this is not the data set that the run {} was started with: other {}"
         raise UserError(

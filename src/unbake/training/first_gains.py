@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import final
 
 import drjit as dr
@@ -126,19 +127,21 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
     side = [((origins[v] - points[source]) * normals[source]).sum(1) for v in (own[source], target)]
     clear = np.sign(side[0]) == np.sign(side[1])
     clear &= _visible(scene, points[source], normals[source], origins[target])
+    # Masked pixels show something else, and those beside a hidden background nothing.
+    clear &= pixels.photographs.counts(firsts[target] + place)
     source, target, place = source[clear], target[clear], place[clear]
 
-    start = own[source]
+    start, partner = own[source], firsts[target] + place
     logs, bound = _logs(pixels, views, numbers, own)
-    there = _logs(pixels, views, firsts[target] + place, target)
+    there = _logs(pixels, views, partner, target)
     known = np.ma.masked_array(logs, bound != 0)
     whole = [np.ma.median(known[own == i], 0) for i in range(len(views))]
     whole = np.ma.filled(np.ma.array(whole) - whole[0], 0.0)
     logs, bound = (
         np.stack([here[source], x]) for here, x in zip((logs, bound), there, strict=True)
     )
-    radii = np.concatenate([radius2(view.camera) for view in views])
-    away = np.stack([radii[numbers[source]], radii[firsts[target] + place]])
+    pairs = (numbers[source], start), (partner, target)
+    away = np.stack([_radius2(views, firsts, *each) for each in pairs])
     return SharedPoints(source, start, target, away, logs, bound, whole)
 
 
@@ -266,6 +269,24 @@ def _logs(
     limit = np.array([view.limit for view in views])[of, None]
     bound = (light >= limit).astype(np.int8) - (light <= least)
     return np.log(np.clip(light, least, limit)), bound
+
+
+def _radius2(
+    views: Sequence[View], firsts: np.ndarray, numbers: np.ndarray, of: np.ndarray
+) -> np.ndarray:
+    """Squared distances of pixels from the middle of their photographs, as `radius2` has them.
+
+    Args:
+        firsts: the number of the first pixel of each view, and of all pixels.
+        numbers: of the pixels.
+        of: the view of each.
+    """
+    found, order = np.empty(len(numbers)), np.argsort(of, kind="stable")
+    ends = np.searchsorted(of[order], np.arange(len(views) + 1)).tolist()
+    for view, first, (start, stop) in zip(views, firsts[:-1].tolist(), pairwise(ends), strict=True):
+        here = order[start:stop]
+        found[here] = radius2(view.camera, numbers[here].astype(np.int64) - first)
+    return found
 
 
 def _points(

@@ -38,7 +38,7 @@ def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
     """A fit of a data set that writes nothing."""
     config = with_defaults(config, dataset)
     pixels = pixels_of(dataset, config, clip_negative=False)
-    problem = problem_of(dataset, config, pixels.photographs.mean)
+    problem = problem_of(dataset, config, pixels.photographs.level)
     begin_cameras(problem, dataset, pixels)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))

@@ -81,7 +81,7 @@ def open_run(
         moved = f"Put it back, or tell where it is now: unbake fit DATA --out {run} --resume"
         raise UserError(f"the data set of the run {run} is gone", data, moved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
-    problem = problem_of(dataset, config, origin.mean_radiance, change=change)
+    problem = problem_of(dataset, config, origin.photographs_level, change=change)
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
     return OpenedRun(folder, problem, dataset, config, initial_state(problem), origin.clip_negative)

@@ -49,6 +49,7 @@ SUFFIX_OF_VERSION_0_1 = ".safetensors"
 _CHECKPOINT = re.compile(r"step-(\d{1,18})(\.safetensors)?", re.ASCII)
 _GIVE_RUN = "Give the folder of a run"
 _MACHINES = json_checks.list_of(json_checks.any_object)
+_LEVEL = json_checks.or_none(lambda value: json_checks.count(value) and value > 0)
 
 
 @final
@@ -89,7 +90,7 @@ class Origin:
     """The input of a run, beside its settings."""
 
     data: str  #: the data set's folder; a relative path starts at the run folder
-    mean_radiance: float  #: of its training pixels; the scale of a radiance field that is untrained
+    mean_radiance: float  #: of its training pixels
     clip_negative: bool
     #: Chosen at the start of a run; its checkpoints name it, too. None: begun by version 0.1.
     run: str | None = None
@@ -98,6 +99,9 @@ class Origin:
     warm_start: WarmStart | None = None  #: None: the radiance field started untrained
     #: That took steps, in their order (`machine.machine`); empty: none did, or nobody wrote it.
     machines: tuple[Mapping[str, Any], ...] = ()
+    #: Of the photographs, which is the scale of a radiance field that is untrained; see
+    #: `Photographs`. None: that was their mean radiance.
+    level: float | None = None
 
     def on(self, machine: Mapping[str, Any]) -> Origin:
         """The same of a run whose next steps are taken on a machine."""
@@ -105,9 +109,14 @@ class Origin:
         return self if known else replace(self, machines=(*self.machines, machine))
 
     @property
+    def photographs_level(self) -> float:
+        """The level of the photographs, as the run has it."""
+        return self.mean_radiance if self.level is None else self.level
+
+    @property
     def radiance_scale(self) -> float:
         """The scale of the radiance field."""
-        return self.mean_radiance if self.warm_start is None else self.warm_start.scale
+        return self.photographs_level if self.warm_start is None else self.warm_start.scale
 
 
 @final
@@ -301,14 +310,15 @@ class RunFolder:
                 "clip_negative": bool(clip),
             } if data and "\0" not in data and 0 < radiance < math.inf:
                 run, fingerprint = facts.get("run"), facts.get("fingerprint", {})
-                machines = facts.get("machines", [])
+                machines, level = facts.get("machines", []), facts.get("level")
                 texts = fingerprint.values() if isinstance(fingerprint, dict) else (None,)
                 good = isinstance(run, str | None) and all(isinstance(x, str) for x in texts)
+                good = good and _LEVEL(level)
                 if good and _MACHINES(machines):
                     with suppress(ValueError):
                         start = WarmStart.read(facts.get("warm_start"))
                         return Origin(
-                            data, radiance, clip, run, fingerprint, start, tuple(machines)
+                            data, radiance, clip, run, fingerprint, start, tuple(machines), level
                         )
         raise UserError("cannot be read", self.origin_file, again)
 
