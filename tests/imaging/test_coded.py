@@ -26,6 +26,58 @@ def test_eight_bits_are_read(tmp_path, suffix):
     assert np.abs(read_codes(file).astype(int) - CODES).max() <= (4 if options else 0)
 
 
+@pytest.mark.parametrize("subsampling", ["4:2:2", "4:2:0"])
+@pytest.mark.parametrize("size", [(32, 48), (31, 47)])
+def test_colour_of_jpeg_has_the_edges_of_brightness(tmp_path, subsampling, size):
+    """Of coloured squares in more and less light, whose edges lie within blocks of colour."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    light = 1 - 0.8 * (((y + 1) // 7 + (x + 1) // 5) % 2)
+    linear = np.array((0.7, 0.2, 0.1)) * light[..., None]
+    codes = tonemap(linear.astype(np.float32))
+    file = save(tmp_path / "a.jpg", codes, quality=100, subsampling=subsampling)
+    with Image.open(file) as image:
+        smooth = np.array(image)
+    errors = [np.abs(found.astype(int) - codes).mean() for found in (read_codes(file), smooth)]
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_colour_that_brightness_says_nothing_of_keeps_its_means(tmp_path):
+    rng, grey = np.random.default_rng(0), np.full((64, 64, 1), 128.0)
+    colour = rng.uniform(-40, 40, (32, 32, 2)).repeat(2, 0).repeat(2, 1)
+    ycc = np.round(np.concatenate([grey, 128 + colour], 2)).astype(np.uint8)
+    Image.fromarray(ycc, "YCbCr").save(tmp_path / "a.jpg", quality=100, subsampling="4:2:0")
+    found = Image.fromarray(read_codes(tmp_path / "a.jpg")).convert("YCbCr")
+    means = [np.asarray(x, float).reshape(32, 2, 32, 2, 3).mean((1, 3)) for x in (found, ycc)]
+    with Image.open(tmp_path / "a.jpg") as image:
+        smooth = np.asarray(image.convert("YCbCr"), float).reshape(32, 2, 32, 2, 3).mean((1, 3))
+    errors = [np.abs(x - means[1])[..., 1:].mean() for x in (means[0], smooth)]
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_colour_is_as_sharp_where_other_pictures_follow_in_the_file(tmp_path):
+    """As phones and cameras of two lenses write them: Pillow calls these MPO."""
+    codes = np.random.default_rng(0).integers(0, 256, (24, 20, 3)).astype(np.uint8)
+    options = {"quality": 95, "subsampling": "4:2:0"}
+    alone = save(tmp_path / "a.jpg", codes, **options)
+    others = {"format": "MPO", "save_all": True, "append_images": [Image.fromarray(codes[::-1])]}
+    several = save(tmp_path / "b.jpg", codes, **options, **others)
+    with Image.open(several) as image:
+        assert image.format == "MPO"
+        smooth = np.array(image)
+    assert np.array_equal(read_codes(several), read_codes(alone))
+    assert not np.array_equal(read_codes(several), smooth)
+
+
+@pytest.mark.parametrize(
+    ("mode", "options"), [("RGB", {"subsampling": "4:4:4"}), ("L", {}), ("RGB", {"keep_rgb": True})]
+)
+def test_other_jpeg_files_are_as_pillow_reads_them(tmp_path, mode, options):
+    file = tmp_path / "a.jpg"
+    Image.fromarray(CODES).convert(mode).save(file, **options)
+    with Image.open(file) as image:
+        assert np.array_equal(read_codes(file), np.array(image.convert("RGB")))
+
+
 @pytest.mark.parametrize(("mode", "channels"), [("L", 3), ("LA", 4), ("P", 3), ("RGBA", 4)])
 def test_grey_palettes_and_alpha_are_read(tmp_path, mode, channels):
     image = Image.fromarray(CODES).convert(mode)

@@ -9,16 +9,22 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 from PIL import Image
+from PIL.JpegImagePlugin import get_sampling
 
 from ..errors import UserError
 from ..io import require_file
+from .chroma import with_sharp_colour
 from .headers import HeaderError, read_header
 from .srgb import from_srgb, to_srgb
 
 #: Formats that Pillow may try, by its names: it knows some that start other programs.
 _FORMATS = ("PNG", "JPEG", "TIFF")
+#: What Pillow calls JPEG files; the second where small pictures, or those of another eye, follow.
+_JPEG = ("JPEG", "MPO")
 #: The tag of EXIF and of TIFF.
 _ORIENTATION = 0x0112
+#: Pixels across and down that have one colour: 4:2:2 and 4:2:0, by Pillow's number.
+_BLOCKS = {1: (2, 1), 2: (2, 2)}
 #: Pillow's names of colours that become RGB without a profile.
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 
@@ -127,8 +133,21 @@ def _read_by_pillow(path: Path) -> np.ndarray:
             image.getexif().pop(_ORIENTATION, None)
             if image.mode not in _MODES:
                 raise _Unreadable(f"its colours are {image.mode}, not RGB or grey")
+            blocks = _colour_blocks(image)
+            if blocks is not None:
+                image.draft("YCbCr", image.size)
+                return with_sharp_colour(np.array(image), *blocks)
             alpha = "A" in image.mode or "transparency" in image.info
             return np.array(image.convert("RGBA" if alpha else "RGB"))
+
+
+def _colour_blocks(image: Image.Image) -> tuple[int, int] | None:
+    """Pixels across and down that have one colour in a JPEG file; None where each has its own."""
+    if image.format not in _JPEG or image.mode != "RGB":
+        return None
+    if image.info.get("adobe_transform", 1) != 1:  # files of Adobe that hold RGB say so
+        return None
+    return _BLOCKS.get(get_sampling(image))
 
 
 def _read_tiff(path: Path) -> np.ndarray:
