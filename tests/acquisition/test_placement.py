@@ -176,6 +176,20 @@ def test_a_box_without_its_front_is_a_room_seen_from_outside():
     assert all(np.abs(c.origin).max() < 1 for _, c in place_room(cornell, 4, 0))
 
 
+def test_a_near_plane_beyond_a_room_does_not_make_it_an_object():
+    """In large units Mitsuba's usual one is; one that cuts a wall away is where the view begins."""
+    look = mi.ScalarTransform4f().look_at([0.2, 0, 0.5], [0, 0, 0], [0, 1, 0])
+    far = {"type": "perspective", "near_clip": 50.0, "far_clip": 100.0, "to_world": look}
+    closed = scene(**walls(), lamp=on_emitter((0.2, 0.3, 0)), sensor=far)
+    assert is_room(closed)
+    np.testing.assert_allclose(free_space.sensor_eyes(closed), [[0.2, 0, 0.5]], atol=1e-6)
+    back = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    cut = {"type": "perspective", "near_clip": 3.5, "far_clip": 100.0, "to_world": back}
+    np.testing.assert_allclose(
+        free_space.sensor_eyes(scene(**walls(), sensor=cut)), [[0, 0, 0.5]], atol=1e-5
+    )
+
+
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1), (0, -1, 0), (1, 0, 0)])
 def test_up_is_the_axis_that_the_sensor_stands_on(up):
     side = np.roll(up, 1).astype(float)
@@ -437,6 +451,44 @@ def test_cameras_of_an_object_stand_in_front_of_its_backdrop(flipped):
     assert any(look_at.origin[2] < -2 for _, look_at in untold)
 
 
+@pytest.mark.parametrize("thickness", [0.04, 0.4, 2.0])
+def test_no_camera_of_an_object_stands_behind_a_thick_backdrop(thickness):
+    """A closed box, whose far side no sensor sees, turned so that it is along no axis."""
+    turn = mi.ScalarTransform4f().rotate([0, 1, 0], 30)
+    to_world = turn.translate([0, 0, -2 - thickness / 2]).scale([4, 3, thickness / 2])
+    drop = {"type": "cube", "to_world": to_world, "bsdf": MATTE}
+    ball = {"type": "sphere", "bsdf": MATTE}
+    look = sensor((4.5, 1, 7.8), (0, 0, 0))
+    placed = place_object(scene(ball=ball, drop=drop, sensor=look), 12, 4)
+    ahead = np.array([math.sin(math.radians(30)), 0, math.cos(math.radians(30))])
+    eyes = np.array([look_at.origin for _, look_at in placed])
+    assert len(np.unique(eyes, axis=0)) == 16
+    # Beside a thick one, cameras see the ball and a side of the box.
+    assert (eyes @ ahead > -2 - thickness / 2).all()
+    untold = place_object(scene(ball=ball, drop=drop), 12, 4)
+    assert sum(look_at.origin @ ahead < -2 - thickness for _, look_at in untold) > 3
+
+
+def test_the_back_of_a_thick_thing_is_photographed_where_nothing_stands_before_it():
+    """A television: its screen is as wide as it, and flush with it."""
+    case = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([2, 1, 0.1]), "bsdf": MATTE}
+    to_world = mi.ScalarTransform4f().translate([0, 0, 0.11]).scale([1.8, 0.9, 1])
+    screen = {"type": "rectangle", "to_world": to_world, "bsdf": MATTE}
+    seen = place_object(scene(a=case, b=screen, sensor=sensor((0, 1, 9), (0, 0, 0))), 12, 4)
+    assert seen == place_object(scene(a=case, b=screen), 12, 4)
+
+
+def test_an_open_vessel_is_seen_from_all_around():
+    """Its sensor sees its inside alone, which only cameras straight above it would see as well."""
+    sides = {name: wall for name, wall in walls().items() if name != "wall4"}
+    vessel = scene(**sides, sensor=sensor((0, 6, 1), (0, 0, 0)), floor=lawn(-1.01, 6))
+    placed = place_object(vessel, 12, 4)
+    eyes = np.array([look_at.origin for _, look_at in placed])
+    height = (eyes - placed[0][1].target)[:, 1] / np.linalg.norm(eyes - placed[0][1].target, axis=1)
+    assert height.min() < 0.2 and height.max() > 0.8
+    assert len(np.unique(np.sign(eyes[height < 0.5][:, [0, 2]]), axis=0)) == 4
+
+
 THINGS = {
     "ball": {"type": "sphere", "bsdf": MATTE},
     "one-sided cube": {"type": "cube", "bsdf": MATTE["bsdf"]},
@@ -464,3 +516,42 @@ def test_a_large_floor_does_not_count_in_the_coverage_of_an_object():
     # A floor that is all there is counts.
     above = Camera.look_at((0, 4, 0.1), (0, 0, 0), (0, 1, 0), 60.0, 32, 32)
     assert coverage(scene(floor=lawn(0, 1), sensor=look), [above], 2000) > 0.95
+
+
+def fence(opacity):
+    """A square of half an edge of 2 before one of half an edge of 1, cut out where x > 0."""
+    solid = np.full((64, 64, 1), opacity, np.float32)
+    solid[:, :32] = 1
+    picture = {
+        "type": "bitmap",
+        "raw": True,
+        "filter_type": "nearest",
+        "bitmap": mi.Bitmap(solid),
+    }
+    to_world = mi.ScalarTransform4f().translate([0, 0, 1]).scale([2, 2, 1])
+    bsdf = {"type": "mask", "opacity": picture, "bsdf": MATTE}
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+@pytest.mark.parametrize(("opacity", "area", "seen"), [(0.0, 4 + 8, 2 + 8), (0.8, 4 + 16, 16)])
+def test_holes_are_no_surface_and_hide_none(opacity, area, seen):
+    """Half of a wall is seen through half of a fence."""
+    wall = {"type": "rectangle", "bsdf": MATTE}
+    stage = scene(wall=wall, fence=fence(opacity))
+    camera = Camera.look_at((0, 0, 60), (0, 0, 0), (0, 1, 0), 5.0, 32, 32)
+    assert coverage(stage, [camera], 8000) == pytest.approx(seen / area, abs=0.03)
+    counts = view_counts(stage, [camera, camera], 4000)
+    assert (counts == 2).mean() == pytest.approx(seen / area, abs=0.03)
+    assert set(counts) == {0, 2}
+
+
+def test_lamps_hide_what_photographs_show_behind_them_only_where_they_show_lamps():
+    ball = {"type": "sphere", "bsdf": MATTE}
+    lit = lamp((0, 0, 3), 2, (0, 0, 0))
+    stage = scene(ball=ball, lamp=lit)
+    camera = Camera.look_at((0, 0, 9), (0, 0, 0), (0, 1, 0), 40.0, 32, 32)
+    cap = (1 - 1 / 9) / 2
+    assert coverage(stage, [camera], 4000) == pytest.approx(cap, abs=0.03)
+    for hidden, expected in ((None, cap), (True, cap), (False, 0)):
+        counts = view_counts(stage, [camera], 4000, hide_emitters=hidden)
+        assert (counts > 0).mean() == pytest.approx(expected, abs=0.03)

@@ -41,6 +41,20 @@ def test_a_comparison_has_a_column_for_each_quantity(monkeypatch):
     assert "gloss" in text and "17.00" in text
 
 
+def test_aligned_albedo_has_a_column_where_some_run_has_it():
+    means = {"render_psnr": 20.0, "albedo_psnr": 12.5, "albedo_psnr_aligned": 31.75}
+    marks = {"representation": "neural", "yardsticks": {"constant": {"albedo_psnr": 15.0}}}
+    methods = {"ours": LENGTH | marks | {"heldout": means}}
+    text = printed(print_comparison, compared(methods))
+    rows = [[c.strip() for c in x.split("│")[1:6]] for x in text.splitlines() if x[:1] == "│"]
+    assert "albedo, aligned" in text
+    assert rows[0] == ["untrained", "11.00", "12.25", "—", "0"]
+    assert rows[1] == ["ours", "20.00", "12.50", "31.75", "5"]
+    assert rows[2][:4] == ["constant", "", "15.00", ""]
+    del means["albedo_psnr_aligned"]
+    assert "aligned" not in printed(print_comparison, compared(methods))
+
+
 def test_yardsticks_are_the_last_rows():
     low, high = {"albedo_psnr": 12.0}, {"albedo_psnr": 33.25}
     own = {"representation": "neural", "yardsticks": {"ceiling": high, "constant": low}}

@@ -230,6 +230,11 @@ def test_strengths_stand_beside_the_true_ones(built_in, tmp_path):
     assert light.truth == [4, 4, 2]
     assert light.emission_error == pytest.approx(2 / 6, rel=1e-5)
 
+    known[0]["strength"] = [0, 0, 0]  # nothing that an error could be relative to
+    (tmp_path / "truth" / "emission.json").write_text(json.dumps(known))
+    (light,) = recovered_emitters(problem, tmp_path)
+    assert light.truth == [0, 0, 0] and light.emission_error is None
+
     materials = make_problem(built_in("cornell"), "visible", TINY_FIT, 4.0)
     assert recovered_emitters(materials, tmp_path) == []
 

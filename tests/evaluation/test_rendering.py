@@ -162,6 +162,27 @@ def test_scores_do_not_depend_on_the_exposure_of_the_png_files(folder, tmp_path)
     assert found[0] == found[1]
 
 
+@pytest.mark.parametrize("scale", [0.2, 6.0])
+def test_pictures_are_aligned_where_the_fit_left_their_brightness_open(scale, folder, tmp_path):
+    """Also where they are brighter than white, and the truth is not."""
+    truth, light = tmp_path / "truth", LightConfig(envmap=folder / "sky.exr", envmap_scale=scale)
+    more = CaptureSettings(resolution=SIZE, spp=128, max_depth=4)
+    scene, cameras = folder / "scene.xml", folder / "cameras.json"
+    capture(scene, truth, more, cameras=cameras, light=light, **SILENT)
+    settings = RenderSettings(spp=128, max_depth=4)
+    brighter = replace(light, envmap_scale=2 * scale)
+    made = relight(folder / "run", tmp_path / "out", brighter, settings, truth=truth, **SILENT)
+    (frame,) = made["frames"]
+    np.testing.assert_allclose(made["render_scale"], 0.5, rtol=0.02)
+    assert frame["render_psnr_aligned"] > frame["render_psnr"] + 6 > 12
+    assert made["mean"]["render_psnr_aligned"] == pytest.approx(frame["render_psnr_aligned"])
+    assert "render_psnr_aligned" in made["definitions"]
+    known = replace(tiny_fields("grid"), method="direct", steps=0)
+    fit(folder / "data", tmp_path / "known", known)
+    made = relight(tmp_path / "known", tmp_path / "more", light, settings, truth=truth, **SILENT)
+    assert not any("aligned" in key for key in (*made["frames"][0], *made["mean"], *made))
+
+
 def test_another_light_than_that_of_the_truth_scores_less(folder, tmp_path):
     settings = RenderSettings(spp=64, max_depth=8)
     light = LightConfig(envmap=folder / "sky.exr")
@@ -564,4 +585,5 @@ def test_relight_tells_of_how_many_views_means_are(unbake, folder, tmp_path):
     assert outcome.status == 0, outcome.err
     assert re.search(r"mean over 3 views: render_psnr \S+ dB \(2 of 3 views\), ", outcome.out)
     made = json.loads((out / "render.json").read_text())
-    assert made["mean"]["views"] == 3 and made["scored"] == dict.fromkeys(METRICS, 2)
+    scored = dict.fromkeys((*METRICS, "render_psnr_aligned"), 2)
+    assert made["mean"]["views"] == 3 and made["scored"] == scored

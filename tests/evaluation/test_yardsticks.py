@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -50,6 +51,26 @@ def short(monkeypatch):
     """Ceilings take a second."""
     monkeypatch.setattr(yardsticks, "STEPS", 150)
     monkeypatch.setattr(truth_fit, "PIXELS", 256)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_materials_of_views_are_held_only_where_there_is_truth(
+    known, untrained, tmp_path, monkeypatch
+):
+    """Those of many large photographs would fill the memory, and nothing reads them."""
+    run, held, find = shutil.copytree(untrained, tmp_path / "run"), [], yardsticks.find_yardsticks
+
+    def spy(dataset, config, heldout):
+        held.extend(heldout)
+        return find(dataset, config, heldout)
+
+    monkeypatch.setattr("unbake.evaluation.evaluate.find_yardsticks", spy)
+    if not known:
+        without = SimpleNamespace(of=lambda *words: None)
+        monkeypatch.setattr("unbake.evaluation.evaluate.GroundTruth", without)
+    metrics = evaluate(run, FEW, tell=lambda line: None)
+    assert [(seen is None, truth is None) for seen, truth in held] == [(not known,) * 2]
+    assert (metrics["heldout"]["albedo_psnr"] is None) != known
 
 
 def forget(data):

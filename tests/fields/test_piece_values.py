@@ -300,7 +300,7 @@ def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
     assert most(now) == FitConfig().materials["roughness"]["neural"].pieces.most > 0
     assert most("steps = 5") == most(now)
     assert most("materials.roughness.neural.pieces.most = 7") == 7
-    old = now.replace("format = 4", "format = 2")
+    old = now.replace("format = 5", "format = 2")
     before = re.sub(r"\[materials\.roughness\.neural\.pieces\]\n(.+\n)+", "", old)
     assert before != old
     assert most(before) == 0

@@ -86,6 +86,22 @@ def test_a_converted_diffuse_scene_looks_much_the_same(parse):
     assert 0.02 < np.abs(after - before).mean() + 0.02 < 0.08
 
 
+def test_materials_of_lamps_alone_are_told_by_number(parse):
+    """Not those that another shape has as well, also inside of another BSDF."""
+    names = ("lamp", "wall", "both", "inside")
+    shared = "".join(f'<bsdf type="principled" id="{name}"/>' for name in names)
+    lamp = BALL.replace("</shape>", '<emitter type="area"/></shape>')
+    shapes = lamp.format('<bsdf type="twosided"><ref id="lamp"/></bsdf>')
+    shapes += BALL.format('<ref id="wall"/>') + BALL.format('<ref id="both"/>')
+    shapes += lamp.format('<ref id="both"/>') + lamp.format('<ref id="inside"/>')
+    shapes += BALL.format('<bsdf type="mask"><ref id="inside"/></bsdf>')
+    parsed = parse(shared + shapes)
+    known = edit.lamp_materials(parsed)
+    assert [edit.material_names(parsed)[number] for number in known] == ["lamp"]
+    furnace = parse(lamp.format('<bsdf type="principled"/>'))
+    assert edit.lamp_materials(furnace) == frozenset()
+
+
 # -------------------------------------------------------------------------------- set_textures
 
 

@@ -618,7 +618,7 @@ def test_a_response_that_photographs_do_not_tell_is_doubted_and_stays(cornell, t
     config = replace(read_toml(tiny), camera=CameraConfig(response="monotone"))
     dataset = Dataset.load(cornell)  # of one exposure
     pixels = pixels_of(dataset, config, clip_negative=False)
-    problem = problem_of(dataset, config, pixels.photographs.mean)
+    problem = problem_of(dataset, config, pixels.photographs.level)
     line = begin_cameras(problem, dataset, pixels)
     assert "exposures that differ tell it: it is taken as known" in line
     np.testing.assert_allclose(problem.camera.curves(), [np.linspace(0, 1, 17)] * 3, atol=1e-6)
@@ -632,7 +632,7 @@ def test_one_photograph_tells_nothing_of_its_camera(unknown, cornell, tiny):
     dataset = Dataset.load(cornell)
     dataset = replace(dataset, views=(dataset.train[0], *dataset.heldout))
     pixels = pixels_of(dataset, config, clip_negative=False)
-    problem = problem_of(dataset, config, pixels.photographs.mean)
+    problem = problem_of(dataset, config, pixels.photographs.level)
     line = begin_cameras(problem, dataset, pixels)
     assert (line is not None) == ("response" in unknown)
     np.testing.assert_allclose(problem.camera.gains(), np.ones((1, 3)))

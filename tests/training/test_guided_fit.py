@@ -31,7 +31,7 @@ def fitted(cornell):
     config = replace(tiny_fields(), pixels=256, guide=GuideConfig(cells=4, bands=4, sectors=8))
     dataset = Dataset.load(cornell)
     pixels = pixels_of(dataset, config, clip_negative=False)
-    problem = problem_of(dataset, config, pixels.photographs.mean)
+    problem = problem_of(dataset, config, pixels.photographs.level)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
     terms = [step(state, i, learning_rates(config, i, i / STEPS)) for i in range(STEPS)]
     return step, state, pixels, [float(term["guide"][0]) for term in terms]
@@ -93,7 +93,7 @@ def test_no_step_is_skipped_where_holes_show_the_sky(tmp_path):
     dataset = replace(Dataset.load(tmp_path / "data"), background="visible")
     config = replace(tiny_fields(), pixels=64, guide=GuideConfig(cells=4, bands=4, sectors=8))
     pixels = pixels_of(dataset, config, clip_negative=False)
-    problem = problem_of(dataset, config, pixels.photographs.mean)
+    problem = problem_of(dataset, config, pixels.photographs.level)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
     for number in range(6):
         terms = step(state, number, learning_rates(config, number, number / 6))
@@ -117,5 +117,5 @@ def test_runs_of_before_go_on_without_a_guide(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text(text)
     assert read_toml(file).guide.cells == GuideConfig().cells
-    file.write_text(text.replace(table, "").replace("format = 4", "format = 2"))
+    file.write_text(text.replace(table, "").replace("format = 5", "format = 2"))
     assert read_toml(file).guide.cells == 0

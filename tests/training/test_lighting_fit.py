@@ -50,12 +50,12 @@ def photographs(tmp_path_factory):
 
 
 def fitted(dataset, unknown, *, steps=200, **settings):
-    """The problem after a short fit, and the mean radiance that it began with."""
+    """The problem after a short fit, and the radiance that it began with."""
     settings = {"pixels": 64, "warm_up": 20, "lighting": FAST} | settings
     config = dataclasses.replace(TINY_FIT, unknown=unknown, **settings)
     config = update(config, {"materials": {"albedo": {"neural": {"learning_rate": 0.02}}}})
     pixels = training_pixels(dataset, clip_negative=False)
-    mean = pixels.photographs.mean
+    mean = pixels.photographs.level
     problem = make_problem(dataset.scene, dataset.background, config, mean)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
     for i in range(steps):
@@ -155,6 +155,32 @@ def test_the_mean_albedo_is_the_convention_where_nothing_else_tells_it(photograp
     assert means[0.0].min() > 0.35
     visible = dataclasses.replace(problem, hide_emitters=False)
     assert not is_anchored(visible, dataclasses.replace(TINY_FIT, unknown="materials+lighting"))
+
+
+def test_a_mirror_tells_the_scale_that_is_a_convention_without_it(tmp_path):
+    """Its pixels are the radiance of the environment, though the background is hidden."""
+    grey = '<rgb name="base_color" value="0.2"/><float name="specular" value="0"/>'
+    balls = "".join(
+        f"""<shape type="sphere"><point name="center" value="{3 * i},0,0"/>
+          <bsdf type="{kind}">{grey if kind == "principled" else ""}</bsdf></shape>"""
+        for i, kind in enumerate(("principled", "conductor", "principled"), -1)
+    )
+    (tmp_path / "scene.xml").write_text(
+        f"""<scene version="3.0.0"><sensor type="perspective">
+          <float name="fov" value="45"/><transform name="to_world">
+            <lookat origin="0,-11,4" target="0,0,0" up="0,0,1"/></transform></sensor>{balls}
+          <emitter type="constant"><rgb name="radiance" value="0.8"/></emitter></scene>"""
+    )
+    small = CaptureSettings(views=4, held_out=1, resolution=24, spp=64, max_depth=8)
+    dataset = capture(tmp_path / "scene.xml", tmp_path / "data", small, tell=lambda line: None)
+    assert dataset.background == "hidden"
+    problem, _ = fitted(dataset, "materials+lighting", steps=120)
+    rays = pixel_rays([view.camera for view in dataset.train], 1, 0)
+    si = problem.scene_view.scene.ray_intersect(rays)
+    grey = si.is_valid() & problem.scene_view.is_optimized(si.shape)
+    with dr.suspend_grad():
+        albedo = np.array(problem.materials.evaluate(si, grey)["albedo"])[:, np.array(grey)]
+    np.testing.assert_allclose(albedo.mean(1), 0.2, atol=0.06)
 
 
 # ------------------------------------------------------------------------------------ gradients

@@ -41,7 +41,7 @@ def steps_of(data, config, ranks, take):
     """The digest of the state after some steps, the terms of the last one, and the step."""
     dataset = Dataset.load(data)
     pixels = pixels_of(dataset, config, clip_negative=False)
-    problem = problem_of(dataset, config, pixels.photographs.mean)
+    problem = problem_of(dataset, config, pixels.photographs.level)
     step, state = TrainingStep(problem, pixels, config, ranks), initial_state(problem)
     terms = {}
     with one_thread():

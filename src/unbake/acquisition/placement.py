@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import mitsuba as mi
@@ -17,6 +17,7 @@ import numpy as np
 from unbake.dataset.camera import Camera, LookAt, spread_rays
 from unbake.errors import UserError
 from unbake.scene import free_space
+from unbake.scene.sight import Sight
 from unbake.transport.optimized import one_sided_shapes
 
 # Sampling of candidate views: positions and surface points, directions and rays of each view.
@@ -33,6 +34,10 @@ _VALUE = 1.1
 _FREE_POSITIONS = 512
 #: How many times as many cameras as are wanted spirals around an object have, at most.
 _DENSEST = 16
+#: Cameras around an object of which the lowest third tells whether it has a front.
+_AROUND = 96
+#: Thickness of a backdrop that has one, in parts of its width: more than, and less than.
+_FLAT, _THICK = 1e-5, 0.4
 #: Surface points that tell what these cameras see, and cameras that are tested at once.
 _SEEN, _EYES = 500, 1024
 #: Rays along an edge of an image that look for backs; from this share of them on it is told.
@@ -169,7 +174,7 @@ def place_object(
     ground plane that is larger than everything else does not count as part of the object.
 
     Cameras that would see little but backs of what the scene's own sensors see, such as those
-    behind a backdrop, are left out: the others come from a denser spiral.
+    behind a backdrop, are left out: the others come from a denser spiral. Open vessels keep all.
 
     Args:
         scene: the object.
@@ -215,7 +220,9 @@ def coverage(
     object only those of the object, without a ground that is larger than all else. A point is
     reachable if a given camera sees it, or one of 512 other positions: in a room, positions in free
     space (`free_space.free_positions`); around an object, positions on the sphere of twice its
-    radius, including below it. Backs of walls and insides of furniture are not reachable.
+    radius, including below it. Backs of walls and insides of furniture are not reachable. Holes of
+    cut-outs are no surface and hide nothing, nor do lamps around an object, whose photographs do
+    not show them.
 
     Args:
         scene: the scene.
@@ -224,13 +231,8 @@ def coverage(
         own: the scene's own sensors tell whether it is a room, and not these cameras.
     """
     room = is_room(scene, () if own else cameras)
-    points = _counted(scene, samples, room)
-    seen = np.zeros(len(points.position), dtype=bool)
-    for camera in cameras:
-        framed = np.flatnonzero(~seen & (camera.pixel_of(points.position) >= 0))
-        seen[framed] = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
-    reachable = _reachable(scene, points, seen, () if own else cameras, room)
-    return float(seen.sum() / max(reachable.sum(), 1))
+    counts = _counts(scene, cameras, samples, () if own else cameras, room, hidden=not room)
+    return float((counts > 0).sum() / max(len(counts), 1))
 
 
 def black_share(scene: mi.Scene, cameras: Sequence[Camera]) -> float:
@@ -242,7 +244,13 @@ def black_share(scene: mi.Scene, cameras: Sequence[Camera]) -> float:
     return float((hits.back & np.isin(hits.shape, list(one_sided_shapes(scene)))).mean())
 
 
-def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000) -> np.ndarray:
+def view_counts(
+    scene: mi.Scene,
+    cameras: Sequence[Camera],
+    samples: int = 4000,
+    *,
+    hide_emitters: bool | None = None,
+) -> np.ndarray:
     """The number of cameras that see points of the reachable surface, (points,).
 
     Args:
@@ -250,24 +258,45 @@ def view_counts(scene: mi.Scene, cameras: Sequence[Camera], samples: int = 4000)
         cameras: the training views.
         samples: number of surface points tested, uniform by area; those that are reachable, as in
             `coverage`, are counted.
+        hide_emitters: whether photographs do not show lamps; None: as of `coverage`.
     """
     room = is_room(scene, cameras)
+    hidden = not room if hide_emitters is None else hide_emitters
+    return _counts(scene, cameras, samples, cameras, room, hidden=hidden)
+
+
+def _counts(
+    scene: mi.Scene,
+    cameras: Sequence[Camera],
+    samples: int,
+    telling: Sequence[Camera],
+    room: bool,
+    *,
+    hidden: bool,
+) -> np.ndarray:
+    """The number of cameras that see points of the reachable surface, (points,).
+
+    Args:
+        telling: cameras that tell where one may stand in a room; none: the scene's own sensors.
+        hidden: whether photographs do not show lamps.
+    """
+    sight = Sight.of(scene, hide_emitters=hidden)
     points = _counted(scene, samples, room)
     counts = np.zeros(len(points.position), dtype=int)
     for camera in cameras:
         framed = np.flatnonzero(camera.pixel_of(points.position) >= 0)
-        shown = free_space.visibility(scene, camera.origin[None], _subset(points, framed))[0]
-        counts[framed] += shown
-    return counts[_reachable(scene, points, counts > 0, cameras, room)]
+        part = _subset(points, framed)
+        counts[framed] += free_space.visibility(scene, camera.origin[None], part, sight)[0]
+    return counts[_reachable(scene, points, counts > 0, telling, room, sight)]
 
 
 def _counted(scene: mi.Scene, samples: int, room: bool) -> free_space.SurfacePoints:
     """Points on the surface of a room, or of an object without its ground if that leaves any."""
-    if not room:
-        points = free_space.sample_surface(scene, samples, 1, within=_object_box(scene))
-        if len(points.position):
-            return points
-    return free_space.sample_surface(scene, samples, 1)
+    within = None if room else _object_box(scene)
+    points = free_space.sample_surface(scene, samples, 1, within=within)
+    if within is not None and not len(points.position):
+        points = free_space.sample_surface(scene, samples, 1)
+    return _subset(points, np.flatnonzero(~free_space.cut_out(scene, points)))
 
 
 def _reachable(
@@ -276,6 +305,7 @@ def _reachable(
     seen: np.ndarray,
     cameras: Sequence[Camera],
     room: bool,
+    sight: Sight,
 ) -> np.ndarray:
     """Points that were seen, or that one of the standpoints sees."""
     reachable = seen.copy()
@@ -285,7 +315,8 @@ def _reachable(
     while first < len(positions) and not reachable.all():
         hidden = np.flatnonzero(~reachable)
         block = positions[first : first + count]
-        reachable[hidden] = free_space.visibility(scene, block, _subset(points, hidden)).any(axis=0)
+        shown = free_space.visibility(scene, block, _subset(points, hidden), sight)
+        reachable[hidden] = shown.any(axis=0)
         first, count = first + len(block), min(2 * count, 32)
     return reachable
 
@@ -460,13 +491,18 @@ def _outward(
     """Directions (count, 3) from the centre of an object to cameras, lower ones first.
 
     They are those of a spiral, or evenly spread ones of a denser spiral where cameras of the first
-    one would stand behind things (`_sees_fronts`).
+    one would stand behind things (`_sees_fronts`). An open vessel hides its inside from all that
+    look level at it: it has no front, and is seen from all around.
     """
     density = 1
     while density <= _DENSEST:
         spiral = _spiral(density * count, up, seed)
         chosen = np.flatnonzero(_sees_fronts(scene, centre + distance * spiral, points))
         if len(chosen) >= count:
+            if density > 1:
+                around = centre + distance * _spiral(_AROUND, up, seed)
+                if not _sees_fronts(scene, around, points)[: _AROUND // 3].any():
+                    break
             return spiral[chosen[((np.arange(count) + 0.5) * len(chosen) / count).astype(int)]]
         density *= 2
     return _spiral(count, up, seed)
@@ -493,11 +529,14 @@ def _sees_fronts(scene: mi.Scene, eyes: np.ndarray, points: free_space.SurfacePo
     points = _subset(points, np.arange(0, len(points.position), len(points.position) // _SEEN or 1))
     if not len(sensors) or not len(points.position):
         return np.ones(len(eyes), dtype=bool)
-    wanted = _seen_sides(scene, sensors, points)
+    wanted, normal = _seen_sides(scene, sensors, points), points.normal.copy()
+    for own, front in _backdrops(points, sensors):
+        wanted[own], normal[own] = 1, front
+    planes = replace(points, normal=normal)
     shares = []
     for block in np.array_split(eyes, -(-len(eyes) // _EYES)):
         shown = free_space.visibility(scene, block, points)
-        back = shown & (_sides(block, points) * wanted < 0)
+        back = shown & (_sides(block, planes) * wanted < 0)
         shares.append([back.mean(axis=1), (shown & ~back).mean(axis=1)])
     backs, others = np.concatenate(shares, axis=1)
     return (backs <= others) | (others >= 0.5 * others.max())
@@ -515,6 +554,39 @@ def _seen_sides(
     fronts, backs = (np.bincount(points.surface, weights=seen) for seen in (front, back))
     both = np.minimum(fronts, backs) > 0.1 * (fronts + backs)
     return np.where(both[points.surface], 0, front - back)
+
+
+def _backdrops(
+    points: free_space.SurfacePoints, sensors: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Shapes that are thick, and are walls before which things stand all the same.
+
+    Each is the only one as wide and as high as all that there is, and what stands before it, where
+    the sensors (n, 3) are, is deeper than it is. Of its far side sensors see nothing.
+
+    Returns:
+        For each one which points (m,) are its own, and the direction (3,) to what is before it.
+    """
+    found = []
+    shapes = [points.surface == surface for surface in np.unique(points.surface)]
+    for own in shapes:
+        if own.sum() < 3 or own.all():
+            continue
+        middle = points.position[own].mean(axis=0)
+        axes = np.linalg.svd(points.position[own] - middle, full_matrices=False)[2]
+        along, eyes = (points.position - middle) @ axes.T, (sensors - middle) @ axes.T
+        size, whole = np.ptp(along[own], axis=0), np.ptp(along, axis=0)
+        spanning = [(np.ptp(along[shape], axis=0) > 0.9 * whole)[:2].all() for shape in shapes]
+        if sum(spanning) != 1 or (size[:2] <= 0.9 * whole[:2]).any():
+            continue
+        if not _FLAT < size[2] / size[0] < _THICK:
+            continue
+        for sign in (1, -1):
+            face, others = (sign * along[own, 2]).max(), sign * along[~own, 2]
+            before = (others > face).mean() > 0.9 and others.max() - face > size[2]
+            if before and (sign * eyes[:, 2] > face).all():
+                found.append((own, sign * axes[2]))
+    return found
 
 
 def _sides(eyes: np.ndarray, points: free_space.SurfacePoints) -> np.ndarray:

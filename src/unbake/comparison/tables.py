@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
@@ -11,6 +11,9 @@ from rich.table import Column, Table
 from ..quantities import QUANTITIES
 
 Row = dict[str, Any]
+
+#: The score of albedo after alignment, of runs whose lighting is unknown as well.
+_ALIGNED = "albedo_psnr_aligned"
 
 
 def print_comparison(result: Row, console: Console) -> None:
@@ -55,30 +58,28 @@ def print_rates(searches: list[Row], console: Console) -> None:
 def _print_quality(rows: dict[str, Row], console: Console) -> None:
     evaluated = [row["heldout"] for row in rows.values() if "heldout" in row]
     materials = [q for q in QUANTITIES if any(f"{q}_psnr" in means for means in evaluated)]
-    quantities = ("render", *materials)
+    columns = {f"{name}_psnr": name for name in ("render", *materials)}
+    if any(_ALIGNED in means for means in evaluated):
+        columns[_ALIGNED] = "albedo, aligned"
     table = _table("run", title="Held-out views, PSNR in dB")
-    _add_numbers(table, *quantities, "steps", "time", "ms/step", "samples/s")
+    _add_numbers(table, *columns.values(), "steps", "time", "ms/step", "samples/s")
     for name, row in rows.items():
         if "error" in row:
             table.add_row(name, "failed")
             continue
-        table.add_row(name, *_scores(row["heldout"], quantities), *_effort(row))
+        table.add_row(name, *_scores(row["heldout"], columns), *_effort(row))
+    own = [f"{name}_psnr" for name in materials]
     measured = [_yardsticks(rows, kind) for kind in ("constant", "ceiling")]
     if any(measured):
         table.add_section()
     for label, scores in (pair for pairs in measured for pair in pairs):
-        table.add_row(
-            label,
-            *(
-                "" if q == "render" else x
-                for q, x in zip(quantities, _scores(scores, quantities), strict=True)
-            ),
-        )
+        told = zip(columns, _scores(scores, columns), strict=True)
+        table.add_row(label, *(x if key in own else "" for key, x in told))
     console.print(table)
 
 
-def _scores(means: Row, quantities: Sequence[str]) -> list[str]:
-    return [_number(means.get(f"{quantity}_psnr"), 2) for quantity in quantities]
+def _scores(means: Row, keys: Iterable[str]) -> list[str]:
+    return [_number(means.get(key), 2) for key in keys]
 
 
 def _yardsticks(rows: dict[str, Row], kind: str) -> list[tuple[str, Row]]:

@@ -27,6 +27,8 @@ Reference = Literal["smoothed", "photograph"]
 PixelSampling = Literal["all-views", "one-view-crop"]
 PriorName = Literal["one-bounce", "extra-bounce"]
 Unknown = Literal["auto", "materials", "lighting", "materials+lighting", "emission"]
+Lamps = Literal["known", "fitted"]
+ScaleToldBy = Literal["pixels", "background"]
 Precision = Literal["single", "half"]
 PresetName = Literal["cpu", "paper", "release", "release-lighting"]
 
@@ -99,8 +101,8 @@ class PathConfig:
 class LightingConfig:
     """The unknown environment map and the unknown strength of lights (Sec. 5.1, Fig. 8).
 
-    Where materials are unknown as well, the environment is never seen directly and no other light
-    is known, albedo and light are known up to one factor a channel. It is then chosen such that the
+    Where materials are unknown as well, no photograph shows the environment and no other light is
+    known, albedo and light are known up to one factor a channel. It is then chosen such that the
     mean albedo of what the training views see is `mean_albedo`.
     """
 
@@ -108,10 +110,13 @@ class LightingConfig:
     #: around the horizon, as an image of 2n x n pixels has.
     resolution: int = 64
     learning_rate: float = 0.02  #: Adam, log radiance
-    #: Radiance of the map at the start, W·sr⁻¹·m⁻²; 0: the mean of the photographs (ours).
+    #: Radiance of the map at the start, W·sr⁻¹·m⁻²; 0: the level of the photographs (ours).
     initial_radiance: float = 0.0
     mean_albedo: float = 0.5  #: the convention, each channel (ours)
     anchor: float = 1.0  #: weight of the squared deviation from it
+    #: What tells the factor instead. pixels: those to train on that show the environment, directly
+    #: or in mirrors and glass; background: any that is visible, and no mirror (ours).
+    scale_told_by: ScaleToldBy = "pixels"
 
     def __post_init__(self) -> None:
         known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
@@ -155,7 +160,7 @@ class RegularizationConfig:
 #: What a fit can recover, each with a learning rate of its own.
 UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
-#: Mean radiance below which photographs are dim: the darkest of the published scenes has more.
+#: Level below which photographs are dim: the darkest of the published scenes has more.
 DIM = 0.08
 #: How many times as much as untrained ones the surfaces of rooms are planned to reflect.
 GAIN_OF_ROOMS = 1.6
@@ -326,6 +331,8 @@ class FitConfig:
     #: Added to the denominator of the relative L2 loss (release: 0.01), see `epsilon`.
     loss_epsilon: float = 0.001
 
+    #: Whether materials that lamps alone have stay as the scene gives them (ours).
+    lamps: Lamps = "known"
     #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
     #: Of albedo by numbers before its bounds, in gradients (ours; `fields/arrays.py`). With 0,
@@ -455,19 +462,19 @@ class FitConfig:
         ):
             object.__setattr__(self, key, value)
 
-    def epsilon(self, mean: float) -> float:
+    def epsilon(self, level: float) -> float:
         """What is added to the denominator of the relative L2 loss (ours).
 
-        Where photographs are darker than `DIM`, it falls with the square of their mean, so that
+        Where photographs are darker than `DIM`, it falls with the square of their level, so that
         errors stay relative, and such a fit does not depend on the unit of light. The presets of
         the paper and of its authors add the same to all.
 
         Args:
-            mean: radiance of the photographs, linear RGB, mean over channels and pixels.
+            level: of the photographs, radiance; see `Photographs`.
         """
-        if self.preset != "cpu" or not 0 < mean < DIM:
+        if self.preset != "cpu" or not 0 < level < DIM:
             return self.loss_epsilon
-        return self.loss_epsilon * (mean / DIM) ** 2
+        return self.loss_epsilon * (level / DIM) ** 2
 
     @property
     def chosen_estimator(self) -> ChosenEstimator:
@@ -533,6 +540,11 @@ class FitConfig:
     def learns_environment(self) -> bool:
         """Whether the environment map is unknown."""
         return self.unknown in ("lighting", "materials+lighting")
+
+    @property
+    def shares_scale(self) -> bool:
+        """Whether albedo and the environment are both unknown, and may share an open factor."""
+        return self.unknown == "materials+lighting" and "albedo" in self.quantities
 
     @property
     def unknowns(self) -> tuple[str, ...]:

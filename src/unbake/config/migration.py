@@ -9,9 +9,8 @@ from ..errors import UserError
 from ..fields.settings import GridConfig
 from ..formats import check_format
 
-#: Version of the settings file. Keys that are absent in earlier ones have the values of
-#: `_BEFORE_3` and `_BEFORE_4`.
-FORMAT = 4
+#: Version of the settings file. Keys that are absent in earlier ones have the values of `_BEFORE`.
+FORMAT = 5
 
 #: Where keys of format 1, which knew albedo and roughness alone, are now.
 _MOVED = {
@@ -36,14 +35,17 @@ _MOVED = {
 _GROUPS = ("grid", "bitmap")
 _NEURAL_ROUGHNESS = "materials.roughness.neural"
 _NEURAL_ALBEDO = "materials.albedo.neural"
-#: Settings that came after format 3, at their value before; by the table that they are in.
+#: Settings that came with a format, at their value before: a run of an earlier version goes on as
+#: it began. By the table that they are in, where there is one.
+_BEFORE_5: dict[str, dict[str, Any]] = {
+    "": {"lamps": "fitted"},
+    "lighting": {"scale_told_by": "background"},
+}
 _BEFORE_4: dict[str, dict[str, Any]] = {
     "path": {"planned_gain": 1.0},
     _NEURAL_ALBEDO: {"pieces.across_slivers": False},
     _NEURAL_ROUGHNESS: {"pieces.across_slivers": False},
 }
-#: Settings that came after format 2, at their value before: a run of an earlier version goes on as
-#: it began. By the table that they are in, where there is one.
 _BEFORE_3: dict[str, dict[str, Any]] = {
     "": {
         "held_aside": 0.0,
@@ -65,6 +67,8 @@ _BEFORE_3: dict[str, dict[str, Any]] = {
         "pieces.variation": False,
     },
 }
+#: All of these, by the format that they came with.
+_BEFORE = {5: _BEFORE_5, 4: _BEFORE_4, 3: _BEFORE_3}
 #: Keys that are no more.
 _GONE = (("camera", "smoothness"),)
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.
@@ -77,7 +81,9 @@ def as_before(outer: str) -> dict[str, Any]:
     Args:
         outer: the dotted key of the table.
     """
-    return _BEFORE_4.get(outer, {}) | _BEFORE_3.get(outer, {})
+    return {
+        key: value for tables in _BEFORE.values() for key, value in tables.get(outer, {}).items()
+    }
 
 
 def migrated(table: dict[str, Any]) -> dict[str, Any]:
@@ -94,10 +100,14 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
         check_format(table, FORMAT, "format")
         del table["format"]
     # Where unbake wrote the file, all settings are in it but those of later versions.
-    written = version in (1, 2, 3) or (version is None and _OF_RUN <= table.keys())
+    written = version in range(1, FORMAT) or (version is None and _OF_RUN <= table.keys())
     found = _moved(table, version) if version in (None, 1) else table
-    later = [_BEFORE_4] if version == 3 else [_BEFORE_4, _BEFORE_3]
-    every = [item for tables in later for item in tables.items()]
+    every = [
+        item
+        for came_with, tables in _BEFORE.items()
+        if version is None or version < came_with
+        for item in tables.items()
+    ]
     for outer, settings in every if written else ():
         if outer and not _has(found, outer):
             continue

@@ -42,7 +42,7 @@ from .renderings import (
     scored_views,
 )
 from .settings import EvaluationSettings
-from .yardsticks import find_yardsticks, seen_materials
+from .yardsticks import Seen, find_yardsticks, seen_materials
 
 DEFINITIONS = {
     "psnr": f"10 log10(1 / MSE), peak 1, {HIGHEST:g} at most; MSE over unmasked pixels and "
@@ -140,7 +140,8 @@ def _evaluate(
     clip = settings.clip_negative or recovered.clip_negative
     exposure = exposure_of(read_photograph(view, clip) for view in views)
     cameras = Cameras(recovered.problem.camera, dataset.train)
-    rows, materials, gains, placed = [], [], [], []
+    rows, gains, placed = [], [], []
+    materials: list[Seen] = []  # of views with truth alone: those of many views are large
     for given in views:
         lock.require_held()
         view = placed_view(recovered, cameras, given, settings)
@@ -150,12 +151,11 @@ def _evaluate(
         )
         rows.append(row)
         gains.append(gain)
-        materials.append((seen, truth))
+        materials.append((None if truth is None else seen, truth))
         told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
         values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told)
         tell(f"{view.name}: {', '.join(values)}")
-    both = recovered.config.unknown == "materials+lighting"
-    if both and "albedo" in recovered.config.quantities:
+    if recovered.config.shares_scale:
         recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
     measures: dict[str, Any] = {}
     if recovered.config.learns_materials:
@@ -368,15 +368,15 @@ def _evaluate_lighting(
     return found
 
 
-def _align_albedo(
-    rows: list[dict], materials: list[tuple[MaterialBuffers, GroundTruth]]
-) -> list[float] | None:
+def _align_albedo(rows: list[dict], materials: Sequence[Seen]) -> list[float] | None:
     """Add `albedo_psnr_aligned` to rows; returns the factor of each channel, one for all views.
 
     Photographs may determine albedo and lighting only up to a common factor.
     """
     known = [
-        (s.values["albedo"], t.values["albedo"], s.mask(t)) if t and "albedo" in t.values else None
+        (s.values["albedo"], t.values["albedo"], s.mask(t))
+        if s and t and "albedo" in t.values
+        else None
         for s, t in materials
     ]
     counted = [(s[m], t[m]) for s, t, m in filter(None, known)]

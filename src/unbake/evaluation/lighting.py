@@ -29,13 +29,16 @@ DEFINITIONS = {
     "to [0,1]",
     "aligned": "the same after each channel of the recovered map has been multiplied by the number "
     "that brings its coefficients nearest to the true ones in the least squares sense",
-    "emission_error": "|c - c*| / |c*| of a light's radiance, RGB",
+    "emission_error": "|c - c*| / |c*| of a light's radiance, RGB; none of a light that is black",
 }
 
 
 @dataclass(frozen=True)
 class RecoveredEmitter:
-    """An emitter whose strength was optimized, and its relative error."""
+    """An emitter whose strength was optimized, and its relative error.
+
+    There is no error where the truth is not known or black.
+    """
 
     name: str
     strength: list[float]  # linear RGB
@@ -63,7 +66,7 @@ def recovered_emitters(
     recovered = []
     for name, strength in zip(problem.emitter_names, found, strict=True):
         truth, error = known.get(name), None
-        if truth is not None:
+        if truth is not None and np.linalg.norm(truth) > DARK:
             error = _relative_error(strength, truth)
         true = None if truth is None else truth.tolist()
         recovered.append(RecoveredEmitter(name, [float(x) for x in strength], true, error))

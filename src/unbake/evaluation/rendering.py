@@ -41,6 +41,7 @@ from .renderings import (
     exposure_of,
     mean_scores,
     render_camera,
+    render_psnr,
     render_scores,
     scored_views,
 )
@@ -52,6 +53,14 @@ from .yardsticks import seen_materials
 _PIXEL_BYTES = 64
 #: Of scenes that are not the same: how far bounding boxes differ, as a part of their extent.
 _ANOTHER = 0.1
+#: The score of pictures whose brightness was aligned, where the fit left that open.
+_ALIGNED = "render_psnr_aligned"
+_ALIGNED_DEFINITION = (
+    "render_psnr after each channel of the pictures was multiplied by one number for all of them, "
+    "`render_scale`, which brings them nearest to the truth in the least squares sense, of pixels "
+    "that the truth does not show clipped: lighting and materials were both unknown, which may leave "
+    "a common factor open"
+)
 
 
 @dataclass(frozen=True)
@@ -248,15 +257,21 @@ def _render(
     exposure = 0.0
     if compared:
         exposure = exposure_of(read_photograph(v, recovered.clip_negative) for v in compared)
-    frames, brightest = [], 0.0
+    shared = bool(compared) and recovered.config.shares_scale
+    frames, masks, brightest = [], [], 0.0
     with filled_folder(out) as folder:
         for number, shot in enumerate(shots):
             radiance = _picture(recovered, shot.camera, settings, hide, settings.seed + number)
             brightest = max(brightest, float(radiance.max()))
             write_exr(folder / f"{shot.name}.exr", radiance)
             write_png(folder / f"{shot.name}.png", tonemap(radiance, settings.exposure))
-            frames.append(_frame(shot) | _scores(recovered, shot, radiance, settings, exposure))
+            mask = _counted(recovered, shot, settings)
+            masks.append(np.packbits(mask) if shared and mask is not None else None)
+            frames.append(_frame(shot) | _scores(recovered, shot, radiance, mask, exposure))
             _tell_progress(number, len(shots), frames[-1], tell)
+        keys, aligned = METRICS, {}
+        if shared:
+            keys, aligned = (*METRICS, _ALIGNED), _aligned(recovered, folder, shots, masks, frames)
         notes = []
         if brightest == 0:
             notes.append("all pictures are black: no light reaches what they show; a closed room "
@@ -275,14 +290,16 @@ def _render(
             "settings": asdict(settings),
             "variant": mi.variant(),
             "truth": None if cameras.truth is None else os.fspath(cameras.truth.folder),
-            "mean": mean_scores(frames, METRICS) if compared else None,
-            **_scored(frames if compared else ()),
+            "mean": mean_scores(frames, keys) if compared else None,
+            **_scored(frames if compared else (), keys),
+            **aligned,
             "display_exposure": exposure if compared else None,
             "frames": frames,
             "definitions": {
                 key: DEFINITIONS[key] for key in ("psnr", "colour_space", "mask")
             }
             | renderings.DEFINITIONS
+            | ({_ALIGNED: _ALIGNED_DEFINITION} if aligned else {})
             | {"files": "OpenEXR: linear RGB radiance; PNG: the same times 2^exposure as sRGB"},
             "notes": notes,
         }  # fmt: skip
@@ -355,30 +372,84 @@ def _picture(
     return np.array(denoiser(mi.TensorXf(seen)))
 
 
-def _scores(
-    recovered: Recovered,
-    shot: _Shot,
-    radiance: np.ndarray,
-    settings: RenderSettings,
-    exposure: float,
-) -> dict[str, float | None]:
-    """Scores of a picture against the truth, counted as in an evaluation; empty without truth.
-
-    Args:
-        exposure: stops, of SSIM and FLIP.
-    """
+def _counted(recovered: Recovered, shot: _Shot, settings: RenderSettings) -> np.ndarray | None:
+    """The pixels of a picture that count, (H, W) bool, as in an evaluation; None without truth."""
     if shot.truth is None:
-        return {}
+        return None
     photograph = read_photograph(shot.truth, recovered.clip_negative)
     truth = GroundTruth.of(shot.truth, recovered.config.quantities)
     seen = None
     if recovered.config.learns_materials:
         seen = seen_materials(recovered.problem, shot.truth, settings.material_spp)
-    mask = counted_pixels(photograph, seen, truth)
+    return counted_pixels(photograph, seen, truth)
+
+
+def _scores(
+    recovered: Recovered,
+    shot: _Shot,
+    radiance: np.ndarray,
+    mask: np.ndarray | None,
+    exposure: float,
+) -> dict[str, float | None]:
+    """Scores of a picture against the truth; empty without truth.
+
+    Args:
+        mask: the pixels that count; None without truth.
+        exposure: stops, of SSIM and FLIP.
+    """
+    if shot.truth is None or mask is None:
+        return {}
     if not mask.any():
         return dict.fromkeys(METRICS)
+    photograph = read_photograph(shot.truth, recovered.clip_negative)
     shown, compared = shot.truth.photographed(radiance), shot.truth.readable(photograph[..., :3])
     return render_scores(shown, compared, mask, exposure)
+
+
+def _aligned(
+    recovered: Recovered,
+    folder: Path,
+    shots: Sequence[_Shot],
+    masks: Sequence[np.ndarray | None],
+    frames: Sequence[dict[str, Any]],
+) -> dict[str, Any]:
+    """Add the score of aligned pictures to frames; returns the factor of each channel.
+
+    The pictures are read again, so that not all of them have to be held at once.
+
+    Args:
+        folder: with the pictures.
+        masks: the pixels of each that count, as bits.
+    """
+
+    def pictures(shot: _Shot, view: View) -> tuple[np.ndarray, np.ndarray]:
+        bitmap = mi.Bitmap(str(folder / f"{shot.name}.exr"))
+        radiance = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+        photograph = read_photograph(view, recovered.clip_negative)[..., :3]
+        return np.array(radiance), view.readable(photograph)
+
+    every = list(zip(shots, masks, frames, strict=True))
+    above, below = np.zeros(3), np.zeros(3)
+    for shot, bits, frame in every:
+        frame[_ALIGNED] = None
+        if shot.truth is not None and bits is not None:
+            radiance, true = pictures(shot, shot.truth)
+            shown, mask = radiance * np.float32(shot.truth.exposure), _unpacked(bits, radiance)
+            told = mask[..., None] & (true < min(1.0, shot.truth.clipped or 1.0))
+            above += np.where(told, shown * true, 0).sum((0, 1), dtype=np.float64)
+            below += np.where(told, shown * shown, 0).sum((0, 1), dtype=np.float64)
+    scale = np.where((above > 0) & (below > 0), above / np.where(below > 0, below, 1), 1)
+    for shot, bits, frame in every:
+        if shot.truth is not None and bits is not None and bits.any():
+            radiance, true = pictures(shot, shot.truth)
+            shown = shot.truth.photographed(radiance * scale.astype(radiance.dtype))
+            frame[_ALIGNED] = render_psnr(shown, true, _unpacked(bits, radiance))
+    return {"render_scale": scale.tolist()}
+
+
+def _unpacked(bits: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    height, width = picture.shape[:2]
+    return np.unpackbits(bits, count=height * width).astype(bool).reshape(height, width)
 
 
 def _frame(shot: _Shot) -> dict[str, Any]:
@@ -387,9 +458,9 @@ def _frame(shot: _Shot) -> dict[str, Any]:
     return {"name": shot.name, "file_path": f"{shot.name}.exr", **frame_of(shot.camera), **split}
 
 
-def _scored(frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _scored(frames: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[str, Any]:
     """Of how many pictures means are; empty where they are of all."""
-    found = scored_views(frames, METRICS)
+    found = scored_views(frames, keys)
     return {"scored": found} if found else {}
 
 

@@ -12,13 +12,11 @@ from ..dataset.camera import Camera
 from ..dataset.views import fitted_pixels
 from ..fields.arrays import from_numpy
 from ..scene import free_space
+from ..scene.sight import Sight
 from ..training.recovered import Recovered
-from ..transport.emitter_sampling import MOST_PASSED, has_cut_outs
 
 #: How far from a point a ray towards it ends, as a fraction of the diagonal of its extent.
 _OFFSET = 2e-4
-#: A cut-out that lets more than this pass is a hole.
-_HOLE = 0.5
 #: The cosine below which a surface is seen from its edge, where nothing can be read from it.
 _GRAZING = 0.02
 
@@ -47,8 +45,7 @@ class Views:
         hide_emitters: bool = False,
     ) -> None:
         self._scene, self._cameras, self._counted = scene, cameras, counted
-        self._lamps_pass = hide_emitters and any(s.is_emitter() for s in scene.shapes())
-        self._some_pass = self._lamps_pass or has_cut_outs(scene)
+        self._sight = Sight.of(scene, hide_emitters=hide_emitters)
         # A bit for each pixel, by camera; None where all count.
         self._bits: dict[int, np.ndarray | None] = {}
         self._offset = free_space.lift(scene, _OFFSET)
@@ -101,10 +98,7 @@ class Views:
         tried = active & inside & facing & (distance > self._offset)
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(d))
         ray.maxt = dr.maximum(distance - dr.opaque(mi.Float, self._offset), 0)
-        if self._some_pass:
-            free = _free(self._scene, ray, tried, self._lamps_pass)
-        else:
-            free = tried & ~self._scene.ray_test(ray, tried)
+        free = self._sight.free(self._scene, ray, tried)
         return self._counting(number, film, free)
 
     def _counting(self, number: int, film: mi.Point2f, seen: mi.Bool) -> mi.Bool:
@@ -148,27 +142,6 @@ def training_views(recovered: Recovered) -> Views:
     problem = recovered.problem
     scene, hidden = problem.scene_view.scene, problem.hide_emitters
     return Views(scene, recovered.cameras, counted, hide_emitters=hidden)
-
-
-@dr.syntax
-def _free(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, lamps_pass: bool) -> mi.Bool:
-    """Whether images show the ends of rays: holes and hidden lamps stop none."""
-    end, lamps = ray(ray.maxt), mi.Bool(lamps_pass)
-    ray, active = mi.Ray3f(ray), mi.Bool(active)
-    free, count = mi.Bool(False), mi.UInt32(0)
-    while dr.hint(active, label="what cameras see"):
-        hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
-        met = active & hit.is_valid()
-        free |= active & ~met
-        bsdf = hit.bsdf()
-        cut = met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-        cut &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        passes = cut & (dr.max(bsdf.eval_null_transmission(hit, cut)) > _HOLE)
-        passes |= met & lamps & hit.shape.is_emitter()
-        ray = dr.select(passes, hit.spawn_ray_to(end), ray)
-        count += 1
-        active = passes & (count < MOST_PASSED)
-    return free
 
 
 def _opaque(vector: np.ndarray) -> mi.Vector3f:

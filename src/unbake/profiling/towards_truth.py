@@ -8,7 +8,6 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..dataset.views import Dataset
 from ..fields.domain import SurfacePoint
 from ..fields.envmap import environment_emitter
 from ..fields.field import Cost, Engine, Field
@@ -18,7 +17,7 @@ from ..fields.texture import material_numbers, material_textures, texture_base
 from ..quantities import QUANTITIES
 from ..scene import edit
 from ..scene.parse import parse
-from ..training.problem import Problem
+from ..training.problem import Problem, known_materials
 from ..training.recovered import Recovered
 from ..transport.vertex import SceneView
 
@@ -84,12 +83,12 @@ def towards_truth(recovered: Recovered) -> Problem:
     Raises:
         UserError: the scene cannot be loaded.
     """
-    problem, dataset = recovered.problem, recovered.dataset
+    problem = recovered.problem
     assert problem.materials is not None
     fields = {name: TowardsTruth(fitted) for name, fitted in problem.materials.items()}
     materials = Materials(fields)
     materials.domain = problem.materials.domain
-    scene = _scene(dataset, problem, materials, fields)
+    scene = _scene(recovered, materials, fields)
     if representation(recovered.config.representation).unwrapped:
         materials.numbers = material_numbers(scene)
     materials.pieces = problem.materials.pieces
@@ -102,17 +101,19 @@ def towards_truth(recovered: Recovered) -> Problem:
 
 
 def _scene(
-    dataset: Dataset,
-    problem: Problem,
-    materials: Materials,
-    fields: Mapping[str, TowardsTruth],
+    recovered: Recovered, materials: Materials, fields: Mapping[str, TowardsTruth]
 ) -> mi.Scene:
     """The scene, with textures that go from the fields to its own."""
+    problem, dataset = recovered.problem, recovered.dataset
     parsed = parse(dataset.scene, dataset.root)
     edit.to_principled(parsed)
     _register()
-    wrapped = []
+    wrapped: list[dict[str, mi.Texture]] = []
+    known = known_materials(parsed, recovered.config)
     for number in range(len(edit.material_names(parsed))):
+        if number in known:
+            wrapped.append({})
+            continue
         fitted = material_textures(materials, number)
         for name, field in fields.items():
             # A frozen function calls all textures that there are, those of other scenes too. What

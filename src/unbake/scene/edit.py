@@ -165,6 +165,31 @@ def material_names(scene: ParsedScene) -> list[str]:
     return names
 
 
+def lamp_materials(scene: ParsedScene) -> frozenset[int]:
+    """The numbers of materials that lamps alone have, as in `material_names`.
+
+    Photographs show the light of a lamp, and next to nothing of what it reflects. Where no other
+    shape has a material, as in a furnace, there are none.
+
+    Args:
+        scene: after `to_principled`.
+    """
+    nodes = scene.state.nodes
+    of_lamps: set[int] = set()
+    of_others: set[int] = set()
+    for place in scene.reachable(0):
+        if nodes[place].type != mi.ObjectType.Shape:
+            continue
+        inner = scene.references(place)
+        lamp = any(nodes[i].type == mi.ObjectType.Emitter for i in inner)
+        bsdfs = [i for i in inner if nodes[i].type == mi.ObjectType.BSDF]
+        (of_lamps if lamp else of_others).update(*map(scene.reachable, bsdfs))
+    places = scene.principled_indices()
+    if of_others.isdisjoint(places):
+        return frozenset()
+    return frozenset(n for n, i in enumerate(places) if i in of_lamps - of_others)
+
+
 def set_textures(scene: ParsedScene, textures: Mapping[str, object]) -> None:
     """Give every `principled` BSDF these textures, by parameter; all its other parameters stay.
 
@@ -175,7 +200,7 @@ def set_textures(scene: ParsedScene, textures: Mapping[str, object]) -> None:
 
 
 def set_own_textures(scene: ParsedScene, textures: Sequence[Mapping[str, object]]) -> None:
-    """Give each `principled` BSDF textures of its own, by parameter.
+    """Give each `principled` BSDF textures of its own, by parameter; none: it stays as it is.
 
     BSDFs with textures of their own are not merged, nor are their shapes.
     """

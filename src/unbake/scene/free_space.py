@@ -15,8 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.shapes import placed_shapes, registry_number
+from ..transport.emitter_sampling import has_cut_outs
 from ..transport.optimized import has_optimized_material, one_sided_shapes
 from ..transport.render import path_integrator
+from .sight import OPAQUE, Sight, is_hole
 
 # Fractions of the diagonal of `extent`.
 CLEARANCE = 0.03
@@ -34,6 +36,8 @@ ROOM_ENCLOSURE = 0.75
 _DIRECTIONS = 64
 #: View rays of a camera that tell what space it sees.
 PROBES = 64
+#: View rays along an edge of a picture that tell whether a camera sees anything.
+_GRID = 8
 _CHUNK = 1 << 20
 # Segments whose visibility is tested at once: few are slow, and many take memory.
 _SEGMENTS = 1 << 16
@@ -165,7 +169,11 @@ def trace(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> Hits:
 
 
 def unoccluded(
-    scene: mi.Scene, starts: np.ndarray, ends: np.ndarray, offset: float | None = None
+    scene: mi.Scene,
+    starts: np.ndarray,
+    ends: np.ndarray,
+    offset: float | None = None,
+    sight: Sight = OPAQUE,
 ) -> np.ndarray:
     """Whether the segment between two points is free, (n,) bool; glass occludes.
 
@@ -173,6 +181,7 @@ def unoccluded(
         scene: what stands in the way.
         starts, ends: (n, 3).
         offset: how far before its end a segment ends; None: as suits the scene.
+        sight: what does not stand in the way.
     """
     offset = lift(scene, _RAY_OFFSET) if offset is None else offset
     free = np.empty(len(starts), dtype=bool)
@@ -181,11 +190,13 @@ def unoccluded(
         length = np.maximum(np.linalg.norm(segment, axis=1), 1e-12)
         ray = as_ray(start, segment / length[:, None])
         ray.maxt = mi.Float(np.maximum(length - offset, 0.0).astype(np.float32))
-        free[i : i + _CHUNK] = ~np.array(scene.ray_test(ray))
+        free[i : i + _CHUNK] = np.array(sight.free(scene, ray, mi.Bool(True)))
     return free
 
 
-def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) -> np.ndarray:
+def visibility(
+    scene: mi.Scene, positions: np.ndarray, points: SurfacePoints, sight: Sight = OPAQUE
+) -> np.ndarray:
     """Visibility of surface points (m) from positions (n), from either side: (n, m) bool."""
     offset = lift(scene, _RAY_OFFSET)
     result = np.empty((len(positions), len(points.position)), dtype=bool)
@@ -198,7 +209,7 @@ def visibility(scene: mi.Scene, positions: np.ndarray, points: SurfacePoints) ->
         position, normal = (np.tile(a, (count, 1)) for a in (points.position, points.normal))
         side = np.sign(np.einsum("ij,ij->i", ends - position, normal))
         start = position + (offset * side)[:, None] * normal
-        result[row : row + rows] = unoccluded(scene, start, ends, offset).reshape(count, -1)
+        result[row : row + rows] = unoccluded(scene, start, ends, offset, sight).reshape(count, -1)
     return result
 
 
@@ -280,6 +291,17 @@ def sample_surface(
         turned = surfaces[i].turned(normal[here])
         normal[here] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
     return SurfacePoints(position, normal, chosen)
+
+
+def cut_out(scene: mi.Scene, points: SurfacePoints) -> np.ndarray:
+    """Which points lie in holes of cut-outs, and on no surface: (n,) bool."""
+    if not len(points.position) or not has_cut_outs(scene):
+        return np.zeros(len(points.position), dtype=bool)
+    offset = lift(scene, _RAY_OFFSET)
+    ray = as_ray(points.position + offset * points.normal, -points.normal)
+    ray.maxt = mi.Float(2 * offset)
+    hit = scene.ray_intersect(ray)
+    return np.array(is_hole(hit, hit.is_valid()))
 
 
 def inside_geometry(scene: mi.Scene, positions: np.ndarray) -> np.ndarray:
@@ -380,8 +402,7 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
     probes = [np.empty((0, 3))]
     for sensor in scene.sensors():
         film = mi.Point2f(rng.random((2, PROBES)).astype(np.float32))
-        ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
-        probes.append(probes_along(scene, as_rows(ray.o), as_rows(ray.d), rng))
+        probes.append(probes_along(scene, *_view_rays(scene, sensor, film), rng))
     return np.concatenate(probes)
 
 
@@ -392,9 +413,30 @@ def sensor_eyes(scene: mi.Scene) -> np.ndarray:
     middle = mi.Point2f(0.5)
     found = [np.empty((0, 3))]
     for sensor in list(filter(_is_camera, sensors)) or sensors:
-        ray, _ = sensor.sample_ray(0.0, 0.5, middle, middle)
-        found.append(as_rows(ray.o))
+        found.append(_view_rays(scene, sensor, middle)[0])
     return np.concatenate(found)
+
+
+def _view_rays(
+    scene: mi.Scene, sensor: mi.Sensor, film: mi.Point2f
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of rays of a sensor, (n, 3) each.
+
+    Mitsuba lets them begin at the near plane, by which people cut walls away. If it lies beyond all
+    there is, as in scenes in large units, they begin at the camera.
+    """
+    ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
+    origins, directions = as_rows(ray.o), as_rows(ray.d)
+    if _is_camera(sensor) and _sees_nothing(scene, sensor):
+        origins = np.broadcast_to(_matrix(sensor)[:3, 3], directions.shape)
+    return origins, directions
+
+
+def _sees_nothing(scene: mi.Scene, sensor: mi.Sensor) -> bool:
+    side = (np.arange(_GRID) + 0.5) / _GRID
+    film = np.stack(np.meshgrid(side, side)).reshape(2, -1).astype(np.float32)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(film), mi.Point2f(0.5))
+    return not np.isfinite(trace(scene, as_rows(ray.o), as_rows(ray.d)).distance).any()
 
 
 def probes_along(

@@ -60,6 +60,8 @@ class Problem:
     outliers: OutlierModel | None = None  #: of the training views; None: all pixels count alike
     guide: LightGuide | None = None  #: of bounces; None: BSDFs alone draw directions
     beta2: float = OWN_BETA2  #: Adam's first one, for the unknowns
+    #: Whether pixels to train on show the environment (`told_scale.py`); None: nobody looked.
+    shows_environment: bool | None = None
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -297,12 +299,21 @@ def _unknown_materials(parsed: ParsedScene, config: FitConfig, seed: int) -> Mat
         half=config.half_precision,
         least_slope=max(config.least_slope, 0.0),
     )
-    if representation(config.representation).unwrapped:
-        each = [material_textures(materials, number) for number in range(len(names))]
-        edit.set_own_textures(parsed, each)
-    else:
-        edit.set_textures(parsed, material_textures(materials))
+    shared = material_textures(materials)
+    own = representation(config.representation).unwrapped
+    each = [material_textures(materials, n) if own else shared for n in range(len(names))]
+    for number in known_materials(parsed, config):
+        each[number] = {}
+    edit.set_own_textures(parsed, each)
     return materials
+
+
+def known_materials(parsed: ParsedScene, config: FitConfig) -> frozenset[int]:
+    """The numbers of the `principled` BSDFs that a fit of materials leaves as the scene has them.
+
+    They keep their numbers, so that the arrays of a fit are those of its scene.
+    """
+    return edit.lamp_materials(parsed) if config.lamps == "known" else frozenset()
 
 
 def _pieces(scene: mi.Scene, config: FitConfig) -> Pieces | None:

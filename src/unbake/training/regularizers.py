@@ -16,6 +16,7 @@ from ..transport.regularizers import (
 )
 from ..transport.vertex import find_vertex
 from .problem import Problem
+from .told_scale import is_shared
 
 #: The largest photometric loss that differences of albedo are weighed by: that of black pictures.
 _LARGEST_LOSS = 1.0
@@ -94,7 +95,9 @@ def is_anchored(problem: Problem, config: FitConfig) -> bool:
     """Whether the scale between albedo and light is set by convention.
 
     Photographs determine it where they show the environment itself, and where some light is known.
+    Where nobody has looked what they show, a visible background is taken for it.
     """
-    both = problem.environment is not None and "albedo" in (problem.materials or ())
-    alone = len(problem.scene_view.scene.emitters()) == 1
-    return both and alone and problem.hide_emitters and config.lighting.anchor > 0
+    told = problem.shows_environment
+    if told is None:
+        told = not problem.hide_emitters
+    return is_shared(problem) and not told and config.lighting.anchor > 0

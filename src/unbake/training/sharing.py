@@ -10,6 +10,7 @@ from __future__ import annotations
 from ..config import FitConfig
 from ..dataset.views import Dataset
 from ..ranks import Ranks
+from .told_scale import may_be_untold
 
 
 def kept_whole(config: FitConfig, dataset: Dataset, ranks: Ranks) -> str | None:
@@ -21,7 +22,6 @@ def kept_whole(config: FitConfig, dataset: Dataset, ranks: Ranks) -> str | None:
         ranks: more than one.
     """
     regularization, views = config.regularization, len(dataset.train)
-    both = config.learns_materials and config.learns_environment
     scattered = config.pixel_sampling == "all-views"
     reasons = {
         f"there are {views} training views for {ranks.size} processes": views < ranks.size,
@@ -33,9 +33,7 @@ def kept_whole(config: FitConfig, dataset: Dataset, ranks: Ranks) -> str | None:
             config.objective.outliers != "kept"
         ),
         # The square of a mean is not the mean of squares of parts.
-        "the mean albedo of all views is known (lighting.anchor)": (
-            both and dataset.background == "hidden" and config.lighting.anchor > 0
-        ),
+        "the mean albedo of all views is known (lighting.anchor)": may_be_untold(config, dataset),
         # In crops both points of a pair are of one view anyway.
         "points of all views are paired (regularization.albedo_ties_roughness)": (
             scattered and config.learns_materials and regularization.albedo_ties_roughness > 0

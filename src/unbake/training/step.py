@@ -29,6 +29,7 @@ from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
 from .problem import Problem
 from .state import State
+from .told_scale import shows_environment
 
 #: Pixels that tell the loss of black pictures.
 _OF_BLACK = 1 << 15
@@ -91,6 +92,7 @@ class TrainingStep:
         gc.collect()
         if problem.materials is not None:
             problem.materials.carried = True  # a run that was read back may stand alone
+        problem.shows_environment = shows_environment(problem, config, pixels)
         self._problem = problem
         self.pixels = pixels
         self.config = config  #: of this process, with its share of each batch

@@ -1,0 +1,105 @@
+"""Whether photographs tell the scale between albedo and light, where both are unknown.
+
+They do where they show the environment itself, directly or in mirrors and glass: its radiance is
+then that of pixels. Where none shows it, the scale is a convention (`regularizers.py`).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..config import FitConfig
+from ..dataset.pixels import CameraRays, PixelSource
+from ..dataset.views import Dataset, fitted_pixels
+from ..fields.arrays import from_numpy
+from ..scene import free_space
+from ..scene.emitters import ENVIRONMENTS, lights_besides
+from ..scene.parse import parse
+from ..transport.vertex import find_vertex
+from .problem import Problem
+
+#: Pixels, at most, that are looked at.
+_PIXELS = 1 << 16
+#: The part of them, at least, that must show the environment: cracks of a mesh show it as well.
+_LEAST = 1e-4
+
+
+def is_shared(problem: Problem) -> bool:
+    """Whether albedo and all light are unknown, so that a factor is shared between them."""
+    both = problem.environment is not None and "albedo" in (problem.materials or ())
+    return both and len(problem.scene_view.scene.emitters()) == 1
+
+
+def shows_environment(problem: Problem, config: FitConfig, pixels: PixelSource) -> bool | None:
+    """Whether pixels to train on show the environment, directly or in mirrors and glass.
+
+    Processes that share the photographs all call this together.
+
+    Returns:
+        None where that is not asked: the settings hold no mean albedo, or go by the background.
+    """
+    lighting = config.lighting
+    if not lighting.anchor or lighting.scale_told_by == "background":
+        return None
+    if not is_shared(problem):
+        return None
+    found = pixels.photographs
+    places = np.linspace(0, found.count - 1, min(found.count, _PIXELS)).astype(np.int64)
+    own = places[(places >= found.places.start) & (places < found.places.stop)]
+    shown = found.joined(lambda: _shown(problem, pixels.rays, found.own_numbers(own)))
+    return bool(shown.mean() >= _LEAST)
+
+
+def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:
+    """Whether the mean albedo of a data set may be held, as far as is known without a problem.
+
+    Mirrors and glass are not looked at.
+
+    Raises:
+        UserError: the scene or a mask cannot be read.
+    """
+    hidden, lighting = dataset.background == "hidden", config.lighting
+    if not (config.shares_scale and lighting.anchor > 0):
+        return False
+    if hidden or lighting.scale_told_by == "background":
+        return hidden
+    parsed = parse(dataset.scene, dataset.root)
+    if lights_besides(parsed, ENVIRONMENTS):
+        return False
+    scene, looked, shown = parsed.instantiate(), 0, 0
+    views = dataset.train
+    each = max(1, _PIXELS // len(views))
+    for view in views:
+        counted, camera = fitted_pixels(view, dataset.background), view.camera
+        size = camera.width * camera.height
+        numbers = np.arange(size) if counted is None else np.flatnonzero(counted)
+        if len(numbers) == 0:
+            continue
+        places = np.linspace(0, len(numbers) - 1, min(len(numbers), each)).astype(np.int64)
+        row, column = np.divmod(numbers[places], camera.width)
+        hits = free_space.trace(scene, *camera.rays(column + 0.5, row + 0.5))
+        looked += len(places)
+        shown += int(np.isinf(hits.distance).sum())
+        if shown >= _LEAST * len(views) * each:  # whatever the others show
+            return False
+    return shown < _LEAST * looked
+
+
+def _shown(problem: Problem, rays: CameraRays, numbers: np.ndarray) -> np.ndarray:
+    """Whether pixels show the environment, which is the only light, (n,) bool."""
+    if not len(numbers):
+        return np.zeros(0, bool)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, len(numbers))
+    with dr.suspend_grad():
+        ray = rays.through(from_numpy(mi.UInt32, numbers.astype(np.uint32)), mi.Point2f(0.5))
+        vertex = find_vertex(
+            problem.scene_view,
+            ray,
+            dr.full(mi.Bool, True, len(numbers)),
+            sampler,
+            hide_emitters=problem.hide_emitters,
+        )
+        return np.array(dr.max(vertex.emitted) > 0)

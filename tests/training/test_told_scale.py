@@ -1,0 +1,159 @@
+"""Whether photographs tell the scale between albedo and light, and what holds it otherwise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import TINY_FIT, built_in_cameras, on_ranks, tiny_fields
+
+from unbake.config import LightingConfig
+from unbake.dataset.pixels import PixelSource
+from unbake.dataset.views import Dataset, View
+from unbake.imaging.pictures import write_exr, write_png
+from unbake.ranks import Ranks
+from unbake.scene import free_space
+from unbake.training.problem import make_problem, pixels_of
+from unbake.training.regularizers import is_anchored
+from unbake.training.sharing import kept_whole
+from unbake.training.step import TrainingStep
+from unbake.training.told_scale import shows_environment
+
+SIZE = 8
+BOTH = replace(TINY_FIT, unknown="materials+lighting")
+LAMP = '<emitter type="point"><rgb name="intensity" value="1"/></emitter></scene>'
+MIRROR = """<shape type="sphere"><point name="center" value="0,0,0.9"/>
+    <float name="radius" value="0.3"/><bsdf type="conductor"/></shape></scene>"""
+
+
+@pytest.fixture
+def still(built_in):
+    return built_in("still")
+
+
+def with_more(scene, text):
+    """The scene with something at its end."""
+    more = scene.with_name("more.xml")
+    more.write_text(scene.read_text().replace("</scene>", text))
+    return more
+
+
+def lighting(**settings):
+    return LightingConfig(resolution=8, **settings)
+
+
+def surfaces(problem, cameras):
+    """Whether pixels show a surface, (n,) bool."""
+    size = cameras[0].width * cameras[0].height
+    row, column = np.divmod(np.arange(size), cameras[0].width)
+    each = [camera.rays(column + 0.5, row + 0.5) for camera in cameras]
+    rays = [np.concatenate(parts) for parts in zip(*each, strict=True)]
+    return np.isfinite(free_space.trace(problem.scene_view.scene, *rays).distance)
+
+
+def begun(scene, background, config, *, masked):
+    """The problem of a fit to photographs that show whatever there is, or surfaces alone."""
+    problem, cameras = make_problem(scene, background, config, 0.2), built_in_cameras("still", SIZE)
+    counted = surfaces(problem, cameras) if masked else np.ones(SIZE * SIZE, bool)
+    assert 0.2 < surfaces(problem, cameras).mean() < 1
+    rgb = np.full((len(counted), 3), 0.2)
+    pixels = PixelSource.of(cameras, rgb, counted.astype(float), foreground_only=masked)
+    TrainingStep(problem, pixels, config)
+    return problem
+
+
+@pytest.mark.parametrize(
+    ("background", "masked", "mirror", "told"),
+    [
+        ("visible", False, False, True),
+        ("visible", True, False, False),
+        ("visible", True, True, True),
+        ("hidden", True, False, False),
+        ("hidden", True, True, True),
+        ("hidden", False, False, False),
+    ],
+)
+def test_the_scale_is_told_where_counted_pixels_show_the_environment(
+    background, masked, mirror, told, still
+):
+    scene = with_more(still, MIRROR) if mirror else still
+    config = replace(BOTH, lighting=lighting())
+    problem = begun(scene, background, config, masked=masked)
+    assert problem.shows_environment is told
+    assert is_anchored(problem, config) is not told
+
+
+@pytest.mark.parametrize(("background", "anchored"), [("visible", False), ("hidden", True)])
+def test_earlier_fits_go_by_the_background(background, anchored, still):
+    config = replace(BOTH, lighting=lighting(scale_told_by="background"))
+    problem = begun(still, background, config, masked=True)
+    assert problem.shows_environment is None
+    assert is_anchored(problem, config) is anchored
+
+
+@pytest.mark.parametrize("unknown", ["materials", "lighting"])
+def test_nobody_looks_where_no_scale_is_open(unknown, still):
+    config = replace(BOTH, unknown=unknown, lighting=lighting())
+    problem = begun(still, "visible", config, masked=False)
+    assert problem.shows_environment is None and not is_anchored(problem, config)
+
+
+@pytest.mark.parametrize(
+    ("background", "masked", "more", "change", "whole"),
+    [
+        ("visible", False, "</scene>", {}, False),
+        ("visible", True, "</scene>", {}, True),
+        ("visible", True, LAMP, {}, False),
+        ("visible", True, "</scene>", {"anchor": 0.0}, False),
+        ("visible", True, "</scene>", {"scale_told_by": "background"}, False),
+        ("hidden", True, "</scene>", {}, True),
+    ],
+)
+def test_processes_that_may_hold_the_mean_albedo_read_all_photographs(
+    background, masked, more, change, whole, still, tmp_path
+):
+    scene = with_more(still, more)
+    config = replace(tiny_fields(), unknown="materials+lighting", lighting=lighting(**change))
+    cameras = built_in_cameras("still", SIZE, 2)
+    seen = surfaces(make_problem(scene, background, config, 0.2), cameras)
+    views = []
+    for number, part in enumerate(seen.reshape(2, SIZE, SIZE)):
+        mask = tmp_path / f"mask_{number}.png" if masked else None
+        if mask is not None:
+            write_png(mask, np.where(part, 255, 0).astype(np.uint8))
+        image = tmp_path / f"{number}.exr"
+        views.append(View(str(number), "train", cameras[number], image, {}, mask=mask))
+    dataset = Dataset(scene.parent, scene, background, tuple(views), {}, None)
+    several = Ranks()
+    several.size = 2
+    found = kept_whole(config, dataset, several)
+    assert ("mean albedo" in found) if whole else found is None
+
+
+def test_processes_learn_what_the_views_of_others_show(still, tmp_path):
+    config, cameras = replace(BOTH, lighting=lighting()), built_in_cameras("still", SIZE, 2)
+    problem = make_problem(still, "visible", config, 0.2)
+    seen = surfaces(problem, cameras).reshape(2, SIZE, SIZE)
+    views = []
+    for number, counted in enumerate((np.ones_like(seen[0]), seen[1])):
+        image, mask = tmp_path / f"{number}.exr", tmp_path / f"{number}.png"
+        write_exr(image, np.full((SIZE, SIZE, 3), 0.2, np.float32))
+        write_png(mask, np.where(counted, 255, 0).astype(np.uint8))
+        views.append(View(str(number), "train", cameras[number], image, {}, mask=mask))
+
+    def told(chosen):
+        dataset = Dataset(tmp_path, still, "visible", tuple(chosen), {}, None)
+
+        def look(ranks):
+            pixels = pixels_of(dataset, config, clip_negative=False, ranks=ranks)
+            return shows_environment(problem, config, pixels)
+
+        return on_ranks(len(chosen), look)
+
+    assert told(views) == [True, True]
+    assert told(views[1:]) == [False]
+
+
+def test_a_known_lamp_tells_the_scale(still):
+    config = replace(BOTH, lighting=lighting())
+    problem = begun(with_more(still, LAMP), "visible", config, masked=True)
+    assert problem.shows_environment is None and not is_anchored(problem, config)
