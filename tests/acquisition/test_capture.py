@@ -164,6 +164,24 @@ def test_a_capture_that_fails_leaves_nothing(failure, tmp_path, monkeypatch):
 TINY = CaptureSettings(views=1, held_out=0, resolution=4, spp=1, max_depth=2)
 
 
+def test_photographs_without_light_are_refused(tmp_path):
+    """Of a lamp that looks away, with all that is wrong with values told before."""
+    away = """<scene version="3.0.0">
+      <shape type="sphere"><bsdf type="diffuse"/></shape>
+      <emitter type="spot"><transform name="to_world">
+        <lookat origin="0, 4, 0" target="0, 9, 0" up="0, 0, 1"/></transform></emitter>
+    </scene>"""
+    (tmp_path / "away.xml").write_text(away)
+    with pytest.raises(UserError, match=r"away.xml: all photographs are black: no light"):
+        capture(str(tmp_path / "away.xml"), tmp_path / "data", TINY, tell=lambda line: None)
+    bad = away.replace('"diffuse"/>', '"diffuse"><float name="reflectance" value="2"/></bsdf>')
+    bad = bad.replace("</emitter>", '<rgb name="intensity" value="-1"/></emitter>')
+    (tmp_path / "bad.xml").write_text(bad)
+    with pytest.raises(UserError, match=r"'intensity' of the light.*'base_color' is 2, not"):
+        capture(str(tmp_path / "bad.xml"), tmp_path / "data", TINY, tell=lambda line: None)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["away.xml", "bad.xml"]
+
+
 @pytest.mark.parametrize("scene", ["cube", "cbue", "none.xml"])
 def test_a_folder_of_the_user_is_left_alone(scene, tmp_path):
     """`data.partial` was deleted, even if the scene's name was misspelt."""

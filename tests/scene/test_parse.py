@@ -203,20 +203,65 @@ UNUSED = {
     '<integer name="width" value="24"/><integer name="height" value="16"/></film></sensor>',
     "sampler": '<sensor type="perspective"><sampler type="sobol">'
     '<integer name="scramble" value="5"/></sampler></sensor>',
+    "property of an integrator": '<integrator type="path">'
+    '<boolean name="strict_normals" value="true"/></integrator>',
+    "property of a sampler": '<sensor type="perspective"><sampler type="ldsampler">'
+    '<integer name="sampleCount" value="4"/></sampler></sensor>',
+    "property of a film": '<sensor type="perspective"><film type="hdrfilm">'
+    '<integer name="width" value="24"/><integer name="height" value="16"/>'
+    '<float name="gamma" value="2.2"/><rfilter type="gaussian"/></film></sensor>',
 }
 
 
 @pytest.mark.parametrize("kind", UNUSED)
 def test_what_nothing_uses_need_not_be_there(kind, parse):
     """Integrators, films and samplers of older versions, and for spectra and polarised light."""
-    scene = parse(BALL.format(DIFFUSE) + UNUSED[kind]).instantiate()
+    parsed = parse(BALL.format(DIFFUSE) + UNUSED[kind])
+    given = {node.props.plugin_name(): set(node.props) for node in parsed.state.nodes}
+    assert not set.union(*given.values()) & {"strict_normals", "sampleCount", "gamma", "scramble"}
+    scene = parsed.instantiate()
     if "film" in kind:
         assert list(scene.sensors()[-1].film().size()) == [24, 16]
 
 
-def test_integrators_that_mitsuba_has_stay(parse):
-    parsed = parse(BALL.format(DIFFUSE) + '<integrator type="volpath"/>')
-    assert "volpath" in [node.props.plugin_name() for node in parsed.state.nodes]
+@pytest.mark.parametrize(
+    "inner",
+    [
+        "",
+        '<integer name="max_depth" value="7"/><boolean name="hide_emitters" value="true"/>',
+    ],
+)
+def test_integrators_that_mitsuba_has_stay(inner, parse):
+    parsed = parse(BALL.format(DIFFUSE) + f'<integrator type="volpath">{inner}</integrator>')
+    (found,) = (n for n in parsed.state.nodes if n.props.plugin_name() == "volpath")
+    assert found.props.get("max_depth", 0) == (7 if inner else 0)
+    parsed.instantiate()
+
+
+def test_films_and_samplers_that_mitsuba_has_stay(parse):
+    camera = (
+        '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="24"/>'
+        '<rfilter type="gaussian"/></film><sampler type="stratified">'
+        '<integer name="sample_count" value="16"/></sampler></sensor>'
+    )
+    nodes = [node.props for node in parse(BALL.format(DIFFUSE) + camera).state.nodes]
+    found = {props.plugin_name(): set(props) for props in nodes}
+    assert "width" in found["hdrfilm"] and "gaussian" in found
+    assert "sample_count" in found["stratified"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        '<sensor type="perspective"><sampler type="blendbsdf"/></sensor>',
+        '<sensor type="perspective"><film type="bitmap"/></sensor>',
+        '<integrator type="ply"><string name="filename" value="../outside.ply"/></integrator>',
+    ],
+)
+def test_what_nothing_uses_is_not_made_where_it_is_of_another_kind(given, parse, monkeypatch):
+    monkeypatch.setattr(mi, "load_dict", lambda *_, **__: pytest.fail("it was made"))
+    with pytest.raises(UserError):
+        parse(BALL.format(DIFFUSE) + given).instantiate()
 
 
 @pytest.mark.parametrize("name", ["blackbody", "regular", "irregular"])

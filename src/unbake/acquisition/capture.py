@@ -21,13 +21,14 @@ from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
-from ..errors import UserError, printable
+from ..errors import UserError, printable, raise_together
 from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
 from ..io import is_locked, locked, removed_with_parents, require_file, require_utf8
 from ..quantities import QUANTITIES
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse, write
+from ..scene.values import require_attributes, value_faults
 from ..signals import cleaned_up
 from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
@@ -158,6 +159,9 @@ def _capture(
         tell(f"{spp} samples per pixel instead of {settings.spp}: they fill a grid")
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
     rgb, alpha, noise = photographs(scene, rays, settings, sampler, room, tell)
+    if not rgb.any():
+        what = "all photographs are black: no light reaches what the cameras see"
+        raise UserError(what, source.file, "Check where its lights are, and where they shine")
     _tell_noise(noise, spp, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
@@ -274,10 +278,12 @@ def _copy_scene(
     if parsed.media:
         tell(f"participating media are left out: {parsed.media}")
     changed = edit.to_principled(parsed)
+    raise_together(value_faults(parsed))
     if changed:
         tell(f"{changed} BSDFs made principled")
     scene = source.instance(merge=False)
     edit.require_optimized(scene, source.file)
+    require_attributes(scene, source.file)
     emitters.require_emitters(scene, source.file)
     return write(parsed, folder), scene
 

@@ -136,11 +136,11 @@ def _require_triangles(elements: list[_Element], path: Path) -> None:
             _refuse(f"the mesh is empty: it has no {name}", path)
 
 
-def ply_fields(path: Path) -> dict[str, list[str]]:
-    """The names of the properties in a PLY file, by element, in their order."""
+def ply_fields(path: Path) -> dict[str, dict[str, str]]:
+    """The properties in a PLY file with their types of NumPy, by element, in their order."""
     with path.open("rb") as file:
         _, elements = _ply_header(file, path)
-    return {element.name: [name for name, _ in element.fields] for element in elements}
+    return {element.name: dict(element.fields) for element in elements}
 
 
 def _ply_header(file: BinaryIO, path: Path) -> tuple[str | None, list[_Element]]:

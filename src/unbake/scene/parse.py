@@ -31,6 +31,12 @@ _PLUGIN_NAME = re.compile(r"[A-Za-z0-9_]{1,100}", re.ASCII)
 _SPECTRAL, _WITHOUT_RGB = ("specfilm", "stokes"), ("blackbody", "irregular", "regular")
 #: Names of a film's properties begin so: its size, and what of it is rendered.
 _FILM = ("width", "height", "crop_")
+#: Properties of films of older versions, as these and as Mitsuba's own upgrade spell them.
+_OLD_FILM = frozenset(
+    ("attachLog", "attach_log", "banner", "burn", "componentFormat", "exposure", "fileFormat")
+    + ("gamma", "highQualityEdges", "high_quality_edges", "key", "pixelFormat")
+    + ("tonemapMethod", "tonemap_method")
+)
 _LIBRARY = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 #: Properties without which Mitsuba 3.9 crashes (segmentation fault) where other plugins complain.
 _NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}
@@ -173,7 +179,7 @@ class ParsedScene:
 def parse(path: Path, root: Path | None = None) -> ParsedScene:
     """Parse a Mitsuba XML scene and resolve its references.
 
-    Nothing that the scene names is loaded yet, plugins least of all.
+    No file that the scene names is loaded yet, and of plugins integrators and samplers alone.
 
     Args:
         path: the scene.
@@ -327,18 +333,46 @@ def _require_own_plugins(scene: ParsedScene) -> None:
 def _replace_unused(scene: ParsedScene) -> None:
     """Put usual plugins in place of those that Mitsuba cannot make here, and that nothing uses.
 
-    Integrators, films and samplers of a scene are not used. They may be of older versions of
-    Mitsuba, or for spectra and polarised light.
+    Integrators and samplers of a scene are not used, nor is more of a film than its size. They may
+    be of older versions of Mitsuba, have properties of these, or be for spectra and polarised light.
     """
     own = mitsuba_folder() / "plugins"
     for node in scene.state.nodes:
         usual, name = _UNUSED.get(node.type), node.props.plugin_name()
-        if usual is None or (name not in _SPECTRAL and (own / f"{name}{_LIBRARY}").exists()):
+        if usual is None:
+            continue
+        known = name not in _SPECTRAL and (own / f"{name}{_LIBRARY}").exists()
+        if known and node.type == mi.ObjectType.Film:  # its size is used
+            for key in list(node.props):
+                if key in _OLD_FILM:
+                    del node.props[key]
+            continue
+        if known and _can_be_made(node):
             continue
         node.props.set_plugin_name(usual)
         for key in list(node.props):
             if node.type != mi.ObjectType.Film or not key.startswith(_FILM):
                 del node.props[key]
+
+
+def _can_be_made(node: mi.parser.SceneNode) -> bool:
+    """Whether a plugin knows all the properties of an integrator or a sampler.
+
+    Integrators in others are not tried, nor are those around them, nor plugins of another kind than
+    the node, of which scenes are refused later.
+    """
+    name = node.props.plugin_name()
+    if mi.PluginManager.instance().plugin_type(name) != node.type:
+        return True
+    values = {key: node.props[key] for key in list(node.props)}
+    plain = {key: value for key, value in values.items() if not is_reference(value)}
+    if len(plain) < len(values) and node.type == mi.ObjectType.Integrator:
+        return True
+    try:
+        mi.load_dict({"type": name} | plain, parallel=False)
+    except (RuntimeError, ValueError, TypeError):
+        return False
+    return True
 
 
 def _require_rgb(scene: ParsedScene) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
+import numpy as np
 
 from ..errors import UserError
 from .meshes import ply_fields
@@ -19,6 +20,7 @@ _AREA = ("area", "directionalarea")
 _PATTERNS = ("checkerboard", "mesh_attribute")
 #: The properties of a PLY file that are colours, in either way.
 _COLOURS = ({"red", "green", "blue"}, {"r", "g", "b"})
+_AS_COLOURS = "Write it as PLY with red, green and blue as float, linear from 0 to 1, without alpha"
 #: BSDFs that let light pass as it is.
 _OPEN = ("mask", "null", "thindielectric")
 #: Those that are fitted: `principled`, and what `edit.to_principled` turns into it.
@@ -45,7 +47,7 @@ def require_able(scene: ParsedScene) -> None:
         elif plugin in _AREA and (pattern := _first(names, _PATTERNS)):
             fault, remedy = f"the radiance of a lamp cannot be a {pattern}", "Give a bitmap"
         elif node.type == mi.ObjectType.Shape and (missing := _missing_colours(scene, place)):
-            fault, remedy = missing, "Write it as PLY with red, green and blue, without alpha"
+            fault, remedy = missing, _AS_COLOURS
         elif plugin == "shapegroup" and _has_vertex_colours(scene, place):
             fault = "instances of meshes whose vertices have colours have other colours"
             remedy = "Place the meshes themselves, or give a bitmap"
@@ -95,10 +97,14 @@ def _missing_colours(scene: ParsedScene, place: int) -> str | None:
         if shape.plugin_name() == "obj":
             return "the colours of an OBJ file are not read"
         if shape.plugin_name() == "ply":
-            names = {name.lower() for name in ply_fields(Path(shape["filename"])).get(element, [])}
-            if not any(colours <= names for colours in _COLOURS):
+            fields = ply_fields(Path(shape["filename"])).get(element, {})
+            types = {name.lower(): kind for name, kind in fields.items()}
+            colours = next((each for each in _COLOURS if each <= types.keys()), None)
+            if colours is None:
                 return f"the mesh has no {element}_color"
-            if names & {"alpha", "a"}:
+            if any(np.dtype(types[name]).kind != "f" for name in colours):
+                return f"{element}_color has integers, of which Mitsuba makes albedo up to 255"
+            if types.keys() & {"alpha", "a"}:
                 return f"{element}_color has an alpha, and is not read"
     return None
 
