@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +25,7 @@ from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
 from unbake.exports import export as exporting
 from unbake.exports import gltf
-from unbake.exports.bake import WANTED
+from unbake.exports.bake import WANTED, Baker, own_textures
 from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
 from unbake.exports.mitsuba import write_scene
@@ -528,6 +529,48 @@ def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
     assert {row["name"] for row in manifest["materials"]} == {"shiny", "velvet", "spectral"}
 
 
+@pytest.mark.parametrize(
+    ("given", "ior"),
+    [
+        ('<float name="specular" value="-1"/><float name="clearcoat_gloss" value="-3"/>', 1.0),
+        ('<float name="specular" value="12.5"/><float name="clearcoat_gloss" value="4"/>', 98.0),
+        ('<float name="specular" value="20"/><float name="clearcoat" value="9"/>', 98.0),
+    ],
+)
+def test_constants_beyond_what_any_material_has_are_limited(given, ior, tmp_path):
+    text = f'<scene version="3.0.0"><bsdf type="principled">{given}</bsdf></scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    found = material_constants(parsed_principled(tmp_path / "scene.xml", tmp_path), [0])
+    assert found.ior == pytest.approx(ior, rel=0.02)
+    assert 0 <= found.clearcoat <= 1 and 0 < found.clearcoat_roughness <= 0.1**0.5 + 1e-9
+
+
+TEXTURE = '<texture type="checkerboard" name="alpha"/>'
+WIDTHS = '<float name="alpha_u" value="{}"/><float name="alpha_v" value="{}"/>'
+
+
+@pytest.mark.parametrize(
+    ("plugin", "given", "alpha"),
+    [
+        ("roughconductor", '<float name="alpha" value="0.3"/>', 0.3),
+        ("roughconductor", "", 0.1),
+        ("roughconductor", TEXTURE, 0.1),
+        ("roughdielectric", TEXTURE, 0.1),
+        ("roughconductor", WIDTHS.format(0.1, 0.5), 0.3),
+        ("roughdielectric", WIDTHS.format(0.2, 0.4), 0.3),
+        ("conductor", "", 0.0),
+    ],
+)
+def test_plain_materials_are_as_rough_as_mitsuba_s(plugin, given, alpha, tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        f'''<scene version="3.0.0"><shape type="rectangle"><bsdf type="{plugin}">{given}</bsdf>
+          </shape><emitter type="constant"/></scene>'''
+    )
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
+    assert material["pbrMetallicRoughness"]["roughnessFactor"] == pytest.approx(alpha**0.5)
+
+
 @pytest.mark.parametrize("kind", ["usd", "mitsuba"])
 def test_masks_of_what_no_view_saw_come_with_all_formats(kind, exported, tmp_path, monkeypatch):
     exported.use(monkeypatch)
@@ -652,7 +695,7 @@ def test_mitsuba_alone_renders_what_was_recovered(exported, tmp_path):
         env=environment, cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "'ground'" in done.stdout and "'block-2'" in done.stdout
+    assert all(f"'{name}'" in done.stdout for name in ("ground", "block-2", "lens", "lamp"))
     problem = exported.recovered.problem
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
     reference = mi.render(problem.scene_view.scene, integrator=integrator, spp=2048, seed=0)
@@ -737,7 +780,146 @@ def test_recovered_strengths_are_numbers_of_the_scene(data, tmp_path, monkeypatc
     assert any("learned no materials" in note for note in manifest["notes"])
 
 
+#: A lamp whose enamel no other shape has.
+ENAMEL = """<scene version="3.0.0">
+  <bsdf type="principled" id="enamel"><rgb name="base_color" value="0.9 0.1 0.3"/></bsdf>
+  <bsdf type="diffuse" id="paint"/>
+  <shape type="rectangle" id="floor"><ref id="paint"/></shape>
+  <shape type="sphere" id="bulb"><ref id="enamel"/><float name="radius" value="0.3"/>
+    <point name="center" x="0" y="0" z="1"/><emitter type="area"/></shape></scene>"""
+
+
+@pytest.mark.parametrize("unknown", ["materials", "emission"])
+def test_materials_that_were_not_learned_stay_as_they_are(unknown, tmp_path):
+    learned, scene = unknown == "materials", tmp_path / "scene"
+    scene.mkdir()
+    (scene / "scene.xml").write_text(ENAMEL)
+    data = grey_data(scene / "scene.xml", tmp_path / "data")
+    config = replace(tiny_fields("grid"), method="direct", unknown=unknown, steps=0)
+    fit(data, tmp_path / "run", config)
+    options = {"texels": 4.0, "tell": lambda line: None}
+    exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba"], **options)
+    folder = tmp_path / "out" / "mitsuba"
+    shapes = ElementTree.parse(folder / "scene.xml").getroot().findall("shape")
+    found = {shape.get("id"): shape.get("type") for shape in shapes}
+    assert found == {"floor": "ply" if learned else "rectangle", "bulb": "sphere"}
+    assert any(folder.rglob("*.exr")) == any(folder.rglob("*.ply")) == learned
+    ray = mi.Ray3f(mi.Point3f(0, 0, 3), mi.Vector3f(0, 0, -1))
+    written = mi.load_file(str(folder / "scene.xml"))
+    si = written.ray_intersect(ray)
+    np.testing.assert_allclose(
+        np.ravel(si.bsdf().eval_diffuse_reflectance(si)), [0.9, 0.1, 0.3], atol=1e-5
+    )
+
+
 # ------------------------------------------------------------------------------- the parts of a job
+
+
+class SeenFrom:
+    """Views that see what lies beyond a plane across the x axis."""
+
+    def __init__(self, x):
+        self._x = x
+
+    def see(self, p, n, two_sided, active):
+        return active & (p.x > self._x)
+
+
+def rewritten(file, out, texels=100.0):
+    """Have Mitsuba's scene written with its own values, all in the coordinates of atlases."""
+    found = read_parts(file, file.parent)
+    scene, scratch, own = (parsed_principled(file, file.parent) for _ in range(3))
+    wanted = [part for part in found.parts if part.is_optimized]
+    baker = Baker(None, own_textures(own, ()), SeenFrom(-np.inf))
+    baked = [baker.bake(atlas) for atlas in make_atlases(found.scene, wanted, texels)]
+    assert {one.atlas.method for one in baked} == {"uvunwrap"}
+    out.mkdir()
+    camera = LookAt((0, 0, 3), (0, 0, 0), (0, 1, 0), 40).camera(16, 16)
+    return write_scene(out, scene, scratch, found.parts, baked, [], None, camera)
+
+
+def two_sheets(name, x=0.0):
+    """Squares of a material, one below the other, whose own coordinates are the same."""
+    return "".join(
+        f'''<shape type="rectangle"><ref id="{name}"/><transform name="to_world">
+          <translate x="{x}" z="{z}"/></transform></shape>'''
+        for z in (0, -0.5)
+    )
+
+
+#: A metal in two blends, and on a square alone.
+BLENDS = f"""<scene version="3.0.0">
+  <bsdf type="roughconductor" id="metal"><texture type="bitmap" name="alpha">
+    <string name="filename" value="worn.exr"/><boolean name="raw" value="true"/>
+    <string name="filter_type" value="nearest"/></texture></bsdf>
+  <bsdf type="blendbsdf" id="grey"><float name="weight" value="0.5"/>
+    <bsdf type="diffuse"/><ref id="metal"/></bsdf>
+  <bsdf type="blendbsdf" id="green"><float name="weight" value="0.7"/>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.1 0.6 0.2"/></bsdf>
+    <ref id="metal"/></bsdf>
+  {two_sheets("grey")}{two_sheets("green", 3)}
+  <shape type="rectangle"><ref id="metal"/><transform name="to_world"><translate x="6"/>
+    </transform></shape>
+  <emitter type="constant"/></scene>"""
+
+
+def test_a_metal_in_several_materials_keeps_its_texture_in_all(tmp_path):
+    rng = np.random.default_rng(0)
+    write_exr(tmp_path / "worn.exr", rng.uniform(0.2, 0.9, (4, 4)))
+    (tmp_path / "scene.xml").write_text(BLENDS)
+    made = rewritten(tmp_path / "scene.xml", tmp_path / "out")
+    original = parsed_principled(tmp_path / "scene.xml", tmp_path).instantiate(merge=False)
+    written = mi.load_file(str(made.path), optimize=False)
+    for x in (0, 3, 6):
+        places = rng.uniform(-0.99, 0.99, (2, 1000)).astype(np.float32)
+        ray = mi.Ray3f(mi.Point3f(places[0] + x, places[1], 1), mi.Vector3f(0, 0, -1))
+        truth, found = (
+            np.array(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0.6, 0, 0.8)))
+            for si in (original.ray_intersect(ray), written.ray_intersect(ray))
+        )
+        assert np.ptp(truth) > 0.1, x
+        assert (np.abs(found - truth).max(0) < 0.01).mean() > 0.9, x
+
+
+BRUSHED = """<bsdf type="blendbsdf" id="sheet"><float name="weight" value="0.5"/>
+  <bsdf type="diffuse"/><bsdf type="roughconductor"><float name="alpha_u" value="0.1"/>
+  <float name="alpha_v" value="{}"/></bsdf></bsdf>"""
+TURNED = '<bsdf type="principled" id="sheet"><float name="anisotropic" value="{}"/></bsdf>'
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "told"),
+    [
+        (TURNED.format(0.7), True),
+        (TURNED.format(0.0), False),
+        (BRUSHED.format(0.4), True),
+        (BRUSHED.format(0.1), False),
+    ],
+)
+def test_highlights_that_turn_with_the_coordinates_are_told(bsdf, told, tmp_path):
+    text = f'<scene version="3.0.0">{bsdf}{two_sheets("sheet")}<emitter type="constant"/></scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    notes = rewritten(tmp_path / "scene.xml", tmp_path / "out", 10.0).notes
+    assert any("anisotropic highlights follow" in note for note in notes) == told
+
+
+def test_what_no_view_saw_is_told_by_area(tmp_path):
+    """Of two squares beside each other, one has seven eighths of the texels."""
+    x, y = (axis.ravel() for axis in np.meshgrid([-1, 0, 1], [0, 1]))
+    u = np.interp(x, [-1, 0, 1], [0, 7 / 8, 1])
+    faces = np.array([(0, 1, 3), (1, 4, 3), (1, 2, 4), (2, 5, 4)], np.uint32)
+    write_mesh(tmp_path / "sheet.ply", np.stack([x, y, 0 * x], -1), faces, uv=np.stack([u, y], -1))
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0"><shape type="ply"><string name="filename" value="sheet.ply"/>
+          <bsdf type="diffuse"/></shape><emitter type="constant"/></scene>"""
+    )
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    own = own_textures(parsed_principled(tmp_path / "scene.xml", tmp_path), ())
+    (atlas,) = make_atlases(found.scene, found.parts, 10.0)
+    baked = Baker(None, own, SeenFrom(0)).bake(atlas)
+    assert atlas.method == "own"
+    assert (~baked.observed[baked.covered]).mean() == pytest.approx(7 / 8, abs=0.01)
+    assert baked.unobserved_share == pytest.approx(0.5, abs=0.01)
 
 
 LAYERS = """<scene version="3.0.0">

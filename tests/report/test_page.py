@@ -154,6 +154,16 @@ def test_the_page_shows_every_view_run_and_number(made, tmp_path: Path):
     assert "10 log10(1/MSE)" in text
 
 
+def test_of_many_held_out_views_some_are_shown(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "HELDOUT", 30)
+    data = _make_data(tmp_path / "room")
+    run = _make_run(tmp_path / "run", data, "ours", 0.01)
+    text = write_report([run], tmp_path / "report.html").read_text()
+    assert text.count('data-view="heldout_') == 24
+    assert "heldout_000" in text and "heldout_029" in text
+    assert "24 of 30 views, evenly spaced" in _section(text, "heldout")
+
+
 def test_logged_terms_without_a_title_have_charts_too(made, tmp_path: Path):
     """Regularizers, and terms of methods that are not registered here."""
     log = made[1][0] / "log.jsonl"
@@ -722,6 +732,15 @@ def test_the_mean_of_relit_pictures_is_of_those_that_have_a_score(made, tmp_path
     _edit_json(folder / "render.json", scored={"render_psnr": 5})
     text = write_report(made[1], tmp_path / "report.html", relit=[folder]).read_text()
     assert "32.50 dB, mean of 5 views; SSIM" in _section(text, "relit")
+
+
+def test_relit_pictures_have_their_aligned_score_beside_the_other(made, tmp_path: Path):
+    folder = _relit(tmp_path / "relit", made[1][0])
+    mean = json.loads((folder / "render.json").read_text())["mean"]
+    _edit_json(folder / "render.json", mean=mean | {"render_psnr_aligned": 41.25})
+    text = write_report(made[1], tmp_path / "report.html", relit=[folder]).read_text()
+    told = "32.50 dB, mean of 6 views; 41.25 dB once aligned in brightness; SSIM"
+    assert told in _section(text, "relit")
 
 
 def test_pictures_keep_their_shape(made, tmp_path: Path):

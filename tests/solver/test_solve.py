@@ -16,6 +16,7 @@ from support import TINY, assert_only_replayed, seeded
 
 from unbake.config import FitConfig, read_toml
 from unbake.config.light import LightConfig
+from unbake.dataset.camera import LookAt
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.fields.domain import Domain
@@ -253,6 +254,20 @@ def test_a_solve_that_is_stopped_keeps_all_that_was_learned(tmp_path, monkeypatc
     assert sent and 30 < len(taken) < 60 and last["step"] == len(taken)
     assert made["finished"] is False
     assert read_object(tmp_path / "out" / "solve.json")["measurements"][-1] == last
+
+
+@pytest.mark.parametrize(("problem", "option"), [(None, "--resolution"), (object(), "--cameras")])
+def test_pictures_that_do_not_fit_into_memory_are_refused_at_once(
+    problem, option, tmp_path, monkeypatch
+):
+    camera = LookAt((0, 0, 3), (0, 0, 0), (0, 1, 0), 40).camera(640, 480)
+    known = learn.Known(None, {"a": camera, "b": camera}, True, None, {}, problem)
+    monkeypatch.setattr("unbake.memory.free_bytes", lambda: 100 * 2 * 640 * 480)
+    with pytest.raises(UserError, match="pictures of 2 views need about") as caught:
+        learn.learn(known, None, SolveSettings(), tmp_path / "out", None, print)
+    assert option in caught.value.remedy and "--reference-spp 0" in caught.value.remedy
+    assert not (tmp_path / "out").exists()
+    learn._require_memory(known, SolveSettings(reference_spp=0))  # it needs less
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,8 @@ _TEXEL_BYTES = 120
 NEAR, WANTED = 2 / 255, 0.95
 #: Points of an atlas at which that is tried.
 _TRIED = 4096
+#: Points of an atlas that tell how much of its surface was seen.
+_COUNTED = 1 << 16
 #: By how much the resolution of an atlas may rise for it, and to how many texels in all of them.
 _FINEST, _MOST = 8, 1 << 25
 
@@ -47,6 +49,7 @@ class Baked:
     covered: np.ndarray  #: (n, n) bool: there is surface
     observed: np.ndarray  #: (n, n) bool: and a training view saw it
     learned: tuple[str, ...]  #: quantities that were recovered; the others are the scene's own
+    unobserved_share: float  #: of the surface, by area, that no training view saw
     #: By recovered quantity, the share of the surface that training views saw where the texture
     #: has the field's value, to `NEAR`.
     near: Mapping[str, float] = field(default_factory=dict)
@@ -55,11 +58,6 @@ class Baked:
     def is_near(self) -> bool:
         """Whether all textures are near to the fields where it counts."""
         return min(self.near.values(), default=1.0) >= WANTED
-
-    @property
-    def unobserved_share(self) -> float:
-        """Of the texels with surface, those that no training view saw."""
-        return 1 - int(self.observed.sum()) / max(int(self.covered.sum()), 1)
 
 
 class Baker:
@@ -138,7 +136,10 @@ class Baker:
             default = [quantity.default] * quantity.channels
             square = values[name].reshape(n, n, quantity.channels)
             baked[name] = filled(square, known.reshape(n, n), default)
-        return Baked(atlas, baked, covered.reshape(n, n), observed.reshape(n, n), self._learned)
+        covered, observed = covered.reshape(n, n), observed.reshape(n, n)
+        _, everywhere = surface_points(atlas.placed, _COUNTED, seed=1)
+        unseen = _share_unseen(covered, observed, everywhere)
+        return Baked(atlas, baked, covered, observed, self._learned, unseen)
 
     def at(
         self, placed: Placed, uv: np.ndarray
@@ -277,6 +278,21 @@ def look_up(
             value = dr.select(here, mi.Color3f(looked_up), value)
         found[name] = list(value)[: quantity.channels]
     return found
+
+
+def _share_unseen(covered: np.ndarray, observed: np.ndarray, uv: np.ndarray) -> float:
+    """The share of points in texels that no training view saw; 1 where no texel has surface.
+
+    Texels do not tell it: where coordinates are stretched, some have more surface than others.
+
+    Args:
+        covered, observed: as of `Baked`.
+        uv: (points, 2), by area.
+    """
+    last = len(covered) - 1
+    x, y = np.minimum((uv * len(covered)).astype(np.int64), last).T
+    counted = covered[y, x]
+    return float((~observed[y, x])[counted].mean()) if counted.any() else 1.0
 
 
 def _share_near(

@@ -17,6 +17,8 @@ from ..scene.parse import ParsedScene
 _UNKNOWN = ("anisotropic", "flatness", "sheen", "spec_tint", "spec_trans")
 #: Quantities that glTF and OpenUSD have textures of.
 TEXTURED = ("albedo", "roughness", "metallic")
+#: From 12.5 on, no index of refraction belongs to `specular`.
+_MOST_SPECULAR = 12.0
 
 
 @dataclass(frozen=True)
@@ -43,9 +45,11 @@ def material_constants(scene: ParsedScene, materials: Sequence[int]) -> Constant
         left_out.append("clearcoat")
         coat = 0.0
     gloss = props.get("clearcoat_gloss", 0.0)
-    alpha = 0.1 + (0.001 - 0.1) * (gloss if isinstance(gloss, float) else 0.0)
+    gloss = min(max(gloss, 0.0), 1.0) if isinstance(gloss, float) else 0.0
+    alpha = 0.1 + (0.001 - 0.1) * gloss
     # Mitsuba's coat reflects a quarter of what a smooth layer would.
-    return Constants(_index(props), 0.25 * coat, math.sqrt(alpha), tuple(left_out))
+    coat = min(max(0.25 * coat, 0.0), 1.0)
+    return Constants(_index(props), coat, math.sqrt(alpha), tuple(left_out))
 
 
 def _index(props: Any) -> float:
@@ -53,5 +57,6 @@ def _index(props: Any) -> float:
     eta, specular = props.get("eta", None), props.get("specular", 0.5)
     if not isinstance(eta, float):
         specular = specular if isinstance(specular, float) else 0.5
+        specular = min(max(specular, 0.0), _MOST_SPECULAR)
         eta = 2 / (1 - math.sqrt(0.08 * specular)) - 1
     return max(eta, 1.0)

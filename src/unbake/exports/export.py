@@ -29,6 +29,7 @@ from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
 from ..scene.parse import ParsedScene
 from ..training.grid_sizes import surface_seen
+from ..training.problem import known_materials
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..version import VERSION
@@ -78,6 +79,7 @@ _CONVENTIONS = {
     "were seen, or is the quantity's default where a material has none, and all else is the "
     "scene's own; what is seen in mirrors, through glass or in pixels that are not fitted alone "
     "counts as not seen",
+    "unobserved_share": "of the surface, by its area, as the masks have it",
 }
 
 
@@ -160,10 +162,12 @@ def _export(
         seen = surface_seen(scene, cameras)
         density = _BLIND / free_space.bounds(scene)[2] if seen is None else 1 / seen.footprint
     found = read_parts(dataset.scene, dataset.root, problem.pieces)
+    found = found.without(known_materials(found.scene, recovered.config))
     lights = read_lights(found.scene, problem)
     learned = () if problem.materials is None else tuple(problem.materials)
     own = own_textures(parsed_principled(dataset.scene, dataset.root), learned)
-    wanted = [p for p in found.parts if "mitsuba" in formats or p.is_optimized]
+    of_lamps = "mitsuba" in formats and bool(learned)
+    wanted = [p for p in found.parts if p.is_optimized or of_lamps]
     with _Bar(console) as bar:
         atlases = make_atlases(found.scene, wanted, density, bar.unwraps)
         bar.total(sum(atlas.resolution**2 for atlas in atlases))
@@ -268,7 +272,7 @@ def _write(
             parsed_principled(dataset.scene, dataset.root),
             parsed_principled(dataset.scene, dataset.root),
             found.parts,
-            baked,
+            baked if learned else (),  # what was not learned stays as it is
             lights,
             recovered_environment,
             recovered.camera(dataset.train[0]),

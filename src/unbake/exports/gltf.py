@@ -38,6 +38,8 @@ _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _GLASS = ("dielectric", "thindielectric", "roughdielectric")
 _CONDUCTORS = ("conductor", "roughconductor")
 _PLASTIC = "plastic"
+#: Width of microfacets in Mitsuba where nothing is said.
+_ALPHA = 0.1
 _SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
 
 #: Bytes that the header of a file can tell.
@@ -271,11 +273,16 @@ def _refraction(document: Document, props: Any, default: float) -> dict[str, Any
 
 
 def _roughness(props: Any, rough: str) -> float:
-    """Perceptual roughness of a microfacet width, 0 of what is smooth."""
-    alpha = props.get("alpha", 0.1)
-    if props.plugin_name() != rough or not isinstance(alpha, float):
+    """Perceptual roughness of a microfacet width, 0 of what is smooth.
+
+    Of two widths their mean counts; one that is a texture counts as Mitsuba's default.
+    """
+    if props.plugin_name() != rough:
         return 0.0
-    return math.sqrt(min(max(alpha, 0.0), 1.0))
+    keys = ("alpha_u", "alpha_v") if {"alpha_u", "alpha_v"} & set(props) else ("alpha",)
+    given = [props.get(key, _ALPHA) for key in keys]
+    widths = [alpha if isinstance(alpha, float) else _ALPHA for alpha in given]
+    return math.sqrt(min(max(sum(widths) / len(widths), 0.0), 1.0))
 
 
 def _colour(value: Any, default: float = 0.9) -> list[float]:

@@ -66,7 +66,7 @@ def write_scene(
         scene: freshly parsed; it is changed.
         scratch: the same scene once more; its nodes are used up.
         parts: of the scene.
-        baked: the textures of all materials that were unknown, those of lights included.
+        baked: the textures of all materials that a fit changed, those of lights included.
         lights: with recovered strengths.
         environment: the recovered one, as `envmap` reads it.
         camera: of the sensor that is added where the scene has none.
@@ -87,13 +87,14 @@ def write_scene(
         if one.atlas.method != "own":
             notes += _move_others(folder, stem, one, scene, scratch, copied)
     placed = {id(p.part): p.triangles for one in baked for p in one.atlas.placed}
-    names = _replace_shapes(folder, scene, parts, placed)
+    names = {part.node: part.name for part in parts if not part.instanced}
+    names |= _replace_shapes(folder, scene, parts, placed)
     if environment is not None:
         _replace_environment(folder, scene, environment)
     notes += _require_sensor(scene, camera)
     _forget_unused(scene)
     path = write(scene, folder)
-    _name_shapes(path, names)
+    _name_shapes(path, [names.get(i, "") for i in _shapes_of_root(scene)])
     return Written(path, notes)
 
 
@@ -101,17 +102,29 @@ def write_scene(
 
 
 def _own_bsdfs(scene: ParsedScene, baked: Sequence[Baked]) -> list[dict[int, int]]:
-    """Give parts copies of BSDFs that another atlas has already, as lamps have those of walls.
+    """Give parts copies of BSDFs that shapes outside of their atlas have, too.
+
+    Lamps may have those of walls, and a metal may lie in the blends of several materials.
 
     Returns:
         For each of `baked` the nodes of its own BSDFs, by those that they are copies of.
     """
+
+    def held(place: int, kind: mi.ObjectType) -> set[int]:
+        return {i for i in scene.reachable(place) if scene.state.nodes[i].type == kind}
+
+    placed = {each.part.node for one in baked for each in one.atlas.placed}
     used: set[int] = set()
+    for shape in held(0, mi.ObjectType.Shape) - placed:
+        for i in scene.references(shape):
+            if scene.state.nodes[i].type == mi.ObjectType.BSDF:
+                used |= held(i, mi.ObjectType.BSDF)
     found = []
     for one in baked:
-        shared = not used.isdisjoint(one.atlas.materials)
-        used.update(one.atlas.materials)
-        found.append(_copied_bsdfs(scene, one) if shared else {})
+        outer = {each.part.bsdf for each in one.atlas.placed if each.part.bsdf is not None}
+        own = {i for bsdf in outer for i in held(bsdf, mi.ObjectType.BSDF)}
+        found.append({} if used.isdisjoint(own) else _copied_bsdfs(scene, one))
+        used |= own
     return found
 
 
@@ -175,12 +188,17 @@ def _move_others(
     Returns:
         What is not as it was.
     """
-    notes = []
     parts = [placed.part for placed in baked.atlas.placed]
     learned = {QUANTITIES[name].slot for name in baked.learned}
+    numbered = [scene.principled_indices()[number] for number in baked.atlas.materials]
+    fitted = {copies.get(i, i) for i in numbered}
     outer = {copies.get(part.bsdf, part.bsdf) for part in parts if part.bsdf is not None}
     inside = {i for bsdf in outer for i in scene.reachable(bsdf)}
     inside |= {part.emitter for part in parts if part.emitter is not None}
+    notes = []
+    if any(_is_anisotropic(scene.state.nodes[i].props) for i in inside):
+        # They are along the coordinates.
+        notes.append(f"{baked.atlas.name}: anisotropic highlights follow the new coordinates")
     moved: dict[tuple[int, bool], int] = {}
     for i in sorted(inside):
         node = scene.state.nodes[i]
@@ -190,7 +208,7 @@ def _move_others(
         for key in list(node.props):
             node = scene.state.nodes[i]  # anew: a node that is appended moves all others
             inner = referenced(scene, node.props[key])
-            baked_here = plugin == "principled" and key in learned
+            baked_here = i in fitted and key in learned
             if inner is None or inner.type != mi.ObjectType.Texture or baked_here:
                 continue
             if plugin == "normalmap":
@@ -210,6 +228,13 @@ def _move_others(
     return notes
 
 
+def _is_anisotropic(props: mi.Properties) -> bool:
+    """Whether the highlights of a BSDF have a direction."""
+    if props.get("anisotropic", 0.0) != 0.0:
+        return True
+    return props.get("alpha_u", None) != props.get("alpha_v", None)
+
+
 def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
     """Write an image and append a texture of it; the number of the texture's node."""
     write_exr(file, values)
@@ -227,8 +252,8 @@ def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
 
 def _replace_shapes(
     folder: Path, scene: ParsedScene, parts: Sequence[Part], placed: dict[int, Triangles]
-) -> dict[str, str]:
-    """Put PLY meshes in the place of shapes; returns names of parts by file."""
+) -> dict[int, str]:
+    """Put PLY meshes in the place of shapes; returns names of parts by the nodes of the meshes."""
     chosen = [part for part in parts if id(part) in placed or part.instanced]
     replaced = {part.node for part in chosen if not part.instanced}
     instances = any(part.instanced for part in parts)
@@ -257,18 +282,29 @@ def _replace_shapes(
             if is_reference(old[key]):
                 node.props[key] = old[key]
         scene.append_to_root(f"exported shape {number}", node)
-        names[f"{_MESHES}/{stem}.ply"] = part.name
+        names[len(scene.state.nodes) - 1] = part.name
     return names
 
 
-def _name_shapes(path: Path, names: dict[str, str]) -> None:
-    """Give shapes their names again: `mi.parser.write_file` of Mitsuba 3.9 drops them."""
+def _shapes_of_root(scene: ParsedScene) -> list[int]:
+    """The shapes that the scene itself refers to, in the order in which they are written."""
+    nodes = scene.state.nodes
+    return [i for i in scene.references(0) if nodes[i].type == mi.ObjectType.Shape]
+
+
+def _name_shapes(path: Path, names: Sequence[str]) -> None:
+    """Give shapes their names again: `mi.parser.write_file` of Mitsuba 3.9 drops them.
+
+    Args:
+        path: the scene's file.
+        names: of the shapes, in their order.
+    """
     tree = ElementTree.parse(path)
     taken = {node.get("id") for node in tree.iter() if node.get("id")}
-    for shape in tree.iter("shape"):
-        files = [s.get("value") for s in shape.findall("string") if s.get("name") == "filename"]
-        name = _as_id(names.get(files[0] or "", "")) if files else ""
-        if name and name not in taken:
+    shapes = tree.getroot().findall("shape")
+    told = names if len(names) == len(shapes) else [""] * len(shapes)
+    for shape, name in zip(shapes, map(_as_id, told), strict=True):
+        if name and name not in taken and not shape.get("id"):
             taken.add(name)
             shape.set("id", name)
     ElementTree.indent(tree, "    ")

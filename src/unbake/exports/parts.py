@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,6 +51,14 @@ class Parts:
     scene: ParsedScene  #: whose nodes the numbers of the parts are of
     parts: list[Part]
     left_out: list[str]  #: names of shapes that are no surfaces of triangles
+
+    def without(self, known: Collection[int]) -> Parts:
+        """The same, but for materials of these numbers, which no fit changes: no part has them."""
+        parts = [
+            replace(part, materials=tuple(n for n in part.materials if n not in known))
+            for part in self.parts
+        ]
+        return replace(self, parts=parts)
 
 
 def parsed_principled(path: Path, root: Path) -> ParsedScene:

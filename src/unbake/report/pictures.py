@@ -52,15 +52,16 @@ def shared_scales(runs: list[EvaluatedRun], views: list[ShownView]) -> Scales:
 def view_groups(
     dataset: Dataset, views: Sequence[ShownView], runs: list[EvaluatedRun], scales: Scales
 ) -> list[dict[str, Any]]:
-    """The pictures of each split, view by view, and how many views it has in the data set."""
-    return [
-        {
-            "split": split,
-            "total": sum(view.split == split for view in dataset.views),
-            "views": [_view_block(view, runs, scales) for view in views if view.split == split],
-        }
-        for split in SHOWN_SPLITS
-    ]
+    """The pictures of each split, view by view, and of how many views they are."""
+    names = {row["name"] for run in runs for row in run.metrics["per_view"]}
+    groups = []
+    for split in SHOWN_SPLITS:
+        every = [view.name for view in dataset.views if view.split == split]
+        blocks = [_view_block(view, runs, scales) for view in views if view.split == split]
+        # Training views were chosen so by the evaluation.
+        spaced = split == "train" or len(blocks) < len(names.intersection(every))
+        groups.append({"split": split, "total": len(every), "views": blocks, "spaced": spaced})
+    return groups
 
 
 def _view_block(view: ShownView, runs: list[EvaluatedRun], scales: Scales) -> dict[str, Any]:

@@ -120,6 +120,9 @@ def _row(
     if psnr is not None:
         views = (manifest.get("scored") or {}).get("render_psnr", mean.get("views"))
         told.insert(0, f"{display.decibels(psnr)} dB, mean of {views} views")
+    aligned = display.number(mean.get("render_psnr_aligned"))
+    if aligned is not None:
+        told.insert(1, f"{display.decibels(aligned)} dB once aligned in brightness")
     return {"cells": cells, "told": "; ".join(filter(None, told))}
 
 

@@ -17,6 +17,7 @@ from unbake.training.run_folder import RunFolder
 #: Splits of the data in the order of the page.
 SHOWN_SPLITS = ("heldout", "train")
 TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
+HELDOUT_VIEWS = 24  # each has several pictures of every run, and all are in one file
 
 
 @final
@@ -160,7 +161,7 @@ def data_folder(runs: list[EvaluatedRun]) -> Path:
 
 
 def read_views(dataset: Dataset, runs: list[EvaluatedRun]) -> list[ShownView]:
-    """Every evaluated held-out view, then at most four training views, evenly spaced.
+    """The evaluated held-out views, then training views: some of many, evenly spaced.
 
     Raises:
         UserError: an evaluated view is missing from the data set.
@@ -175,7 +176,7 @@ def read_views(dataset: Dataset, runs: list[EvaluatedRun]) -> list[ShownView]:
         )
     heldout = [_view(view) for view in dataset.heldout if view.name in evaluated]
     training = [_view(view) for view in dataset.train if view.name in evaluated]
-    return heldout + evenly(training, TRAINING_VIEWS)
+    return evenly(heldout, HELDOUT_VIEWS) + evenly(training, TRAINING_VIEWS)
 
 
 def _view(view: View) -> ShownView:

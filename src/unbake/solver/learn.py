@@ -19,6 +19,7 @@ from ..fields.radiance import RadianceField
 from ..fields.settings import FieldSettings
 from ..imaging.pictures import tonemap, write_exr, write_png
 from ..machine import machine
+from ..memory import require_memory
 from ..signals import deferred
 from ..training.memory import memory_mb
 from ..training.monitor import Monitor
@@ -36,6 +37,9 @@ LOG = "progress.jsonl"
 MEASURED = (0.0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
 #: Steps between looks at the clock, and between lines of the log.
 _TIMED, _READ = 8, 32
+#: Bytes a pixel of the pictures of both sides, of which two measurements are held at once; and of a
+#: reference, with all that they are compared by.
+_SIDES_BYTES, _REFERENCE_BYTES = 60, 180
 _DEFINITIONS = {
     "relmse": "mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of all pictures; "
     "a: lhs or rhs, b: the path traced reference",
@@ -117,8 +121,9 @@ def learn(
         The contents of `solve.json`.
 
     Raises:
-        UserError: the folder cannot be written.
+        UserError: the pictures do not fit into the memory, or the folder cannot be written.
     """
+    _require_memory(known, settings)
     told = asdict(settings)
     del told["radiance"]
     manifest: dict[str, Any] = {
@@ -141,6 +146,23 @@ def learn(
     learning.train(console or Console(quiet=True))
     learning.write_pictures()
     return manifest
+
+
+def _require_memory(known: Known, settings: SolveSettings) -> None:
+    """Refuse pictures for which there is no memory: those of all views are held at once.
+
+    Raises:
+        UserError: it names what to lower.
+    """
+    pixels = sum(camera.width * camera.height for camera in known.cameras.values())
+    remedy = "Lower --resolution"
+    if known.problem is not None:  # whose pictures are as large as its photographs
+        remedy = "Give smaller or fewer --cameras"
+    each = _SIDES_BYTES
+    if settings.reference_spp:
+        each += _REFERENCE_BYTES
+        remedy += ", or --reference-spp 0"
+    require_memory(each * pixels, f"pictures of {len(known.cameras)} views need", remedy)
 
 
 @dataclass
