@@ -58,8 +58,8 @@ _ALIGNED = "render_psnr_aligned"
 _ALIGNED_DEFINITION = (
     "render_psnr after each channel of the pictures was multiplied by one number for all of them, "
     "`render_scale`, which brings them nearest to the truth in the least squares sense, of pixels "
-    "that the truth does not show clipped: lighting and materials were both unknown, which may leave "
-    "a common factor open"
+    "that the truth does not show clipped: lighting and materials were both unknown, which may "
+    "leave a common factor open"
 )
 
 

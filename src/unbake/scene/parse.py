@@ -32,11 +32,11 @@ _SPECTRAL, _WITHOUT_RGB = ("specfilm", "stokes"), ("blackbody", "irregular", "re
 #: Names of a film's properties begin so: its size, and what of it is rendered.
 _FILM = ("width", "height", "crop_")
 #: Properties of films of older versions, as these and as Mitsuba's own upgrade spell them.
-_OLD_FILM = frozenset(
-    ("attachLog", "attach_log", "banner", "burn", "componentFormat", "exposure", "fileFormat")
-    + ("gamma", "highQualityEdges", "high_quality_edges", "key", "pixelFormat")
-    + ("tonemapMethod", "tonemap_method")
-)
+_OLD_FILM = {
+    *("attachLog", "attach_log", "banner", "burn", "componentFormat", "exposure", "fileFormat"),
+    *("gamma", "highQualityEdges", "high_quality_edges", "key", "pixelFormat"),
+    *("tonemapMethod", "tonemap_method"),
+}
 _LIBRARY = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 #: Properties without which Mitsuba 3.9 crashes (segmentation fault) where other plugins complain.
 _NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}
@@ -334,7 +334,7 @@ def _replace_unused(scene: ParsedScene) -> None:
     """Put usual plugins in place of those that Mitsuba cannot make here, and that nothing uses.
 
     Integrators and samplers of a scene are not used, nor is more of a film than its size. They may
-    be of older versions of Mitsuba, have properties of these, or be for spectra and polarised light.
+    be of older versions of Mitsuba, have properties of these, or be for spectra and polarisation.
     """
     own = mitsuba_folder() / "plugins"
     for node in scene.state.nodes:
