@@ -452,6 +452,19 @@ def test_photographs_without_light_are_an_error(spoilt):
     assert not [f for f in findings if f.check == "duplicates"]
 
 
+def test_silhouettes_are_not_black_photographs(spoilt):
+    data = spoilt("cornell")
+
+    def silhouette(picture):
+        picture = picture * [0, 0, 0, 1]
+        picture[0, 0] = [0.5, 0.5, 0.5, 0]
+        return picture
+
+    for frame in data.frames:
+        data.picture(frame, silhouette)
+    assert not [f for f in found(data.save()) if (f.check, f.level) == ("black", "error")]
+
+
 def test_a_photograph_that_is_blurred_is_named():
     rng = np.random.default_rng(0)
     every = np.ones((64, 64), bool)

@@ -60,3 +60,9 @@ def test_without_a_balance_of_the_first_all_have_that_of_their_daylight(shots):
     assert raw_balances(shots("nothing")[0].image) == (None, (2.2, 1.0, 1.25, 1.0))
     found = _balanced(Source("test", shots("nothing", "other sensor")))
     assert [shot.balance for shot in found.shots] == [None, None]
+    assert [note.split(", ")[1] for note in found.notes] == ["all have that of daylight"]
+
+
+def test_a_first_sensor_that_nobody_knows_changes_no_factors(shots):
+    found = _balanced(Source("test", shots("unknown", "same sensor", "other sensor")))
+    assert len({shot.balance for shot in found.shots}) == len(found.notes) == 1

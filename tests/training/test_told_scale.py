@@ -129,6 +129,25 @@ def test_processes_that_may_hold_the_mean_albedo_read_all_photographs(
     assert ("mean albedo" in found) if whole else found is None
 
 
+def test_a_narrow_strip_of_sky_is_not_enough_for_processes_to_share_photographs(still, tmp_path):
+    """Other pixels are looked at later, and may not show it."""
+    config = replace(tiny_fields(), unknown="materials+lighting", lighting=lighting())
+    (camera,) = built_in_cameras("still", 256)
+    seen = surfaces(make_problem(still, "visible", config, 0.2), [camera])
+    several = Ranks()
+    several.size = 2
+    assert 1e-4 * seen.sum() < 6 < 4e-4 * seen.sum() < 200
+    found = []
+    for count in (6, 200):
+        shown = seen.copy()
+        shown[np.flatnonzero(~seen)[:count]] = True
+        write_png(tmp_path / f"{count}.png", 255 * shown.reshape(256, 256).astype(np.uint8))
+        view = View("0", "train", camera, tmp_path / "0.exr", {}, mask=tmp_path / f"{count}.png")
+        dataset = Dataset(still.parent, still, "visible", (view, view), {}, None)
+        found.append(kept_whole(config, dataset, several))
+    assert "mean albedo" in found[0] and found[1] is None
+
+
 def test_processes_learn_what_the_views_of_others_show(still, tmp_path):
     config, cameras = replace(BOTH, lighting=lighting()), built_in_cameras("still", SIZE, 2)
     problem = make_problem(still, "visible", config, 0.2)

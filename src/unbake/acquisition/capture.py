@@ -69,7 +69,8 @@ def capture(
         tell: called with lines of progress.
 
     Raises:
-        UserError: scene or cameras cannot be used, or `out` exists.
+        UserError: scene or cameras cannot be used, values of the scene make no sense, all
+            photographs are black, or `out` exists.
 
     Paper: Sec. 6.
     """

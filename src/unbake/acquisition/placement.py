@@ -249,7 +249,7 @@ def view_counts(
     cameras: Sequence[Camera],
     samples: int = 4000,
     *,
-    hide_emitters: bool | None = None,
+    hide_emitters: bool,
 ) -> np.ndarray:
     """The number of cameras that see points of the reachable surface, (points,).
 
@@ -258,11 +258,10 @@ def view_counts(
         cameras: the training views.
         samples: number of surface points tested, uniform by area; those that are reachable, as in
             `coverage`, are counted.
-        hide_emitters: whether photographs do not show lamps; None: as of `coverage`.
+        hide_emitters: whether photographs do not show lamps.
     """
     room = is_room(scene, cameras)
-    hidden = not room if hide_emitters is None else hide_emitters
-    return _counts(scene, cameras, samples, cameras, room, hidden=hidden)
+    return _counts(scene, cameras, samples, cameras, room, hidden=hide_emitters)
 
 
 def _counts(

@@ -343,7 +343,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
         for j, other in enumerate(result.views[:i]):
             pair = f"{printable(other.view.name)} and {printable(one.view.name)}"
             if one.facts.digest == other.facts.digest:
-                if one.facts.black == 1:  # which is told as such
+                if not one.small.rgb.any():  # black, which is told as such
                     continue
                 what = "the photographs are the same" + (
                     "" if posed[j] else ", and their poses not"
@@ -370,7 +370,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
 
 def _check_pictures(result: DataCheck) -> None:
     views = result.views
-    if all(view.facts.black == 1 for view in views):
+    if not any(view.small.rgb.any() for view in views):
         remedy = "Check the lights, the cameras and the exposures that they were made with"
         result.add(Finding("error", "black", "all photographs are black", None, remedy))
         return

@@ -41,7 +41,7 @@ def in_file(plan: Plan) -> Decoded:
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
-    if any(view.encoding == "srgb" for view in views):
+    if any(view.image.suffix.lower() in (".jpg", ".jpeg") for view in views):
         key["colour of JPEG"] = "sharp"
     if any(view.exposure != 1 for view in views):
         key["exposures"] = [view.exposure for view in views]

@@ -59,8 +59,8 @@ class Photographs:
         share: what this process holds; None: all.
         masked: whether pixels are masked, and not only background.
         level: mean radiance of the same pixels where no pixel has more than `LAMP` times the
-            median. A lamp in view, a few pixels, may be most of the mean. That is the level of
-            lamps then, and not of what they light.
+            median of lit ones. A lamp in view, a few pixels, may be most of the mean. That is the
+            level of lamps then, and not of what they light.
 
     Paper: Sec. 5.4.
     """

@@ -136,6 +136,7 @@ def _read_by_pillow(path: Path) -> np.ndarray:
             blocks = _colour_blocks(image)
             if blocks is not None:
                 image.draft("YCbCr", image.size)
+            if image.mode == "YCbCr" and blocks is not None:
                 return with_sharp_colour(np.array(image), *blocks)
             alpha = "A" in image.mode or "transparency" in image.info
             return np.array(image.convert("RGBA" if alpha else "RGB"))

@@ -223,8 +223,10 @@ def _balanced(source: Source) -> Source:
             own = for_sensor(first, daylight[name], daylight.get(shot.name))
             shots[number] = replace(shot, balance=own)
     note = "white balance: cameras chose several, all photographs have that of the first"
+    if first is None:
+        note = "white balance: the first photograph tells none, all have that of daylight"
     notes = [note] if len(set(balances.values())) > 1 else []
-    if len(set(daylight.values()) - {None}) > 1:
+    if None not in (first, daylight[name]) and len(set(daylight.values()) - {None}) > 1:
         notes.append("white balance: sensors differ, each has it in factors of its own")
     return replace(source, shots=tuple(shots), notes=(*source.notes, *notes))
 

@@ -102,7 +102,10 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = asked.clip_negative or (before is not None and before.clip_negative)
     files = _require_same_input(config, dataset, ranks)
-    whole = kept_whole(config, dataset, ranks) if ranks.size > 1 else None
+    whole = None
+    if ranks.size > 1:  # as the first one has it: rays may differ between machines
+        own = ranks.together(lambda: kept_whole(config, dataset, ranks), math.inf)
+        whole = ranks.gather(own)[0]
     if whole is not None:
         console.print(f"each process reads all photographs: {whole}", highlight=False)
     dealing = None if whole is not None else ranks

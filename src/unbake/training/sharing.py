@@ -20,6 +20,9 @@ def kept_whole(config: FitConfig, dataset: Dataset, ranks: Ranks) -> str | None:
         config: of the fit.
         dataset: of the fit, with training views.
         ranks: more than one.
+
+    Raises:
+        UserError: the scene or a mask cannot be read.
     """
     regularization, views = config.regularization, len(dataset.train)
     scattered = config.pixel_sampling == "all-views"
@@ -32,11 +35,13 @@ def kept_whole(config: FitConfig, dataset: Dataset, ranks: Ranks) -> str | None:
         "outliers are found by the error of all views (--outliers)": (
             config.objective.outliers != "kept"
         ),
-        # The square of a mean is not the mean of squares of parts.
-        "the mean albedo of all views is known (lighting.anchor)": may_be_untold(config, dataset),
         # In crops both points of a pair are of one view anyway.
         "points of all views are paired (regularization.albedo_ties_roughness)": (
             scattered and config.learns_materials and regularization.albedo_ties_roughness > 0
         ),
     }
-    return next((told for told, holds in reasons.items() if holds), None)
+    told = next((told for told, holds in reasons.items() if holds), None)
+    # The square of a mean is not the mean of squares of parts.
+    if told is None and may_be_untold(config, dataset):
+        told = "the mean albedo of all views is known (lighting.anchor)"
+    return told

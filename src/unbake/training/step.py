@@ -67,7 +67,7 @@ class TrainingStep:
         problem: what is learned; the same on all ranks.
         pixels: to draw batches from; they may be the views of this rank.
         config: says the batch of all ranks together.
-        ranks: that take the step together; None: there is one.
+        ranks: that take the step, and make it, together; None: there is one.
 
     Raises:
         UserError: the batch cannot be shared equally, or crops cannot have its pixels.
@@ -92,7 +92,9 @@ class TrainingStep:
         gc.collect()
         if problem.materials is not None:
             problem.materials.carried = True  # a run that was read back may stand alone
-        problem.shows_environment = shows_environment(problem, config, pixels)
+        # As the first one has it: rays may differ between machines, and terms must not.
+        shown = self._ranks.together(lambda: shows_environment(problem, config, pixels))
+        problem.shows_environment = self._ranks.gather(shown)[0]
         self._problem = problem
         self.pixels = pixels
         self.config = config  #: of this process, with its share of each batch

@@ -24,6 +24,8 @@ from .problem import Problem
 _PIXELS = 1 << 16
 #: The part of them, at least, that must show the environment: cracks of a mesh show it as well.
 _LEAST = 1e-4
+#: How many times as much makes sure that it is so, by whatever pixels are looked at.
+_SURELY = 4
 
 
 def is_shared(problem: Problem) -> bool:
@@ -74,17 +76,18 @@ def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:
     for view in views:
         counted, camera = fitted_pixels(view, dataset.background), view.camera
         size = camera.width * camera.height
-        numbers = np.arange(size) if counted is None else np.flatnonzero(counted)
-        if len(numbers) == 0:
+        numbers = None if counted is None else np.flatnonzero(counted)
+        count = size if numbers is None else len(numbers)
+        if not count:
             continue
-        places = np.linspace(0, len(numbers) - 1, min(len(numbers), each)).astype(np.int64)
-        row, column = np.divmod(numbers[places], camera.width)
+        places = np.linspace(0, count - 1, min(count, each)).astype(np.int64)
+        row, column = np.divmod(places if numbers is None else numbers[places], camera.width)
         hits = free_space.trace(scene, *camera.rays(column + 0.5, row + 0.5))
         looked += len(places)
         shown += int(np.isinf(hits.distance).sum())
-        if shown >= _LEAST * len(views) * each:  # whatever the others show
+        if shown >= _SURELY * _LEAST * len(views) * each:  # whatever the others show
             return False
-    return shown < _LEAST * looked
+    return shown < _SURELY * _LEAST * looked
 
 
 def _shown(problem: Problem, rays: CameraRays, numbers: np.ndarray) -> np.ndarray:
