@@ -1,5 +1,6 @@
 """Capture from scene files: truth is what the scene says, and nothing is lost on the way."""
 
+import json
 import os
 from dataclasses import replace
 
@@ -119,6 +120,20 @@ def test_bitmap_textures_are_the_truth_pixel_by_pixel(tmp_path):
     assert np.allclose(roughness[1::3, 1::3, 0], rough, atol=1e-3)
     names = {p.name for p in (data.scene.parent).rglob("*") if p.is_file()}
     assert names == {"scene.xml", "paint.exr", "rough.exr"}
+
+
+def test_cameras_that_are_not_square_are_told(objects, tmp_path, told):
+    told.clear()
+    content = json.loads((objects.folder / "transforms.json").read_text())
+    content["frames"][0] |= {"w": 24, "h": 12, "cy": 6}
+    (tmp_path / "oblong.json").write_text(json.dumps(content))
+    words = {"cameras": tmp_path / "oblong.json", "tell": told.append}
+    again = capture(tmp_path / "scene.xml", tmp_path / "again", TINY, **words)
+    assert {(view.camera.width, view.camera.height) for view in again.views} == {
+        (TINY.resolution,) * 2
+    }
+    (line,) = (line for line in told if "are square" in line)
+    assert "1 cameras of" in line and "fields of view stay" in line
 
 
 def test_a_sky_that_lies_on_its_side_is_told(tmp_path, told):

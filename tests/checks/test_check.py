@@ -10,12 +10,13 @@ from PIL import Image
 from unbake.checks.check import check_data
 from unbake.checks.pictures import PictureFacts, blurred, percentage, picture_facts
 from unbake.checks.told import told_rows
+from unbake.dataset import alignment as aligning
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
-from unbake.dataset.mistakes import OPENCV, all_mistakes
+from unbake.dataset.mistakes import OPENCV, Mistake, all_mistakes
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.quick_check import quick_findings
-from unbake.dataset.small_views import seen_by, small_view
+from unbake.dataset.small_views import SmallView, seen_by, small_view
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
@@ -501,6 +502,34 @@ def test_the_screen_fits_and_the_page_stands_alone(captured, unbake, tmp_path, m
     assert "http" not in text.replace("http-equiv", "") and "url(" not in text
     for word in ("Coverage", "Exposures", "Edges of the geometry", "train_007"):
         assert word in text
+
+
+@pytest.mark.parametrize("cut_out", [False, True])
+def test_of_poses_with_the_same_edges_those_count_that_cover_a_cut_out(cut_out, monkeypatch):
+    """A floor with things on it has much the same edges from below, which hides the things."""
+    rng = np.random.default_rng(0)
+    pictures = rng.random((4, 32, 32))
+    shown = np.zeros((32, 32), bool)
+    shown[8:24] = True
+    from_below = shown & (np.arange(32) < 28)
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 40.0, 32, 32)
+    alpha = shown.astype(float) if cut_out else np.ones((32, 32))
+    views = [SmallView(str(i), camera, p[..., None], alpha, 0 * p) for i, p in enumerate(pictures)]
+    wrong, right = Mistake(("below",)), Mistake(("above",))
+    other = [rng.random((32, 32)) for _ in views]
+
+    def drawn(scene, cameras, mistakes):
+        hits = {"below": from_below, "above": shown}
+        return [
+            (list(pictures) if m.parts else other, [hits.get(m.told, shown)] * 4) for m in mistakes
+        ]
+
+    monkeypatch.setattr(aligning, "photograph_edges", lambda view: view.rgb[..., 0])
+    monkeypatch.setattr(aligning, "_drawn", drawn)
+    monkeypatch.setattr(aligning, "_likely", lambda scene, views: [wrong, right])
+    found = aligning.alignment(None, views)
+    assert found.mistake is (right if cut_out else wrong)
+    assert found.best == pytest.approx(1)
 
 
 def test_mistakes_are_undone():

@@ -111,6 +111,44 @@ def test_decoding_is_the_inverse_of_tone_mapping():
     assert np.array_equal(encode(decode(fine)[..., :1]), fine)
 
 
+@pytest.mark.parametrize("planes", ["contig", "separate"])
+@pytest.mark.parametrize(
+    "kind", ["plain", "white is zero", "unspecified", "unassalpha", "assocalpha"]
+)
+def test_what_samples_of_sixteen_bits_of_tiff_are_is_looked_up(kind, planes, tmp_path):
+    tifffile = pytest.importorskip("tifffile", reason="16 bits of TIFF need tifffile")
+    rng, file = np.random.default_rng(1), tmp_path / "a.tif"
+    codes = rng.integers(0, 1 << 16, (5, 7, 3), np.uint16)
+    if kind in ("plain", "white is zero"):
+        grey = codes[..., 0]
+        name = "minisblack" if kind == "plain" else "miniswhite"
+        tifffile.imwrite(file, grey, photometric=name)
+        expected = grey if kind == "plain" else 65535 - grey
+        assert np.array_equal(read_codes(file)[..., 0], expected)
+        return
+    fourth = rng.integers(20000, 1 << 16, (5, 7, 1), np.uint16)
+    written = codes
+    if kind == "assocalpha":
+        written = np.round(codes * (fourth / 65535)).astype(np.uint16)
+    every = np.concatenate([written, fourth], -1)
+    every = every if planes == "contig" else np.moveaxis(every, 2, 0)
+    tifffile.imwrite(file, every, photometric="rgb", planarconfig=planes, extrasamples=[kind])
+    found = read_codes(file)
+    if kind == "unspecified":
+        assert np.array_equal(found, codes)
+    else:
+        np.testing.assert_allclose(found[..., :3].astype(float), codes, atol=4)
+        assert np.array_equal(found[..., 3:], fourth)
+
+
+def test_inks_of_sixteen_bits_of_tiff_are_refused(tmp_path):
+    tifffile = pytest.importorskip("tifffile", reason="16 bits of TIFF need tifffile")
+    inks = np.zeros((5, 7, 4), np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", inks, photometric="separated")
+    with pytest.raises(UserError, match=r"are SEPARATED, not RGB or grey\). Convert it to RGB"):
+        read_codes(tmp_path / "a.tif")
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png"])
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_pictures_are_not_turned_by_their_exif(suffix, orientation, tmp_path):

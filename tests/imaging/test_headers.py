@@ -83,7 +83,7 @@ def test_what_is_cut_off_or_something_else_is_named(written, suffix):
         file.write_bytes(whole[:length])
         refused(file, "it is|its header|bytes cannot hold")
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    refused(file, "it is not (OpenEXR|Radiance HDR|PFM)")
+    refused(file, "it is not OpenEXR but PNG: rename it|it is not (Radiance HDR|PFM)")
 
 
 def test_a_size_behind_long_notes_is_found(written):

@@ -216,6 +216,15 @@ def _choose_views(
         Cameras; the share of the surface that training views see; whether they stand in a room.
     """
     posed = posed_cameras(name, scene, settings, camera_file)
+    if camera_file is not None:
+        size = settings.resolution
+        own = read_cameras(camera_file, size, size, keep_size=True)
+        if oblong := sum(camera.width != camera.height for _, camera in own):
+            file = printable(camera_file)
+            tell(
+                f"photographs are square, and {oblong} cameras of {file} are not: their horizontal "
+                "fields of view stay"
+            )
     if not any(split == "train" for split, _ in posed):
         remedy = "Ask for at least one with --views"
         raise UserError("no training view", where=camera_file, remedy=remedy)

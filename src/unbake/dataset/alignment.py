@@ -23,6 +23,9 @@ MARGIN, AGREEING = 0.1, 0.75
 _NEARLY = 0.03
 #: All mistakes are tried on so many views, of at most 36 pixels, and so many of them on all views.
 _FEW_VIEWS, _LIKELY = 4, 20
+#: And that sees surface in so many fewer of the pixels that show some, at most: a cut-out tells
+#: two poses apart that have much the same edges.
+_UNCOVERED = 0.03
 #: Relative jump of inverse depth, and jump of normals, that are a whole edge.
 _JUMP, _CREASE = 0.1, 0.5
 #: Photographs may be mirrored: what is told, and the axis of the picture that is turned round.
@@ -75,21 +78,57 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     edges = [photograph_edges(view) for view in views]
     cameras = [view.camera for view in views]
     mistakes = _likely(scene, views)
-    (drawn, share), *others = _drawn(scene, cameras, [Mistake(()), *mistakes])
-    given = _scores(edges, drawn)
+    shown = [view.alpha > 0.5 for view in views]
+    (drawn, hits), *others = _drawn(scene, cameras, [Mistake(()), *mistakes])
+    given, share = _scores(edges, drawn), _share(hits)
     result = Alignment(len(views), float(given.mean()), share)
-    tried: list[tuple[np.ndarray, Mistake | None, str | None, float]] = []
+    tried: list[_Other] = []
     for told, axis in _MIRRORED.items():
-        tried.append((_scores([np.flip(e, axis) for e in edges], drawn), None, told, share))
-    for mistake, (found, hit) in zip(mistakes, others, strict=True):
-        tried.append((_scores(edges, found), mistake, None, hit))
-    better = [entry for entry in tried if _clearly_better(entry[0], given)]
+        mirrored = [np.flip(e, axis) for e in edges]
+        covered = _share(hits, [np.flip(s, axis) for s in shown])
+        tried.append(_Other(_scores(mirrored, drawn), covered, share, mirrored=told))
+    for mistake, (found, seen) in zip(mistakes, others, strict=True):
+        scores, covered = _scores(edges, found), _share(seen, shown)
+        tried.append(_Other(scores, covered, _share(seen), mistake))
+    better = [other for other in tried if _clearly_better(other.scores, given)]
     if not better:
         return result
-    top = max(entry[0].mean() for entry in better)
-    scores, mistake, mirrored, hit = next(e for e in better if e[0].mean() >= top - _NEARLY)
-    best = float(scores.mean())
-    return Alignment(len(views), result.score, share, mistake, mirrored, best, hit)
+    if not any(view.of_mesh for view in views) and not all(s.all() for s in shown):
+        most = max(other.covered for other in better)
+        better = [other for other in better if other.covered >= most - _UNCOVERED]
+    top = max(other.scores.mean() for other in better)
+    best = next(other for other in better if other.scores.mean() >= top - _NEARLY)
+    return replace(
+        result,
+        mistake=best.mistake,
+        mirrored=best.mirrored,
+        best=float(best.scores.mean()),
+        best_share=best.share,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Other:
+    """Poses without a mistake, or photographs that are mirrored back.
+
+    Args:
+        scores: of the views.
+        covered: share of the pixels that show a surface, and see one.
+        share: of all pixels that see one.
+    """
+
+    scores: np.ndarray
+    covered: float
+    share: float
+    mistake: Mistake | None = None
+    mirrored: str | None = None
+
+
+def _share(hits: Sequence[np.ndarray], shown: Sequence[np.ndarray] | None = None) -> float:
+    """The mean share of pixels of a view, or of those that are shown, that see a surface."""
+    if shown is None:
+        return float(np.mean([hit.mean() for hit in hits]))
+    return float(np.mean([hit[s].mean() for hit, s in zip(hits, shown, strict=True) if s.any()]))
 
 
 def _likely(scene: mi.Scene, views: Sequence[SmallView]) -> list[Mistake]:
@@ -116,15 +155,15 @@ def _clearly_better(scores: np.ndarray, given: np.ndarray) -> bool:
 
 def _drawn(
     scene: mi.Scene, cameras: Sequence[Camera], mistakes: Sequence[Mistake]
-) -> list[tuple[list[np.ndarray], float]]:
-    """Edges that cameras see without each mistake, and the share of pixels that see a surface."""
+) -> list[tuple[list[np.ndarray], list[np.ndarray]]]:
+    """What cameras see without each mistake: edges, and whether pixels see a surface."""
     corrected = [m.corrected(camera) for m in mistakes for camera in cameras]
     seen = seen_by(scene, corrected)
     found = []
     for i in range(0, len(corrected), len(cameras)):
         pairs = list(zip(corrected, seen, strict=True))[i : i + len(cameras)]
-        share = float(np.mean([np.isfinite(s.distance).mean() for _, s in pairs]))
-        found.append(([geometry_edges(c, s.distance, s.normal) for c, s in pairs], share))
+        hits = [np.isfinite(s.distance).reshape(c.height, c.width) for c, s in pairs]
+        found.append(([geometry_edges(c, s.distance, s.normal) for c, s in pairs], hits))
     return found
 
 

@@ -25,12 +25,22 @@ _JPEG = ("JPEG", "MPO")
 _ORIENTATION = 0x0112
 #: Pixels across and down that have one colour: 4:2:2 and 4:2:0, by Pillow's number.
 _BLOCKS = {1: (2, 1), 2: (2, 2)}
+#: What TIFF calls grey whose 0 is white; grey whose 0 is black, and RGB; alpha that colours have
+#: been multiplied by; and alpha of either kind.
+_WHITE_IS_ZERO, _TIFF_COLOURS, _ASSOCIATED, _TIFF_ALPHA = 0, (1, 2), 1, (1, 2)
 #: Pillow's names of colours that become RGB without a profile.
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 
 
 class _Unreadable(ValueError):
     """Why an image of code values cannot be decoded, as the end of a sentence."""
+
+
+class _OtherColours(_Unreadable):
+    """It has colours that are not read."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"its colours are {name}, not RGB or grey")
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -60,7 +70,7 @@ def read_codes(path: Path, remedy: str = "Write it again, or copy it again") -> 
     except MemoryError:
         said = "it does not fit into memory"
     except (_Unreadable, HeaderError) as error:
-        said = error
+        said, remedy = error, "Convert it to RGB" if isinstance(error, _OtherColours) else remedy
     raise UserError(f"the image cannot be read ({said})", path, remedy)
 
 
@@ -132,7 +142,7 @@ def _read_by_pillow(path: Path) -> np.ndarray:
             # Pillow turns TIFF files while it reads them.
             image.getexif().pop(_ORIENTATION, None)
             if image.mode not in _MODES:
-                raise _Unreadable(f"its colours are {image.mode}, not RGB or grey")
+                raise _OtherColours(image.mode)
             blocks = _colour_blocks(image)
             if blocks is not None:
                 image.draft("YCbCr", image.size)
@@ -158,6 +168,22 @@ def _read_tiff(path: Path) -> np.ndarray:
         raise _Unreadable("16 bits of TIFF need tifffile: pip install 'unbake[import]'") from None
     with TiffFile(path) as file:
         page = file.pages[0]
+        kind, more = int(page.photometric), tuple(map(int, page.extrasamples))
+        if kind not in (_WHITE_IS_ZERO, *_TIFF_COLOURS):
+            raise _OtherColours(page.photometric.name)
         codes = np.asarray(page.asarray())
-        apart = page.planarconfig != 1 and page.samplesperpixel > 1
-        return np.moveaxis(codes, 0, 2) if apart else codes
+        if page.planarconfig != 1 and page.samplesperpixel > 1:
+            codes = np.moveaxis(codes, 0, 2)
+    codes = codes[..., None] if codes.ndim == 2 else codes
+    count = codes.shape[-1] - len(more)
+    colours, most = codes[..., :count], np.iinfo(codes.dtype).max
+    if kind == _WHITE_IS_ZERO:
+        colours = most - colours
+    alphas = [codes[..., count + i] for i, what in enumerate(more) if what in _TIFF_ALPHA]
+    if not alphas:
+        return np.ascontiguousarray(colours)
+    alpha = alphas[0][..., None]
+    if _ASSOCIATED in more:
+        whole = colours.astype(np.float64) * (most / np.maximum(alpha, 1))
+        colours = np.minimum(whole + 0.5, most).astype(codes.dtype)
+    return np.concatenate([colours, alpha], axis=-1)

@@ -47,6 +47,17 @@ class ImageHeader:
     whole: bool = True
 
 
+#: How files begin, by their formats.
+_MAGIC = {
+    _EXR_MAGIC: "OpenEXR",
+    b"\x89PNG": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"#?": "Radiance HDR",
+}
+
+
 class HeaderError(ValueError):
     """What is wrong with a header, as the end of a sentence."""
 
@@ -63,10 +74,22 @@ def read_header(path: Path) -> ImageHeader:
         return read(file, path.stat().st_size)
 
 
+def _another(wanted: str, head: bytes) -> str:
+    """That a file is not of the format that its suffix names, and of which it is, if that is known.
+
+    Args:
+        head: its first bytes.
+    """
+    if not head:
+        return "it is empty"
+    found = next((name for magic, name in _MAGIC.items() if head.startswith(magic)), None)
+    return f"it is not {wanted}" + ("" if found is None else f" but {found}: rename it")
+
+
 def _read_exr(file: BinaryIO, size: int) -> ImageHeader:
     head = file.read(8)
     if not head.startswith(_EXR_MAGIC):
-        raise HeaderError("it is not OpenEXR" if head else "it is empty")
+        raise HeaderError(_another("OpenEXR", head))
     try:
         (version,) = struct.unpack_from("<I", head, 4)
         if version & _EXR_DEEP:
@@ -148,7 +171,7 @@ def _read_pfm(file: BinaryIO, size: int) -> ImageHeader:
 def _read_png(file: BinaryIO, size: int) -> ImageHeader:
     head = file.read(33)
     if not head.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise HeaderError("it is not PNG" if head else "it is empty")
+        raise HeaderError(_another("PNG", head))
     if len(head) < 33 or head[12:16] != b"IHDR":
         raise HeaderError("it is cut off")
     width, height, bits, kind = struct.unpack_from(">2I2B", head, 16)
@@ -161,7 +184,7 @@ def _read_png(file: BinaryIO, size: int) -> ImageHeader:
 def _read_jpeg(file: BinaryIO, size: int) -> ImageHeader:
     head = file.read(_JPEG)
     if not head.startswith(b"\xff\xd8"):
-        raise HeaderError("it is not JPEG" if head else "it is empty")
+        raise HeaderError(_another("JPEG", head))
     at = 2
     while at + 10 <= len(head) and head[at] == 0xFF:
         kind = head[at + 1]
@@ -180,7 +203,7 @@ def _read_tiff(file: BinaryIO, size: int) -> ImageHeader:
     head = file.read(8)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
     if order is None or len(head) < 8:
-        raise HeaderError("it is not TIFF (or a BigTIFF)" if head else "it is empty")
+        raise HeaderError(_another("TIFF (or a BigTIFF)", head))
     found: dict[int, int] = {}
     try:
         file.seek(struct.unpack_from(f"{order}I", head, 4)[0])
