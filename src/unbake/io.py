@@ -363,7 +363,8 @@ def read_json(path: Path, remedy: str | None = None) -> Any:
     Raises:
         UserError: the file is missing, unreadable, or not JSON.
     """
-    content = read_text(path, remedy)
+    # Programs of Windows may begin a file with the mark of its byte order.
+    content = read_text(path, remedy).removeprefix("\ufeff")
     try:
         parsed = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from layouts import (
     codes,
     photograph_through,
@@ -183,7 +184,7 @@ def test_faults_of_a_model_are_told(captured, meshes, tmp_path):
     with pytest.raises(ImportFaults, match="no image of the model has a pose"):
         import_data(project, tmp_path / "data", meshes, tell=quiet)
     (model / "cameras.txt").write_text("1 NO_SUCH_MODEL 16 16 1 2 3\n")
-    with pytest.raises(UserError, match="pycolmap cannot read the model"):
+    with pytest.raises(UserError, match=r"pycolmap cannot read the model.*Write the model again"):
         import_data(project, tmp_path / "data", meshes, tell=quiet)
 
 
@@ -198,6 +199,18 @@ def test_what_a_model_leaves_out_is_told(captured, meshes, tmp_path):
     import_data(project, tmp_path / "data", meshes, tell=told.append)
     assert f"{project / 'sparse'} has other models, left out: 1" in told
     assert "1 of 4 photographs have no pose, left out: alone.png" in told
+
+
+def test_a_model_that_is_elsewhere_is_told_with_its_place(captured, tmp_path):
+    project = tmp_path / "project"
+    (project / "sparse").mkdir(parents=True)
+    model_of(captured, project).write_text(str(project / "sparse"))
+    box = trimesh.creation.box((4, 2, 2))
+    box.apply_translation([90, 0, -7])
+    box.export(tmp_path / "box.ply")
+    with pytest.raises(UserError, match=r"4 units wide around .90, 0, -7.; the cameras") as caught:
+        import_data(project, tmp_path / "data", [tmp_path / "box.ply"], tell=quiet)
+    assert "one frame and unit" in caught.value.remedy and "--keep" not in caught.value.remedy
 
 
 def test_cameras_that_see_all_around_are_refused(captured, meshes, tmp_path):

@@ -32,7 +32,7 @@ from support import TINY_FIT
 from unbake.config import to_toml
 from unbake.config.light import LightConfig
 from unbake.dataset.photographs import Photographs
-from unbake.dataset.views import Dataset, read_photograph
+from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
 from unbake.imaging.coded import encode
 from unbake.imaging.pictures import write_exr
@@ -199,6 +199,21 @@ def test_cameras_of_blender_without_pictures_are_left_out(frames, captured, mesh
     found = Dataset.load(tmp_path / "data")
     # What is held out is chosen as where nothing is said of it
     assert (len(found.train), len(found.heldout)) == (1, 1)
+
+
+def test_names_that_are_equal_when_joined_are_told(captured, meshes, tmp_path):
+    source, frames = tmp_path / "source", []
+    for name, view in zip(("a_b/c", "a/b_c", "c"), captured.views, strict=True):
+        save(codes(view), source / f"{name}.png")
+        pose = view.camera.to_world.tolist()
+        frames.append({"file_path": f"{name}.png", "transform_matrix": pose})
+    frames[2]["file_path"] = "a/c.png"
+    (source / "c.png").rename(source / "a" / "c.png")
+    top = intrinsics(captured.views[0].camera)
+    write_json(source / "transforms.json", top | {"frames": frames})
+    told = "has the name of a_b/c.png once folders are joined by _: a/b_c.png"
+    with pytest.raises(ImportFaults, match=told):
+        import_data(source, tmp_path / "data", meshes, tell=quiet)
 
 
 def test_names_in_two_folders_are_kept_apart(captured, meshes, tmp_path):
@@ -423,6 +438,24 @@ def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
     )
 
 
+def test_a_table_of_exposures_names_folders(captured, meshes, tmp_path):
+    source, frames = tmp_path / "source", []
+    for name, view in zip(("cam1/0001", "cam2/0001", "cam2/0002"), captured.views, strict=True):
+        save(codes(view), source / "images" / f"{name}.png")
+        pose = view.camera.to_world.tolist()
+        frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose})
+    top = intrinsics(captured.views[0].camera)
+    write_json(source / "transforms.json", top | {"frames": frames})
+    table = tmp_path / "exposures.csv"
+    table.write_text("name,exposure\ncam1/0001,1\nimages/cam2/0001.png,2\n0002,3\n")
+    import_data(source, tmp_path / "data", meshes, exposures=table, tell=quiet)
+    assert [frame["exposure"] for frame in frames_of(tmp_path / "data")] == [1, 2, 3]
+    table.write_text("name,exposure\n0001,1\n0002,3\n")
+    told = "'0001', for several photographs: images/cam1/0001.png, images/cam2/0001.png. Name"
+    with pytest.raises(ImportFaults, match=told):
+        import_data(source, tmp_path / "other", meshes, exposures=table, tell=quiet)
+
+
 @pytest.mark.parametrize(
     "keys",
     [
@@ -457,6 +490,60 @@ def test_lenses_are_straightened(keys, suffix, captured, meshes, tmp_path):
     (view,) = Dataset.load(tmp_path / "data").views
     assert view.camera.fl_x == view.camera.fl_y
     straightened_as_seen(view, lens, 0.002 if suffix == ".exr" else 0.006)
+
+
+def bent(folder, captured, keys):
+    """A source of one grey photograph of 96 x 64 pixels, whose lens has these keys."""
+    save(np.full((64, 96, 3), 60, np.uint8), folder / "images" / "a.png")
+    frame = {"transform_matrix": captured.views[0].camera.to_world.tolist()}
+    frames = [frame | {"file_path": "images/a.png"}]
+    top = {"w": 96, "h": 64, "fl_x": 80.0} | keys
+    write_json(folder / "transforms.json", top | {"frames": frames})
+    return folder
+
+
+def test_places_beyond_a_photograph_are_masked(captured, meshes, tmp_path):
+    """As of a crop, whose principal point lies outside."""
+    from unbake.importing.frames import _lens
+
+    source = bent(
+        tmp_path / "source", captured, {"cx": -20.0, "cy": 32.0, "fl_x": 100.0, "k1": 0.3}
+    )
+    told = []
+    import_data(source, tmp_path / "data", meshes, tell=told.append)
+    assert any("beyond its edge are masked (images/a.png)" in line for line in told)
+    (view,) = Dataset.load(tmp_path / "data").views
+    counted, keys = read_masked(view)[1], json.loads((source / "transforms.json").read_text())
+    y, x = np.divmod(np.arange(96 * 64), 96)
+    points = (np.stack([x + 0.5, y + 0.5], 1) - (-20, 32)) / view.camera.fl_x
+    at = _lens(keys, 96, 64, "here").pixels(points)
+    inside = ((at >= 0) & (at <= (96, 64))).all(1)
+    assert np.array_equal(counted.ravel(), inside) and 0.5 < inside.mean() < 1
+
+
+@pytest.mark.parametrize(
+    ("keys", "fault"),
+    [
+        ({"cx": -90.0, "k1": -0.3}, "its lens cannot be straightened"),
+        ({"fl_x": 1.0, "k1": 0.1}, "its focal length of 1 pixels is too short"),
+    ],
+)
+def test_a_lens_that_no_pinhole_stands_for_is_a_fault(keys, fault, captured, meshes, tmp_path):
+    source = bent(tmp_path / "source", captured, keys)
+    with pytest.raises(ImportFaults, match=fault):
+        import_data(source, tmp_path / "data", meshes, tell=quiet)
+
+
+def test_fisheye_lenses_are_cut_off(captured, meshes, tmp_path):
+    keys = {"fl_x": 20.0, "camera_model": "OPENCV_FISHEYE"}
+    told = []
+    source = bent(tmp_path / "source", captured, keys)
+    import_data(source, tmp_path / "data", meshes, tell=told.append)
+    assert any(
+        "more than 120 degrees: what lies beyond is cut off (images/a.png)" in x for x in told
+    )
+    (view,) = Dataset.load(tmp_path / "data").views
+    assert 118 < np.degrees(2 * np.arctan(48 / view.camera.fl_x)) <= 120
 
 
 def test_pixels_between_clipped_and_other_ones_do_not_count(captured, meshes, tmp_path):
@@ -756,6 +843,42 @@ def test_an_angle_of_a_frame_stands_before_a_focal_length_at_the_top(
     same_as_captured(captured, tmp_path / "data")
 
 
+def test_an_angle_that_contradicts_a_focal_length_is_told(nerfstudio, meshes, tmp_path):
+    top = json.loads((nerfstudio / "transforms.json").read_text())
+    angle = 2 * float(np.arctan(0.5 * top["w"] / top["fl_x"]))
+    for factor, count in ((1.0, 0), (1.1, 1)):
+        change(nerfstudio, set_top("camera_angle_x", factor * angle))
+        told = []
+        import_data(nerfstudio, tmp_path / f"{factor}", meshes, tell=told.append)
+        assert sum("differ, the first is taken: ./images/" in line for line in told) == count
+    # Those of a frame stand before the angle at the top
+    change(nerfstudio, lambda c: [frame.update(fl_x=c["fl_x"]) for frame in c["frames"]])
+    told = []
+    import_data(nerfstudio, tmp_path / "own", meshes, tell=told.append)
+    assert not any("differ" in line for line in told)
+
+
+def test_a_mesh_in_another_unit_around_the_cameras_is_told(captured, nerfstudio, tmp_path):
+    origins = np.array([view.camera.origin for view in captured.views])
+    for size, wanted in ((1000.0, True), (5.0, False)):
+        box = trimesh.creation.box((size * np.ptp(origins, axis=0).max(),) * 3)
+        box.apply_translation(0.5 * (origins.min(0) + origins.max(0)))
+        box.export(tmp_path / "box.ply")
+        told = []
+        import_data(nerfstudio, tmp_path / f"{size}", [tmp_path / "box.ply"], tell=told.append)
+        assert "all cameras stand inside the mesh" in told[-1]
+        assert ("1000 times as wide as the space of the cameras" in told[-1]) == wanted
+
+
+def test_a_train_file_that_cannot_be_read_is_one_fault(captured, meshes, tmp_path):
+    write_blender(captured, tmp_path / "blender")
+    (tmp_path / "blender" / "transforms_train.json").write_text("{")
+    with pytest.raises(ImportFaults) as caught:
+        import_data(tmp_path / "blender", tmp_path / "data", meshes, tell=quiet)
+    (fault,) = caught.value.faults
+    assert "is not readable JSON" in fault
+
+
 def test_a_file_that_cannot_be_read_does_not_hide_other_faults(nerfstudio, tmp_path):
     (nerfstudio / "transforms.json").write_text("{")
     with pytest.raises(ImportFaults) as caught:
@@ -857,3 +980,10 @@ def test_the_smallest_scene_of_the_guide_is_one(meshes, tmp_path):
     parsed = parse(tmp_path / "scene.xml")
     assert material_names(parsed) == ["clay"]
     assert parsed.instantiate().environment() is not None
+
+
+def test_a_byte_order_mark_is_skipped(captured, nerfstudio, meshes, tmp_path):
+    file = nerfstudio / "transforms.json"
+    file.write_text(file.read_text(), encoding="utf-8-sig")
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    same_as_captured(captured, tmp_path / "data")

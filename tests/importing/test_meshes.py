@@ -172,6 +172,19 @@ def test_a_mesh_far_from_the_origin_is_a_fault(tmp_path):
     assert len(parts_of(file)) == 1
 
 
+def test_a_part_far_from_the_others_is_a_fault(tmp_path):
+    """All parts together are then as wide as they are far from the origin."""
+    near, far = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2)
+    far.apply_translation([450_000, 5_400_000, 100])
+    near.export(tmp_path / "near.obj")
+    far.export(tmp_path / "far.obj")
+    with pytest.raises(ImportFaults, match=r"5.4e\+06 units from the origin.* units: far. Move"):
+        parts_of(tmp_path / "near.obj", tmp_path / "far.obj")
+    far.apply_translation([-450_000, -5_399_000, 0])
+    far.export(tmp_path / "far.obj")
+    assert len(parts_of(tmp_path / "near.obj", tmp_path / "far.obj")) == 2
+
+
 def test_a_node_that_flattens_its_mesh_is_a_fault(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box(), node_name="flat", transform=np.diag([1.0, 0, 1, 1]))

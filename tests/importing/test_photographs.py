@@ -30,8 +30,8 @@ P3 = (0.680, 0.320, 1.0, 0.265, 0.690, 1.0, 0.150, 0.060, 1.0)
 TO_SRGB = np.array(
     [[1.2249, -0.2247, 0.0], [-0.0420, 1.0419, 0.0], [-0.0197, -0.0786, 1.0979]], np.float64
 )
-#: The orientation in EXIF, and a quarter turn.
-ORIENTATION, QUARTER = 0x0112, 6
+#: The orientation in EXIF, a quarter turn and half a turn.
+ORIENTATION, QUARTER, HALF = 0x0112, 6, 3
 
 
 @pytest.fixture
@@ -123,6 +123,18 @@ def test_photographs_that_wait_to_be_turned_are_told(project, meshes, tmp_path):
         import_data(project, tmp_path / "data", meshes, tell=quiet)
 
 
+def test_photographs_that_programs_show_turned_are_told(project, meshes, tmp_path):
+    """Square ones, and half turns, have the shape of their camera."""
+    first, second, _ = sorted((project / "images").iterdir())
+    for file, turn in ((first, QUARTER), (second, HALF)):
+        exif = Image.Exif()
+        exif[ORIENTATION] = turn
+        Image.open(file).save(file, exif=exif)
+    told = imported(project, tmp_path / "data", meshes)[1]
+    asks = "the EXIF of 2 photographs asks to turn them; they are taken as stored: "
+    assert f"{asks}{first.name}, {second.name}" in told
+
+
 # ------------------------------------------------------------------------------------------ missing
 
 
@@ -211,13 +223,13 @@ def test_masks_that_are_given_come_before_those_of_the_source(captured, meshes, 
     for frame in content["frames"]:
         name = frame["file_path"].rsplit("/", 1)[1]
         save(np.full((16, 16), 255, np.uint8), folder / "own" / name)
-        save(np.zeros((16, 16), np.uint8), folder / "given" / name)
+        save(np.eye(16, dtype=np.uint8), folder / "given" / name)
         frame["mask_path"] = f"own/{name}"
     (folder / "transforms.json").write_text(json.dumps(content))
     data, _ = imported(folder, tmp_path / "data", meshes)
     assert all(read_masked(view)[1].all() for view in data.views)
     data, _ = imported(folder, tmp_path / "other", meshes, masks=folder / "given")
-    assert not any(read_masked(view)[1].any() for view in data.views)
+    assert all((read_masked(view)[1] == np.eye(16)).all() for view in data.views)
 
 
 def test_masks_do_not_lead_out_of_their_folder(project, meshes, tmp_path):
@@ -247,6 +259,59 @@ def test_a_folder_without_masks_is_a_fault(project, meshes, tmp_path):
     for folder, told in (("empty", "no photograph has a mask"), ("none", "no folder of masks")):
         with pytest.raises(ImportFaults, match=told):
             import_data(project, tmp_path / "data", meshes, masks=project / folder, tell=quiet)
+
+
+def test_a_folder_of_masks_that_there_is_not_is_told_beside_other_faults(project, meshes, tmp_path):
+    shutil.rmtree(project / "images")
+    (project / "images").mkdir()
+    with pytest.raises(ImportFaults) as caught:
+        import_data(project, tmp_path / "data", meshes, masks=project / "none", tell=quiet)
+    told = "; ".join(caught.value.faults)
+    assert "the image does not exist" in told and "there is no folder of masks" in told
+
+
+def test_masks_that_leave_no_pixel_are_told(project, meshes, tmp_path):
+    files = sorted((project / "images").iterdir())
+    for number, file in enumerate(files):
+        save(np.full((16, 16), 255 * (number > 0), np.uint8), tmp_path / "masks" / file.name)
+    told = imported(project, tmp_path / "data", meshes, masks=tmp_path / "masks")[1]
+    assert any(f"masks leave no pixel of 1 photographs: {files[0].name}" in line for line in told)
+    for file in files:
+        save(np.zeros((16, 16), np.uint8), tmp_path / "masks" / file.name)
+    with pytest.raises(UserError, match="masks leave no pixel of any photograph to train on"):
+        imported(project, tmp_path / "none", meshes, masks=tmp_path / "masks")
+    assert not (tmp_path / "none").exists()
+
+
+# -------------------------------------------------------------------------------- alpha and colours
+
+
+@pytest.mark.parametrize("background", ["auto", "visible", "hidden"])
+def test_transparent_pixels_that_are_fitted_as_black_are_told(
+    background, captured, project, meshes, tmp_path
+):
+    """One opaque photograph among cut-outs shows the background of all."""
+    first, *others = sorted((project / "images").iterdir())
+    for file in others:
+        alpha = np.full((16, 16, 1), 255, np.uint8)
+        alpha[:4] = 0
+        save(np.concatenate([np.asarray(Image.open(file)), alpha], 2), file)
+    settings, told = ImportSettings(background=background), []
+    import_data(project, tmp_path / "data", meshes, settings, tell=told.append)
+    names = ", ".join(file.name for file in others)
+    wanted = f"black background: {names}, beside opaque ones ({first.name}). Give --background hid"
+    assert any(wanted in line for line in told) == (background != "hidden")
+
+
+def test_grey_photographs_among_others_are_told(project, meshes, tmp_path):
+    first, *others = sorted((project / "images").iterdir())
+    save(np.full((16, 16), 90, np.uint8), first)
+    told = imported(project, tmp_path / "data", meshes)[1]
+    assert any(f"takes their grey for the colour: {first.name}. Remove" in line for line in told)
+    for file in others:
+        save(np.full((16, 16), 90, np.uint8), file)
+    told = imported(project, tmp_path / "grey", meshes)[1]
+    assert not any("grey" in line for line in told), "all are grey"
 
 
 # ---------------------------------------------------------------------------------- colour profiles

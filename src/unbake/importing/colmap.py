@@ -120,7 +120,8 @@ def _reconstruction(model: Path) -> Any:
         read(str(model))
     except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
         told = " ".join(str(error).split())[:200]
-        raise UserError(f"pycolmap cannot read the model ({told})", model) from None
+        remedy = "Write the model again with COLMAP, or copy it again"
+        raise UserError(f"pycolmap cannot read the model ({told})", model, remedy) from None
     return reconstruction
 
 

@@ -12,11 +12,11 @@ from typing import Any
 from PIL import Image
 
 from ..dataset.views import MEASURABLE
-from ..errors import UserError
+from ..errors import UserError, named, printable
 from ..io import read_text
 from .faults import Faults
 from .raw import raw_exposure
-from .source import Shot
+from .source import Shot, ends_of
 
 #: The directory of EXIF that tells of the exposure, and its tags: seconds, ISO, f-number.
 _DIRECTORY, _SECONDS, _ISO, _APERTURE = 0x8769, 0x829A, 0x8827, 0x829D
@@ -60,7 +60,8 @@ def exposures_of(shots: Sequence[Shot]) -> tuple[dict[str, float], str]:
 def read_table(file: Path, shots: Sequence[Shot], faults: Faults) -> tuple[dict[str, float], str]:
     """Exposures from a table of comma separated `name,exposure`, and a line that tells of them.
 
-    Names are those of images, with or without folders and suffix. Values are taken as they are.
+    Names are those of images, with or without suffix, and folders at their beginning. A line of
+    several photographs is a fault. Values are taken as they are.
 
     Args:
         file: the table, whose first line is `name,exposure`.
@@ -89,18 +90,27 @@ def read_table(file: Path, shots: Sequence[Shot], faults: Faults) -> tuple[dict[
             faults.add("a line of the table is no name and positive number", f"line {number}")
         elif table.setdefault(row[0].strip(), value) != value:
             faults.add("the table has two exposures of a photograph", row[0].strip())
-    found = {shot.name: _looked_up(shot, table) for shot in shots}
-    for name, value in found.items():
-        if value is None:
+    used: dict[str, list[str]] = {}
+    for name in dict.fromkeys(shot.name for shot in shots):
+        key = _line_of(name, table)
+        if key is None:
             faults.add("the table of exposures has no line for a photograph", name)
-    known = {name: value for name, value in found.items() if value is not None}
+        else:
+            used.setdefault(key, []).append(name)
+    for key, names in used.items():
+        if len(names) > 1:
+            what = (
+                f"the table of exposures has one line, {printable(key)!r}, for several photographs"
+            )
+            faults.add(what, named(names), "Name them with their folders and suffix")
+    known = {name: table[key] for key, names in used.items() for name in names}
     return known, f"exposures: {_spread(known)}, by {file.name}" if known else ""
 
 
-def _looked_up(shot: Shot, table: Mapping[str, float]) -> float | None:
-    name = Path(shot.name)
-    keys = (shot.name, name.with_suffix("").as_posix(), name.name, name.stem)
-    return next((table[key] for key in keys if key in table), None)
+def _line_of(name: str, table: Mapping[str, float]) -> str | None:
+    """What the table calls a photograph: the longest name first; None where it has no line."""
+    keys = [str(key) for end in ends_of(name) for key in (end, end.with_suffix(""))]
+    return next((key for key in (name, *keys) if key in table), None)
 
 
 def _positive(word: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
@@ -17,6 +18,8 @@ from .faults import Faults
 from .lens import Lens, fisheye, opencv
 from .source import Reading, Shot, Source, ends_of, find_image, image_header, suited
 
+#: What the layout with one file is called, for people.
+NERFSTUDIO = "nerfstudio"
 #: The files of a folder with one file a split, and our names of the splits.
 SPLIT_FILES = {
     "transforms_train.json": "train",
@@ -41,6 +44,8 @@ _INSTANT_NGP = (
     f"{TRANSFORMS} may be of instant-ngp, whose colmap2nerf.py turns and scales cameras unless it "
     "is run with --keep_colmap_coords: a mesh of COLMAP does not fit then"
 )
+#: The difference of two focal lengths of one camera, relative, that is more than rounding.
+_CONTRADICTS = 0.01
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
@@ -56,7 +61,7 @@ def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
     with faults.collected():
         top = read_object(file)
     if top is None:
-        return Source("nerfstudio", ())
+        return Source(NERFSTUDIO, ())
     if "scene" in top:
         faults.add(f"the folder is a data set already: {file.name} names a 'scene'")
         return Source("data set", ())
@@ -75,7 +80,7 @@ def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
         for shot in shots
     ]
     kept, left_out = _of_lists(placed, splits)
-    return Source("nerfstudio", kept, (*notes, *_unknown_names(top, splits), *left_out))
+    return Source(NERFSTUDIO, kept, (*notes, *_unknown_names(top, splits), *left_out))
 
 
 def _of_lists(
@@ -198,7 +203,10 @@ def _shot(
         if not reading.has(image, name):
             return None
         header = image_header(image)
-        lens = suited(_lens(with_top(top, frame), header.width, header.height, name), image)
+        lens = _lens(with_top(top, frame), header.width, header.height, name)
+        if _contradicts(top, frame, lens):
+            reading.contradicting.append(name)
+        lens = suited(lens, image)
     with faults.collected(f"{file.name}: {name}"):
         pose = _pose(frame, name)
     if "mask_path" in frame:
@@ -291,6 +299,24 @@ def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
             raise UserError("the lens has k4, k5 or k6, which programs use differently", where)
         project = opencv(focal, centre, np.array([k1, k2, k3]), p1, p2)
     return Lens(camera.width, camera.height, *focal, *centre, project)
+
+
+def _contradicts(top: Mapping[str, Any], frame: Mapping[str, Any], lens: Lens) -> bool:
+    """Whether the keys of a frame, or those at the top without it, tell two focal lengths.
+
+    Where one is of the frame and the other at the top, that of the frame alone counts.
+    """
+    for length, angle, size in (
+        ("fl_x", "camera_angle_x", lens.width),
+        ("fl_y", "camera_angle_y", lens.height),
+    ):
+        own = frame if length in frame or angle in frame else top
+        told = own.get(angle)
+        if length in own and isinstance(told, int | float) and 0 < told < math.pi:
+            focal = 0.5 * size / math.tan(0.5 * told)
+            if abs(focal / own[length] - 1) > _CONTRADICTS:
+                return True
+    return False
 
 
 def _taken_back(

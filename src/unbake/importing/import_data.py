@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,7 +19,7 @@ from ..config.light import LightConfig
 from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.views import LONGEST_NAME, PIXEL_BYTES, counted_by, read_radiance
-from ..errors import UserError, named
+from ..errors import UserError, named, printable
 from ..imaging.coded import decode, encode, read_codes
 from ..imaging.pictures import write_exr
 from ..imaging.profiles import linear_srgb, profile_name, read_profile
@@ -30,14 +30,14 @@ from ..scene.parse import parse, write
 from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
-from .frames import SPLIT_FILES, read_one_file, read_split_files
-from .lens import Lens
+from .frames import NERFSTUDIO, SPLIT_FILES, read_one_file, read_split_files
+from .lens import WIDEST, Lens
 from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
 from .raw import CLIPPED as CLIPPED_RAW
 from .raw import for_sensor, raw_balances, raw_told, read_raw
 from .rooms import is_room, read_room
 from .settings import ImportSettings
-from .source import Reading, Shot, Source, image_header, masks_in, same_shape
+from .source import Reading, Shot, Source, image_header, masks_in, orientation, same_shape
 
 #: Codes at and above this share of the largest one are taken for clipped: 250 of 255.
 CLIPPED_CODE = 250 / 255
@@ -48,6 +48,8 @@ _BEYOND, _OFTEN = 0.01, 0.01
 _RAYS = 64
 #: Poses are the same but for this in their axes, and this part of the largest coordinate.
 _SAME = 1e-6
+#: A mesh that is this many times as wide as the space of the cameras may be in another unit.
+_LARGER = 20
 #: A camera from which this share of all directions hits the mesh stands in a room.
 _ENCLOSED = 0.95
 _KNOWN = (
@@ -117,44 +119,41 @@ def import_data(
     names = _names(found.shots, faults)
     pictures = _check_pictures(found.shots, faults)
     splits = _splits(found.shots, settings.holdout)
-    if splits and "train" not in splits.values():
+    if splits and "train" not in splits.values() and not faults:
         faults.add("no photograph is left to train on: the source holds all of them out")
     faults.require_none(source)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
         file, scene = _write_scene(data, parts, found.shots, light, allow_outside, tell)
-        seen = _shares_seen(scene, found.shots)
+        seen = _shares_seen(scene, found, parts)
         dark = light is None and _enclosed(scene, found.shots)
-        background = settings.background
-        if background == "auto":
-            # Screenshots and pictures of some converters have an alpha of 1 everywhere.
-            cut_out = pictures.transparent and pictures.with_alpha == set(names)
-            background = "hidden" if cut_out else "visible"
-        frames = []
+        background = pictures.background(settings.background, names)
+        frames, blank = [], []
         for shot in found.shots:
             cut = background == "hidden" and shot.name not in pictures.transparent
             on_mesh = _on_mesh(scene, shot.lens.camera(shot.to_world)) if cut else None
             changed = pictures.negative | pictures.profiles.keys()
             same = shot.lens.straight and not shot.raw and shot.name not in changed
             name, split = names[shot.name], splits[shot.name]
-            frames.append(_write_view(data, shot, name, split, known, on_mesh, same=same))
+            frame, counts = _write_view(data, shot, name, split, known, on_mesh, same=same)
+            frames.append(frame)
+            blank += [] if counts else [shot.name]
+        if all(shot.name in blank for shot in found.shots if splits[shot.name] == "train"):
+            what = "masks leave no pixel of any photograph to train on"
+            raise UserError(what, None, "Masks are black where pixels do not count: correct them")
         _complete_masks(data, frames)
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
             | ({"light": "unknown"} if light is None else {})
             | {"frames": frames}
         )
-    found = replace(found, notes=(*found.notes, *pictures.told()))
+    found = replace(found, notes=(*found.notes, *_straightening(found.shots), *pictures.told()))
     for line in _summary(found, splits, seen, parts, told):
         tell(line)
-    if pictures.negative:
-        few = ", ".join(sorted(pictures.negative)[:3])
-        tell(f"{len(pictures.negative)} photographs have negative pixels, taken as zero: {few}")
+    for line in pictures.warnings(names, background, blank):
+        tell(line)
     if dark:
-        tell(
-            "warning: all cameras stand inside the mesh, which keeps an environment out, and lamps "
-            "are not found by a fit. Give the lights of the room with --lights FILE"
-        )
+        tell(_dark(parts, found.shots))
     return DataFolder(out)
 
 
@@ -167,7 +166,8 @@ def _found(source: Path, reading: Reading, masks: Path | None, faults: Faults) -
     if reading.missing and not found.shots and not faults:
         faults.add("no photograph of the source exists", found.kind, "--images names their folder")
     found = masks_in(found, masks, reading, faults)
-    return replace(found, notes=(*found.notes, *reading.notes(), *_scaled(found.shots)))
+    told = (*_scaled(found.shots), *_turned(found.shots))
+    return replace(found, notes=(*found.notes, *reading.notes(), *told))
 
 
 def _read_source(source: Path, reading: Reading, faults: Faults) -> Source:
@@ -255,7 +255,7 @@ def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
     for shot in shots:
         other = taken.setdefault(names[shot.name], shot.name)
         if other != shot.name:
-            faults.add("two photographs have one name but for their suffix", shot.name)
+            faults.add(_clash(other, shot.name), shot.name, "Rename one of them")
         if len(names[shot.name].encode()) > LONGEST_NAME:
             faults.add(f"the name of the photograph has over {LONGEST_NAME} bytes", shot.name)
     files: dict[Path, str] = {}
@@ -267,6 +267,13 @@ def _names(shots: Sequence[Shot], faults: Faults) -> dict[str, str]:
         if count > 1:
             faults.add("a photograph has two poses", name)
     return names
+
+
+def _clash(name: str, other: str) -> str:
+    """Why the views of two photographs would have one name."""
+    both = [PurePosixPath(path).with_suffix("") for path in (name, other)]
+    how = "but for its suffix" if both[0] == both[1] else "once folders are joined by _"
+    return f"the photograph has the name of {printable(name)} {how}"
 
 
 def _printable(name: str) -> str:
@@ -284,6 +291,8 @@ class _Pictures:
     Args:
         with_alpha: have an alpha channel.
         transparent: have pixels whose alpha is less than 1.
+        empty: have pixels whose alpha is 0.
+        grey: have one channel of colour.
         negative: have negative radiance.
         profiles: the names of colour profiles that are not those of sRGB.
         beyond: have such a profile, and colours that sRGB lacks.
@@ -291,6 +300,8 @@ class _Pictures:
 
     with_alpha: set[str] = field(default_factory=set)
     transparent: set[str] = field(default_factory=set)
+    empty: set[str] = field(default_factory=set)
+    grey: set[str] = field(default_factory=set)
     negative: set[str] = field(default_factory=set)
     profiles: dict[str, str] = field(default_factory=dict)
     beyond: set[str] = field(default_factory=set)
@@ -310,6 +321,8 @@ class _Pictures:
         """Take a photograph into account: (H, W, 4)."""
         if (pixels[..., 3] < 1).any():
             self.transparent.add(shot.name)
+        if (pixels[..., 3] <= 0).any():
+            self.empty.add(shot.name)
         profile = _profile(shot)
         if profile is not None:
             self.profiles[shot.name] = profile_name(profile)
@@ -317,8 +330,56 @@ class _Pictures:
                 self.beyond.add(shot.name)
         elif (pixels < 0).any():
             self.negative.add(shot.name)
-        if shot.name in self.transparent or image_header(shot.image).channels in (2, 4):
+        channels = image_header(shot.image).channels
+        if shot.name in self.transparent or channels in (2, 4):
             self.with_alpha.add(shot.name)
+        if channels <= 2:
+            self.grey.add(shot.name)
+
+    def background(self, wanted: str, names: Collection[str]) -> str:
+        """The background of the data set, "visible" or "hidden".
+
+        Args:
+            wanted: the same, or "auto".
+            names: of all photographs.
+        """
+        if wanted != "auto":
+            return wanted
+        # Screenshots and pictures of some converters have an alpha of 1 everywhere.
+        return "hidden" if self.transparent and self.with_alpha == set(names) else "visible"
+
+    def warnings(
+        self, names: Collection[str], background: str, blank: Sequence[str]
+    ) -> Iterator[str]:
+        """What may be fitted for something else than it is, or not at all, for people.
+
+        Args:
+            names: of all photographs.
+            background: of the data set, "visible" or "hidden".
+            blank: photographs of which no pixel counts.
+        """
+        if self.grey and len(self.grey) < len(names):
+            yield (
+                "warning: photographs without colours are among others, and a fit takes their grey "
+                f"for the colour: {named(sorted(self.grey))}. Remove them"
+            )
+        if self.empty and background == "visible":
+            opaque = sorted(set(names) - self.transparent)
+            others = f", beside opaque ones ({named(opaque)})" if opaque else ""
+            which = "the opaque ones" if opaque else "their alpha"
+            yield (
+                "warning: photographs have pixels of alpha 0, fitted as a black background: "
+                f"{named(sorted(self.empty))}{others}. Give --background hidden or --masks FOLDER, "
+                f"or remove {which}"
+            )
+        if blank:
+            yield (
+                f"warning: masks leave no pixel of {len(blank)} photographs: {named(blank)}. They "
+                "are black where pixels do not count"
+            )
+        if self.negative:
+            few = ", ".join(sorted(self.negative)[:3])
+            yield f"{len(self.negative)} photographs have negative pixels, taken as zero: {few}"
 
 
 def _check_pictures(shots: Sequence[Shot], faults: Faults) -> _Pictures:
@@ -404,6 +465,29 @@ def _scaled(shots: Sequence[Shot]) -> list[str]:
     return [f"cameras are scaled by {by}, to the size of their photographs: {count}"]
 
 
+def _turned(shots: Sequence[Shot]) -> list[str]:
+    """A note of photographs that programs would show turned or mirrored."""
+    names = [shot.name for shot in shots if orientation(shot.image) != 1]
+    if not names:
+        return []
+    told = "asks to turn them; they are taken as stored"
+    return [f"the EXIF of {len(names)} photographs {told}: {named(names)}"]
+
+
+def _straightening(shots: Sequence[Shot]) -> list[str]:
+    """Notes of photographs whose lens is not taken out as a whole."""
+    narrowed = [shot.name for shot in shots if shot.lens.narrowed]
+    beyond = [shot.name for shot in shots if shot.lens.beyond]
+    notes = []
+    if narrowed:
+        what = f"lenses that see more than {WIDEST} degrees: what lies beyond is cut off"
+        notes.append(f"{what} ({named(narrowed)})")
+    if beyond:
+        what = "principal points outside of the photograph: pixels beyond its edge are masked"
+        notes.append(f"{what} ({named(beyond)})")
+    return notes
+
+
 def _splits(shots: Sequence[Shot], holdout: int) -> dict[str, str]:
     """Splits by name: the source's own, else every n-th photograph by name is held out.
 
@@ -458,24 +542,55 @@ def _write_scene(
     return file, parse(file).instantiate()
 
 
-def _shares_seen(scene: mi.Scene, shots: Sequence[Shot]) -> np.ndarray:
+def _shares_seen(scene: mi.Scene, source: Source, parts: Sequence[Part]) -> np.ndarray:
     """The share of each photograph's pixels that see the mesh."""
-    cameras = [shot.lens.camera(shot.to_world) for shot in shots]
+    cameras = [shot.lens.camera(shot.to_world) for shot in source.shots]
     seen = np.array([_hits(scene, *spread_rays([c], _RAYS)).mean() for c in cameras])
     if not seen.any():
-        raise UserError(
-            "no photograph sees the mesh",
-            None,
-            "Mesh and cameras must be in one frame and unit; --keep-applied-transform leaves "
-            "nerfstudio's cameras in the frame of their file",
-        )
+        mesh, stand = _box(_corners(parts)), _box(_origins(source.shots))
+        remedy = "Mesh and cameras must be in one frame and unit"
+        if source.kind == NERFSTUDIO:
+            remedy += (
+                "; --keep-applied-transform leaves nerfstudio's cameras in the frame of their file"
+            )
+        what = f"no photograph sees the mesh, which is {mesh}; the cameras stand {stand}"
+        raise UserError(what, None, remedy)
     return seen
+
+
+def _corners(parts: Sequence[Part]) -> np.ndarray:
+    """The least and the largest coordinates of each part, (2 n, 3)."""
+    return np.concatenate([(part.positions.min(0), part.positions.max(0)) for part in parts])
+
+
+def _origins(shots: Sequence[Shot]) -> np.ndarray:
+    """Where cameras stand, (n, 3)."""
+    return np.array([shot.to_world[:3, 3] for shot in shots])
+
+
+def _box(points: np.ndarray) -> str:
+    """The size and place of points (n, 3), for people."""
+    low, high = points.min(0), points.max(0)
+    middle = ", ".join(f"{value:.3g}" for value in 0.5 * (low + high))
+    return f"{(high - low).max():.3g} units wide around ({middle})"
+
+
+def _dark(parts: Sequence[Part], shots: Sequence[Shot]) -> str:
+    """A warning of cameras that all stand inside of the mesh."""
+    warning = (
+        "warning: all cameras stand inside the mesh, which keeps an environment out, and lamps "
+        "are not found by a fit. Give the lights of the room with --lights FILE"
+    )
+    mesh, stand = (np.ptp(points, axis=0).max() for points in (_corners(parts), _origins(shots)))
+    if not 0 < _LARGER * stand <= mesh:
+        return warning
+    times = f"{mesh / stand:.0f} times as wide as the space of the cameras"
+    return f"{warning}. The mesh is {times}: check that both are in one unit"
 
 
 def _enclosed(scene: mi.Scene, shots: Sequence[Shot]) -> bool:
     """Whether all cameras stand where the mesh is in nearly all directions."""
-    origins = np.array([shot.to_world[:3, 3] for shot in shots])
-    return bool((free_space.enclosure(scene, origins) >= _ENCLOSED).all())
+    return bool((free_space.enclosure(scene, _origins(shots)) >= _ENCLOSED).all())
 
 
 def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:
@@ -499,8 +614,8 @@ def _write_view(
     on_mesh: np.ndarray | None,
     *,
     same: bool,
-) -> dict[str, Any]:
-    """Write the photograph and the mask of a view; returns its frame.
+) -> tuple[dict[str, Any], bool]:
+    """Write the photograph and the mask of a view; returns its frame, and whether any pixel counts.
 
     Args:
         data: to write to.
@@ -538,13 +653,14 @@ def _write_view(
         straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
         mask = straight[..., 0] >= 1
     masks = [one for one in (on_mesh, mask, exact) if one is not None]
+    counted = np.all(masks, 0)
     if masks:
         file = data.mask(name)
-        _write_codes(file, np.where(np.all(masks, 0), 255, 0).astype(np.uint8)[..., None])
+        _write_codes(file, np.where(counted, 255, 0).astype(np.uint8)[..., None])
         frame["mask_path"] = data.relative(file)
     if on_mesh is not None:
         frame["mask_from"] = "mesh"
-    return frame
+    return frame, bool(counted.any())
 
 
 def _complete_masks(data: DataFolder, frames: Sequence[dict[str, Any]]) -> None:
@@ -562,17 +678,19 @@ def _straightened(
     """The photograph of the pinhole camera, and which of its pixels say what they say.
 
     A pixel between a clipped one and another is darker than the limit, and nobody knows how bright
-    it should be: neither its value nor that it is clipped would be true.
+    it should be: neither its value nor that it is clipped would be true. A pixel that
+    looks beyond the photograph's edge says nothing.
 
     Args:
-        limit: from which on channels are clipped; None: they never are, and all pixels count.
+        limit: from which on channels are clipped; None: they never are.
     """
-    straight = lens.straightened(pixels, focal)
+    straight, shown = lens.straightened(pixels, focal), lens.shown(focal)
     if limit is None:
-        return straight, None
+        return straight, shown
     clipped = (pixels[..., :3] >= np.float32(limit)).astype(np.float32)
     between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
-    return straight, np.logical_not(np.any(between, axis=2))
+    exact = np.logical_not(np.any(between, axis=2))
+    return straight, exact if shown is None else exact & shown
 
 
 def _write_picture(file: Path, pixels: np.ndarray) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 
 from ..dataset.camera import Camera
+from ..errors import UserError
 
 #: Maps points of the plane in front of a camera to pixels: (n, 2) to (n, 2), both x to the right
 #: and y down; the plane lies at distance 1, pixels count from the upper left corner.
@@ -22,6 +23,9 @@ _SQUARE = 1e-4
 _EDGE = 128
 #: How far the focal length may change: from the longest to the shortest, relative, in equal steps.
 _LONGEST, _SHORTEST, _STEPS = 4.0, 0.25, 1200
+#: The widest picture that a pinhole camera takes here, from edge to edge, in degrees: of wider ones
+#: nearly all pixels would show what a fisheye lens has in few of them.
+WIDEST = 120
 #: Rows that are resampled at a time.
 _ROWS = 128
 
@@ -95,30 +99,64 @@ class Lens:
         """The pinhole camera that photographs belong to after `straightened`.
 
         It has as many pixels and the same principal point. Its focal length is the shortest with
-        which all of its image lies inside the photograph.
+        which all of its image lies inside the photograph and is no wider than `WIDEST`. No image
+        does where the principal point lies outside of the photograph: see `shown`.
 
         Args:
             to_world: (4, 4), OpenGL axes.
 
         Raises:
-            UserError: the pose or the lens is none.
+            UserError: the pose or the lens is none, or no such camera sees what the lens does.
         """
-        fl_x, fl_y = (self.fl_x, self.fl_y) if self.straight else (self._focal, self._focal)
+        focal = None if self.straight else self._fitted[0]
+        fl_x, fl_y = (self.fl_x, self.fl_y) if focal is None else (focal, focal)
         return Camera(to_world, fl_x, fl_y, self.cx, self.cy, self.width, self.height)
 
     def straightened(self, image: np.ndarray, focal: float) -> np.ndarray:
         """The image (H, W, C) of the pinhole camera with this focal length, sampled bilinearly."""
         straight = np.empty(image.shape, np.float32)
+        for rows, at in self._seen(focal):
+            straight[rows] = _bilinear(image, at - 0.5).reshape(len(rows), self.width, -1)
+        return straight
+
+    def shown(self, focal: float) -> np.ndarray | None:
+        """Which pixels of `straightened` show what is within the photograph's edge.
+
+        Returns:
+            (H, W) bool; None: all do.
+        """
+        if not self.beyond:
+            return None
+        inside = np.empty((self.height, self.width), bool)
+        for rows, at in self._seen(focal):
+            within = ((at >= 0) & (at <= (self.width, self.height))).all(1)
+            inside[rows] = within.reshape(len(rows), self.width)
+        return None if inside.all() else inside
+
+    @property
+    def beyond(self) -> bool:
+        """Whether `camera` sees places beyond the photograph's edge; errors as there."""
+        return not self.straight and self._fitted[2]
+
+    @property
+    def narrowed(self) -> bool:
+        """Whether the photograph is wider than `camera` may be; errors as there."""
+        return not self.straight and self._fitted[1]
+
+    def _seen(self, focal: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Some rows of the pinhole camera at a time, (r,), and where the photograph has them.
+
+        Yields:
+            The rows, and places in pixels from the photograph's upper left corner, (r * W, 2).
+        """
         for top in range(0, self.height, _ROWS):
             rows = np.arange(top, min(top + _ROWS, self.height))
             x, y = np.meshgrid(np.arange(self.width) + 0.5 - self.cx, rows + 0.5 - self.cy)
-            at = self.pixels(np.stack([x.ravel(), y.ravel()], 1) / focal) - 0.5
-            straight[rows] = _bilinear(image, at).reshape(len(rows), self.width, -1)
-        return straight
+            yield rows, self.pixels(np.stack([x.ravel(), y.ravel()], 1) / focal)
 
     @cached_property
-    def _focal(self) -> float:
-        """The shortest focal length with which no pixel looks beyond the photograph's edge.
+    def _fitted(self) -> tuple[float, bool, bool]:
+        """The focal length of `camera`, and whether it is `narrowed` and sees `beyond`.
 
         It comes from long ones, as distortions of high order turn back outside of the photograph.
         """
@@ -128,16 +166,33 @@ class Lens:
         sides += [(0 * along + u, along * h) for u in (0.0, w)]
         edge = np.concatenate([np.stack(side, 1) for side in sides]) - (self.cx, self.cy)
         middle = self.pixels(np.zeros((1, 2)))
-        found = start = max(self.fl_x, self.fl_y)
-        reach = np.zeros(len(edge))
-        for factor in np.geomspace(_LONGEST, _SHORTEST, _STEPS):
-            seen = self.pixels(edge / (start * factor))
+        start = max(self.fl_x, self.fl_y)
+        focals = start * np.geomspace(_LONGEST, _SHORTEST, _STEPS)
+        across = [
+            np.arctan((size - centre) / focals) + np.arctan(centre / focals)
+            for size, centre in ((w, self.cx), (h, self.cy))
+        ]
+        allowed = focals[(np.degrees(across) <= WIDEST).all(0)]
+        if not len(allowed):
+            told = f"its focal length of {start:.3g} pixels is too short for {w} x {h} pixels"
+            raise UserError(told, None, "Check the focal length of its camera")
+        found, reach = None, np.zeros(len(edge))
+        for focal in allowed:
+            seen = self.pixels(edge / focal)
             further = np.linalg.norm(seen - middle, axis=1)
             inside = (seen >= -1e-6).all() and (seen <= (w + 1e-6, h + 1e-6)).all()
             if not (inside and (further >= reach).all()):
                 break
-            found, reach = start * factor, further
-        return float(found)
+            found, reach = float(focal), further
+        if found is not None:
+            return found, len(allowed) < _STEPS and found == allowed[-1], False
+        found = float(max(start, allowed[-1]))
+        shares = np.linspace(0, 1, _EDGE)[:, None, None]
+        seen = self.pixels((shares * edge / found).reshape(-1, 2)).reshape(_EDGE, -1, 2)
+        if not (np.diff(np.linalg.norm(seen - middle, axis=2), axis=0) >= 0).all():
+            told = "its lens cannot be straightened from a principal point outside the photograph"
+            raise UserError(told, None, "Undistort it with the program that posed it")
+        return found, False, True
 
 
 def opencv(

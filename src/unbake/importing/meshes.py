@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UserError, printable
+from ..errors import UserError, named, printable
 from ..io import array, number, read_object, require_file
 from ..scene.meshes import HEADER, check_mesh
 from ..scene.normals import repaired
@@ -38,6 +38,8 @@ _PACKED = {
 TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 #: Steps between positions in single precision, as a share of all geometry, that do not show.
 _COARSEST = 1e-5
+#: The same of the positions of one part, as a share of the largest part: parts may lie far apart.
+_OF_PART = 1e-4
 #: Of the constant environment.
 _ENVIRONMENT = "environment"
 _VERSION = "3.0.0"
@@ -102,21 +104,24 @@ def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
 
 def _check_place(parts: Sequence[Part], faults: Faults) -> None:
     """Meshes far from the origin lose their shape, as Mitsuba has them in single precision."""
-    corners = [
-        corner for part in parts for corner in (part.positions.min(0), part.positions.max(0))
-    ]
-    extent = float(np.ptp(corners, axis=0).max())
-    largest = float(np.abs(corners).max())
-    step = float(np.spacing(np.float32(largest)))
+    corners = np.array([(part.positions.min(0), part.positions.max(0)) for part in parts])
+    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    farthest = np.abs(corners).max(axis=(1, 2))
+    steps = np.spacing(farthest.astype(np.float32)).astype(np.float64)
     if not extent:
         faults.add("all vertices of the mesh lie at one point")
         return
-    if step > _COARSEST * extent:
-        faults.add(
-            f"the mesh is {extent:.3g} units wide and lies up to {largest:.3g} units from the "
-            f"origin, where single precision has steps of {step:.2g} units",
-            remedy="Move mesh and cameras to the origin together",
-        )
+    units, step = f"{farthest.max():.3g} units", f"{steps.max():.2g} units"
+    place = f"up to {units} from the origin, where single precision has steps of {step}"
+    remedy = "Move mesh and cameras to the origin together"
+    if (steps > _COARSEST * extent).any():
+        faults.add(f"the mesh is {extent:.3g} units wide and lies {place}", remedy=remedy)
+        return
+    largest = float(np.ptp(corners, axis=1).max())
+    far = [p.name for p, step in zip(parts, steps, strict=True) if step > _OF_PART * largest]
+    if far:
+        what = f"the largest part of the mesh is {largest:.3g} units wide, and others lie {place}"
+        faults.add(what, named(far), remedy)
 
 
 def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Path:

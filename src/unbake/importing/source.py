@@ -80,7 +80,8 @@ class Reading:
         allow_outside: read files that lie outside of their folder.
         keep_applied_transform: leave cameras in the frame of nerfstudio's file.
         leave_out_missing: go on without photographs that do not exist.
-        missing: names of those that were left out; `require` adds to it.
+        missing: names of those that were left out; `has` adds to it.
+        contradicting: names of those whose focal length and angle of view are not of one camera.
     """
 
     images: Path | None = None
@@ -88,6 +89,7 @@ class Reading:
     keep_applied_transform: bool = False
     leave_out_missing: bool = False
     missing: list[str] = field(default_factory=list)
+    contradicting: list[str] = field(default_factory=list)
 
     def has(self, image: Path, name: str) -> bool:
         """Whether there is a photograph; false where it is missing and left out.
@@ -106,12 +108,19 @@ class Reading:
         return True
 
     def notes(self) -> tuple[str, ...]:
-        """What was left out, for people."""
-        if not self.missing:
-            return ()
-        count = len(self.missing)
-        what = "one photograph does" if count == 1 else f"{count} photographs do"
-        return (f"{what} not exist, left out: {named(sorted(self.missing))}",)
+        """What was left out, and what cameras contradict themselves in, for people."""
+        notes = []
+        if self.missing:
+            count = len(self.missing)
+            what = "one photograph does" if count == 1 else f"{count} photographs do"
+            notes.append(f"{what} not exist, left out: {named(sorted(self.missing))}")
+        if self.contradicting:
+            names = named(sorted(self.contradicting))
+            notes.append(
+                "warning: focal length (fl_x, fl_y) and angle of view (camera_angle_x, "
+                f"camera_angle_y) differ, the first is taken: {names}. Remove the wrong one"
+            )
+        return tuple(notes)
 
 
 @final
@@ -201,10 +210,12 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
     """
     given = folder is not None
     folder = folder or source.masks
-    if folder is None or not source.shots:
+    if folder is None:
         return source
     if not folder.is_dir():
         faults.add("there is no folder of masks", folder)
+        return source
+    if not source.shots:
         return source
     shots = []
     for shot in source.shots:
@@ -262,7 +273,8 @@ def suited(lens: Lens, image: Path) -> Lens:
     if not is_raw(image) and same_shape(size, (lens.width, lens.height)):
         return lens.scaled(*size)
     what = f"its camera is for {lens.width} x {lens.height} pixels, it has {size[0]} x {size[1]}"
-    if same_shape((size[1], size[0]), (lens.width, lens.height)) and _turned_by_exif(image):
+    quarter = orientation(image) in (5, 6, 7, 8)
+    if quarter and same_shape((size[1], size[0]), (lens.width, lens.height)):
         told = f"{what}; its EXIF says that it is to be turned"
         remedy = "Save the photographs turned (ImageMagick: mogrify -auto-orient)"
         raise UserError(told, image, remedy)
@@ -279,12 +291,13 @@ def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return low <= high
 
 
-def _turned_by_exif(image: Path) -> bool:
-    """Whether an image's EXIF asks for a quarter turn."""
+def orientation(image: Path) -> int:
+    """How an image's EXIF asks to turn or mirror it, from 1 to 8; 1: it does not."""
     if image.suffix.lower() not in CODED_SUFFIXES:
-        return False
+        return 1
     try:
-        with Image.open(image) as opened:
-            return opened.getexif().get(_ORIENTATION) in (5, 6, 7, 8)
-    except (OSError, ValueError):
-        return False
+        with Image.open(image, formats=("PNG", "JPEG", "TIFF")) as opened:
+            told = opened.getexif().get(_ORIENTATION)
+    except Exception:  # EXIF that is damaged raises whatever Pillow meets
+        return 1
+    return told if isinstance(told, int) and 1 <= told <= 8 else 1
