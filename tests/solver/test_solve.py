@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -66,6 +67,25 @@ def test_the_radiance_in_a_furnace_is_found_within_one_percent(solved):
         assert abs(error.mean()) < 0.01
         # A pixel of RHS keeps the noise of its 64 bounces.
         assert np.sqrt(np.mean(error**2)) < (0.01 if side == "lhs" else 0.03)
+
+
+@pytest.mark.parametrize("unit", [1e-5, 1e5])
+def test_the_unit_of_light_does_not_matter(unit, solved, built_in, tmp_path):
+    """Dim scenes were within epsilon, and bright ones were fitted to the noise of dark corners."""
+    text = built_in("furnace").read_text()
+    (given,) = re.findall(r'name="radiance" value="([^"]*)"', text)
+    value = " ".join(str(unit * float(x)) for x in given.replace(",", " ").split())
+    shutil.copytree(built_in("furnace").parent, tmp_path / "scene")
+    scene = tmp_path / "scene" / built_in("furnace").name
+    scene.write_text(text.replace(f'"{given}"', f'"{value}"'))
+    look = {"origin": [0, 0, 0], "target": [1, 0.2, 0.1], "up": [0, 0, 1], "fov": 60}
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps([look]))
+    solve(scene, tmp_path / "out", SETTINGS, cameras=cameras, tell=lambda line: None)
+    read = read_object(tmp_path / "out" / "solve.json")["measurements"]
+    error = read_exr(tmp_path / "out" / "train_000-lhs.exr") / (unit * TRUTH) - 1
+    assert abs(error.mean()) < 0.02
+    assert read[0]["relmse"]["lhs"] > 10 * read[-1]["relmse"]["lhs"]
 
 
 def test_the_untrained_field_did_not_know_it(solved):
@@ -150,6 +170,8 @@ def test_gradients_of_the_right_hand_side_pass_only_where_it_is_attached(built_i
     for attach in (False, True):
 
         class Constant:
+            scale = 1.0
+
             value = mi.Float(3.0)
 
             def evaluate(self, p, w, n, albedo, valid, engine=None):
@@ -346,6 +368,16 @@ def test_a_field_is_brightened_until_both_sides_have_the_same_mean(solved, built
     radiance.scale /= 8
     factor = matching_scale(SceneView.of(scene, None, 8), radiance, points, 0)
     assert factor == pytest.approx(8, rel=0.03)
+
+
+def test_a_field_is_brightened_by_any_factor(solved, built_in):
+    scene = mi.load_file(str(built_in("furnace")))
+    points, radiance = SurfacePoints.of(scene), load_radiance(solved)
+    scale = radiance.scale
+    for factor in (1e-9, 1e9):
+        radiance.scale = scale / factor
+        found = matching_scale(SceneView.of(scene, None, 8), radiance, points, 0)
+        assert found == pytest.approx(factor, rel=0.03)
 
 
 def test_a_fit_starts_with_a_solved_field(tuned, unbake, cornell, tiny, tmp_path):

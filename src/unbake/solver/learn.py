@@ -42,7 +42,8 @@ _TIMED, _READ = 8, 32
 _SIDES_BYTES, _REFERENCE_BYTES = 60, 180
 _DEFINITIONS = {
     "relmse": "mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of all pictures; "
-    "a: lhs or rhs, b: the path traced reference",
+    "a: lhs or rhs, b: the path traced reference. Where the mean m of b is below 0.08 or above 1, "
+    "0.01 is multiplied by (m / 0.08)^2 or m^2",
     "relmse_debiased": "the same without the noise of the reference: (a - b) (a - c) in the place "
     "of the square, b and c independent halves of the reference; the noise of a is in it",
     "spp": "samples per pixel of a",
@@ -51,7 +52,7 @@ _DEFINITIONS = {
     "reference_noise": "expected relMSE of the reference against itself without noise, from two "
     "independent halves of its samples; every relmse has it in it",
     "residual": "mean of (L_theta - T)^2 / (L_theta^2 + epsilon), T a mean of M samples; it keeps "
-    "their variance",
+    "their variance. epsilon follows the scale of L_theta as that of relmse follows m",
     "seconds": "of training, without measurements and without the reference",
     "cpu_seconds": "the same of all cores that were at work for it; on a machine that does nothing "
     "else, at most the seconds times its cores",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,8 +18,8 @@ from .points import SurfacePoints
 
 #: Points that means are taken over.
 _POINTS = 1 << 15
-#: Factors on the scale of a field that are believed.
-_LEAST, _MOST = 1e-4, 1e4
+#: Of its light, what a field loses at a bounce at least: below, it is the noise of the estimate.
+_LEAST_LOST = 0.01
 
 
 def direct_light(scene_view: SceneView, points: SurfacePoints, seed: int) -> float:
@@ -35,24 +37,32 @@ def matching_scale(
     """The factor on a field with which both sides of the rendering equation have the same mean.
 
     Of c L = D + c K L, with the direct light D and one bounce K of the field: 1 where the field
-    solves the equation.
+    solves the equation. Where that cannot be told, the field gets the mean of D; 1 where it has no
+    light at all.
 
     Raises:
         UserError: no light reaches any surface, or it is not finite.
     """
-    direct, lost = _means(scene_view, radiance, points, seed)
-    factor = direct / lost if lost > 0 else 1.0
-    return factor if _LEAST < factor < _MOST else 1.0
+    direct, _, own = _means(scene_view, radiance, points, seed)
+    if not 0 < own < math.inf:
+        return 1.0
+    given = radiance.scale
+    try:  # single precision tells light from a field of much the same alone
+        radiance.scale = given * direct / own
+        direct, lost, near = _means(scene_view, radiance, points, seed)
+    finally:
+        radiance.scale = given
+    return direct / own * (direct / lost if _LEAST_LOST * near < lost < math.inf else 1.0)
 
 
 @carrying()
 def _means(
     scene_view: SceneView, radiance: RadianceField | None, points: SurfacePoints, seed: int
-) -> tuple[float, float]:
-    """Means over points and directions of D, and of L − K L where there is a field; else 0."""
+) -> tuple[float, float, float]:
+    """Means over points and directions of D, and of L − K L and L of a field; else 0."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, _POINTS)
-    lost = mi.Float(0)
+    lost = own = mi.Float(0)
     with dr.suspend_grad():
         x = find_vertex(scene_view, points.rays(sampler), mi.Bool(True), sampler)
         x = attach_material(scene_view, x)
@@ -61,11 +71,15 @@ def _means(
         if radiance is not None:
             end = attach_albedo(scene_view, step.next)
             left, incoming = reflected_radiance(radiance, x, end)
+            own = dr.mean(left)
             lost = dr.mean(left - (transported(step, incoming) - light))
     valid = np.array(x.valid)
-    mean, lost = (float(np.mean(np.broadcast_to(v, valid.shape)[valid])) for v in (light, lost))
+    mean, lost, own = (
+        float(np.mean(np.broadcast_to(v, valid.shape)[valid], dtype=np.float64))
+        for v in (light, lost, own)
+    )
     if not np.isfinite(mean):
         raise UserError("the direct light is not finite", None, "Check the scene's values")
     if mean <= 0:
         raise UserError("no light reaches any surface", None, "Check where the lights are")
-    return mean, lost
+    return mean, lost, own

@@ -17,7 +17,7 @@ from ..fields.radiance import RadianceField
 from ..transport.path_sample import Requirements, lhs, rhs, trace
 from ..transport.render import parts_of, render_radiance
 from ..transport.vertex import SceneView
-from .settings import SolveSettings
+from .settings import SolveSettings, epsilon_at
 
 #: Added to squared pixels of the reference in relMSE.
 EPSILON = 0.01
@@ -103,14 +103,16 @@ def path_traced_halves(
 
 
 def relative_mse(images: Sequence[np.ndarray], reference: Sequence[np.ndarray]) -> float:
-    """relMSE: the mean of (a − b)² / (b² + 0.01) over all pixels and channels of all pictures.
+    """relMSE: the mean of (a − b)² / (b² + ε) over all pixels and channels of all pictures.
+
+    ε is 0.01, or follows the mean of b as of `epsilon_at`.
 
     Args:
         images: a, linear RGB, (H, W, 3) each.
         reference: b, the same.
     """
     a, b = _flat(images), _flat(reference)
-    return float(np.mean((a - b) ** 2 / (b**2 + EPSILON)))
+    return float(np.mean((a - b) ** 2 / (b**2 + epsilon_at(EPSILON, float(b.mean())))))
 
 
 def debiased_relative_mse(
@@ -125,7 +127,9 @@ def debiased_relative_mse(
         halves: two references, the same; their mean is what errors are relative to.
     """
     a, b, c = _flat(images), *(_flat(half) for half in halves)
-    return float(np.mean((a - b) * (a - c) / (((b + c) / 2) ** 2 + EPSILON)))
+    mean = (b + c) / 2
+    below = mean**2 + epsilon_at(EPSILON, float(mean.mean()))
+    return float(np.mean((a - b) * (a - c) / below))
 
 
 def _flat(images: Sequence[np.ndarray]) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from ..config.fit import DEEPEST
+from ..config.fit import DEEPEST, DIM
 from ..config.flag import Flag
 from ..errors import UserError, require_ranges
 from ..fields.settings import LEAK, GridConfig, NetworkConfig, require_no_pieces
@@ -19,6 +19,25 @@ MOST_BOUNCES = 1 << 22
 def _network() -> NetworkConfig:
     """The network of L_θ; the sizes of its hash grid are chosen from the pictures."""
     return NetworkConfig(grid=GridConfig(levels=0, table_log2=0), leak=LEAK)
+
+
+#: Mean radiance from which on scenes are bright, in other units than most.
+_BRIGHT = 1.0
+
+
+def epsilon_at(epsilon: float, level: float) -> float:
+    """What is added to squared radiance, where a scene is dim or bright.
+
+    It follows the square of the level below `DIM` and above 1, so that nothing depends on the unit
+    of light there.
+
+    Args:
+        epsilon: for scenes between these.
+        level: mean radiance, linear RGB.
+    """
+    if level <= 0:
+        return epsilon
+    return epsilon * (min(level / DIM, 1.0) * max(level / _BRIGHT, 1.0)) ** 2
 
 
 @dataclass(frozen=True)
@@ -68,7 +87,7 @@ class SolveSettings:
     max_depth: Annotated[int, Flag("Longest light path of the reference")] = 64
     rr_depth: int = 8  #: bounces of the reference before Russian roulette
     max_specular: int = 8  #: longest chain of specular interactions
-    #: Added to the squared radiance that residuals are relative to.
+    #: Added to the squared radiance that residuals are relative to; see `epsilon_at`.
     epsilon: float = 0.01
     #: The last learning rate, as a fraction of the first.
     final_learning_rate: float = 0.03

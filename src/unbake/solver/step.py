@@ -19,7 +19,7 @@ from ..transport.path_sample import reflected_radiance
 from ..transport.prior import residual_norm
 from ..transport.vertex import SceneView, find_vertex
 from .points import SurfacePoints
-from .settings import SolveSettings
+from .settings import SolveSettings, epsilon_at
 
 
 @dataclass
@@ -61,6 +61,7 @@ class SolverStep:
         self._settings = settings
         self._problem = problem
         self._samplers = [mi.load_dict({"type": "independent"}) for _ in range(2)]
+        self._epsilon = epsilon_at(settings.epsilon, radiance.scale)
         self._frozen = dr.freeze(self._step)
 
     def __call__(
@@ -143,11 +144,11 @@ class SolverStep:
         if not settings.attach_rhs:
             right = pixel_means(right, samples)
             residual = dr.select(x.valid, left - right, 0)
-            return residual_norm(residual, left, settings.epsilon)
+            return residual_norm(residual, left, self._epsilon)
         halves = pixel_means(right, samples // 2)
         even = 2 * dr.arange(mi.UInt32, settings.batch)
         first, second = (
             dr.select(x.valid, left - dr.gather(mi.Color3f, halves, even + half), 0)
             for half in (0, 1)
         )
-        return residual_norm(first, left, settings.epsilon, second)
+        return residual_norm(first, left, self._epsilon, second)
