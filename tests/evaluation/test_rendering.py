@@ -546,6 +546,18 @@ def test_evaluate_tells_that_photographs_are_far_from_white(unbake, folder, tmp_
     assert "note: photographs are far brighter than white, 1: render_psnr says" in outcome.out
 
 
+def test_relit_pictures_that_are_far_from_white_are_told(folder, tmp_path):
+    light = LightConfig(envmap=folder / "sky.exr", envmap_scale=1e5)
+    more = CaptureSettings(resolution=SIZE, spp=4, max_depth=3)
+    scene, cameras = folder / "scene.xml", folder / "cameras.json"
+    capture(scene, tmp_path / "truth", more, cameras=cameras, light=light, **SILENT)
+    settings = RenderSettings(spp=4, max_depth=3)
+    out, truth = tmp_path / "out", tmp_path / "truth"
+    made = relight(folder / "run", out, light, settings, truth=truth, **SILENT)
+    (note,) = (note for note in made["notes"] if "render_psnr says little" in note)
+    assert note.startswith("photographs are far brighter than white")
+
+
 def mask_all(data, name):
     """Mask all of a view, so that no pixel of its rendering is scored."""
     write_png(data / "black.png", np.zeros((SIZE, SIZE, 3), np.uint8))

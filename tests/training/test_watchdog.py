@@ -383,6 +383,20 @@ def test_batches_of_other_processes_are_not_compared(begun, monkeypatch):
         assert (dog.verdict({"albedo": 0.01, "roughness": 0.01}) is not None) == told
 
 
+@pytest.mark.parametrize("unknown", ["materials", "emission"])
+def test_a_loss_that_rises_is_no_verdict_where_lamps_are_unknown(unknown, begun, monkeypatch):
+    """The untrained L_θ has the light of photographs, and lamps have to get it first."""
+    step, state = begun()
+    monkeypatch.setattr(step, "config", dataclasses.replace(step.config, unknown=unknown))
+    monkeypatch.setattr(type(state), "moved", lambda self: True)
+    now = [{"photometric": 2.0, "skipped": 0.0}] * 8
+    monkeypatch.setattr(Watchdog, "_looked_at_again", lambda *_: now)
+    monkeypatch.setattr(type(step), "loss_of_black", lambda self: 1.0)
+    dog = Watchdog(state, step, Progress(step=LONG_ENOUGH, untrained=(1.0,) * 8), ["view"])
+    told = dog.verdict({"albedo": 0.01, "roughness": 0.01})
+    assert (told is None) == (unknown == "emission")
+
+
 def test_a_fit_that_learns_ends_well(fit):
     outcome, run = fit()
     assert outcome.status == 0 and not notes(run), outcome

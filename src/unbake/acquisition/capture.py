@@ -162,7 +162,10 @@ def _capture(
     rgb, alpha, noise = photographs(scene, rays, settings, sampler, room, tell)
     if not rgb.any():
         what = "all photographs are black: no light reaches what the cameras see"
-        raise UserError(what, source.file, "Check where its lights are, and where they shine")
+        remedy = "Check where its lights are, and where they shine"
+        if not room:
+            remedy += "; photographs of objects do not show lamps themselves"
+        raise UserError(what, source.file, remedy)
     _tell_noise(noise, spp, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)

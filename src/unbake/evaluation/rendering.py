@@ -44,6 +44,7 @@ from .renderings import (
     render_psnr,
     render_scores,
     scored_views,
+    told_unit,
 )
 from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
 from .turntable import turntable as make_turntable
@@ -273,6 +274,8 @@ def _render(
         if shared:
             keys, aligned = (*METRICS, _ALIGNED), _aligned(recovered, folder, shots, masks, frames)
         notes = []
+        if compared and (note := told_unit(exposure)):
+            notes.append(note)
         if brightest == 0:
             notes.append("all pictures are black: no light reaches what they show; a closed room "
                          "is lit by lights inside of it, as --lights puts them there")  # fmt: skip

@@ -162,6 +162,9 @@ class Watchdog:
                 f"nothing useful was learned: the loss is {end:.3g}, and of black pictures "
                 f"{black:.3g}. Look at the strength of the lights, and the unit of the photographs"
             )
+        if self._step.config.unknown == "emission":
+            # L_θ begins with the light that lamps have yet to give: the loss rises before it falls.
+            return None
         # With rates that are far too high, the fields are not untrained any more after one step.
         pairs = [(a, b[PHOTOMETRIC]) for a, b in zip(before, again, strict=False)]
         if progress.processes != self._step.processes:  # their batches are others
