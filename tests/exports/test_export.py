@@ -959,6 +959,54 @@ def test_other_textures_of_unwrapped_materials_move_along(mixed, tmp_path, monke
     assert '"metallic" value="0.25"' in (tmp_path / "out/mitsuba/scene.xml").read_text()
 
 
+#: BSDFs around others, glass among them.
+AROUND = """<scene version="3.0.0">
+  <shape type="rectangle" id="fence"><bsdf type="mask"><float name="opacity" value="0.5"/>
+    <bsdf type="bumpmap"><texture type="bitmap" name="arbitrary">
+      <string name="filename" value="bump.exr"/></texture>
+      <bsdf type="principled"/></bsdf></bsdf></shape>
+  <shape type="rectangle" id="tiles"><bsdf type="normalmap">
+    <rgb name="normalmap" value="0.5 0.5 1"/><bsdf type="diffuse"/></bsdf></shape>
+  <shape type="rectangle" id="pane"><bsdf type="mask"><float name="opacity" value="0.5"/>
+    <bsdf type="conductor"/></bsdf></shape>
+  <shape type="rectangle" id="rust"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>
+    <bsdf type="diffuse"/><bsdf type="conductor"/></bsdf></shape>
+  <shape type="rectangle" id="floor"><bsdf type="diffuse"/></shape></scene>"""
+
+
+@pytest.mark.parametrize("kind", ["gltf", "usd", "mitsuba"])
+def test_layers_of_materials_that_are_left_out_are_told(kind, tmp_path):
+    write_exr(tmp_path / "bump.exr", np.zeros((4, 4)))
+    (tmp_path / "scene.xml").write_text(AROUND)
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    notes = exporting._without_place(found, [], [kind], [])
+    told = {
+        "cut-outs": "fence, pane",
+        "bump maps": "fence",
+        "normal maps": "tiles",
+        "blends of materials": "rust",
+    }
+    lost = [f"glTF and usd have no {name}: left out of {of}" for name, of in told.items()]
+    assert sorted(notes) == ([] if kind == "mitsuba" else sorted(lost))
+
+
+@pytest.mark.parametrize("lamps", ["known", "fitted"])
+def test_what_was_learned_of_lamps_and_is_left_out_is_told(lamps, tmp_path):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "scene.xml").write_text(ENAMEL)
+    data = grey_data(scene / "scene.xml", tmp_path / "data")
+    config = replace(tiny_fields("grid"), method="direct", lamps=lamps, steps=0)
+    fit(data, tmp_path / "run", config)
+    for formats, told in ((["gltf", "textures"], lamps == "fitted"), (["mitsuba"], False)):
+        out, lines = tmp_path / formats[0], []
+        options = {"texels": 4.0, "tell": lines.append}
+        notes = exporting.export(tmp_path / "run", out, formats, **options)["notes"]
+        note = "what was learned of materials on lamps is in the scene for Mitsuba alone: "
+        assert (f"{note}left out of bulb" in notes) == told
+        assert (f"note: {note}left out of bulb" in lines) == told
+
+
 LIGHT = """<emitter type="area"><texture type="bitmap" name="radiance">
     <string name="filename" value="picture.exr"/><boolean name="raw" value="true"/>
   </texture></emitter>"""

@@ -1,5 +1,7 @@
 """Scenes are read and copied with all their files; what is missing is named."""
 
+from xml.etree import ElementTree
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
 from unbake.scene import parse as scenes
 from unbake.scene.edit import material_names, require_optimized
+from unbake.scene.emitters import named_emitters
 from unbake.scene.free_space import surface_area
 
 
@@ -61,6 +64,51 @@ def test_a_copy_has_all_files_and_looks_the_same(absolute, with_files, tmp_path,
     assert np.allclose(again, expected, atol=1e-5)
     files = [p for p in (tmp_path / "moved").rglob("*") if p.is_file()]
     assert len(files) == 4 and {p.suffix for p in files} == {".xml", ".ply", ".exr"}
+
+
+NAMED = """<shape type="rectangle" id="panel"><emitter type="area"/></shape>
+  <shape type="rectangle" id="wall.1"><transform name="to_world"><scale value="300"/></transform>
+    </shape>
+  <shape type="sphere"><emitter type="area"/></shape>
+  <shape type="sphere" id="_unnamed_7"/><shape type="cube" id="__1"/>
+  <shape type="disk" id="elm__2"/>
+  <shape type="shapegroup" id="stack"><shape type="cube" id="block"/></shape>
+  <shape type="instance" id="first"><ref id="stack"/></shape>
+  <shape type="instance"><ref id="stack"/></shape>
+  <shape type="ply" id="{name}"><string name="filename" value="meshes/box.ply"/></shape>"""
+
+
+@pytest.mark.parametrize("name", ["chest", "box_shape"])
+def test_a_copy_has_the_names_of_shapes(name, parse, tmp_path):
+    mesh, copy = mi.load_dict({"type": "cube"}), tmp_path / "copy"
+    (tmp_path / "meshes").mkdir()
+    mesh.write_ply(str(tmp_path / "meshes" / "box.ply"))
+    copy.mkdir()
+    scene = parse(NAMED.format(name=name))
+    before = [(node.props.id(), list(node.props)) for node in scene.state.nodes]
+    path = scenes.write(scene, copy)
+    assert [(node.props.id(), list(node.props)) for node in scene.state.nodes] == before
+    written = ElementTree.parse(path).getroot()
+    # The built-in scenes name shapes so, and all know them by their files.
+    mine = None if name == "box_shape" else name
+    shapes = [shape.get("id") for shape in written.findall("shape")]
+    given = ["panel", "wall.1", None, None, None, None, "stack", "first", None, mine]
+    assert shapes == given
+    assert [shape.get("id") for shape in written.findall("shape/shape")] == ["block"]
+    again = scenes.parse(path)
+    lights = [light.name for light in named_emitters(again)]
+    assert lights == ["constant light", "panel", "area light"]
+    assert again.instantiate(merge=False).shapes()
+
+
+def test_no_two_nodes_of_a_copy_have_one_name(parse, tmp_path):
+    scene = parse("".join(f'<shape type="sphere" id="{name}"/>' for name in "abc"))
+    for node in scene.state.nodes:
+        if node.props.id() == "b":
+            node.props.set_id("a")
+    (tmp_path / "copy").mkdir()
+    written = ElementTree.parse(scenes.write(scene, tmp_path / "copy"))
+    assert [node.get("id") for node in written.iter("shape")] == ["a", None, "c"]
 
 
 @pytest.mark.parametrize("name", ["meshes/box.ply", "textures/paint.exr", "light/paint.exr"])

@@ -27,7 +27,6 @@ from ..errors import UserError, collected, named, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
-from ..scene.parse import ParsedScene
 from ..training.grid_sizes import surface_seen
 from ..training.problem import known_materials
 from ..training.recovered import Recovered, load_run
@@ -51,6 +50,13 @@ _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 _BLIND = 1024
 #: Materials that are told one by one.
 _TOLD = 12
+#: BSDFs around others that glTF and OpenUSD have no place for, and what they give.
+_LAYERS = {
+    "mask": "cut-outs",
+    "bumpmap": "bump maps",
+    "normalmap": "normal maps",
+    "blendbsdf": "blends of materials",
+}
 #: What to do where textures are coarser than what was recovered: if --texels was given, else.
 _COARSE = "without --texels, textures are as dense as it takes", "a larger --texels keeps more"
 
@@ -212,7 +218,8 @@ def _export(
         "conventions": _CONVENTIONS,
         "notes": [
             *_notes(found, baked, lights, _COARSE[texels is None]),
-            *_without_place(found.scene, baked, formats, learned),
+            *_without_place(found, baked, formats, learned),
+            *_of_lamps(found, formats, learned),
             *written.notes,
         ],
     }
@@ -367,16 +374,32 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
 
 
 def _without_place(
-    scene: ParsedScene, baked: Sequence[Baked], formats: Sequence[Format], learned: Sequence[str]
+    found: Parts, baked: Sequence[Baked], formats: Sequence[Format], learned: Sequence[str]
 ) -> list[str]:
     """What materials have and glTF and OpenUSD have not."""
     if not {"gltf", "usd"} & set(formats):
         return []
     lost = {name: ["all materials"] for name in learned if name not in TEXTURED}
     for one in filter(lambda each: each.atlas.is_optimized, baked):
-        for name in material_constants(scene, one.atlas.materials).left_out:
+        for name in material_constants(found.scene, one.atlas.materials).left_out:
             lost.setdefault(name, []).append(one.atlas.name)
+    nodes = found.scene.state.nodes
+    for part in found.parts:
+        inside = [] if part.bsdf is None else found.scene.reachable(part.bsdf)
+        plugins = {nodes[i].props.plugin_name() for i in inside}
+        for plugin in filter(plugins.__contains__, _LAYERS):
+            lost.setdefault(_LAYERS[plugin], []).append(part.name)
     return [f"glTF and usd have no {name}: left out of {named(of)}" for name, of in lost.items()]
+
+
+def _of_lamps(found: Parts, formats: Sequence[Format], learned: Sequence[str]) -> list[str]:
+    """What was learned of materials of lamps, which Mitsuba's scene alone has."""
+    lamps = [part.name for part in found.parts if part.materials and part.emitter is not None]
+    others = [name for name in formats if name != "mitsuba"]
+    if not (lamps and others and learned):
+        return []
+    what = "what was learned of materials on lamps is in the scene for Mitsuba alone"
+    return [f"{what}: left out of {named(lamps)}"]
 
 
 def _report(manifest: dict[str, Any], tell: Callable[[str], None]) -> None:

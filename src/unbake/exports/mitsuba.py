@@ -6,14 +6,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
 
 from ..dataset.camera import Camera
 from ..imaging.pictures import write_exr
-from ..io import write_atomically
 from ..quantities import QUANTITIES
 from ..scene.emitters import ENVIRONMENTS, STRENGTHS
 from ..scene.parse import ParsedScene, is_reference, referenced, write
@@ -93,9 +91,8 @@ def write_scene(
         _replace_environment(folder, scene, environment)
     notes += _require_sensor(scene, camera)
     _forget_unused(scene)
-    path = write(scene, folder)
-    _name_shapes(path, [names.get(i, "") for i in _shapes_of_root(scene)])
-    return Written(path, notes)
+    _name_shapes(scene, names)
+    return Written(write(scene, folder), notes)
 
 
 # ----------------------------------------------------------------------------------------- textures
@@ -286,29 +283,19 @@ def _replace_shapes(
     return names
 
 
-def _shapes_of_root(scene: ParsedScene) -> list[int]:
-    """The shapes that the scene itself refers to, in the order in which they are written."""
-    nodes = scene.state.nodes
-    return [i for i in scene.references(0) if nodes[i].type == mi.ObjectType.Shape]
-
-
-def _name_shapes(path: Path, names: Sequence[str]) -> None:
-    """Give shapes their names again: `mi.parser.write_file` of Mitsuba 3.9 drops them.
+def _name_shapes(scene: ParsedScene, names: Mapping[int, str]) -> None:
+    """Give the shapes of the scene itself names of parts as ids, each once.
 
     Args:
-        path: the scene's file.
-        names: of the shapes, in their order.
+        names: by the nodes of the shapes.
     """
-    tree = ElementTree.parse(path)
-    taken = {node.get("id") for node in tree.iter() if node.get("id")}
-    shapes = tree.getroot().findall("shape")
-    told = names if len(names) == len(shapes) else [""] * len(shapes)
-    for shape, name in zip(shapes, map(_as_id, told), strict=True):
-        if name and name not in taken and not shape.get("id"):
-            taken.add(name)
-            shape.set("id", name)
-    ElementTree.indent(tree, "    ")
-    write_atomically(path, lambda p: tree.write(p, encoding="utf-8", xml_declaration=True))
+    nodes = scene.state.nodes
+    shapes = [i for i in scene.references(0) if i in names]
+    taken = {nodes[i].props.id() for i in scene.reachable(0) if i not in shapes}
+    for i in shapes:
+        name = _as_id(names[i])
+        nodes[i].props.set_id("" if name in taken else name)
+        taken.add(name)
 
 
 def _as_id(name: str) -> str:

@@ -158,7 +158,7 @@ def _names(scene: ParsedScene) -> dict[int, str]:
     names = {}
     for i, node in enumerate(scene.state.nodes):
         if node.type == mi.ObjectType.Shape:
-            # `mi.parser.write_file` of Mitsuba 3.9 drops ids that nothing refers to.
+            # Shapes need no id, and data sets of earlier versions have lost theirs.
             stem = Path(str(node.props.get("filename", ""))).stem
             names[i] = node.props.id() or stem or f"{node.props.plugin_name()}-{len(names)}"
     return names

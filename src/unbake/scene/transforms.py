@@ -1,8 +1,9 @@
-"""Scenes written as XML, with transforms as they are.
+"""Scenes written as XML, with transforms and names as they are.
 
 Mitsuba 3.9.1 writes a transform along the axes as a scale, a rotation and a translation, which it
 finds by an iteration that ends too soon: a scale of 300 becomes 300.65, one of 3,000 becomes 9,128,
-one of 0.001 becomes 0.0013. Some that mirror and turn a shape lose the mirror.
+one of 0.001 becomes 0.0013. Some that mirror and turn a shape lose the mirror. It drops ids that
+nothing refers to, by which people know shapes and the lamps on them; those are kept.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -21,19 +23,26 @@ if TYPE_CHECKING:
 _LEAST, _LARGEST = 0.05, 20.0
 #: How a translation along x alone is written, by which transforms are found again.
 _MARK = re.compile(r'<translate x="(\d+)"/>')
+#: A property that shapes have while they are written, by which they are found again.
+_NUMBER = "unbake number"
+#: Ids that nobody chose: of Mitsuba, and of its add-on for Blender.
+_UNNAMED = re.compile(r"_|elm__\d+$")
 
 
 def write_nodes(scene: ParsedScene, file: Path) -> None:
-    """Write a scene's nodes.
+    """Write a scene's nodes, shapes with their ids, each once.
+
+    Ids that nobody chose are left out unless references need them.
 
     Args:
         scene: is the same afterwards.
         file: to write.
 
     Raises:
-        RuntimeError: Mitsuba cannot write it, or writes transforms in an unknown way.
+        RuntimeError: Mitsuba cannot write it, or writes it in an unknown way.
     """
     kept: list[tuple[Any, str, Any]] = []
+    named: list[Any] = []
     marks: dict[int, str] = {}
     try:
         # Nodes that nothing refers to are not written.
@@ -47,11 +56,16 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
                 mark = 987_654_000 + len(kept)
                 marks[mark] = " ".join(repr(x) for x in matrix_of(value).ravel().tolist())
                 node.props[key] = mi.ScalarTransform4d().translate([mark, 0, 0])
+            if _is_named(node):
+                node.props[_NUMBER] = len(named)
+                named.append(node.props)
         mi.parser.write_file(scene.state, str(file))
     finally:
         for props, key, value in kept:
             props[key] = value
-    if not marks:
+        for props in named:
+            del props[_NUMBER]
+    if not marks and not named:
         return
     found: set[int] = set()
 
@@ -65,7 +79,46 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
     text = _MARK.sub(exact, file.read_text(encoding="utf-8"))
     if found != marks.keys():
         raise RuntimeError("Mitsuba writes transforms in an unknown way")
+    if named:
+        text = _with_ids(text, [props.id() for props in named])
     file.write_text(text, encoding="utf-8")
+
+
+def _is_named(node: Any) -> bool:
+    """Whether a node is a shape with an id by which people know it.
+
+    The built-in scenes call the shape of `lamp.ply` `lamp_shape`, and all know it as `lamp`.
+    """
+    if node.type != mi.ObjectType.Shape:
+        return False
+    name, file = node.props.id(), Path(str(node.props.get("filename", "")))
+    return bool(name) and not _UNNAMED.match(name) and name != f"{file.stem}_shape"
+
+
+def _with_ids(text: str, ids: list[str]) -> str:
+    """A scene's XML with the ids of its numbered shapes in place of their numbers.
+
+    Raises:
+        RuntimeError: it is no XML.
+    """
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise RuntimeError(f"Mitsuba writes what is no XML: {error}") from None
+    taken = {element.get("id") for element in root.iter()}
+    for element in root.iter("shape"):
+        number = element.find(f"integer[@name='{_NUMBER}']")
+        if number is None:
+            continue
+        element.remove(number)
+        if not len(element):
+            element.text = None
+        name = ids[int(number.get("value", ""))]
+        if name not in taken and not element.get("id"):
+            taken.add(name)
+            element.set("id", name)
+    ElementTree.indent(root, "    ")
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _is_misread(value: object) -> bool:
