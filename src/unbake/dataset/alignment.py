@@ -125,10 +125,11 @@ class _Other:
 
 
 def _share(hits: Sequence[np.ndarray], shown: Sequence[np.ndarray] | None = None) -> float:
-    """The mean share of pixels of a view, or of those that are shown, that see a surface."""
+    """The mean share of pixels, or of those that are shown, that see a surface; 0 of none."""
     if shown is None:
         return float(np.mean([hit.mean() for hit in hits]))
-    return float(np.mean([hit[s].mean() for hit, s in zip(hits, shown, strict=True) if s.any()]))
+    found = [hit[s].mean() for hit, s in zip(hits, shown, strict=True) if s.any()]
+    return float(np.mean(found)) if found else 0.0
 
 
 def _likely(scene: mi.Scene, views: Sequence[SmallView]) -> list[Mistake]:
