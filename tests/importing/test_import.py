@@ -511,7 +511,7 @@ def test_places_beyond_a_photograph_are_masked(captured, meshes, tmp_path):
     )
     told = []
     import_data(source, tmp_path / "data", meshes, tell=told.append)
-    assert any("beyond its edge are masked (images/a.png)" in line for line in told)
+    assert any("what lies beyond it is masked (images/a.png)" in line for line in told)
     (view,) = Dataset.load(tmp_path / "data").views
     counted, keys = read_masked(view)[1], json.loads((source / "transforms.json").read_text())
     y, x = np.divmod(np.arange(96 * 64), 96)

@@ -168,9 +168,11 @@ def _read_tiff(path: Path) -> np.ndarray:
         raise _Unreadable("16 bits of TIFF need tifffile: pip install 'unbake[import]'") from None
     with TiffFile(path) as file:
         page = file.pages[0]
-        kind, more = int(page.photometric), tuple(map(int, page.extrasamples))
+        told = 262 in page.tags  # how its colours are meant
+        kind = int(page.photometric) if told else _TIFF_COLOURS[0]
+        more = tuple(map(int, page.extrasamples))
         if kind not in (_WHITE_IS_ZERO, *_TIFF_COLOURS):
-            raise _OtherColours(page.photometric.name)
+            raise _OtherColours(getattr(page.photometric, "name", f"of the unknown kind {kind}"))
         codes = np.asarray(page.asarray())
         if page.planarconfig != 1 and page.samplesperpixel > 1:
             codes = np.moveaxis(codes, 0, 2)

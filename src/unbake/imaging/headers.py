@@ -83,7 +83,11 @@ def _another(wanted: str, head: bytes) -> str:
     if not head:
         return "it is empty"
     found = next((name for magic, name in _MAGIC.items() if head.startswith(magic)), None)
-    return f"it is not {wanted}" + ("" if found is None else f" but {found}: rename it")
+    if found is None:
+        return f"it is not {wanted}"
+    if wanted.startswith(found):
+        return "it is cut off or damaged"
+    return f"it is not {wanted} but {found}: rename it"
 
 
 def _read_exr(file: BinaryIO, size: int) -> ImageHeader:

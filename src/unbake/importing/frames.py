@@ -311,10 +311,14 @@ def _contradicts(top: Mapping[str, Any], frame: Mapping[str, Any], lens: Lens) -
         ("fl_y", "camera_angle_y", lens.height),
     ):
         own = frame if length in frame or angle in frame else top
-        told = own.get(angle)
-        if length in own and isinstance(told, int | float) and 0 < told < math.pi:
+        if own is top and ("fl_x" in frame or "camera_angle_x" in frame):
+            continue
+        given, told = own.get(length), own.get(angle)
+        if not (isinstance(given, int | float) and isinstance(told, int | float)):
+            continue
+        if given > 0 and 0 < told < math.pi:
             focal = 0.5 * size / math.tan(0.5 * told)
-            if abs(focal / own[length] - 1) > _CONTRADICTS:
+            if abs(focal / given - 1) > _CONTRADICTS:
                 return True
     return False
 

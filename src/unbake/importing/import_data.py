@@ -137,7 +137,7 @@ def import_data(
             name, split = names[shot.name], splits[shot.name]
             frame, counts = _write_view(data, shot, name, split, known, on_mesh, same=same)
             frames.append(frame)
-            blank += [] if counts else [shot.name]
+            blank += [] if counts or shot.mask is None else [shot.name]
         if all(shot.name in blank for shot in found.shots if splits[shot.name] == "train"):
             what = "masks leave no pixel of any photograph to train on"
             raise UserError(what, None, "Masks are black where pixels do not count: correct them")
@@ -291,7 +291,7 @@ class _Pictures:
     Args:
         with_alpha: have an alpha channel.
         transparent: have pixels whose alpha is less than 1.
-        empty: have pixels whose alpha is 0.
+        empty: have pixels whose alpha is 0, and no mask.
         grey: have one channel of colour.
         negative: have negative radiance.
         profiles: the names of colour profiles that are not those of sRGB.
@@ -321,7 +321,7 @@ class _Pictures:
         """Take a photograph into account: (H, W, 4)."""
         if (pixels[..., 3] < 1).any():
             self.transparent.add(shot.name)
-        if (pixels[..., 3] <= 0).any():
+        if shot.mask is None and (pixels[..., 3] <= 0).any():
             self.empty.add(shot.name)
         profile = _profile(shot)
         if profile is not None:
@@ -483,7 +483,8 @@ def _straightening(shots: Sequence[Shot]) -> list[str]:
         what = f"lenses that see more than {WIDEST} degrees: what lies beyond is cut off"
         notes.append(f"{what} ({named(narrowed)})")
     if beyond:
-        what = "principal points outside of the photograph: pixels beyond its edge are masked"
+        where = "principal points outside of the photograph or near its edge"
+        what = f"{where}: what lies beyond it is masked"
         notes.append(f"{what} ({named(beyond)})")
     return notes
 

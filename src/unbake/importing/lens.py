@@ -190,7 +190,7 @@ class Lens:
         shares = np.linspace(0, 1, _EDGE)[:, None, None]
         seen = self.pixels((shares * edge / found).reshape(-1, 2)).reshape(_EDGE, -1, 2)
         if not (np.diff(np.linalg.norm(seen - middle, axis=2), axis=0) >= 0).all():
-            told = "its lens cannot be straightened from a principal point outside the photograph"
+            told = "its lens cannot be straightened: it turns back within the photograph"
             raise UserError(told, None, "Undistort it with the program that posed it")
         return found, False, True
 

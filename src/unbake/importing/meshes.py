@@ -38,8 +38,9 @@ _PACKED = {
 TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 #: Steps between positions in single precision, as a share of all geometry, that do not show.
 _COARSEST = 1e-5
-#: The same of the positions of one part, as a share of the largest part: parts may lie far apart.
-_OF_PART = 1e-4
+#: The same of the positions of one part, as a share of the largest part; and how many times as wide
+#: as that the mesh is where a part is lost, and not one of many small ones.
+_OF_PART, _LOST = 1e-4, 1e4
 #: Of the constant environment.
 _ENVIRONMENT = "environment"
 _VERSION = "3.0.0"
@@ -119,9 +120,9 @@ def _check_place(parts: Sequence[Part], faults: Faults) -> None:
         return
     largest = float(np.ptp(corners, axis=1).max())
     far = [p.name for p, step in zip(parts, steps, strict=True) if step > _OF_PART * largest]
-    if far:
-        what = f"the largest part of the mesh is {largest:.3g} units wide, and others lie {place}"
-        faults.add(what, named(far), remedy)
+    if far and extent > _LOST * largest:
+        what = f"the largest part of the mesh is {largest:.3g} units wide, and some lie {place}"
+        faults.add(what, named(far), "Remove these parts, or move them to the others")
 
 
 def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Path:

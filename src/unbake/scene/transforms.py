@@ -26,7 +26,7 @@ _MARK = re.compile(r'<translate x="(\d+)"/>')
 #: A property that shapes have while they are written, by which they are found again.
 _NUMBER = "unbake number"
 #: Ids that nobody chose: of Mitsuba, and of its add-on for Blender.
-_UNNAMED = re.compile(r"_|elm__\d+$")
+_UNNAMED = re.compile(r"_+(unnamed_|arg_)?\d+$|elm__\d+$")
 
 
 def write_nodes(scene: ParsedScene, file: Path) -> None:

@@ -37,8 +37,8 @@ def matching_scale(
     """The factor on a field with which both sides of the rendering equation have the same mean.
 
     Of c L = D + c K L, with the direct light D and one bounce K of the field: 1 where the field
-    solves the equation. Where that cannot be told, the field gets the mean of D; 1 where it has no
-    light at all.
+    solves the equation, and where it has no light at all. Where L − K L is not told, it is taken
+    for the least share of L that could be.
 
     Raises:
         UserError: no light reaches any surface, or it is not finite.
@@ -52,7 +52,8 @@ def matching_scale(
         direct, lost, near = _means(scene_view, radiance, points, seed)
     finally:
         radiance.scale = given
-    return direct / own * (direct / lost if _LEAST_LOST * near < lost < math.inf else 1.0)
+    least = _LEAST_LOST * near
+    return direct / own * (direct / (lost if least < lost < math.inf else least))
 
 
 @carrying()
