@@ -1,5 +1,6 @@
 """Batches: rays go through the right pixels, which come with their own targets, evenly drawn."""
 
+import gc
 import tracemalloc
 from dataclasses import replace
 
@@ -387,6 +388,9 @@ MANY, LITTLE = 1024, 50_000
 
 def with_peak(work):
     """What some work comes to, and the memory in bytes that it takes at most."""
+    # Python 3.11 crashes where a thread of Dr.Jit, which lets go of arrays, begins meanwhile.
+    gc.collect()
+    dr.sync_thread()
     tracemalloc.start()
     try:
         return work(), tracemalloc.get_traced_memory()[1]
