@@ -229,12 +229,19 @@ def test_names_in_two_folders_are_kept_apart(captured, meshes, tmp_path):
     assert names == {("train_r_0", "train"), ("test_r_0", "heldout")}
 
 
-def test_lists_tell_images_of_one_name_apart(captured, meshes, tmp_path):
-    source, frames = tmp_path / "source", []
-    for name, view in zip(("a/001", "b/001", "b/002"), captured.views, strict=True):
+def saved_frames(captured, source, names):
+    """Save the photographs of a data set by these names; returns their frames, with their poses."""
+    frames = []
+    for name, view in zip(names, captured.views, strict=True):
         save(codes(view), source / "images" / f"{name}.png")
         pose = view.camera.to_world.tolist()
         frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose})
+    return frames
+
+
+def test_lists_tell_images_of_one_name_apart(captured, meshes, tmp_path):
+    source = tmp_path / "source"
+    frames = saved_frames(captured, source, ("a/001", "b/001", "b/002"))
     # As the frames name them, and from another folder
     lists = {
         "train_filenames": ["./images/a/001.png", "b/002.png"],
@@ -439,11 +446,8 @@ def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
 
 
 def test_a_table_of_exposures_names_folders(captured, meshes, tmp_path):
-    source, frames = tmp_path / "source", []
-    for name, view in zip(("cam1/0001", "cam2/0001", "cam2/0002"), captured.views, strict=True):
-        save(codes(view), source / "images" / f"{name}.png")
-        pose = view.camera.to_world.tolist()
-        frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose})
+    source = tmp_path / "source"
+    frames = saved_frames(captured, source, ("cam1/0001", "cam2/0001", "cam2/0002"))
     top = intrinsics(captured.views[0].camera)
     write_json(source / "transforms.json", top | {"frames": frames})
     table = tmp_path / "exposures.csv"

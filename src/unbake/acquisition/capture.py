@@ -218,16 +218,10 @@ def _choose_views(
     Returns:
         Cameras; the share of the surface that training views see; whether they stand in a room.
     """
-    posed = posed_cameras(name, scene, settings, camera_file)
-    if camera_file is not None:
-        size = settings.resolution
-        own = read_cameras(camera_file, size, size, keep_size=True)
-        if oblong := sum(camera.width != camera.height for _, camera in own):
-            file = printable(camera_file)
-            tell(
-                f"photographs are square, and {oblong} cameras of {file} are not: their horizontal "
-                "fields of view stay"
-            )
+    if camera_file is None:
+        posed = posed_cameras(name, scene, settings)
+    else:
+        posed = _read_square(camera_file, settings.resolution, tell)
     if not any(split == "train" for split, _ in posed):
         remedy = "Ask for at least one with --views"
         raise UserError("no training view", where=camera_file, remedy=remedy)
@@ -301,23 +295,31 @@ def _copy_scene(
     return write(parsed, folder), scene
 
 
+def _read_square(file: Path, size: int, tell: Callable[[str], None]) -> list[tuple[str, Camera]]:
+    """The cameras of a camera file and their splits, with pictures of `size` x `size` pixels."""
+    own = read_cameras(file, size, size, keep_size=True)
+    if oblong := sum(camera.width != camera.height for _, camera in own):
+        tell(
+            f"photographs are square, and {oblong} cameras of {printable(file)} are not: their "
+            "horizontal fields of view stay"
+        )
+    return [(split, camera.rescaled(size, size)) for split, camera in own]
+
+
 def posed_cameras(
-    name: str, scene: mi.Scene, settings: CaptureSettings, file: Path | None
+    name: str, scene: mi.Scene, settings: CaptureSettings
 ) -> list[tuple[str, Camera]]:
-    """The cameras of a scene and their splits.
+    """A built-in scene's own cameras, or such as are placed automatically, and their splits.
 
     Args:
         name: of the scene, a file or a built-in one.
         scene: the same. Shapes tell its ground from what stands on it: merged meshes may hide it.
         settings: how many, and the size of their images.
-        file: a camera file; None: the built-in scene's own cameras, or automatic placement.
 
     Raises:
-        UserError: the file cannot be used, or there is no place for cameras.
+        UserError: there is no place for cameras.
     """
     size = settings.resolution
-    if file is not None:
-        return read_cameras(file, size, size)
     if name in SCENES:
         return [
             (c["split"], Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], size, size))

@@ -162,6 +162,18 @@ UNKNOWNS = (*QUANTITIES, "environment", "emission")
 
 #: Level below which photographs are dim: the darkest of the published scenes has more.
 DIM = 0.08
+
+
+def dimmed(epsilon: float, level: float) -> float:
+    """What is added to squared radiance, which falls with the square of a level below `DIM`.
+
+    Args:
+        epsilon: where the level is larger.
+        level: mean radiance, linear RGB.
+    """
+    return epsilon * (level / DIM) ** 2 if 0 < level < DIM else epsilon
+
+
 #: How many times as much as untrained ones the surfaces of rooms are planned to reflect.
 GAIN_OF_ROOMS = 1.6
 
@@ -472,9 +484,7 @@ class FitConfig:
         Args:
             level: of the photographs, radiance; see `Photographs`.
         """
-        if self.preset != "cpu" or not 0 < level < DIM:
-            return self.loss_epsilon
-        return self.loss_epsilon * (level / DIM) ** 2
+        return dimmed(self.loss_epsilon, level) if self.preset == "cpu" else self.loss_epsilon
 
     @property
     def chosen_estimator(self) -> ChosenEstimator:

@@ -24,6 +24,7 @@ from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Totals, fill
 from .hot_pixels import HotPixels
 from .noise_at_black import found_noise
 from .shares import Share
+from .spread import places
 from .views import PIXEL_BYTES, Dataset, SensorNoise
 
 #: Photographs of a process that take more than this, in bytes, are not held in memory but in a file
@@ -267,9 +268,8 @@ def _made(
 
 def _with_level(photographs: Photographs) -> Photographs:
     """The same with their level; all processes that hold some call this together."""
-    count, level = photographs.count, photographs.mean
-    places = np.linspace(0, count - 1, min(count, _LEVEL_PIXELS)).astype(np.int64)
-    values = photographs.radiance(photographs.numbers(places)).mean(axis=1, dtype=np.float64)
+    level, chosen = photographs.mean, places(photographs.count, _LEVEL_PIXELS)
+    values = photographs.radiance(photographs.numbers(chosen)).mean(axis=1, dtype=np.float64)
     lit = values[values > 0]
     if len(lit) and lit.max() > (most := LAMP * np.median(lit)):
         level = float(np.minimum(values, most).mean())

@@ -23,6 +23,8 @@ _FORMATS = ("PNG", "JPEG", "TIFF")
 _JPEG = ("JPEG", "MPO")
 #: The tag of EXIF and of TIFF.
 _ORIENTATION = 0x0112
+#: The tag of TIFF that says how colours are meant.
+_PHOTOMETRIC = 262
 #: Pixels across and down that have one colour: 4:2:2 and 4:2:0, by Pillow's number.
 _BLOCKS = {1: (2, 1), 2: (2, 2)}
 #: What TIFF calls grey whose 0 is white; grey whose 0 is black, and RGB; alpha that colours have
@@ -168,8 +170,7 @@ def _read_tiff(path: Path) -> np.ndarray:
         raise _Unreadable("16 bits of TIFF need tifffile: pip install 'unbake[import]'") from None
     with TiffFile(path) as file:
         page = file.pages[0]
-        told = 262 in page.tags  # how its colours are meant
-        kind = int(page.photometric) if told else _TIFF_COLOURS[0]
+        kind = int(page.photometric) if _PHOTOMETRIC in page.tags else _TIFF_COLOURS[0]
         more = tuple(map(int, page.extrasamples))
         if kind not in (_WHITE_IS_ZERO, *_TIFF_COLOURS):
             raise _OtherColours(getattr(page.photometric, "name", f"of the unknown kind {kind}"))

@@ -561,7 +561,7 @@ def _shares_seen(scene: mi.Scene, source: Source, parts: Sequence[Part]) -> np.n
 
 def _corners(parts: Sequence[Part]) -> np.ndarray:
     """The least and the largest coordinates of each part, (2 n, 3)."""
-    return np.concatenate([(part.positions.min(0), part.positions.max(0)) for part in parts])
+    return np.concatenate([part.corners for part in parts])
 
 
 def _origins(shots: Sequence[Shot]) -> np.ndarray:

@@ -65,6 +65,11 @@ class Part:
     normals: np.ndarray | None
     uv: np.ndarray | None
 
+    @property
+    def corners(self) -> np.ndarray:
+        """The least and the largest coordinates, (2, 3)."""
+        return np.stack([self.positions.min(0), self.positions.max(0)])
+
     def moved(self, matrix: np.ndarray) -> Part:
         """The part after a similarity (4, 4), float64."""
         linear = matrix[:3, :3]
@@ -105,7 +110,7 @@ def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
 
 def _check_place(parts: Sequence[Part], faults: Faults) -> None:
     """Meshes far from the origin lose their shape, as Mitsuba has them in single precision."""
-    corners = np.array([(part.positions.min(0), part.positions.max(0)) for part in parts])
+    corners = np.stack([part.corners for part in parts])
     extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     farthest = np.abs(corners).max(axis=(1, 2))
     steps = np.spacing(farthest.astype(np.float32)).astype(np.float64)

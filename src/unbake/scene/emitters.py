@@ -171,7 +171,7 @@ def _names(scene: ParsedScene, emitters: list[int]) -> list[str]:
     for shape in (n for n in nodes if n.type == mi.ObjectType.Shape):
         for key in list(shape.props):
             if is_reference(shape.props[key]):
-                # `mi.parser.write_file` of Mitsuba 3.9 drops ids that nothing refers to.
+                # Shapes need no id, and data sets of earlier versions have lost theirs.
                 file = str(shape.props.get("filename", ""))
                 shapes[shape.props[key].index()] = shape.props.id() or Path(file).stem
     names = [

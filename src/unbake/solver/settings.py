@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from ..config.fit import DEEPEST, DIM
+from ..config.fit import DEEPEST, dimmed
 from ..config.flag import Flag
 from ..errors import UserError, require_ranges
 from ..fields.settings import LEAK, GridConfig, NetworkConfig, require_no_pieces
@@ -28,16 +28,14 @@ _BRIGHT = 1.0
 def epsilon_at(epsilon: float, level: float) -> float:
     """What is added to squared radiance, where a scene is dim or bright.
 
-    It follows the square of the level below `DIM` and above 1, so that nothing depends on the unit
-    of light there.
+    It follows the square of the level in dim scenes (`dimmed`) and above 1, so that nothing depends
+    on the unit of light there.
 
     Args:
         epsilon: for scenes between these.
         level: mean radiance, linear RGB.
     """
-    if level <= 0:
-        return epsilon
-    return epsilon * (min(level / DIM, 1.0) * max(level / _BRIGHT, 1.0)) ** 2
+    return dimmed(epsilon, level) * max(level / _BRIGHT, 1.0) ** 2
 
 
 @dataclass(frozen=True)

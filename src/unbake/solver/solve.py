@@ -209,7 +209,7 @@ def _posed(
     size = settings.resolution
     if cameras is None:
         wanted = CaptureSettings(settings.views, 0, size, seed=settings.seed)
-        posed = named_by_split(posed_cameras(name, scene, wanted, None))
+        posed = named_by_split(posed_cameras(name, scene, wanted))
         return _named(posed), is_room(scene)
     posed = read_named_cameras(Path(cameras), size, size)
     return _named(posed), is_room(scene, [camera for *_, camera in posed])

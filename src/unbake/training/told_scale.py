@@ -12,6 +12,7 @@ import numpy as np
 
 from ..config import FitConfig
 from ..dataset.pixels import CameraRays, PixelSource
+from ..dataset.spread import places
 from ..dataset.views import Dataset, fitted_pixels
 from ..fields.arrays import from_numpy
 from ..scene import free_space
@@ -48,8 +49,8 @@ def shows_environment(problem: Problem, config: FitConfig, pixels: PixelSource) 
     if not is_shared(problem):
         return None
     found = pixels.photographs
-    places = np.linspace(0, found.count - 1, min(found.count, _PIXELS)).astype(np.int64)
-    own = places[(places >= found.places.start) & (places < found.places.stop)]
+    chosen = places(found.count, _PIXELS)
+    own = chosen[(chosen >= found.places.start) & (chosen < found.places.stop)]
     shown = found.joined(lambda: _shown(problem, pixels.rays, found.own_numbers(own)))
     return bool(shown.mean() >= _LEAST)
 
@@ -80,10 +81,10 @@ def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:
         count = size if numbers is None else len(numbers)
         if not count:
             continue
-        places = np.linspace(0, count - 1, min(count, each)).astype(np.int64)
-        row, column = np.divmod(places if numbers is None else numbers[places], camera.width)
+        chosen = places(count, each)
+        row, column = np.divmod(chosen if numbers is None else numbers[chosen], camera.width)
         hits = free_space.trace(scene, *camera.rays(column + 0.5, row + 0.5))
-        looked += len(places)
+        looked += len(chosen)
         shown += int(np.isinf(hits.distance).sum())
         if shown >= _SURELY * _LEAST * len(views) * each:  # whatever the others show
             return False
