@@ -390,6 +390,29 @@ def test_gains_and_responses_are_the_same_in_steps_and_in_evaluations():
         assert np.isfinite(gradient).all() and (gradient != 0).any() == ("response" not in key), key
 
 
+def test_what_all_images_move_in_common_is_slow():
+    model = CameraModel(3, exposure=True, white_balance="per-image")
+    before = model.parameters()
+    # All but the anchor's move by 0.4 in the mean, away from it; red by 0.6, blue by none.
+    after = {
+        "exposure.log": mi.Float(-0.2, 0.3, 0.1),
+        "white_balance.log": mi.Float(0.1, 0.5, 0.8, 0.6, 0.6, 0.4),
+    }
+    model.assign(model.slowed(before, after))
+    logs = np.log(model.gains())
+    np.testing.assert_allclose(logs[:, 1], [0, 0.14, -0.06], atol=1e-6)
+    balance = logs[:, [0, 2]] - logs[:, [1]]
+    np.testing.assert_allclose(balance, [[0, 0], [0.16, 0.1], [-0.04, -0.1]], atol=1e-6)
+
+
+@pytest.mark.parametrize("balance", ["known", "common"])
+def test_an_only_image_and_what_images_share_move_as_steps_take_them(balance):
+    model = CameraModel(1, exposure=True, white_balance=balance)
+    steps = {key: x + 1 for key, x in model.parameters().items()}
+    assert not CameraModel(1, exposure=True).slowed(model.parameters(), steps)
+    assert "white_balance.log" not in model.slowed(model.parameters(), steps)
+
+
 @pytest.mark.parametrize("pairs", [True, False], ids=["all pairs", "split halves"])
 def test_a_gain_that_is_right_is_as_good_as_a_divided_photograph(pairs):
     """Also in the denominator, with its ε; and gradients of the gain are those of a square."""

@@ -52,6 +52,8 @@ _ORDERS = (1.0, 1 / 4, 1 / 16)
 _DARKEST = 0.05
 #: Pieces of f, of equal length where photographs are as an 8-bit file has them.
 PIECES, GAMMA = 16, 2.2
+#: Of a step that all images take together, away from the anchor, the part that is kept.
+_COMMON = 0.1
 #: `softplus` of it is 1.
 _UNIT = math.log(math.e - 1)
 
@@ -172,6 +174,38 @@ class CameraModel:
             falloff = dr.fma(radius2, dr.fma(radius2, dr.fma(radius2, c, b), a), 1)
             gain *= dr.maximum(falloff, _DARKEST)
         return gain
+
+    def slowed(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, mi.Float]:
+        """Parameters whose steps are slower where all images take them together.
+
+        Steps learn what the others have in common from one photograph alone, the anchor. Meanwhile
+        what the scene lacks there, and albedo that is not there yet, move all of them. Photographs
+        of the same points, with which exposures begin, tell more of it.
+
+        Args:
+            before, after: the parameters before and after a step; others are ignored.
+
+        Returns:
+            Those that change.
+        """
+        strides = {"exposure.log": 1}
+        if self.white_balance == "per-image":
+            strides["white_balance.log"] = 2
+        found, others = {}, self.views - 1
+        for key, stride in strides.items():
+            if key not in self._arrays or not others:
+                continue
+            old, new = dr.detach(before[key]), dr.detach(after[key])
+            moved, place = new - old, dr.arange(mi.UInt32, self.views * stride)
+            kept = mi.Float(new)
+            for offset in range(stride):
+                own = place % stride == offset
+                of_anchor = dr.gather(mi.Float, moved, mi.UInt32(offset))
+                together = dr.sum(dr.select(own, moved - of_anchor, 0)) / others
+                others_own = own & (place >= stride)
+                kept -= dr.select(others_own, (1 - _COMMON) * together, 0)
+            found[key] = kept
+        return found
 
     def exposed(self, photograph: mi.Color3f) -> mi.Color3f:
         """Photographs through f, linear RGB; the same where the response is known.

@@ -378,9 +378,14 @@ class TrainingStep:
             factor, finite = dr.rcp(state.scale), known & fits
             # A loss that is no number says nothing of gradients that overflow.
             state.scale = dr.select(known, next_scale(state.scale, fits), state.scale)
+        camera = self._problem.camera
+        of_camera = [] if camera is None else camera.parameters()
+        before = {key: mi.Float(dr.detach(state.phi[key])) for key in of_camera}
         for _, optimizer in state.optimizers():
             drop_broken_gradients(optimizer)
             optimizer.step(active=finite, grad_scale=factor, eval=False)
+        if camera is not None:
+            state.replace(camera.slowed(before, dict(state.phi.items())))
         terms["skipped"] = dr.select(finite, mi.Float(0), mi.Float(1))
         dr.eval(state, terms)
         return terms
