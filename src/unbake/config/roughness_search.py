@@ -36,7 +36,7 @@ class RoughnessSearchConfig:
     pixels_as_one: float = 3.0
     #: So many pixels of a piece tell as much as all further ones would, too: errors of L_θ do not
     #: average out; 0: there is no such number
-    pixels_at_most: int = 2000
+    pixels_at_most: int = 8000
     #: How near colours are whose pieces have like levels, as square roots of linear RGB
     like_colours: float = 0.1
     #: How probable it is, before photographs are seen, that a piece has one roughness

@@ -8,8 +8,10 @@ often of one. So the distribution is found together with them, about as the one 
 photographs show is most probable (nonparametric maximum likelihood, Laird 1978; by expectation
 maximization with smoothing, Silverman et al. 1990). For each piece it is that of the others: a
 piece by itself would confirm its own noise. It would do so through the others, too: for pieces that
-are odd it is found once more, without them. A piece that no pixel shows by itself has no curve: it
-goes to what is to be expected of its colour.
+are odd it is found once more, without them. A piece may also be of a material that no other one is
+of, with any level: the fewer others there are, the more probable that is, as in a Dirichlet process
+(Ferguson 1973). A piece that no pixel shows by itself has no curve: it goes to what is to be
+expected of its colour.
 
 Each piece moves as a whole: how its roughness varies with brightness and place stays as it is.
 """
@@ -34,10 +36,10 @@ from .seen_pieces import SeenPieces, chances, normalized, values_of
 SHIFTS = np.linspace(-5, 5, 61)
 #: The levels that a distribution knows, as values of the field: where curves are known.
 LEVELS = np.linspace(of_roughness(NODES[0]), of_roughness(NODES[-1]), 48)
-#: The part of a distribution that is even.
-_EVEN = 0.005
 #: So many pieces of a like colour count as much as what all pieces have in common.
 _AS_MANY = 1.0
+#: And this many as much as that a piece is of a material of its own, of any level.
+_NEW = 0.25
 #: Steps of expectation maximization.
 _STEPS = 40
 #: A piece is odd if what it shows is less probable than this, by what the others show, as a part of
@@ -161,7 +163,7 @@ def _prior(
         np.add.at(of_kinds, kind[telling], own[telling].astype(np.float32))
         of_others = own[telling].sum(0) - own[wanted]
         found = (near @ of_kinds)[kind[wanted]] - own[wanted] + _AS_MANY * normalized(of_others)
-        prior[wanted] = (1 - _EVEN) * normalized(found) + _EVEN / len(LEVELS)
+        prior[wanted] = normalized(np.maximum(found, 0) + _NEW / len(LEVELS))
     return prior
 
 
