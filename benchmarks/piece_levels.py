@@ -8,9 +8,9 @@ roughness of these pixels against the true one, PSNR in dB:
 
 - as it was fitted;
 - where the search's descent ends;
-- with each piece of surface moved to what is to be expected of it: as one crowd, in which none has
-  a material of its own; by what all pieces show, its odd ones too; and with the default, odd pieces
-  by what the others show without them;
+- with each piece of surface moved to what is to be expected of it: as one crowd, in which next to
+  none has a material of its own; by what all pieces show, its odd ones too; and with the default,
+  odd pieces by what the others show without them;
 - with each piece varying as much as is to be expected of it, and then moved so: the default;
 - with each piece moved to its true mean, which no fit knows: the most that moving pieces can give;
 - with one roughness, the true mean, on each piece: what is left is how much it truly varies there.
@@ -31,8 +31,8 @@ from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs
 
 from unbake.config import RoughnessSearchConfig
 
-#: What counts as a piece of a material of its own, where next to none is.
-NEVER = 1e-4
+#: How much a material of its own counts, in pieces, where next to none has one.
+SELDOM = 0.02
 #: A piece counts as moved if its mean roughness did by more.
 MOVED = 0.01
 
@@ -62,7 +62,7 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     curves = Curves.of(rows, search.cells, search.colours, albedo=True)
     values = shared.values_with(probable)
     leveled = piece_levels.with_expected_levels
-    with patch.object(piece_levels, "_NEW", NEVER):
+    with patch.object(piece_levels, "_NEW", SELDOM):
         crowd = leveled(shared.field, curves, probable, search)
     with patch.object(piece_levels, "_MOST_ODD", 0):
         echoing = leveled(shared.field, curves, probable, search)

@@ -99,7 +99,7 @@ def test_a_lamp_that_no_photograph_depends_on_is_told(tmp_path, tiny, unbake):
     outcome = unbake("fit", tmp_path / "data", "--out", tmp_path / "run", *words)
     said = " ".join(outcome.out.split())
     assert outcome.status == 0, outcome
-    assert "no photograph depends on the strength of point light 1, along" in said
+    assert "no photograph depends on the strength of inside, along" in said
 
 
 @pytest.mark.parametrize("size", [1.0, 0.01, 100.0])
