@@ -13,6 +13,7 @@ Photographs alone leave some of it open, which conventions decide:
 
 - All exposures times a number is all radiance divided by it. The exposure of the first training
   view is as the data set tells, and so is its white balance where each image has one of its own.
+  Steps move slowly what the others have in common, which this view alone tells them.
 - A white balance that all images share is told from the colour of albedo by interreflection, and
   by lights that are seen, alone, and only where lights are known: else it is their colour.
 - v is 1 at the centre, and f(0) = 0. f(P) = P at the middle of the code values of an 8-bit file,
