@@ -1,0 +1,108 @@
+"""What photographs tell of roughness, by what is known of where it is one.
+
+    python benchmarks/roughness_regions.py --runs RUN [RUN ...] [--pixels 131072] [--spp 64]
+        --out FILE.json
+
+At the end of each run pixels are sampled as for one more search, with albedo eliminated. Pixels of
+a region are taken to share what is wrong of their roughness: each region moves by what is to be
+expected of it, from a normal distribution about no change. Regions are
+
+- pieces of surface;
+- those parts of them that are of one colour of the albedo, which a fit knows;
+- those that are of one true roughness, to 0.02, which no fit knows;
+- those parts of these that lie in one cell of the scene's cube, 1/8 of its edge wide.
+
+Told are PSNRs in dB of roughness at the sampled pixels, as it is expected, and with the true mean
+in each region: the first is bounded by noise and by the radiance field, the second by the regions.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import here
+
+import numpy as np
+from roughness_curves import opened
+from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs
+
+from unbake.config import RoughnessSearchConfig
+
+#: Expected standard deviation of what is wrong of a region, of outputs before their bounds.
+SPREAD = 0.3
+#: By how much regions are moved on trial, in the same units.
+SHIFTS = np.linspace(-2, 2, 81)
+#: Width of the bins of true roughness, colours along each channel, cells along the scene's cube.
+BIN, COLOURS, CELLS = 0.02, 6, 8
+
+
+def main() -> None:
+    """Sample every run, and tell the PSNR of each kind of regions."""
+    told_of_runs(__doc__.splitlines()[0], regions_of, 1 << 17, 64)
+
+
+def regions_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
+    """The PSNRs of a run by kind of regions in dB, and what the run is.
+
+    Args:
+        pixels: how many are sampled; those that searches cannot use are left out.
+        spp: camera samples of each.
+    """
+    from unbake.quantities import QUANTITIES
+    from unbake.training.roughness_curves import Curves, precision
+    from unbake.training.seen_pieces import outputs_of, values_of
+
+    run, steps = opened(folder)
+    (rows,), true = sampled(run, pixels, (spp,))
+    truth = true[:, 0].astype(float)
+    values = Shared(run, rows, truth).values
+    rows["weight"] *= precision(rows, values)
+    search, quantity = RoughnessSearchConfig(), QUANTITIES["roughness"]
+    curves = Curves.of(rows, search.cells, search.colours, albedo=True)
+    span = quantity.upper - quantity.lower
+    outputs = outputs_of((values.astype(float) - quantity.lower) / span)
+    told = []
+    for name, region in kinds(rows, truth).items():
+        moved = quantity.lower + span * values_of(expected(curves, outputs, region, search))
+        found = {"regions": int(region.max()) + 1, "expected": psnr(moved, truth)}
+        told.append({"kind": name} | found | {"true means": psnr(means_of(truth, region), truth)})
+    name, fitted = run.dataset.folder.name, psnr(values, truth)
+    lines = (f"{row['kind']} {row['expected']:.2f} of {row['true means']:.2f} dB" for row in told)
+    print(", ".join([name, f"as fitted {fitted:.2f} dB", *lines]), flush=True)
+    about = {"data": name, "steps": steps, "pixels": len(rows)}
+    return about | {"as fitted": fitted, "kinds": told}
+
+
+def kinds(rows: np.ndarray, truth: np.ndarray) -> dict[str, np.ndarray]:
+    """The region of each pixel, from 0, by kind of regions."""
+    colour = np.floor(np.sqrt(np.clip(rows["albedo"], 0, 1)) * COLOURS)
+    piece, level = rows["piece"][:, None], np.floor(truth / BIN)[:, None]
+    cell = np.floor(rows["position"] * CELLS)
+    columns = {
+        "pieces": (piece,),
+        "colours": (piece, np.minimum(colour, COLOURS - 1)),
+        "one roughness": (piece, level),
+        "one roughness in cells": (piece, level, cell),
+    }
+    return {
+        name: np.unique(np.concatenate(parts, 1), axis=0, return_inverse=True)[1].ravel()
+        for name, parts in columns.items()
+    }
+
+
+def expected(
+    curves: Any, outputs: np.ndarray, region: np.ndarray, settings: RoughnessSearchConfig
+) -> np.ndarray:
+    """Outputs before their bounds, with each region moved to what is to be expected, shape (n,)."""
+    from unbake.training.piece_levels import errors_of
+    from unbake.training.seen_pieces import chances, normalized
+
+    sums = [np.bincount(region, errors_of(curves, outputs + by)) for by in SHIFTS]
+    chance = chances(np.stack(sums, 1), np.bincount(region), settings)
+    by = normalized(chance * np.exp(-((SHIFTS / SPREAD) ** 2) / 2)) @ SHIFTS
+    return outputs + by[region]
+
+
+if __name__ == "__main__":
+    main()
