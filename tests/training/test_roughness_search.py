@@ -53,10 +53,12 @@ from unbake.transport.by_roughness import moments, row_type, stratified
 
 #: With which a fit of few samples has enough of them for a search.
 SHARE = 200.0
+#: Two searches, at other places than the default ones.
+TWICE = replace(SEARCH, times=2, last=0.75, share=0.4)
 SETTINGS = replace(
     TINY_FIT,
     materials={name: {"neural": SMALL} for name in QUANTITIES},
-    roughness_search=replace(SEARCH, share=SHARE, spp=2, steps=30),
+    roughness_search=replace(TWICE, share=SHARE, spp=2, steps=30),
 )
 
 
@@ -354,6 +356,25 @@ def test_searches_come_at_their_places_and_steps_hardly_move_roughness(built_in)
     assert moved == {"roughness.pieces.0", "roughness.colours"}
 
 
+def test_what_later_searches_find_is_averaged(built_in, monkeypatch):
+    search = replace(SEARCH, share=SHARE, spp=2)
+    config = replace(SETTINGS, roughness_search=search)
+    problem, _, step, state = started(built_in, config)
+    searches, key = RoughnessSearch(problem, config, step, Ranks()), "pieces.0"
+    size = dr.width(problem.materials["roughness"].parameters()[key])
+    finds = iter((1.0, 2.0, 4.0))
+    monkeypatch.setattr(
+        roughness_search, "searched", lambda *_: {key: dr.full(mi.Float, next(finds), size)}
+    )
+    numbers = []
+    for done in (0.4, 0.65, 0.9):
+        assert not searches.due(done - 0.01) and searches.search_if_due(done, state, 8)
+        numbers.append(float(state.phi[f"roughness.{key}"][0]))
+    # The first one is of an L_θ that is not there yet.
+    np.testing.assert_allclose(numbers, [1, 2, 3], rtol=1e-6)
+    assert not searches.due(1.0)
+
+
 def test_a_shorter_fit_makes_up_for_the_searches_that_it_missed(built_in):
     problem, _, step, state = started(built_in)
     search = RoughnessSearch(problem, SETTINGS, step, Ranks())
@@ -467,7 +488,7 @@ def test_a_fit_tells_the_samples_of_its_searches(cornell, tmp_path, unbake):
     of_steps = 20 * 16 * SETTINGS.spp
     told = RunFolder(out).log()[-1]["samples"]
     # Both sample as many pixels as two views of 16 x 16 have, eight times each.
-    assert told == of_steps + SEARCH.times * 2 * 16**2 * 8
+    assert told == of_steps + TWICE.times * 2 * 16**2 * 8
     assert unbake("evaluate", out).status == 0
     found = json.loads((out / "evaluation" / "metrics.json").read_text())
     assert found["samples"] == told
@@ -492,7 +513,7 @@ def test_searches_are_part_of_the_time_of_a_fit(cornell, tmp_path, unbake, monke
 
 def test_time_of_searches_is_not_that_of_steps(built_in):
     """Rates fell while nothing was learned: by a third of the whole decay in two searches."""
-    config = replace(SETTINGS, steps=0, seconds=100.0, roughness_search=SEARCH)
+    config = replace(SETTINGS, steps=0, seconds=100.0, roughness_search=TWICE)
     problem, _, step, _ = started(built_in, config)
     search = RoughnessSearch(problem, config, step, Ranks())
 
@@ -505,7 +526,7 @@ def test_time_of_searches_is_not_that_of_steps(built_in):
     # so many pixels.
     photographs = SimpleNamespace(count=10**9)
     search._step = SimpleNamespace(pixels=SimpleNamespace(photographs=photographs))
-    assert SEARCH.share == 0.4 and done(seconds=20.0) == pytest.approx(20 / (100 / 1.8), rel=1e-3)
+    assert done(seconds=20.0) == pytest.approx(20 / (100 / 1.8), rel=1e-3)
     assert done(1, seconds=50.0, searching=20.0, last_search=20.0) == 0.5
     assert done(2, seconds=80.0, searching=40.0, last_search=20.0) == 40 / 60
     assert done(2, seconds=101.0, searching=40.0, last_search=20.0) == 1
@@ -582,7 +603,7 @@ def test_ranks_search_together(cornell, tmp_path):
     assert done.returncode == 0, done.stderr  # which also tells that their states are equal
     told = RunFolder(out).log()[-1]["samples"]
     # Searches sample as many pixels as there are, 512, eight times each.
-    assert told == 20 * 16 * SETTINGS.spp + SEARCH.times * 512 * 8
+    assert told == 20 * 16 * SETTINGS.spp + TWICE.times * 512 * 8
 
 
 SHARED = """

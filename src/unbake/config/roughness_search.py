@@ -14,10 +14,10 @@ class RoughnessSearchConfig:
     Of methods with L_θ; see `training/roughness_search.py`.
     """
 
-    times: int = 2  #: searches, evenly from `first` to `last`; 0: none
+    times: int = 3  #: searches, evenly from `first` to `last`; 0: none
     first: float = 0.4  #: fraction of the steps, or of their time, after which the first one comes
-    last: float = 0.75  #: and the last one; the rest is left for albedo to follow
-    share: float = 0.4  #: camera samples of each one, of those that all steps of the fit take
+    last: float = 0.9  #: and the last one; the rest is left for albedo to follow
+    share: float = 0.27  #: camera samples of each one, of those that all steps of the fit take
     pixels: int = 1 << 19  #: that are sampled, at most, and no more than photographs have
     #: Camera samples of each pixel; up to four times as many where photographs have fewer pixels
     #: than are wanted
