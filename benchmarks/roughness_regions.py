@@ -24,6 +24,7 @@ from typing import Any
 import here
 
 import numpy as np
+from piece_levels import finite
 from roughness_curves import opened
 from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs
 
@@ -66,9 +67,11 @@ def regions_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     for name, region in kinds(rows, truth).items():
         moved = quantity.lower + span * values_of(expected(curves, outputs, region, search))
         found = {"regions": int(region.max()) + 1, "expected": psnr(moved, truth)}
-        told.append({"kind": name} | found | {"true means": psnr(means_of(truth, region), truth)})
+        told.append(
+            {"kind": name} | found | {"true means": finite(psnr(means_of(truth, region), truth))}
+        )
     name, fitted = run.dataset.folder.name, psnr(values, truth)
-    lines = (f"{row['kind']} {row['expected']:.2f} of {row['true means']:.2f} dB" for row in told)
+    lines = (f"{row['kind']} {row['expected']:.2f} dB" for row in told)
     print(", ".join([name, f"as fitted {fitted:.2f} dB", *lines]), flush=True)
     about = {"data": name, "steps": steps, "pixels": len(rows)}
     return about | {"as fitted": fitted, "kinds": told}
