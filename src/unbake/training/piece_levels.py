@@ -38,7 +38,7 @@ SHIFTS = np.linspace(-5, 5, 61)
 LEVELS = np.linspace(of_roughness(NODES[0]), of_roughness(NODES[-1]), 48)
 #: So many pieces of a like colour count as much as what all pieces have in common.
 _AS_MANY = 1.0
-#: And this many as much as that a piece is of a material of its own, of any level.
+#: And so many count as much as that a piece is of a material of its own, of any level.
 _NEW = 0.25
 #: Steps of expectation maximization.
 _STEPS = 40
