@@ -26,8 +26,14 @@ from unittest.mock import patch
 import here
 
 import numpy as np
-from roughness_curves import opened
-from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs
+from roughness_limits import (
+    in_units_of_variance,
+    means_of,
+    outputs_at,
+    psnr,
+    roughness_at,
+    told_of_runs,
+)
 
 from unbake.config import RoughnessSearchConfig
 
@@ -50,13 +56,9 @@ def levels_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         spp: camera samples of each.
     """
     from unbake.training import piece_levels
-    from unbake.training.roughness_curves import Curves, precision
+    from unbake.training.roughness_curves import Curves
 
-    run, steps = opened(folder)
-    (rows,), true = sampled(run, pixels, (spp,))
-    roughness = true[:, 0]
-    shared = Shared(run, rows, roughness)
-    rows["weight"] *= precision(rows, shared.values)
+    run, steps, rows, roughness, shared = in_units_of_variance(folder, pixels, spp)
     search = RoughnessSearchConfig()
     probable = shared.searched(rows, settings=replace(search, pixels_as_one=0))
     curves = Curves.of(rows, search.cells, search.colours, albedo=True)
@@ -133,18 +135,15 @@ def at_means(values: np.ndarray, pieces: np.ndarray, truth: np.ndarray) -> np.nd
         pieces: the number of each pixel's piece, shape (n,).
         truth: as `values`.
     """
-    from unbake.quantities import QUANTITIES
     from unbake.training.piece_levels import SHIFTS
-    from unbake.training.seen_pieces import outputs_of, values_of
 
-    quantity, found = QUANTITIES["roughness"], values.copy()
-    span = quantity.upper - quantity.lower
+    found = values.copy()
     for piece in np.unique(pieces):
         own = pieces == piece
-        outputs = outputs_of((values[own] - quantity.lower) / span)
-        means = [quantity.lower + span * values_of(outputs + by).mean() for by in SHIFTS]
+        outputs = outputs_at(values[own])
+        means = [roughness_at(outputs + by).mean() for by in SHIFTS]
         by = float(np.interp(truth[own].mean(), means, SHIFTS))
-        found[own] = quantity.lower + span * values_of(outputs + by)
+        found[own] = roughness_at(outputs + by)
     return found
 
 

@@ -254,18 +254,57 @@ class Shared:
 
     def without_network(self) -> np.ndarray:
         """Values with what the network adds replaced by its mean in each piece and colour."""
-        from unbake.quantities import QUANTITIES
-
-        quantity = QUANTITIES["roughness"]
-        span = quantity.upper - quantity.lower
-        unit = np.clip((self.values - quantity.lower) / span, 1e-6, 1 - 1e-6)
         tables = self.field.pieces.evaluate(self._point)[0].numpy()
-        network = np.log(unit / (1 - unit)) - tables
-        colour = np.sqrt(np.clip(self._rows["albedo"], 0, 1)) * COLOURS
-        columns = [self._rows["piece"][:, None], np.minimum(colour, COLOURS - 1)]
-        kind = np.concatenate(columns, 1).astype(np.int64)
-        group = np.unique(kind, axis=0, return_inverse=True)[1].ravel()
-        return quantity.lower + span / (1 + np.exp(-(tables + means_of(network, group))))
+        network = outputs_at(self.values) - tables
+        group = numbered(self._rows["piece"][:, None], colours_of(self._rows))
+        return roughness_at(tables + means_of(network, group))
+
+
+def in_units_of_variance(
+    folder: Path, pixels: int, spp: int
+) -> tuple[Any, int, np.ndarray, np.ndarray, Shared]:
+    """A run and its steps, rows in units of their variance, true roughness, and shared numbers.
+
+    Args:
+        pixels: how many are sampled; those that searches cannot use are left out.
+        spp: camera samples of each.
+    """
+    from unbake.training.roughness_curves import precision
+
+    run, steps = opened(folder)
+    (rows,), true = sampled(run, pixels, (spp,))
+    shared = Shared(run, rows, true[:, 0])
+    rows["weight"] *= precision(rows, shared.values)
+    return run, steps, rows, true[:, 0], shared
+
+
+def outputs_at(roughness: np.ndarray) -> np.ndarray:
+    """Outputs of the field before their bounds; the same shape."""
+    from unbake.training.roughness_curves import of_roughness
+    from unbake.training.seen_pieces import outputs_of
+
+    return outputs_of(of_roughness(roughness))
+
+
+def roughness_at(outputs: np.ndarray) -> np.ndarray:
+    """Roughness of outputs of the field before their bounds; the same shape."""
+    from unbake.quantities import QUANTITIES
+    from unbake.training.seen_pieces import values_of
+
+    quantity = QUANTITIES["roughness"]
+    return quantity.lower + (quantity.upper - quantity.lower) * values_of(outputs)
+
+
+def colours_of(rows: np.ndarray) -> np.ndarray:
+    """The colour of the albedo of each pixel, from 0 along each channel, shape (n, 3)."""
+    bright = np.sqrt(np.clip(rows["albedo"], 0, 1))
+    return np.minimum(np.floor(bright * COLOURS), COLOURS - 1)
+
+
+def numbered(*columns: np.ndarray) -> np.ndarray:
+    """The group of each pixel, from 0, whose columns (n, k) are equal, shape (n,)."""
+    rows = np.concatenate(columns, 1).astype(np.int64)
+    return np.unique(rows, axis=0, return_inverse=True)[1].ravel()
 
 
 def means_of(values: np.ndarray, groups: np.ndarray) -> np.ndarray:

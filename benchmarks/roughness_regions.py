@@ -25,8 +25,16 @@ import here
 
 import numpy as np
 from piece_levels import finite
-from roughness_curves import opened
-from roughness_limits import Shared, means_of, psnr, sampled, told_of_runs
+from roughness_limits import (
+    colours_of,
+    in_units_of_variance,
+    means_of,
+    numbered,
+    outputs_at,
+    psnr,
+    roughness_at,
+    told_of_runs,
+)
 
 from unbake.config import RoughnessSearchConfig
 
@@ -34,8 +42,8 @@ from unbake.config import RoughnessSearchConfig
 SPREAD = 0.3
 #: By how much regions are moved on trial, in the same units.
 SHIFTS = np.linspace(-2, 2, 81)
-#: Width of the bins of true roughness, colours along each channel, cells along the scene's cube.
-BIN, COLOURS, CELLS = 0.02, 6, 8
+#: Width of the bins of true roughness, and cells along the scene's cube.
+BIN, CELLS = 0.02, 8
 
 
 def main() -> None:
@@ -50,27 +58,22 @@ def regions_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         pixels: how many are sampled; those that searches cannot use are left out.
         spp: camera samples of each.
     """
-    from unbake.quantities import QUANTITIES
-    from unbake.training.roughness_curves import Curves, precision
-    from unbake.training.seen_pieces import outputs_of, values_of
+    from unbake.training.roughness_curves import Curves
 
-    run, steps = opened(folder)
-    (rows,), true = sampled(run, pixels, (spp,))
-    truth = true[:, 0].astype(float)
-    values = Shared(run, rows, truth).values
-    rows["weight"] *= precision(rows, values)
-    search, quantity = RoughnessSearchConfig(), QUANTITIES["roughness"]
+    run, steps, rows, truth, shared = in_units_of_variance(folder, pixels, spp)
+    search = RoughnessSearchConfig()
     curves = Curves.of(rows, search.cells, search.colours, albedo=True)
-    span = quantity.upper - quantity.lower
-    outputs = outputs_of((values.astype(float) - quantity.lower) / span)
-    told = []
-    for name, region in kinds(rows, truth).items():
-        moved = quantity.lower + span * values_of(expected(curves, outputs, region, search))
-        found = {"regions": int(region.max()) + 1, "expected": psnr(moved, truth)}
-        told.append(
-            {"kind": name} | found | {"true means": finite(psnr(means_of(truth, region), truth))}
-        )
-    name, fitted = run.dataset.folder.name, psnr(values, truth)
+    outputs = outputs_at(shared.values.astype(float))
+    told = [
+        {
+            "kind": name,
+            "regions": int(region.max()) + 1,
+            "expected": psnr(roughness_at(expected(curves, outputs, region, search)), truth),
+            "true means": finite(psnr(means_of(truth, region), truth)),
+        }
+        for name, region in kinds(rows, truth).items()
+    ]
+    name, fitted = run.dataset.folder.name, psnr(shared.values, truth)
     lines = (f"{row['kind']} {row['expected']:.2f} dB" for row in told)
     print(", ".join([name, f"as fitted {fitted:.2f} dB", *lines]), flush=True)
     about = {"data": name, "steps": steps, "pixels": len(rows)}
@@ -79,19 +82,15 @@ def regions_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
 
 def kinds(rows: np.ndarray, truth: np.ndarray) -> dict[str, np.ndarray]:
     """The region of each pixel, from 0, by kind of regions."""
-    colour = np.floor(np.sqrt(np.clip(rows["albedo"], 0, 1)) * COLOURS)
     piece, level = rows["piece"][:, None], np.floor(truth / BIN)[:, None]
     cell = np.floor(rows["position"] * CELLS)
     columns = {
         "pieces": (piece,),
-        "colours": (piece, np.minimum(colour, COLOURS - 1)),
+        "colours": (piece, colours_of(rows)),
         "one roughness": (piece, level),
         "one roughness in cells": (piece, level, cell),
     }
-    return {
-        name: np.unique(np.concatenate(parts, 1), axis=0, return_inverse=True)[1].ravel()
-        for name, parts in columns.items()
-    }
+    return {name: numbered(*parts) for name, parts in columns.items()}
 
 
 def expected(

@@ -98,7 +98,7 @@ def test_a_few_pieces_do_not_tell_one_level_for_all():
 
 
 def test_large_pieces_are_told_by_all_of_their_pixels():
-    """Two of 20,000 pixels each, whose levels one of 2,000 would not tell apart."""
+    """Two of 20,000 pixels each stay apart; if few of many pixels told, they would seem alike."""
     errors = parabolas([0.4, 0.6], [0.2 * 20_000] * 2)
     far, near = (
         np.diff(levels_of(errors, [RED] * 2, pixels=pixels))[0] for pixels in (20_000.0, 2e6)
