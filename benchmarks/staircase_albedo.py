@@ -41,7 +41,7 @@ import unbake
 unbake.activate()
 
 from unbake.config import PAPER_DEPTH  # noqa: E402
-from unbake.dataset.camera import read_cameras  # noqa: E402
+from unbake.dataset.camera_files import read_cameras  # noqa: E402
 from unbake.dataset.pixels import CameraRays  # noqa: E402
 from unbake.experiments import fig4, table1  # noqa: E402
 from unbake.experiments.experiment import ExperimentContext  # noqa: E402

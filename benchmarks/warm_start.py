@@ -34,7 +34,8 @@ from relight_demo import LAMPS, lamps  # noqa: E402
 from unbake.acquisition.new_light import change_light  # noqa: E402
 from unbake.config import preset  # noqa: E402
 from unbake.config.light import LightConfig  # noqa: E402
-from unbake.dataset.camera import Camera, frame_of  # noqa: E402
+from unbake.dataset.camera import Camera  # noqa: E402
+from unbake.dataset.camera_files import frame_of  # noqa: E402
 from unbake.dataset.data_folder import TRANSFORMS  # noqa: E402
 from unbake.dataset.views import Dataset  # noqa: E402
 from unbake.evaluation.convergence import score_curve  # noqa: E402

@@ -21,8 +21,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     activate()
-    from unbake.acquisition.placement import coverage, place
-    from unbake.dataset.camera import write_camera_file
+    from unbake.acquisition.coverage import coverage
+    from unbake.acquisition.placement import place
+    from unbake.dataset.camera_files import write_camera_file
     from unbake.scene.edit import to_principled
     from unbake.scene.parse import parse
 

@@ -341,7 +341,7 @@ def test_groups_of_held_out_views_are_scored_apart(benchmarks, tmp_path):
 
 def test_cameras_of_half_a_room_never_see_the_other_half(repository, built_in):
     """Nor does the mirror of the demo show it; half of the held-out views are of that half."""
-    from unbake.dataset.camera import read_cameras
+    from unbake.dataset.camera_files import read_cameras
     from unbake.dataset.pixels import CameraRays
 
     cameras = read_cameras(repository / "benchmarks" / "prior" / "half.json", 24, 24)

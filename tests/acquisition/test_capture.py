@@ -9,14 +9,17 @@ import pytest
 
 from unbake.acquisition import capture as module
 from unbake.acquisition.capture import capture
+from unbake.acquisition.new_light import change_light
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config.light import LightConfig
-from unbake.dataset.camera import LookAt, write_camera_file
+from unbake.dataset.camera import LookAt
+from unbake.dataset.camera_files import write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.io import locked
-from unbake.scene.parse import parse
+from unbake.scene.emitters import named_emitters
+from unbake.scene.parse import parse, write
 
 SMALL = CaptureSettings(views=2, held_out=1, resolution=24, spp=8, max_depth=6)
 OBJECT = """<scene version="3.0.0">
@@ -195,6 +198,41 @@ def test_photographs_without_light_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"'intensity' of the light.*'base_color' is 2, not"):
         capture(str(tmp_path / "bad.xml"), tmp_path / "data", TINY, tell=lambda line: None)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["away.xml", "bad.xml"]
+
+
+def test_lamps_of_another_light_have_their_own_names(tmp_path):
+    (tmp_path / "scene.xml").write_text(OBJECT)
+    (tmp_path / "lamps.xml").write_text(
+        """<scene version="3.0.0">
+        <shape type="rectangle" id="bulb"><emitter type="area"/></shape>
+        <shape type="sphere"><bsdf type="diffuse"/><emitter type="area"/></shape></scene>"""
+    )
+    (tmp_path / "sky.exr").write_bytes(b"")  # of the light that is replaced
+    parsed = parse(tmp_path / "scene.xml")
+    change_light(parsed, LightConfig(lights=tmp_path / "lamps.xml"), False, lambda line: None)
+    (tmp_path / "copy").mkdir()
+    again = parse(write(parsed, tmp_path / "copy"))
+    assert [light.name for light in named_emitters(again)] == ["bulb", "area light"]
+    assert not [node.props.id() for node in again.state.nodes if "new light" in node.props.id()]
+
+
+def test_all_that_is_wrong_with_a_scene_is_told_at_once(tmp_path):
+    """What its surfaces reflect, what its textures read, and that it is dark."""
+    texture = (
+        '<texture type="mesh_attribute" name="base_color"><string name="name" '
+        'value="vertex_tint"/></texture>'
+    )
+    (tmp_path / "scene.xml").write_text(
+        f"""<scene version="3.0.0"><shape type="cube" id="thing"><bsdf type="principled">{texture}
+        <float name="roughness" value="2"/></bsdf></shape></scene>"""
+    )
+    with pytest.raises(UserError) as caught:
+        capture(str(tmp_path / "scene.xml"), tmp_path / "data", SMALL, tell=lambda line: None)
+    told = str(caught.value)
+    assert "'roughness' is 2, not from 0 to 1" in told
+    assert "the shape 'thing' has no 'vertex_tint'" in told
+    assert "the scene has no light" in told
+    assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize("scene", ["cube", "cbue", "none.xml"])

@@ -6,16 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unbake.acquisition.placement import (
-    black_share,
-    coverage,
-    is_room,
-    place_object,
-    place_room,
-    view_counts,
-)
+from unbake.acquisition.coverage import black_share, coverage, is_room, view_counts
+from unbake.acquisition.placement import place_object, place_room
 from unbake.dataset.camera import Camera
-from unbake.dataset.views import check_cameras
+from unbake.dataset.poses import check_cameras
 from unbake.errors import UserError
 from unbake.scene import free_space
 

@@ -236,7 +236,25 @@ def test_masks_that_leave_nothing_are_told(some, background, spoilt, unbake, tmp
     (finding,) = findings
     assert finding.level == ("warning" if some else "error")
     assert finding.where == ("train_000" if some else None)
-    assert unbake("data", "check", data.folder).status == (0 if some else 2)
+    told = unbake("data", "check", data.folder, "--out", tmp_path / "check.html")
+    assert told.status == (0 if some else 2) and (tmp_path / "check.html").is_file()
+    (row,) = [line for line in told.out.splitlines() if line.strip().startswith("geometry")]
+    assert "% of the pixels see a surface" in row
+    assert ": 0 %" not in row
+
+
+def test_what_masks_hide_is_not_seen(spoilt):
+    data = spoilt("cornell")
+    whole = check_data(data.save()).coverage
+    mask = np.zeros((40, 40), np.uint8)
+    mask[15:25, 15:25] = 255
+    (data.folder / "masks").mkdir()
+    Image.fromarray(mask).save(data.folder / "masks" / "middle.png")
+    for frame in data.content["frames"]:
+        frame["mask_path"] = "masks/middle.png"
+    result = check_data(data.save())
+    assert result.coverage[0] > whole[0] + 0.2
+    assert any("is seen by no training view" in f.what for f in result.findings)
 
 
 def test_masked_pixels_say_nothing_of_poses(spoilt, monkeypatch):

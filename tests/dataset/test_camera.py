@@ -8,13 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unbake.dataset.camera import (
-    Camera,
-    LookAt,
-    read_cameras,
-    read_named_cameras,
-    write_camera_file,
-)
+from unbake.dataset.camera import Camera, LookAt
+from unbake.dataset.camera_files import read_cameras, read_named_cameras, write_camera_file
 from unbake.errors import UserError
 
 ORIGIN, TARGET, UP = (1.0, -2.0, 3.0), (-0.5, 0.25, 1.0), (0.0, 0.3, 1.0)
@@ -353,3 +348,18 @@ def test_a_view_beyond_single_precision_is_refused(value, key):
     points[key] = [value, 1, 1]
     with pytest.raises(UserError, match=r"origin, target or up have entries over 1e\+15"):
         Camera.look_at(*points, 40, 4, 4)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [{"applied_scale": 2.0}, {"applied_transform": np.eye(4)[[1, 0, 2]].tolist()}],
+)
+def test_poses_in_the_frame_of_another_program_are_refused(key, tmp_path):
+    frame = {"transform_matrix": np.eye(4).tolist(), "fl_x": 20.0, "w": 8, "h": 8}
+    same = {"applied_scale": 1.0, "applied_transform": np.eye(4)[:3].tolist()}
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({"frames": [frame]} | same))
+    assert len(read_cameras(file, 8, 8)) == 1
+    file.write_text(json.dumps({"frames": [frame]} | key))
+    with pytest.raises(UserError, match="in the frame after 'applied_transform'"):
+        read_cameras(file, 8, 8)

@@ -12,14 +12,9 @@ import pytest
 from unbake import memory
 from unbake.dataset.camera import Camera
 from unbake.dataset.fingerprint import fingerprint
-from unbake.dataset.views import (
-    Dataset,
-    View,
-    check_cameras,
-    fitted_pixels,
-    read_image,
-    read_photograph,
-)
+from unbake.dataset.image_files import counted_by, read_image
+from unbake.dataset.poses import check_cameras
+from unbake.dataset.views import Dataset, View, fitted_pixels, read_photograph
 from unbake.errors import UserError
 
 WIDTH, HEIGHT = 6, 4
@@ -406,6 +401,25 @@ def test_photographs_are_read_for_fitted_pixels_only_where_their_alpha_counts(fo
     assert fitted_pixels(view, "visible") is None
     opaque = replace(view, image=folder / "images" / "opaque.exr")
     assert fitted_pixels(opaque, "hidden") is None
+
+
+@pytest.mark.parametrize(
+    ("colours", "alpha", "counted"),
+    [
+        ([0, 255], None, [False, True]),
+        ([0, 255], [255, 255], [False, True]),
+        ([255, 255], [0, 255], [False, True]),
+        ([0, 255], [255, 0], [False, False]),
+        ([0, 0], [0, 255], [False, True]),
+        ([0, 0], [255, 255], [False, False]),
+    ],
+)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_black_and_transparent_pixels_of_a_mask_do_not_count(colours, alpha, counted, channels):
+    codes = np.repeat(np.array([[colours]], np.uint8).transpose(0, 2, 1), channels, axis=2)
+    if alpha is not None:
+        codes = np.dstack([codes, np.array([alpha], np.uint8)])
+    assert counted_by(codes).tolist() == [counted]
 
 
 def test_the_fingerprint_knows_masks(folder):

@@ -16,7 +16,8 @@ from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.backend import CUDA_VARIANT
 from unbake.config.light import LightConfig
-from unbake.dataset.camera import LookAt, read_cameras, up_of, write_camera_file
+from unbake.dataset.camera import LookAt, up_of
+from unbake.dataset.camera_files import read_cameras, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.rendering import relight, render

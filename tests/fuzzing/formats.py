@@ -144,7 +144,7 @@ def _load_data(folder: Path) -> None:
 
 
 def _read_cameras(folder: Path) -> None:
-    from unbake.dataset.camera import read_cameras
+    from unbake.dataset.camera_files import read_cameras
 
     read_cameras(folder / "cameras.json", 8, 8)
 
@@ -304,7 +304,7 @@ def _camera():
 
 def _make_scene(folder: Path) -> None:
     """Make the problem of a fit, and look around in its scene."""
-    from unbake.dataset.views import check_cameras
+    from unbake.dataset.poses import check_cameras
     from unbake.training.problem import make_problem
 
     problem = make_problem(folder / "scene.xml", "visible", _tiny_settings(), 0.3)

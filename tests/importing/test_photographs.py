@@ -12,12 +12,14 @@ from PIL import Image
 from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
 from unbake.imaging.coded import decode, read_codes
+from unbake.imaging.pictures import write_exr
 from unbake.imaging.profiles import linear_srgb, profile_name, read_profile
 from unbake.imaging.srgb import from_srgb, to_srgb
 from unbake.importing.faults import ImportFaults
 from unbake.importing.frames import _lens
-from unbake.importing.import_data import CLIPPED_CODE, import_data
+from unbake.importing.import_data import import_data
 from unbake.importing.lens import Lens
+from unbake.importing.photographs import CLIPPED_CODE
 from unbake.importing.settings import ImportSettings
 from unbake.importing.source import same_shape
 
@@ -230,6 +232,36 @@ def test_masks_that_are_given_come_before_those_of_the_source(captured, meshes, 
     assert all(read_masked(view)[1].all() for view in data.views)
     data, _ = imported(folder, tmp_path / "other", meshes, masks=folder / "given")
     assert all((read_masked(view)[1] == np.eye(16)).all() for view in data.views)
+
+
+def test_a_mask_that_could_be_of_several_photographs_is_a_fault(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["train_filenames"], content["test_filenames"]
+    for number, frame in enumerate(content["frames"][:2]):
+        file = folder / frame["file_path"]
+        frame["file_path"] = f"images/cam{number}/0001{file.suffix}"
+        (folder / frame["file_path"]).parent.mkdir()
+        file.rename(folder / frame["file_path"])
+    (folder / "transforms.json").write_text(json.dumps(content))
+    save(np.full((16, 16), 255, np.uint8), tmp_path / "masks" / "0001.png")
+    with pytest.raises(ImportFaults, match=r"the mask has the name of several photographs: .*cam1"):
+        import_data(folder, tmp_path / "data", meshes, masks=tmp_path / "masks", tell=quiet)
+    for camera in ("cam0", "cam1"):
+        save(np.full((16, 16), 255, np.uint8), tmp_path / "masks" / camera / "0001.png")
+    imported(folder, tmp_path / "data", meshes, masks=tmp_path / "masks")
+
+
+def test_a_mask_of_radiance_is_a_fault(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    write_exr(folder / "mask.exr", np.ones((16, 16, 3)))
+    content["frames"][0]["mask_path"] = "mask.exr"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(ImportFaults, match="the mask is no PNG, JPEG or TIFF file"):
+        import_data(folder, tmp_path / "data", meshes, tell=quiet)
 
 
 def test_masks_do_not_lead_out_of_their_folder(project, meshes, tmp_path):

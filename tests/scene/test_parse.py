@@ -111,6 +111,22 @@ def test_no_two_nodes_of_a_copy_have_one_name(parse, tmp_path):
     assert [node.get("id") for node in written.iter("shape")] == ["a", None, "c"]
 
 
+def test_a_copy_has_the_names_of_materials(parse, tmp_path):
+    """Also of those that one shape has, and that lie in others; a reference needs no second one."""
+    scene = parse(
+        """<bsdf type="diffuse" id="shared"/>
+        <shape type="cube"><bsdf type="twosided" id="oak"><bsdf type="diffuse" id="grain"/></bsdf>
+        </shape>
+        <shape type="sphere"><ref id="shared"/></shape><shape type="disk"><ref id="shared"/></shape>
+        <shape type="rectangle"><bsdf type="diffuse" id="_unnamed_3"/></shape>"""
+    )
+    (tmp_path / "copy").mkdir()
+    path = scenes.write(scene, tmp_path / "copy")
+    names = {node.get("id") for node in ElementTree.parse(path).iter("bsdf")}
+    assert names == {"shared", "oak", "grain", None}
+    assert scenes.parse(path).instantiate(merge=False).shapes()
+
+
 @pytest.mark.parametrize("name", ["meshes/box.ply", "textures/paint.exr", "light/paint.exr"])
 def test_a_missing_file_is_named_with_its_line(name, with_files):
     source = with_files(False)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scene_texts import BALL
 
-from unbake.errors import UserError
 from unbake.imaging.pictures import write_exr
 from unbake.scene.edit import to_principled
-from unbake.scene.values import require_attributes, value_faults
+from unbake.scene.values import attribute_faults, value_faults
 
 BITMAP = '<texture type="bitmap" name="{}"><string name="filename" value="{}.exr"/></texture>'
 CHECKS = (
@@ -106,18 +105,19 @@ def test_all_are_told(told):
 
 
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
-def test_values_that_a_mesh_does_not_have_are_refused(shape, parse):
+def test_values_that_a_mesh_does_not_have_are_told(shape, parse):
     texture = '<texture type="mesh_attribute" name="base_color">{}</texture>'
     name = '<string name="name" value="vertex_tint"/>'
     bsdf = f'<bsdf type="principled">{texture.format(name)}</bsdf>'
-    parsed = parse(f'<shape type="{shape}" id="thing">{bsdf}</shape>')
+    parsed = parse("".join(f'<shape type="{shape}" id="{x}">{bsdf}</shape>' for x in "ab"))
     scene = parsed.instantiate(merge=False)
-    with pytest.raises(UserError, match="'thing' has no 'vertex_tint', which its material reads"):
-        require_attributes(scene, parsed.path)
+    assert [fault.what for fault in attribute_faults(scene, parsed.path)] == [
+        f"the shape '{x}' has no 'vertex_tint', which its material reads" for x in "ab"
+    ]
 
 
 def test_values_that_a_mesh_has_are_taken():
     texture = {"type": "mesh_attribute", "name": "vertex_tint"}
     cube = mi.load_dict({"type": "cube", "bsdf": {"type": "principled", "base_color": texture}})
     cube.add_attribute("vertex_tint", 3, np.full(3 * cube.vertex_count(), 0.5))
-    require_attributes(mi.load_dict({"type": "scene", "cube": cube}), "scene.xml")
+    assert not attribute_faults(mi.load_dict({"type": "scene", "cube": cube}), "scene.xml")

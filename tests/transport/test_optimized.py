@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import built_in_cameras, pixel_rays, seeded
 
-from unbake.acquisition.placement import coverage
+from unbake.acquisition.coverage import coverage
 from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays
 from unbake.scene.free_space import sample_surface

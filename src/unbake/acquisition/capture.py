@@ -16,7 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, named_by_split, read_cameras
+from ..dataset.camera import Camera
+from ..dataset.camera_files import named_by_split, read_cameras
 from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
@@ -26,16 +27,17 @@ from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
 from ..io import is_locked, locked, removed_with_parents, require_file, require_utf8
 from ..quantities import QUANTITIES
-from ..scene import edit, emitters
+from ..scene import edit
+from ..scene.checked import checked_scene
 from ..scene.parse import ParsedScene, parse, write
-from ..scene.values import require_attributes, value_faults
 from ..signals import cleaned_up
 from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
 from ..transport.vertex import SceneView
 from .built_in import SCENES, default_cameras, write_scene
+from .coverage import BLACK, BLACK_BACKS, TURN_THEM, black_share, coverage, is_room
 from .new_light import change_light, tell_tilt
-from .placement import BLACK, BLACK_BACKS, TURN_THEM, black_share, coverage, is_room, place
+from .placement import place
 from .settings import LIGHT_PIXELS, LIGHT_SAMPLES, CaptureSettings
 
 #: Samples a pixel of the truth images, which are noisy at edges only.
@@ -284,14 +286,12 @@ def _copy_scene(
     parsed = source.parsed(tell)
     if parsed.media:
         tell(f"participating media are left out: {parsed.media}")
+    scene, faults = checked_scene(source.parsed(lambda line: None), lit=True)
+    raise_together(faults)
+    assert scene is not None
     changed = edit.to_principled(parsed)
-    raise_together(value_faults(parsed))
     if changed:
         tell(f"{changed} BSDFs made principled")
-    scene = source.instance(merge=False)
-    edit.require_optimized(scene, source.file)
-    require_attributes(scene, source.file)
-    emitters.require_emitters(scene, source.file)
     return write(parsed, folder), scene
 
 

@@ -124,7 +124,7 @@ def degrade(
         path = write(parsed, folder.scene.resolve())
         views = []
         for number, (view, truth) in enumerate(zip(dataset.views, truths, strict=True)):
-            pixels, counted = _photograph(view, number, truth, settings)
+            pixels, counted = _photograph(view, number, truth, dataset.background, settings)
             degraded = replace(
                 view,
                 camera=cameras[number],
@@ -218,23 +218,23 @@ def _camera_truths(
 
 
 def _photograph(
-    view: View, number: int, truth: CameraTruth, settings: DegradeSettings
+    view: View, number: int, truth: CameraTruth, background: str, settings: DegradeSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """The degraded photograph, (height, width, 4), and which of its pixels count."""
     pixels, unmasked = read_masked(view)
     rgb = pixels[..., :3].astype(np.float64) / view.exposure
     rgb *= truth.exposure * np.array(truth.white_balance)
     rgb *= vignetting(view.camera, settings.vignetting)[..., None]
+    seen = fitted(pixels, None, background)
     if settings.electrons:
         rng = _random(settings, _NOISE, number)
         counted = rng.poisson(np.minimum(rgb, 1e3) * settings.electrons)
         counted = counted + rng.normal(0, settings.read_noise, rgb.shape)
-        covered = pixels[..., 3:] > 0  # what is hidden behind the scene stays black
-        rgb = np.where(covered, counted / settings.electrons, rgb)
+        # What is hidden behind the scene stays black
+        rgb = np.where(seen[..., None], counted / settings.electrons, rgb)
     rgb = np.maximum(rgb, 0)
     if settings.white is not None:
         rgb = response(np.minimum(rgb, 1), settings.response)
-    seen = pixels[..., 3] > 0
     return np.dstack([rgb, pixels[..., 3]]), seen if unmasked is None else seen & unmasked
 
 

@@ -6,18 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import final
+from typing import Literal, final
 
 import mitsuba as mi
 import numpy as np
 
-from ..acquisition.placement import (
-    BLACK,
-    BLACK_BACKS,
-    TURN_THEM,
-    black_share,
-    view_counts,
-)
+from ..acquisition.coverage import BLACK, BLACK_BACKS, TURN_THEM, black_share, view_counts
 from ..dataset.agreement import (
     Exposures,
     TurningLight,
@@ -37,13 +31,13 @@ from ..dataset.findings import (
 from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
 from ..dataset.noise_at_black import found_noise
 from ..dataset.photographs import Photographs
-from ..dataset.poses import pose_problems
+from ..dataset.poses import check_cameras, pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
-from ..dataset.views import Dataset, View, check_cameras, fitted, read_masked
+from ..dataset.views import Dataset, View, fitted, read_masked
 from ..errors import UserError, collected, named, printable
-from ..scene import edit, emitters, free_space
+from ..scene import free_space
+from ..scene.checked import checked_scene
 from ..scene.parse import parse
-from ..scene.values import require_attributes, value_faults
 from .pictures import PictureFacts, blurred, percentage, picture_facts
 
 #: Share of the pixels of surfaces that may be clipped, of one view and of all; and of one view
@@ -72,14 +66,15 @@ class CheckedView:
         small: the same at low resolution, in radiance.
         facts: what its pixels tell.
         seen: what the pixels of the small view see.
-        share: of the pixels that should see a surface, those that do, in [0, 1].
+        share: of the pixels that should see a surface, those that do, in [0, 1]; None where no
+            pixel counts.
     """
 
     view: View
     small: SmallView
     facts: PictureFacts
     seen: Seen
-    share: float
+    share: float | None
 
 
 @final
@@ -173,16 +168,9 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
     parsed = scene = None
     with collected(faults):
         parsed = parse(dataset.scene, dataset.root)
-        edit.to_principled(parsed)
-        faults += value_faults(parsed)
-        result.scene = scene = parsed.instantiate(merge=False)
-        with collected(faults):
-            require_attributes(scene, dataset.scene)
-        with collected(faults):
-            edit.require_optimized(scene, dataset.scene)
-        if dataset.light == "known":
-            with collected(faults):
-                emitters.require_emitters(scene, dataset.scene)
+        scene, found = checked_scene(parsed, lit=dataset.light == "known")
+        result.scene = scene
+        faults += found
     if parsed is None or scene is None:
         result.findings += [replace(f, check="scene") for f in _grouped(faults, dataset.folder)]
         _check_files(result, dataset, clip_negative)
@@ -251,7 +239,7 @@ def _checked(
         view.clipped,
     )
     wanted = (small.alpha > 0.5).ravel()
-    share = float(hit[wanted].mean()) if wanted.any() else 0.0
+    share = float(hit[wanted].mean()) if wanted.any() else None
     return CheckedView(view, small, facts, seen, share)
 
 
@@ -273,9 +261,23 @@ def _check_masks(result: DataCheck) -> None:
 
 def _enlarged(mask: np.ndarray, camera: Camera) -> np.ndarray:
     """A mask of blocks as one of pixels; a remainder at the edges is False."""
+    return _in_pixels(mask, camera, mode="constant")
+
+
+def _counted(view: CheckedView) -> np.ndarray | None:
+    """Which pixels of a view count, row by row, (pixels,), by the blocks at or next to them.
+
+    None: all.
+    """
+    some = view.small.alpha > 0
+    return None if some.all() else _in_pixels(some, view.view.camera, mode="edge").ravel()
+
+
+def _in_pixels(mask: np.ndarray, camera: Camera, mode: Literal["constant", "edge"]) -> np.ndarray:
+    """A mask of blocks as one of pixels; `mode` is NumPy's, of the remainder at the edges."""
     shape, block = (camera.height, camera.width), block_of(camera)
     large = mask.repeat(block, 0).repeat(block, 1)
-    return np.pad(large, [(0, s - n) for s, n in zip(shape, large.shape, strict=True)])
+    return np.pad(large, [(0, s - n) for s, n in zip(shape, large.shape, strict=True)], mode)
 
 
 # ------------------------------------------------------------------------------------------- poses
@@ -289,8 +291,8 @@ def _check_poses(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -
         # What is wrong with the poses is told once.
         hidden = result.dataset is not None and result.dataset.background == "hidden"
         for problem in _pose_problems(scene, train, hidden, result.folder):
-            share = max(v.share for v in train)
-            level = "error" if share == 0 else "warning"
+            blind = not any(v.share for v in train)
+            level = "error" if blind else "warning"
             result.add(Finding(level, "geometry", problem.what, problem.where, problem.remedy))
         inside = check_cameras(scene, {v.view.name: v.view.camera for v in result.views})
         if inside:
@@ -433,7 +435,8 @@ def _check_light(result: DataCheck) -> None:
 def _coverage(
     scene: mi.Scene, train: list[CheckedView], *, hidden: bool
 ) -> tuple[float, float, float, float] | None:
-    counts = view_counts(scene, [v.view.camera for v in train], hide_emitters=hidden)
+    cameras, counted = [v.view.camera for v in train], map(_counted, train)
+    counts = view_counts(scene, cameras, counted=counted, hide_emitters=hidden)
     if not len(counts):
         return None
     none, one, two = (float((counts == n).mean()) for n in range(3))

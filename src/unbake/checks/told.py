@@ -59,10 +59,11 @@ def _files(result: DataCheck) -> str | None:
 
 
 def _geometry(result: DataCheck) -> str | None:
-    if not result.views:
+    views = [view for view in result.views if view.share is not None]
+    if not views:
         return None
-    shares = [view.share for view in result.views]
-    worst = _lowest(result.views, shares)
+    shares = [view.share or 0.0 for view in views]
+    worst = _lowest(views, shares)
     told = f"{100 * float(np.mean(shares)):.0f} % of the pixels see a surface"
     return told if min(shares) > 0.995 else f"{told}; {worst}: {100 * min(shares):.0f} %"
 

@@ -37,7 +37,7 @@ def in_file(plan: Plan) -> Decoded:
         "columns": plan.columns,
         "clip_negative": plan.clip_negative,
         "foreground_only": plan.hidden,
-        **({"masks": masks} if any(masks) else {}),
+        **({"masks": masks, "alpha of masks": "counts"} if any(masks) else {}),
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
@@ -49,6 +49,8 @@ def in_file(plan: Plan) -> Decoded:
         key["noise"] = [None if view.noise is None else asdict(view.noise) for view in views]
         key["black"] = {"radius": BLACK_RADIUS, "bright": BRIGHT, "less": "what noise adds"}
         key["reference"] = {"of": "others", "peaks": PEAK}
+        if any(view.clipped is not None for view in views):
+            key["clipped"] = [view.clipped for view in views]
     data.require_own_cache()
     found = _find_cache(data, key)
     if found is not None:

@@ -13,7 +13,7 @@ from ..io import array, read_json, text, write_json
 from ..scene import emitters
 from ..scene.parse import parse
 from .data_folder import DataFolder
-from .views import read_image
+from .image_files import read_image
 
 #: Rows of the image of a true environment.
 ROWS = 128

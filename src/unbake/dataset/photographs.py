@@ -22,10 +22,11 @@ from .camera import Camera
 from .decoded_file import in_file
 from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Totals, fill
 from .hot_pixels import HotPixels
+from .image_files import PIXEL_BYTES
 from .noise_at_black import found_noise
 from .shares import Share
 from .spread import places
-from .views import PIXEL_BYTES, Dataset, SensorNoise
+from .views import Dataset, SensorNoise
 
 #: Photographs of a process that take more than this, in bytes, are not held in memory but in a file
 #: of the data set's folder, of which the system keeps in memory what it has room for.

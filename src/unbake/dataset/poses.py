@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import UserError, named
 from ..scene import free_space
-from .camera import Camera
+from .camera import Camera, spread_rays
 from .mistakes import usual_mistakes
 from .photographs import Photographs
 from .views import View
@@ -80,6 +80,26 @@ def pose_problems(
     remedy = _likely(scene, cameras, numbers, share)
     what = "the view sees no surface of the scene"
     return [UserError(what, named(blind), remedy)]
+
+
+def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
+    """The names of the cameras that stand inside geometry or with their nose on it.
+
+    A camera is named when its position is inside an object (the rule is that of
+    `free_space.inside_geometry`), or when over half of 256 rays spread over its image hit something
+    nearer than 0.1 % of the scene's diagonal. Both are signs of a wrong pose, not proof of one.
+
+    Args:
+        scene: the scene that the cameras look at.
+        cameras: name to camera.
+    """
+    if not cameras:
+        return []
+    inside = free_space.inside_geometry(scene, np.array([c.origin for c in cameras.values()]))
+    near = free_space.CONTACT * free_space.extent(scene)[2]
+    touching = free_space.trace(scene, *spread_rays([*cameras.values()], 16)).distance < near
+    nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
+    return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]
 
 
 def _likely(scene: mi.Scene, cameras: Sequence[Camera], numbers: np.ndarray, share: float) -> str:

@@ -8,19 +8,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar, final
 
-import mitsuba as mi
 import numpy as np
 
-from unbake.dataset.camera import Camera, camera_from_frame, frame_of, read_split, spread_rays
-from unbake.dataset.data_folder import TRANSFORMS, DataFolder
+from unbake.dataset.camera import Camera
+from unbake.dataset.camera_files import camera_from_frame, frame_of, read_split
+from unbake.dataset.data_folder import DataFolder
+from unbake.dataset.image_files import ENCODINGS, REPLACE, check_header, counted_by, read_image
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError, collected, raise_together
-from unbake.imaging.coded import decode, read_codes
-from unbake.imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, read_header
+from unbake.imaging.coded import read_codes
+from unbake.imaging.headers import CODED_SUFFIXES, HeaderError, read_header
 from unbake.io import number, require_file, text
-from unbake.memory import require_memory
 from unbake.quantities import QUANTITIES
-from unbake.scene import free_space
 from unbake.transport.light_by_depth import depth_of_light, light_of_depth
 
 BACKGROUNDS = ("visible", "hidden")
@@ -28,16 +27,9 @@ BACKGROUNDS = ("visible", "hidden")
 LIGHTS = ("known", "unknown")
 #: A key of `render`: false where the scene has lost the materials that it was rendered with.
 TRUE_MATERIALS = "true_materials"
-#: How photographs hold radiance: as it is, or as code values of the sRGB curve.
-ENCODINGS = ("linear", "srgb")
 
-_LDR_SUFFIXES = (*CODED_SUFFIXES, ".bmp", ".tga", ".webp", ".gif", ".ppm")
-_MOST_CHANNELS = 4
 #: Suffixes of images that cannot hold alpha.
 _OPAQUE = (".jpg", ".jpeg", ".hdr", ".rgbe", ".pfm")
-_OTHER_CHANNELS = "the image has other channels than RGB and alpha"
-#: Memory in bytes that takes part in decoding a pixel, blurring it included.
-PIXEL_BYTES = 100
 #: Least and greatest exposure, and value at which a photograph is clipped.
 MEASURABLE = (1e-12, 1e12)
 _MEANT = {
@@ -48,12 +40,6 @@ _MEANT = {
 }
 #: Bytes of the name of a view, which files of results are named after.
 LONGEST_NAME = 200
-_NEED_HDR = (
-    "Give linear HDR images (OpenEXR); PNG, JPEG and TIFF files of a camera are read where "
-    f'{TRANSFORMS} has "encoding": "srgb", as `unbake import` writes it'
-)
-_CODED = "Code values of the sRGB curve are read from PNG, JPEG and TIFF files"
-_REPLACE = f"Write the image again, or remove its frame from {TRANSFORMS}"
 
 
 @final
@@ -283,63 +269,13 @@ class Dataset:
         data.write_transforms(content)
 
 
-def read_image(
-    path: Path, width: int, height: int, clip_negative: bool = False, encoding: str = "linear"
-) -> np.ndarray:
-    """One image, row by row: (width * height, 4) float32, linear RGB and alpha (1 if absent).
-
-    Args:
-        path: the image.
-        width, height: in pixels, as they must be.
-        clip_negative: take negative pixels as zero.
-        encoding: "srgb": it holds code values, and is decoded to [0, 1].
-
-    Raises:
-        UserError: it is missing, unreadable, of another kind or size, or has pixels that are NaN,
-            infinite, or (without `clip_negative`) negative.
-    """
-    if encoding == "srgb":
-        _require_readable(path, width, height, encoding)
-        return decode(read_codes(path, _REPLACE)).reshape(-1, 4)
-    pixels = read_radiance(path, width, height)
-    count = int((pixels < 0).any(axis=1).sum())
-    if count and not clip_negative:
-        what = f"{count} of {len(pixels)} pixels are negative"
-        raise UserError(what, path, "Pass --clip-negative to take them as zero")
-    return np.maximum(pixels, 0)
-
-
-def read_radiance(path: Path, width: int, height: int) -> np.ndarray:
-    """One image of radiance as it is, negative pixels too; (width * height, 4) as in `read_image`.
-
-    Raises:
-        UserError: as in `read_image`, but for negative pixels.
-    """
-    _require_readable(path, width, height, "linear")
-    try:
-        bitmap = mi.Bitmap(str(path))
-        size = tuple(bitmap.size())
-        _check_size((int(size[0]), int(size[1])), width, height, path)
-        kind = mi.Bitmap.PixelFormat
-        if bitmap.pixel_format() not in (kind.RGB, kind.RGBA, kind.Y, kind.YA):
-            raise UserError(_OTHER_CHANNELS, path, _REPLACE)
-        bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, False)
-    except (RuntimeError, MemoryError, ValueError) as error:
-        reason = " ".join(str(error).split())[:160]
-        raise UserError(f"the image cannot be read ({reason})", path, _REPLACE) from None
-    pixels = np.array(bitmap).reshape(-1, 4)
-    count = int((~np.isfinite(pixels)).any(axis=1).sum())
-    if count:
-        what = f"{count} of {len(pixels)} pixels are NaN or infinite"
-        remedy = "No measurement is like that: render or convert the image again"
-        raise UserError(what, path, remedy)
-    return pixels
-
-
 def read_view(image: Path, view: View) -> np.ndarray:
-    """A true picture of a view, (H, W, 4) float32, with alpha; errors as in `read_image`."""
+    """A true picture of a view, (H, W, 4) float32, with alpha; errors as in `read_image`.
+
+    Negative pixels, as filters leave them at edges, are taken as zero.
+    """
     width, height = view.camera.width, view.camera.height
-    return read_image(image, width, height).reshape(height, width, 4)
+    return read_image(image, width, height, clip_negative=True).reshape(height, width, 4)
 
 
 def read_photograph(view: View, clip_negative: bool = False) -> np.ndarray:
@@ -390,37 +326,12 @@ def fitted(pixels: np.ndarray, mask: np.ndarray | None, background: str) -> np.n
     return counted & (pixels[..., 3] > 0) if background == "hidden" else counted
 
 
-def counted_by(codes: np.ndarray) -> np.ndarray:
-    """Whether pixels count by the code values of a mask, (H, W, C): (H, W) bool."""
-    return codes[..., : 1 if codes.shape[2] < 3 else 3].max(axis=2) > 0
-
-
-def check_cameras(scene: mi.Scene, cameras: Mapping[str, Camera]) -> list[str]:
-    """The names of the cameras that stand inside geometry or with their nose on it.
-
-    A camera is named when its position is inside an object (the rule is that of
-    `free_space.inside_geometry`), or when over half of 256 rays spread over its image hit something
-    nearer than 0.1 % of the scene's diagonal. Both are signs of a wrong pose, not proof of one.
-
-    Args:
-        scene: the scene that the cameras look at.
-        cameras: name to camera.
-    """
-    if not cameras:
-        return []
-    inside = free_space.inside_geometry(scene, np.array([c.origin for c in cameras.values()]))
-    near = free_space.CONTACT * free_space.extent(scene)[2]
-    touching = free_space.trace(scene, *spread_rays([*cameras.values()], 16)).distance < near
-    nosy = touching.reshape(len(cameras), -1).mean(axis=1) > 0.5
-    return [name for name, bad in zip(cameras, inside | nosy, strict=True) if bad]
-
-
 def _read_mask(view: View) -> np.ndarray | None:
     """Whether pixels count by the mask of a view, (H, W) bool; None where it has none."""
     if view.mask is None:
         return None
-    _check_header(view.mask, view.camera.width, view.camera.height, "srgb")
-    return counted_by(read_codes(view.mask, _REPLACE))
+    check_header(view.mask, view.camera.width, view.camera.height, "srgb")
+    return counted_by(read_codes(view.mask, REPLACE))
 
 
 def _may_be_transparent(image: Path) -> bool:
@@ -465,15 +376,15 @@ def _file_faults(view: View) -> list[UserError]:
     size = view.camera.width, view.camera.height
     found: list[UserError] = []
     with collected(found):
-        _check_header(view.image, *size, view.encoding)
+        check_header(view.image, *size, view.encoding)
     # True pictures have the size of the image: if that is wrong, it is told once.
     for image in () if found else view.truth.values():
         with collected(found):
-            _check_header(image, *size)
+            check_header(image, *size)
     if view.mask is not None:
         with collected(found):
             require_file(view.mask, "mask", "Add it, or remove 'mask_path' from the frame")
-            _check_header(view.mask, *size, "srgb")
+            check_header(view.mask, *size, "srgb")
     return found
 
 
@@ -546,43 +457,6 @@ def _positive(
         what = f"{key!r} is not a number from {low:g} to {high:g}"
         raise UserError(what, where, f"Correct it, or remove it: {_MEANT[key]}")
     return found
-
-
-def _require_readable(path: Path, width: int, height: int, encoding: str) -> None:
-    # The header first: a damaged one may ask for more memory than there is
-    _check_header(path, width, height, encoding)
-    require_memory(PIXEL_BYTES * width * height, "the image needs", "Use a smaller image", path)
-
-
-def _check_header(path: Path, width: int, height: int, encoding: str = "linear") -> None:
-    """Refuse what cannot be an image of that size and encoding, without reading its pixels."""
-    suffix, coded = path.suffix.lower(), encoding == "srgb"
-    if suffix in _LDR_SUFFIXES and not coded:
-        raise UserError("the image is low dynamic range", path, _NEED_HDR)
-    require_file(path, "image", _REPLACE)
-    if coded and suffix in SUFFIXES:
-        raise UserError(f"the image holds no code values: it is {suffix}", path, _CODED)
-    if suffix not in (CODED_SUFFIXES if coded else SUFFIXES):
-        remedy = _CODED if coded else _NEED_HDR
-        raise UserError(f"unknown image format {path.suffix!r}", path, remedy)
-    try:
-        header = read_header(path)
-    except HeaderError as error:
-        raise UserError(f"the image cannot be read ({error})", path, _REPLACE) from None
-    except OSError as error:
-        raise UserError(f"the image cannot be read ({error.strerror})", path, _REPLACE) from None
-    _check_size((header.width, header.height), width, height, path)
-    if header.channels > _MOST_CHANNELS:
-        raise UserError(_OTHER_CHANNELS, path, _REPLACE)
-
-
-def _check_size(size: tuple[int, int], width: int, height: int, path: Path) -> None:
-    if size != (width, height):
-        raise UserError(
-            f"the image has {size[0]} x {size[1]} pixels, its frame says {width} x {height}",
-            path,
-            "Correct 'w' and 'h', or use the image that belongs to the camera",
-        )
 
 
 def _frame(data: DataFolder, view: View) -> dict[str, Any]:

@@ -20,7 +20,8 @@ import numpy as np
 from ..acquisition.new_light import change_light, tell_tilt
 from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, frame_name, frame_of, read_named_cameras
+from ..dataset.camera import Camera
+from ..dataset.camera_files import frame_name, frame_of, read_named_cameras
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError, collected, printable, raise_together
 from ..fields.domain import Domain
@@ -292,7 +293,7 @@ def _render(
             "cameras": placed,
             "settings": asdict(settings),
             "variant": mi.variant(),
-            "truth": None if cameras.truth is None else os.fspath(cameras.truth.folder),
+            "truth": None if cameras.truth is None else os.path.abspath(cameras.truth.folder),
             "mean": mean_scores(frames, keys) if compared else None,
             **_scored(frames if compared else (), keys),
             **aligned,

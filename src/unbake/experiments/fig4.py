@@ -13,7 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig, update
-from ..dataset.camera import Camera, read_cameras
+from ..dataset.camera import Camera
+from ..dataset.camera_files import read_cameras
 from ..dataset.pixels import CameraRays
 from ..errors import UserError
 from ..fields.radiance import RadianceField

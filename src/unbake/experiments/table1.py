@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ..acquisition.capture import light_of_views
-from ..acquisition.placement import coverage
+from ..acquisition.coverage import coverage
 from ..config import PAPER_DEPTH, PathConfig
-from ..dataset.camera import read_cameras
+from ..dataset.camera_files import read_cameras
 from ..dataset.pixels import CameraRays
 from ..imaging.pictures import montage, tonemap, write_png
 from ..scene.edit import to_principled

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera, camera_from_frame, with_top
+from ..dataset.camera import Camera
+from ..dataset.camera_files import camera_from_frame, with_top
 from ..dataset.data_folder import TRANSFORMS
 from ..errors import UserError, named, printable
+from ..imaging.headers import CODED_SUFFIXES
 from ..io import array, number, read_object, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
@@ -213,6 +215,8 @@ def _shot(
         with faults.collected(frame["mask_path"]):
             said = text(frame, "mask_path", name)
             mask = _named_file(file.parent, said, reading)[1]
+            if mask.suffix.lower() not in CODED_SUFFIXES:
+                raise UserError("the mask is no PNG, JPEG or TIFF file", mask, "Convert it to PNG")
             image_header(mask)
     if image is None or lens is None or pose is None:
         return None

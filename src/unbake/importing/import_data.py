@@ -3,47 +3,36 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from PIL import Image
 
 from ..acquisition.new_light import put_light, tell_tilt
 from ..config.light import LightConfig
-from ..dataset.camera import LONGEST_SIDE, Camera, frame_of, spread_rays
+from ..dataset.camera import Camera, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
-from ..dataset.views import LONGEST_NAME, PIXEL_BYTES, counted_by, read_radiance
+from ..dataset.views import LONGEST_NAME
 from ..errors import UserError, named, printable
-from ..imaging.coded import decode, encode, read_codes
-from ..imaging.pictures import write_exr
-from ..imaging.profiles import linear_srgb, profile_name, read_profile
-from ..io import filled_folder, require_new_folder, require_utf8, write_atomically
-from ..memory import require_memory
+from ..io import filled_folder, require_new_folder, require_utf8
 from ..scene import free_space, relight
 from ..scene.parse import parse, write
 from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import NERFSTUDIO, SPLIT_FILES, read_one_file, read_split_files
-from .lens import WIDEST, Lens
+from .lens import WIDEST
 from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
-from .raw import CLIPPED as CLIPPED_RAW
-from .raw import for_sensor, raw_balances, raw_told, read_raw
+from .photographs import check_pictures
+from .raw import for_sensor, raw_balances
 from .rooms import is_room, read_room
 from .settings import ImportSettings
-from .source import Reading, Shot, Source, image_header, masks_in, orientation, same_shape
+from .source import Reading, Shot, Source, masks_in, orientation
+from .views import complete_masks, write_view
 
-#: Codes at and above this share of the largest one are taken for clipped: 250 of 255.
-CLIPPED_CODE = 250 / 255
-#: A linear value below zero by more than this is a colour that sRGB lacks, and the share of pixels
-#: with one from which on it is told.
-_BEYOND, _OFTEN = 0.01, 0.01
 #: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
 _RAYS = 64
 #: Poses are the same but for this in their axes, and this part of the largest coordinate.
@@ -117,7 +106,7 @@ def import_data(
             known, told = read_table(Path(exposures), found.shots, faults)
     _check_light(light, allow_outside, faults)
     names = _names(found.shots, faults)
-    pictures = _check_pictures(found.shots, faults)
+    pictures = check_pictures(found.shots, faults)
     splits = _splits(found.shots, settings.holdout)
     if splits and "train" not in splits.values() and not faults:
         faults.add("no photograph is left to train on: the source holds all of them out")
@@ -135,13 +124,13 @@ def import_data(
             changed = pictures.negative | pictures.profiles.keys()
             same = shot.lens.straight and not shot.raw and shot.name not in changed
             name, split = names[shot.name], splits[shot.name]
-            frame, counts = _write_view(data, shot, name, split, known, on_mesh, same=same)
+            frame, counts = write_view(data, shot, name, split, known, on_mesh, same=same)
             frames.append(frame)
             blank += [] if counts or shot.mask is None else [shot.name]
         if all(shot.name in blank for shot in found.shots if splits[shot.name] == "train"):
             what = "masks leave no pixel of any photograph to train on"
             raise UserError(what, None, "Masks are black where pixels do not count: correct them")
-        _complete_masks(data, frames)
+        complete_masks(data, frames)
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
             | ({"light": "unknown"} if light is None else {})
@@ -282,176 +271,6 @@ def _printable(name: str) -> str:
 
 def _plain(path: PurePosixPath) -> list[str]:
     return [part for part in path.parts if part not in ("/", ".", "..")]
-
-
-@dataclass(frozen=True)
-class _Pictures:
-    """What the pixels of photographs say: names of those with an alpha channel, and so on.
-
-    Args:
-        with_alpha: have an alpha channel.
-        transparent: have pixels whose alpha is less than 1.
-        empty: have pixels whose alpha is 0, and no mask.
-        grey: have one channel of colour.
-        negative: have negative radiance.
-        profiles: the names of colour profiles that are not those of sRGB.
-        beyond: have such a profile, and colours that sRGB lacks.
-    """
-
-    with_alpha: set[str] = field(default_factory=set)
-    transparent: set[str] = field(default_factory=set)
-    empty: set[str] = field(default_factory=set)
-    grey: set[str] = field(default_factory=set)
-    negative: set[str] = field(default_factory=set)
-    profiles: dict[str, str] = field(default_factory=dict)
-    beyond: set[str] = field(default_factory=set)
-
-    def told(self) -> list[str]:
-        """What was changed of the colours, for people."""
-        count = Counter(self.profiles.values())
-        told = [
-            f"colours: photographs with the profile {name}, converted to sRGB: {n}"
-            for name, n in sorted(count.items())
-        ]
-        if self.beyond:
-            told.append(f"colours that sRGB lacks are cut off in {named(sorted(self.beyond))}")
-        return told
-
-    def add(self, shot: Shot, pixels: np.ndarray) -> None:
-        """Take a photograph into account: (H, W, 4)."""
-        if (pixels[..., 3] < 1).any():
-            self.transparent.add(shot.name)
-        if shot.mask is None and (pixels[..., 3] <= 0).any():
-            self.empty.add(shot.name)
-        profile = _profile(shot)
-        if profile is not None:
-            self.profiles[shot.name] = profile_name(profile)
-            if (pixels[..., :3] < -_BEYOND).any(axis=2).mean() > _OFTEN:
-                self.beyond.add(shot.name)
-        elif (pixels < 0).any():
-            self.negative.add(shot.name)
-        channels = image_header(shot.image).channels
-        if shot.name in self.transparent or channels in (2, 4):
-            self.with_alpha.add(shot.name)
-        if channels <= 2:
-            self.grey.add(shot.name)
-
-    def background(self, wanted: str, names: Collection[str]) -> str:
-        """The background of the data set, "visible" or "hidden".
-
-        Args:
-            wanted: the same, or "auto".
-            names: of all photographs.
-        """
-        if wanted != "auto":
-            return wanted
-        # Screenshots and pictures of some converters have an alpha of 1 everywhere.
-        return "hidden" if self.transparent and self.with_alpha == set(names) else "visible"
-
-    def warnings(
-        self, names: Collection[str], background: str, blank: Sequence[str]
-    ) -> Iterator[str]:
-        """What may be fitted for something else than it is, or not at all, for people.
-
-        Args:
-            names: of all photographs.
-            background: of the data set, "visible" or "hidden".
-            blank: photographs of which no pixel counts.
-        """
-        if self.grey and len(self.grey) < len(names):
-            yield (
-                "warning: photographs without colours are among others, and a fit takes their grey "
-                f"for the colour: {named(sorted(self.grey))}. Remove them"
-            )
-        if self.empty and background == "visible":
-            opaque = sorted(set(names) - self.transparent)
-            others = f", beside opaque ones ({named(opaque)})" if opaque else ""
-            which = "the opaque ones" if opaque else "their alpha"
-            yield (
-                "warning: photographs have pixels of alpha 0, fitted as a black background: "
-                f"{named(sorted(self.empty))}{others}. Give --background hidden or --masks FOLDER, "
-                f"or remove {which}"
-            )
-        if blank:
-            yield (
-                f"warning: masks leave no pixel of {len(blank)} photographs: {named(blank)}. They "
-                "are black where pixels do not count"
-            )
-        if self.negative:
-            few = ", ".join(sorted(self.negative)[:3])
-            yield f"{len(self.negative)} photographs have negative pixels, taken as zero: {few}"
-
-
-def _check_pictures(shots: Sequence[Shot], faults: Faults) -> _Pictures:
-    """Decode all photographs and masks once, and add those that cannot be read to the faults."""
-    found = _Pictures()
-    for shot in shots:
-        size = shot.lens.width, shot.lens.height
-        if max(size) > LONGEST_SIDE:
-            faults.add(f"the image has over {LONGEST_SIDE} pixels along an edge", shot.name)
-            continue
-        with faults.collected(shot.name):
-            found.add(shot, _pixels(shot))
-        with faults.collected(shot.name):
-            shot.lens.camera(shot.to_world)
-        if shot.mask is None:
-            continue
-        with faults.collected(shot.mask):
-            header = image_header(shot.mask)
-            if not same_shape((header.width, header.height), size):
-                raise UserError("the mask has another size than its image")
-            _mask(shot)
-    return found
-
-
-def _pixels(shot: Shot) -> np.ndarray:
-    """The photograph, (H, W, 4) float32: linear, alpha premultiplied; maybe negative."""
-    need = PIXEL_BYTES * shot.lens.width * shot.lens.height
-    require_memory(need, "the image needs", "Use a smaller image", shot.name)
-    if shot.coded:
-        codes, profile = read_codes(shot.image), _profile(shot)
-        pixels = decode(codes)
-        if profile is not None and codes.shape[2] >= 3:
-            pixels[..., :3] = linear_srgb(codes[..., :3], profile) * pixels[..., 3:]
-        return pixels
-    if shot.raw:
-        linear = read_raw(shot.image, shot.balance, shot.size)
-        return np.concatenate([linear, np.ones_like(linear[..., :1])], 2)
-    pixels = read_radiance(shot.image, shot.lens.width, shot.lens.height)
-    return pixels.reshape(shot.lens.height, shot.lens.width, 4)
-
-
-def _mask(shot: Shot) -> np.ndarray | None:
-    """Which pixels count, (H, W) bool; None: all do."""
-    mask = None if shot.mask is None else _of_size(counted_by(read_codes(shot.mask)), shot.size)
-    told = raw_told(shot.image, shot.balance, shot.size) if shot.raw else _told(shot)
-    if told is None or told.all():
-        return mask
-    return told if mask is None else mask & told
-
-
-def _of_size(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A mask for an image that was made smaller or larger: a pixel counts if all of it does."""
-    if mask.shape == size[::-1]:
-        return mask
-    share = Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).resize(
-        size, Image.Resampling.BOX
-    )
-    return np.equal(np.asarray(share), 255)
-
-
-def _told(shot: Shot) -> np.ndarray | None:
-    """As `raw_told`, of a photograph whose colours are mixed to those of sRGB; None: all pixels."""
-    if _profile(shot) is None:
-        return None
-    codes = read_codes(shot.image)[..., :3]
-    clipped = codes >= CLIPPED_CODE * np.iinfo(codes.dtype).max
-    return np.logical_or(clipped.all(2), ~clipped.any(2))
-
-
-def _profile(shot: Shot) -> bytes | None:
-    """The colour profile of a photograph, unless it is that of sRGB."""
-    return read_profile(shot.image) if shot.coded else None
 
 
 def _scaled(shots: Sequence[Shot]) -> list[str]:
@@ -604,128 +423,6 @@ def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:
 def _hits(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Whether rays (n, 3) hit something, (n,) bool."""
     return np.isfinite(free_space.trace(scene, origins, directions).distance)
-
-
-def _write_view(
-    data: DataFolder,
-    shot: Shot,
-    name: str,
-    split: str,
-    exposures: Mapping[str, float],
-    on_mesh: np.ndarray | None,
-    *,
-    same: bool,
-) -> tuple[dict[str, Any], bool]:
-    """Write the photograph and the mask of a view; returns its frame, and whether any pixel counts.
-
-    Args:
-        data: to write to.
-        shot: the view.
-        name: its name in the data set.
-        split: its split.
-        exposures: by names of photographs.
-        on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
-        same: copy the file as it is.
-    """
-    camera, limit, exact = shot.lens.camera(shot.to_world), _clipped(shot), None
-    if same:
-        image = data.image(name, shot.image.suffix.lower())
-        image.parent.mkdir(exist_ok=True)
-        shutil.copyfile(shot.image, image)
-    else:
-        image = data.image(name, ".png" if shot.coded else ".exr")
-        pixels = np.maximum(_pixels(shot), 0)
-        if not shot.lens.straight:
-            pixels, exact = _straightened(shot.lens, pixels, camera.fl_x, limit)
-        _write_picture(image, pixels)
-    frame: dict[str, Any] = {
-        "file_path": data.relative(image),
-        "split": split,
-        **frame_of(camera),
-    }
-    if shot.coded:
-        frame["encoding"] = "srgb"
-    if limit is not None:
-        frame["clipped"] = limit
-    if shot.name in exposures:
-        frame["exposure"] = exposures[shot.name]
-    mask = _mask(shot)
-    if mask is not None and not shot.lens.straight:
-        straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
-        mask = straight[..., 0] >= 1
-    masks = [one for one in (on_mesh, mask, exact) if one is not None]
-    counted = np.all(masks, 0)
-    if masks:
-        file = data.mask(name)
-        _write_codes(file, np.where(counted, 255, 0).astype(np.uint8)[..., None])
-        frame["mask_path"] = data.relative(file)
-    if on_mesh is not None:
-        frame["mask_from"] = "mesh"
-    return frame, bool(counted.any())
-
-
-def _complete_masks(data: DataFolder, frames: Sequence[dict[str, Any]]) -> None:
-    """Give all views a mask where any has one, so that none seems to be missing."""
-    bare = [frame for frame in frames if "mask_path" not in frame]
-    for frame in bare if len(bare) < len(frames) else ():
-        file = data.mask(PurePosixPath(frame["file_path"]).stem)
-        _write_codes(file, np.full((frame["h"], frame["w"], 1), 255, np.uint8))
-        frame["mask_path"] = data.relative(file)
-
-
-def _straightened(
-    lens: Lens, pixels: np.ndarray, focal: float, limit: float | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """The photograph of the pinhole camera, and which of its pixels say what they say.
-
-    A pixel between a clipped one and another is darker than the limit, and nobody knows how bright
-    it should be: neither its value nor that it is clipped would be true. A pixel that
-    looks beyond the photograph's edge says nothing.
-
-    Args:
-        limit: from which on channels are clipped; None: they never are.
-    """
-    straight, shown = lens.straightened(pixels, focal), lens.shown(focal)
-    if limit is None:
-        return straight, shown
-    clipped = (pixels[..., :3] >= np.float32(limit)).astype(np.float32)
-    between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
-    exact = np.logical_not(np.any(between, axis=2))
-    return straight, exact if shown is None else exact & shown
-
-
-def _write_picture(file: Path, pixels: np.ndarray) -> None:
-    """Write linear RGBA, premultiplied, as 16-bit codes or OpenEXR by the suffix of the file."""
-    opaque = bool((pixels[..., 3] >= 1).all())
-    if file.suffix == ".exr":
-        write_exr(file, pixels[..., :3] if opaque else pixels)
-        return
-    alpha = pixels[..., 3:]
-    codes = encode(pixels[..., :3] / np.where(alpha > 0, alpha, 1))
-    if not opaque:
-        codes = np.concatenate([codes, np.round(65535 * alpha).astype(np.uint16)], 2)
-    _write_codes(file, codes)
-
-
-def _write_codes(file: Path, codes: np.ndarray) -> None:
-    bitmap = mi.Bitmap(np.ascontiguousarray(codes))
-    write_atomically(file, lambda p: bitmap.write(str(p), mi.Bitmap.FileFormat.PNG))
-
-
-def _clipped(shot: Shot) -> float | None:
-    """The decoded value from which on a photograph is taken for clipped; None of radiance."""
-    if shot.raw:
-        return CLIPPED_RAW
-    if not shot.coded:
-        return None
-    profile = _profile(shot)
-    if profile is None:
-        code = np.full((1, 1, 1), round(CLIPPED_CODE * 255), np.uint8)
-        return round(float(decode(code)[0, 0, 0]), 6)
-    # The least that any mixture of clipped colours can be.
-    codes = np.array([round(CLIPPED_CODE * 255), 255], np.uint8)
-    mixtures = np.stack(np.meshgrid(codes, codes, codes), -1).reshape(1, -1, 3)
-    return round(float(linear_srgb(mixtures, profile).min()), 6)
 
 
 # ------------------------------------------------------------------------------------------ telling

@@ -199,14 +199,16 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
     """Give photographs the masks of a folder.
 
     Masks of `a/0001.jpg` are `a/0001.jpg.png`, as COLMAP has them, or `a/0001.png`; or the same
-    without folders at the beginning. A folder of the source's own that has none of them is told.
+    without folders at the beginning, unless several photographs would have one mask then. A folder
+    of the source's own that has none of them is told.
 
     Args:
         source: with photographs.
         folder: comes before masks that the source names; None: the source's own folder, where it
             has one, for photographs without a mask.
         reading: whether masks may lie outside of the folder.
-        faults: a folder that is none, or has no mask of any photograph, is added to it.
+        faults: a folder that is none, or has no mask of any photograph, and masks of several
+            photographs are added to it.
     """
     given = folder is not None
     folder = folder or source.masks
@@ -218,12 +220,19 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
     if not source.shots:
         return source
     shots = []
+    found: dict[Path, list[str]] = {}
     for shot in source.shots:
         mask = None
         if given or shot.mask is None:
             with faults.collected(shot.name):
                 mask = _mask_of(shot, folder, reading)
+        if mask is not None:
+            found.setdefault(mask, []).append(shot.name)
         shots.append(replace(shot, mask=mask or shot.mask))
+    for mask, names in found.items():
+        if len(names) > 1:
+            what = f"the mask has the name of several photographs: {named(names)}"
+            faults.add(what, mask, "Put masks into folders as the photographs are in")
     bare = [shot.name for shot in shots if shot.mask is None]
     if len(bare) == len(shots):
         what, named_as = "no photograph has a mask in the folder", PurePosixPath(bare[0]).name

@@ -71,7 +71,7 @@ def _row(result: DataCheck, number: int) -> dict[str, Any]:
         "name": view.view.name,
         "split": view.view.split,
         "size": f"{view.view.camera.width} x {view.view.camera.height}",
-        "share": f"{100 * view.share:.0f} %",
+        "share": display.DASH if view.share is None else f"{100 * view.share:.0f} %",
         "stops": display.DASH if stops is None or np.isnan(stops) else f"{stops:+.2f}",
         "clipped": percentage(view.facts.clipped),
         "black": percentage(view.facts.black),

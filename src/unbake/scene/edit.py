@@ -9,7 +9,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..errors import UserError, named
+from ..errors import UserError, collected, named, raise_together
 from ..fields.shapes import bsdf_classes, met_shapes
 from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
@@ -40,48 +40,61 @@ _PROPERTIES = {
 _NO_SURFACES = ("instance", "merge", "shapegroup")
 
 
-def to_principled(scene: ParsedScene) -> int:
+def to_principled(scene: ParsedScene, faults: list[UserError] | None = None) -> int:
     """Turn every `diffuse` and rough plastic BSDF into `principled`, as the paper did (Sec. 6).
 
     Diffuse becomes roughness 0.9; rough plastic keeps its colour, with roughness √α, the perceptual
     roughness of the same microfacet width. Shapes without a BSDF are diffuse to Mitsuba, and share
     a new one.
 
+    Args:
+        scene: whose nodes are changed.
+        faults: what is wrong is added to it, but for numbers out of range, which `value_faults`
+            tells; None: it is raised.
+
     Returns:
         The number of BSDFs changed.
 
     Raises:
-        UserError: one has a property that its plugin does not know, no width that is a number, or a
-            number out of range.
+        UserError: some have a property that their plugin does not know, no width that is a number,
+            or a number out of range; it tells all of them.
     """
+    found: list[UserError] = [] if faults is None else faults
     changed = 0
     for node in scene.state.nodes:
-        props = node.props
-        unknown = sorted(set(props) - _PROPERTIES.get(props.plugin_name(), set(props)))
-        if unknown:
-            raise UserError(
-                f"{props.plugin_name()} has no property {' or '.join(map(repr, unknown))}",
-                mi.parser.file_location(scene.state, node),
-                f"It has {', '.join(sorted(_PROPERTIES[props.plugin_name()]))}",
-            )
-        match props.plugin_name():
-            case "principled":
-                _require_ranges(scene, node)
-                continue
-            case "diffuse":
-                colour, roughness = props.get("reflectance", 0.5), 0.9
-            case "roughplastic":
-                colour = props.get("diffuse_reflectance", 0.5)
-                roughness = math.sqrt(_alpha(scene, node))
-            case _:
-                continue
-        for key in list(props.keys()):
-            del props[key]
-        props.set_plugin_name("principled")
-        props["base_color"] = colour
-        props["roughness"] = roughness
-        changed += 1
+        if faults is None and node.props.plugin_name() == "principled":
+            found += _range_faults(scene, node)
+        with collected(found):
+            changed += _made_principled(scene, node)
+    if faults is None:
+        raise_together(found)
     return changed + _give_bare_shapes_a_bsdf(scene)
+
+
+def _made_principled(scene: ParsedScene, node: mi.parser.SceneNode) -> bool:
+    """Turn a BSDF into `principled` if it is one of those; returns whether it was."""
+    props = node.props
+    unknown = sorted(set(props) - _PROPERTIES.get(props.plugin_name(), set(props)))
+    if unknown:
+        raise UserError(
+            f"{props.plugin_name()} has no property {' or '.join(map(repr, unknown))}",
+            mi.parser.file_location(scene.state, node),
+            f"It has {', '.join(sorted(_PROPERTIES[props.plugin_name()]))}",
+        )
+    match props.plugin_name():
+        case "diffuse":
+            colour, roughness = props.get("reflectance", 0.5), 0.9
+        case "roughplastic":
+            colour = props.get("diffuse_reflectance", 0.5)
+            roughness = math.sqrt(_alpha(scene, node))
+        case _:
+            return False
+    for key in list(props.keys()):
+        del props[key]
+    props.set_plugin_name("principled")
+    props["base_color"] = colour
+    props["roughness"] = roughness
+    return True
 
 
 def _give_bare_shapes_a_bsdf(scene: ParsedScene) -> int:
@@ -111,16 +124,18 @@ def _give_bare_shapes_a_bsdf(scene: ParsedScene) -> int:
     return 1
 
 
-def _require_ranges(scene: ParsedScene, node: mi.parser.SceneNode) -> None:
-    """Refuse numbers that no surface has; Mitsuba 3.9 checks colours alone."""
-    for quantity in QUANTITIES.values():
-        value = node.props.get(quantity.slot)
-        if isinstance(value, int | float) and not 0 <= value <= quantity.upper:
-            raise UserError(
-                f"{quantity.slot!r} of principled is {value:g}, not from 0 to {quantity.upper:g}",
-                mi.parser.file_location(scene.state, node),
-                "Correct it",
-            )
+def _range_faults(scene: ParsedScene, node: mi.parser.SceneNode) -> list[UserError]:
+    """Numbers of a `principled` that no surface has; Mitsuba 3.9 checks colours alone."""
+    values = [(quantity, node.props.get(quantity.slot)) for quantity in QUANTITIES.values()]
+    return [
+        UserError(
+            f"{quantity.slot!r} of principled is {value:g}, not from 0 to {quantity.upper:g}",
+            mi.parser.file_location(scene.state, node),
+            "Correct it",
+        )
+        for quantity, value in values
+        if isinstance(value, int | float) and not 0 <= value <= quantity.upper
+    ]
 
 
 def _alpha(scene: ParsedScene, node: mi.parser.SceneNode) -> float:

@@ -63,6 +63,10 @@ class SurfacePoints:
     normal: np.ndarray  #: (n, 3), unit vectors
     surface: np.ndarray  #: (n,) which shape, or instance of one, has them: numbers from 0
 
+    def of(self, chosen: np.ndarray) -> SurfacePoints:
+        """Some of them, by their numbers."""
+        return SurfacePoints(self.position[chosen], self.normal[chosen], self.surface[chosen])
+
 
 def bounds(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray, float]:
     """Lower corner, upper corner (3,) and diagonal of the scene's bounding box, world units."""

@@ -219,8 +219,8 @@ def parse(path: Path, root: Path | None = None) -> ParsedScene:
 def write(scene: ParsedScene, folder: Path) -> Path:
     """Write the scene and copies of all its files into a folder, as `scene.xml`.
 
-    Shapes keep ids that somebody chose. Files that lie in the folder already are left where they
-    are.
+    Shapes, materials and lights keep ids that somebody chose. Files that lie in the folder already
+    are left where they are.
 
     Raises:
         UserError: a file cannot be copied.

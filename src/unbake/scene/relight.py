@@ -203,7 +203,7 @@ def _copy(source: ParsedScene, indices: list[int], target: ParsedScene) -> dict[
                 place = moved[node.props[key].index()]
                 node.props[key] = mi.Properties.ResolvedReference(place)
         name = node.props.id()
-        if name in taken:
+        if name and name in taken:
             node.props.set_id(f"{_PREFIX} {name} {moved[old]}")
         taken.add(node.props.id())
         target.state.nodes.append(node)

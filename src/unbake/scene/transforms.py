@@ -3,7 +3,7 @@
 Mitsuba 3.9.1 writes a transform along the axes as a scale, a rotation and a translation, which it
 finds by an iteration that ends too soon: a scale of 300 becomes 300.65, one of 3,000 becomes 9,128,
 one of 0.001 becomes 0.0013. Some that mirror and turn a shape lose the mirror. It drops ids that
-nothing refers to, by which people know shapes, the lamps on them and lights; those are kept.
+nothing refers to, by which people know shapes, materials and lights; those are kept.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _UNNAMED = re.compile(r"_+(unnamed_|arg_)?\d+$|elm__\d+$")
 
 
 def write_nodes(scene: ParsedScene, file: Path) -> None:
-    """Write a scene's nodes, shapes and lights with their ids, each once.
+    """Write a scene's nodes, shapes, materials and lights with their ids, each once.
 
     Ids that nobody chose are left out unless references need them.
 
@@ -85,11 +85,11 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
 
 
 def _is_named(node: Any) -> bool:
-    """Whether a node is a shape or a light with an id by which people know it.
+    """Whether a node is a shape, a material or a light with an id by which people know it.
 
     The built-in scenes call the shape of `lamp.ply` `lamp_shape`, and all know it as `lamp`.
     """
-    if node.type not in (mi.ObjectType.Shape, mi.ObjectType.Emitter):
+    if node.type not in (mi.ObjectType.Shape, mi.ObjectType.BSDF, mi.ObjectType.Emitter):
         return False
     name, file = node.props.id(), Path(str(node.props.get("filename", "")))
     return bool(name) and not _UNNAMED.match(name) and name != f"{file.stem}_shape"

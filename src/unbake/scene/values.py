@@ -57,16 +57,17 @@ def value_faults(scene: ParsedScene) -> list[UserError]:
     return faults
 
 
-def require_attributes(scene: mi.Scene, path: Path) -> None:
-    """Refuse a texture that reads values which its mesh does not have: it would be black.
+def attribute_faults(scene: mi.Scene, path: Path) -> list[UserError]:
+    """Textures that read values which their meshes do not have: they would be black.
 
     Args:
         scene: whose shapes are apart.
         path: its file.
 
-    Raises:
-        UserError: names the shape and the values.
+    Returns:
+        An error for each, with the shape and the values; each is told once.
     """
+    found = {}
     for shape in met_shapes(scene):
         bsdf = shape.bsdf()
         for node in () if bsdf is None else mi.traverse(bsdf).hierarchy:
@@ -75,7 +76,8 @@ def require_attributes(scene: mi.Scene, path: Path) -> None:
             name = _ATTRIBUTE.search(str(node))
             if name is not None and not np.all(shape.has_attribute(name[1])):
                 what = f"the shape {shape.id()!r} has no {name[1]!r}, which its material reads"
-                raise UserError(what, path, "Correct the name, or give a bitmap")
+                found[what] = UserError(what, path, "Correct the name, or give a bitmap")
+    return [*found.values()]
 
 
 def _negative(scene: ParsedScene, place: int, key: str, value: float) -> UserError:

@@ -15,11 +15,12 @@ from rich.console import Console
 
 from ..acquisition.built_in import SCENES, write_scene
 from ..acquisition.capture import posed_cameras, require_scene
+from ..acquisition.coverage import is_room
 from ..acquisition.new_light import change_light, tell_tilt
-from ..acquisition.placement import is_room
 from ..acquisition.settings import CaptureSettings
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, named_by_split, read_named_cameras
+from ..dataset.camera import Camera
+from ..dataset.camera_files import named_by_split, read_named_cameras
 from ..errors import UserError
 from ..fields.domain import Domain
 from ..fields.grid_sizes import USUAL, sized

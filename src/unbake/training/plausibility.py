@@ -9,9 +9,9 @@ import numpy as np
 from ..dataset.findings import noise_at_black
 from ..dataset.hot_pixels import told_hot_pixels
 from ..dataset.pixels import PixelSource
-from ..dataset.poses import pose_warnings
+from ..dataset.poses import check_cameras, pose_warnings
 from ..dataset.quick_check import quick_findings
-from ..dataset.views import Dataset, check_cameras
+from ..dataset.views import Dataset
 from ..errors import UserError
 from ..fields.arrays import from_numpy
 from ..scene.emitters import (

@@ -1,0 +1,126 @@
+"""The photographs and the masks of a data set, written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.camera_files import frame_of
+from ..dataset.data_folder import DataFolder
+from ..imaging.coded import encode
+from ..imaging.pictures import write_exr
+from ..io import write_atomically
+from .lens import Lens
+from .photographs import clipped_from, mask_of, pixels_of
+from .source import Shot
+
+
+def write_view(
+    data: DataFolder,
+    shot: Shot,
+    name: str,
+    split: str,
+    exposures: Mapping[str, float],
+    on_mesh: np.ndarray | None,
+    *,
+    same: bool,
+) -> tuple[dict[str, Any], bool]:
+    """Write the photograph and the mask of a view; returns its frame, and whether any pixel counts.
+
+    Args:
+        data: to write to.
+        shot: the view.
+        name: its name in the data set.
+        split: its split.
+        exposures: by names of photographs.
+        on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
+        same: copy the file as it is.
+    """
+    camera, limit, exact = shot.lens.camera(shot.to_world), clipped_from(shot), None
+    if same:
+        image = data.image(name, shot.image.suffix.lower())
+        image.parent.mkdir(exist_ok=True)
+        shutil.copyfile(shot.image, image)
+    else:
+        image = data.image(name, ".png" if shot.coded else ".exr")
+        pixels = np.maximum(pixels_of(shot), 0)
+        if not shot.lens.straight:
+            pixels, exact = _straightened(shot.lens, pixels, camera.fl_x, limit)
+        _write_picture(image, pixels)
+    frame: dict[str, Any] = {
+        "file_path": data.relative(image),
+        "split": split,
+        **frame_of(camera),
+    }
+    if shot.coded:
+        frame["encoding"] = "srgb"
+    if limit is not None:
+        frame["clipped"] = limit
+    if shot.name in exposures:
+        frame["exposure"] = exposures[shot.name]
+    mask = mask_of(shot)
+    if mask is not None and not shot.lens.straight:
+        straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
+        mask = straight[..., 0] >= 1
+    masks = [one for one in (on_mesh, mask, exact) if one is not None]
+    counted = np.all(masks, 0)
+    if masks:
+        file = data.mask(name)
+        _write_codes(file, np.where(counted, 255, 0).astype(np.uint8)[..., None])
+        frame["mask_path"] = data.relative(file)
+    if on_mesh is not None:
+        frame["mask_from"] = "mesh"
+    return frame, bool(counted.any())
+
+
+def complete_masks(data: DataFolder, frames: Sequence[dict[str, Any]]) -> None:
+    """Give all views a mask where any has one, so that none seems to be missing."""
+    bare = [frame for frame in frames if "mask_path" not in frame]
+    for frame in bare if len(bare) < len(frames) else ():
+        file = data.mask(PurePosixPath(frame["file_path"]).stem)
+        _write_codes(file, np.full((frame["h"], frame["w"], 1), 255, np.uint8))
+        frame["mask_path"] = data.relative(file)
+
+
+def _straightened(
+    lens: Lens, pixels: np.ndarray, focal: float, limit: float | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The photograph of the pinhole camera, and which of its pixels say what they say.
+
+    A pixel between a clipped one and another is darker than the limit, and nobody knows how bright
+    it should be: neither its value nor that it is clipped would be true. A pixel that
+    looks beyond the photograph's edge says nothing.
+
+    Args:
+        limit: from which on channels are clipped; None: they never are.
+    """
+    straight, shown = lens.straightened(pixels, focal), lens.shown(focal)
+    if limit is None:
+        return straight, shown
+    clipped = (pixels[..., :3] >= np.float32(limit)).astype(np.float32)
+    between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
+    exact = np.logical_not(np.any(between, axis=2))
+    return straight, exact if shown is None else exact & shown
+
+
+def _write_picture(file: Path, pixels: np.ndarray) -> None:
+    """Write linear RGBA, premultiplied, as 16-bit codes or OpenEXR by the suffix of the file."""
+    opaque = bool((pixels[..., 3] >= 1).all())
+    if file.suffix == ".exr":
+        write_exr(file, pixels[..., :3] if opaque else pixels)
+        return
+    alpha = pixels[..., 3:]
+    codes = encode(pixels[..., :3] / np.where(alpha > 0, alpha, 1))
+    if not opaque:
+        codes = np.concatenate([codes, np.round(65535 * alpha).astype(np.uint16)], 2)
+    _write_codes(file, codes)
+
+
+def _write_codes(file: Path, codes: np.ndarray) -> None:
+    bitmap = mi.Bitmap(np.ascontiguousarray(codes))
+    write_atomically(file, lambda p: bitmap.write(str(p), mi.Bitmap.FileFormat.PNG))
