@@ -49,7 +49,8 @@ def losses(sample: unbake.PathSample, target: mi.Color3f, weight: mi.Float) -> l
 
 def train(data: Path, steps: int) -> list[float]:
     """The sum of the losses, step by step."""
-    dataset, config = unbake.Dataset.load(data), unbake.preset("cpu")
+    dataset = unbake.Dataset.load(data)
+    config = unbake.with_defaults(unbake.preset("cpu"), dataset)
     pixels = unbake.training_pixels(dataset, clip_negative=False, smoothed=False)
     scale = pixels.photographs.level
     problem = unbake.make_problem(dataset.scene, dataset.background, config, scale)

@@ -748,6 +748,22 @@ def test_a_fit_finds_exposures_and_tells_them(fitted, tmp_path):
     assert {f"phi.{key}" for key in trained_model()[1]} <= last_state(run).keys()
 
 
+def test_steps_move_exposures_to_where_photographs_have_them(unknown, tiny):
+    """From both sides: materials stay grey, and exposures make up for that."""
+    camera = CameraConfig(exposure="per-image")
+    config = replace(read_toml(tiny), method="direct", camera=camera)
+    ends = []
+    for start in (-0.6, 0.6):
+        begun = begin_fit(Dataset.load(unknown), config)
+        begun.state.replace({"exposure.log": mi.Float(0, start)})
+        rates = dict.fromkeys(learning_rates(begun.config, 0, 0.0), 0.0) | {"exposure": 0.2}
+        for number in range(100):
+            begun.step(begun.state, number, rates)
+        anchor, other = np.array(begun.state.phi["exposure.log"])
+        ends.append(other - anchor)
+    assert abs(ends[1] - ends[0]) < 0.3, ends
+
+
 def test_a_resumed_fit_goes_on_bit_for_bit(unknown, tiny, tmp_path, monkeypatch):
     settings = replace(read_toml(tiny), method="direct", steps=8, camera=EVERYTHING)
     whole, parts, _ = whole_and_in_parts(unknown, tmp_path, settings, monkeypatch)

@@ -21,14 +21,17 @@ from unbake.evaluation.placing import placed_view, told_of_place
 from unbake.evaluation.rendering import render
 from unbake.evaluation.renderings import render_camera
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings
+from unbake.fields.arrays import from_numpy
 from unbake.imaging.pictures import write_exr
 from unbake.report.page import write_report
 from unbake.scene import edit
 from unbake.scene.parse import parse
 from unbake.training.cameras import Cameras
+from unbake.training.fresh_fit import begin_fit
 from unbake.training.poses import PoseModel
 from unbake.training.recovered import load_run
 from unbake.training.run_folder import RunFolder
+from unbake.training.schedule import learning_rates
 from unbake.transport.vertex import SceneView
 
 SIZE = 12
@@ -246,6 +249,32 @@ def test_a_fit_corrects_poses_tells_them_and_goes_on_bit_for_bit(
     assert RunFolder(run).metrics()["camera"] == found
     page = write_report([run], tmp_path / "report.html").read_text()
     assert "Moved, pixels" in page and "intrinsics: focal length" in page
+
+
+def test_steps_move_poses_to_where_photographs_have_them(cornell, tiny):
+    """From both sides, and next to nothing is known of them beforehand."""
+    camera = CameraConfig(poses="refined", pose_sigma=1e3)
+    config = replace(read_toml(tiny), method="direct", camera=camera)
+    dataset, starts, ends = Dataset.load(cornell), [], []
+    for start in (-1.0, 1.0):
+        begun = begin_fit(dataset, config)
+        moves = np.zeros((2, 6), np.float32)
+        moves[:, :2] = start  # turned about the horizontal and the vertical axis, pixels
+        begun.state.replace({"poses.moves": from_numpy(mi.Float, moves.ravel())})
+        begun.state.publish(begun.problem)
+        starts.append(begun.problem.poses.cameras())
+        rates = dict.fromkeys(learning_rates(begun.config, 0, 0.0), 0.0) | {"poses": 0.02}
+        for number in range(150):
+            begun.step(begun.state, number, rates)
+        begun.state.publish(begun.problem)
+        ends.append(begun.problem.poses.cameras())
+
+    def apart(both):
+        scene = parse(dataset.scene, dataset.root).instantiate()
+        return np.mean([told_of_place(scene, *pair)["pixels"] for pair in zip(*both, strict=True)])
+
+    assert apart(starts) > 2
+    assert apart(ends) < 0.5 * apart(starts), (apart(starts), apart(ends))
 
 
 def test_the_command_line_says_what_is_refined(unbake, cornell, tiny, tmp_path):

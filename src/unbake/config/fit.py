@@ -347,13 +347,13 @@ class FitConfig:
     lamps: Lamps = "known"
     #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
-    #: Of albedo by numbers before its bounds, in gradients (ours; `fields/arrays.py`). With 0,
-    #: what the first steps moved far beyond a bound comes back slowly or never. -1: `LEAST_SLOPE`
-    #: with L_θ, and 0 without; a run that was started has a number.
+    #: Lower bound on the slope of albedo's sigmoid in gradients (ours; `fields/arrays.py`). With
+    #: 0, values that the first steps drive into saturation recover slowly or never. -1:
+    #: `LEAST_SLOPE` with L_θ, and 0 without; a run that was started has a number.
     least_slope: float = -1.0
     #: Of L_θ, by representation (Sec. 5.3).
     radiance: Mapping[str, FieldSettings] = field(default_factory=dict)
-    #: Where bounces of methods with L_θ look for light (ours).
+    #: Path guiding of methods with L_θ (ours).
     guide: GuideConfig = field(default_factory=GuideConfig)
     precision: Precision = "single"  #: of the networks' products; all else is single (ours)
     lighting: LightingConfig = field(default_factory=LightingConfig)

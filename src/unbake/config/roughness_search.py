@@ -34,8 +34,8 @@ class RoughnessSearchConfig:
     #: Pixels of a piece that tell as much of its level as one would by itself, as their errors have
     #: a part in common; 0: pieces stay at what is most probable
     pixels_as_one: float = 3.0
-    #: So many pixels of a piece tell as much as all further ones would, too: errors of L_θ do not
-    #: average out; 0: there is no such number
+    #: A piece tells as much as so many independent pixels at most: errors of L_θ do not average
+    #: out; 0: there is no such number
     pixels_at_most: int = 8000
     #: How near colours are whose pieces have like levels, as square roots of linear RGB
     like_colours: float = 0.1

@@ -29,7 +29,7 @@ class EvaluationSettings:
     spp: Annotated[int, Flag("Samples per pixel: more mean less noise, and more time")] = 64
     #: Bounces, plus one; specular ones are not counted.
     max_depth: Annotated[int, Flag("Longest light path")] = 48
-    rr_depth: int = 5  #: bounces before Russian roulette
+    rr_depth: int = 5  #: first bounce that Russian roulette may take away
     #: All held-out views are rendered.
     train_views: Annotated[int, Flag("Training views to render, besides all held-out ones")] = 4
     material_spp: int = 16  #: camera samples a pixel of the pictures of materials
@@ -67,7 +67,7 @@ class RenderSettings:
     #: Camera samples a pixel.
     spp: Annotated[int, Flag("Samples per pixel: more mean less noise, and more time")] = 128
     max_depth: Annotated[int, Flag("Longest light path")] = 48
-    rr_depth: int = 5  #: bounces before Russian roulette
+    rr_depth: int = 5  #: first bounce that Russian roulette may take away
     seed: Annotated[int, Flag("Seed of all random numbers")] = 1
     #: Stops; of PNG files alone.
     exposure: Annotated[float, Flag("Stops by which PNG files are brighter than the values")] = 0.0

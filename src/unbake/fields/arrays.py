@@ -24,9 +24,8 @@ def sigmoid(x: mi.Float, least_slope: float = 0.0) -> mi.Float:
 
     Args:
         x: any number.
-        least_slope: backwards, gradients are multiplied with this where the slope is less (ours).
-            Those by which a descent would move away from 0 keep their slope beyond ±6, so that
-            numbers come back from wherever they are, and do not run away.
+        least_slope: lower bound on the slope in backpropagation (ours), so that saturated values
+            recover. Beyond ±6 it does not apply to gradients that would push a value further out.
     """
     if least_slope and dr.grad_enabled(x):
         return dr.custom(_Sigmoid, x, least_slope)

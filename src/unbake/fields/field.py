@@ -27,7 +27,7 @@ class FieldSpec:
         bounded: every output lies in (0, 1), and `initial` between; otherwise outputs are any
             numbers, and start near zero.
         initial: value of every output of an untrained field that is bounded.
-        least_slope: of bounded outputs by numbers before their bounds, in gradients; see `sigmoid`.
+        least_slope: lower bound on the slope of bounded outputs, in gradients; see `sigmoid`.
         seed: of random initial parameters.
         half: products may be in half precision.
         materials: names of the scene's materials, in the order of `SurfacePoint.material`.
@@ -95,7 +95,7 @@ class Field(Protocol):
         return {}
 
     def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float | mi.TensorXf]:
-        """The shared numbers with which pieces have higher outputs before their bounds.
+        """Shared parameters, changed to raise the outputs of pieces before their bounds.
 
         Args:
             piece: different pieces of surface.
@@ -109,7 +109,7 @@ class Field(Protocol):
     def varied(
         self, piece: Piece, about: Sequence[mi.Float], factor: mi.Float
     ) -> dict[str, mi.Float | mi.TensorXf]:
-        """The shared numbers with which outputs of pieces, before their bounds, vary less or more.
+        """Shared parameters, changed to scale how outputs before their bounds vary within pieces.
 
         Args:
             piece: different pieces of surface.
@@ -123,7 +123,7 @@ class Field(Protocol):
         return {}
 
     def beside_shared(self, point: SurfacePoint) -> list[mi.Float]:
-        """What does not change at some points while only numbers that points share do.
+        """The part of the outputs at some points that stays while only shared parameters change.
 
         Args:
             point: as of `evaluate`.
@@ -134,7 +134,7 @@ class Field(Protocol):
         return self.evaluate(point)
 
     def with_shared(self, beside: list[mi.Float], point: SurfacePoint) -> list[mi.Float]:
-        """The same as `evaluate`, of which all but the shared numbers is known already.
+        """`evaluate`, given the part that stays: only shared parameters are looked up again.
 
         Args:
             beside: from `beside_shared` of the same points.

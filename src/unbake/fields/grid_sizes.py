@@ -73,7 +73,7 @@ def levels_for(grid: GridConfig, seen: SurfaceSeen) -> int:
 
 
 def table_for(grid: GridConfig, seen: SurfaceSeen) -> int:
-    """log2 of the entries that the cells need which the seen surface has at that fineness."""
+    """log2 of the number of entries for all finest cells on the seen surface."""
     cells = seen.area / (seen.footprint * grid.footprints) ** 2
     least, most = TABLES
     return min(max(least, math.ceil(math.log2(max(cells, 1.0)))), most)

@@ -1,4 +1,4 @@
-"""Where light comes from: directions at places of the scene, learned together with L_θ (ours)."""
+"""Path guiding: where light comes from at each place, learned together with L_θ (ours)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _MOST = 0.9
 #: Logarithms of densities, and of the odds of a guided bounce, are these multiples of what Adam
 #: moves, so that they learn at the rate of L_θ.
 _GAIN, _GAIN_OF_SHARES = 10.0, 4.0
-#: The largest size of a logarithm of a density, whose exponential is a number yet.
+#: Largest magnitude of a log density, so that its exponential stays finite.
 _FURTHEST = 40.0
-#: The most that a sample counts, in multiples of a pixel's radiance: fireflies are no light.
+#: Upper bound on a sample's weight, in multiples of the pixel's radiance, against fireflies.
 _MOST_WEIGHT = 20.0
 
 
@@ -151,8 +151,8 @@ class LightGuide:
     def loss(self, choice: Choice, weight: mi.Float) -> mi.Float:
         """The cross-entropy of the distributions with what samples contribute; smaller is better.
 
-        That of the guide alone trains directions, so that a direction in which nothing was found so
-        far comes back when there is light; that of guide and BSDF together trains the shares.
+        The guide's own density trains the directions, so that one that found nothing so far
+        recovers once there is light; the density of the mixture trains the shares.
 
         Args:
             choice: of each sample.
@@ -164,8 +164,10 @@ class LightGuide:
         index, count = cell * n + self._bin(choice.direction), dr.width(weight)
         own = dr.log(dr.gather(mi.Float, self._weights, index) / self._total(cell))
         told = -dr.mean(dr.select(weight > 0, weight * (own + dr.log(mixed)), 0))
-        # The logarithm of a density passes gradients to all bins of its cell, which are the same
-        # for all samples there: they are summed by cell first.
+        # `_weights` is detached, so `told` trains the shares alone. The gradient of `own` by the
+        # logits is that of a softmax, whose normalizer reaches all bins of a cell. Written out, it
+        # takes one sum per cell, not a scatter per sample and bin. `slope` has that gradient; its
+        # value is not used.
         logits = _GAIN * self._logits
         here = dr.gather(mi.Float, logits, index, mode=dr.ReduceMode.Direct)
         found = dr.zeros(mi.Float, dr.width(self._odds))

@@ -43,8 +43,9 @@ class Materials(Mapping[str, Field]):
         self.numbers: dict[int, int] = {}
         #: Of the scene; set together with the domain, where fields have values of pieces.
         self.pieces: Pieces | None = None
-        #: Whether textures have nothing but what `carry` puts on surface interactions, also outside
-        #: of `carrying`: the fields are not prepared for integrators of Mitsuba; see `stand_alone`.
+        #: Whether textures read what `carry` put on the surface interaction even outside of
+        #: `carrying`, rather than evaluate the fields, which are not prepared for that. While it is
+        #: set, integrators of Mitsuba render wrong materials; `stand_alone` clears it.
         self.carried = True
         self._fields = {name: fields[name] for name in in_order(fields)}
 
@@ -66,7 +67,7 @@ class Materials(Mapping[str, Field]):
         }
 
     def assign(self, parameters: Mapping[str, mi.Float | mi.TensorXf]) -> None:
-        """Use these arrays from now on; but for recorded steps, textures stand alone with them."""
+        """Use these arrays from now on; outside recorded steps, textures evaluate the fields."""
         for name, field in self.items():
             field.assign({k: parameters[f"{name}.{k}"] for k in field.parameters()})
         recorded = is_carrying() or dr.flag(dr.JitFlag.FreezingScope)

@@ -56,6 +56,8 @@ class Progress:
     searching: float = 0.0  #: seconds of training that were those of searches, not of steps
     last_search: float = 0.0  #: of them, those of the last one
     length: float = 0.0  #: of the fit that `searches` is of, in seconds or steps
+    timed: bool | None = None  #: whether that is in seconds; None: nobody wrote that down
+    searched: int = 0  #: searches that were made: one may stand for several places
     warning: str | None = None  #: what is wrong with a fit that has ended; not part of checkpoints
 
     def counted(self) -> dict[str, Any]:
@@ -94,6 +96,8 @@ def save_checkpoint(
         "searching": progress.searching,
         "last_search": progress.last_search,
         "length": progress.length,
+        "timed": progress.timed,
+        "searched": progress.searched,
         **(about or {}),
         "files": {STATE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
     }
@@ -201,6 +205,8 @@ def _good(path: Path, most: int) -> tuple[dict[str, np.ndarray], Progress, dict[
             float(manifest.get("searching", 0.0)),
             float(manifest.get("last_search", 0.0)),
             float(manifest.get("length", 0.0)),
+            None if manifest.get("timed") is None else bool(manifest["timed"]),
+            int(manifest.get("searched", manifest.get("searches") or 0)),
         )
         if not all(np.isfinite(array).all() for array in arrays.values()):
             raise _Damaged("a number is not finite")

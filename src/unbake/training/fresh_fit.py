@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import drjit as dr
 
@@ -34,25 +33,26 @@ class FreshFit:
     state: State
 
 
-def begin_fit(dataset: Dataset, config: FitConfig) -> FreshFit:
+def begin_fit(dataset: Dataset, config: FitConfig, *, clip_negative: bool = False) -> FreshFit:
     """A fit of a data set that writes nothing."""
     config = with_defaults(config, dataset)
-    pixels = pixels_of(dataset, config, clip_negative=False)
+    pixels = pixels_of(dataset, config, clip_negative=clip_negative)
     problem = problem_of(dataset, config, pixels.photographs.level)
     begin_cameras(problem, dataset, pixels)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))
 
 
-def compile_kernels(data: Path, configs: Sequence[FitConfig]) -> None:
+def compile_kernels(
+    dataset: Dataset, configs: Sequence[FitConfig], *, clip_negative: bool = False
+) -> None:
     """Take the first steps of fits and drop them, so that their kernels are in Dr.Jit's cache.
 
     The time of a fit has the compilation of kernels in it that are not there. It is longest for
     methods that follow whole paths, and the first of several fits would pay for all.
     """
-    dataset = Dataset.load(data)
     for config in configs:
-        fit = begin_fit(dataset, config)
+        fit = begin_fit(dataset, config, clip_negative=clip_negative)
         for number in range(_COMPILING_STEPS):
             fit.step(fit.state, number, learning_rates(fit.config, number, 0.0))
         dr.sync_thread()

@@ -311,7 +311,7 @@ class _Training:
             raise
         if samples:  # on all ranks
             progress.samples += samples
-            progress.searches = self._search.made
+            progress.searches, progress.searched = self._search.made, self._search.searched
             self._read_clock()
             progress.last_search = progress.seconds - before
             progress.searching += progress.last_search
@@ -419,14 +419,18 @@ def _searches(begun: Begun, ranks: Ranks) -> RoughnessSearch:
     """The searches of a fit, some of which may have been made before."""
     config, progress = begun.config, begun.progress
     search = RoughnessSearch(begun.problem, config, begun.step, ranks)
-    search.made = progress.searches or 0
+    search.made, search.searched = progress.searches or 0, progress.searched
     passed = search.passed(_fraction(config, progress, search))
     if progress.searches is None:  # older versions made all in their places
-        search.made = passed
-    elif _length(config) > progress.length:  # in a longer fit than before, places lie later
+        search.made = search.searched = passed
+    elif progress.timed not in (None, bool(config.seconds)) or _length(config) > progress.length:
+        # In a longer fit than before, places lie later. The first search there replaces what those
+        # of the shorter fit have found, and until then steps leave it alone.
         search.made = min(search.made, passed)
-        progress.last_search = 0.0  # that of a shorter fit
-    progress.searches, progress.length = search.made, _length(config)
+        search.searched = min(search.searched, max(1, search.made))
+        progress.last_search = 0.0
+    progress.searches, progress.searched = search.made, search.searched
+    progress.length, progress.timed = _length(config), bool(config.seconds)
     return search
 
 

@@ -81,9 +81,11 @@ def with_expected_levels(
     levels = np.stack([np.interp(LEVELS, x, y) for x, y in zip(value, error, strict=True)])
     wanted = expected(levels, seen.pixels, colours, settings)
     by = np.array([np.interp(level, x, SHIFTS) for level, x in zip(wanted, value, strict=True)])
-    # Curves know nothing of what is smoother than their first node: it stays as smooth as it is.
+    # Curves know nothing of what is smoother than their first node or rougher than their last one:
+    # it stays as it is.
     now = value[:, len(SHIFTS) // 2]
     by[(now < LEVELS[0]) & (wanted < LEVELS[2])] = 0
+    by[(now > LEVELS[-1]) & (wanted > LEVELS[-3])] = 0
     return found | seen.raised(by)
 
 

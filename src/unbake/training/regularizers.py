@@ -47,10 +47,10 @@ def regularization_terms(
     They are the same for all methods, and cost one more ray a pixel. `has_terms` tells whether
     there are any.
 
-    Differences of albedo weigh as much as photographs are left unexplained. What the noise of
-    photographs is cannot be told from a photograph alone, where texture looks like it. A fit can
-    tell: texture is the same in all views and is learned, noise is not. So the weight is a multiple
-    of the photometric loss, whose expectation has no noise of the fit's own samples in it.
+    Albedo smoothness is weighted by the photometric loss. One photograph cannot distinguish noise
+    from texture, but a fit can: texture is the same in all views and is learned, noise is not, and
+    stays in the loss. The expected loss has no variance of the rendering in it. That of a batch can
+    be negative and is then clamped to zero, so that clean photographs are smoothed a little, too.
 
     Args:
         ray: a camera ray for each pixel of the batch.

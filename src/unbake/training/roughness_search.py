@@ -1,9 +1,8 @@
-"""Roughness by search: albedo follows at once, where steps of gradients would wait for it (ours).
+"""Roughness by search: variable projection eliminates albedo, which steps would wait for (ours).
 
-Photographs show roughness as a little more light here and a little less there, which a little less
-albedo here and a little more there explains nearly as well. Steps move both by themselves. Where
-roughness is wrong, albedo has adapted to it: the slope that is left is small beside the noise of a
-step, and the two move together only slowly.
+A little more roughness and a little less albedo explain photographs almost equally well. Where
+roughness is wrong, albedo has adapted to it: the gradient that is left is small beside a step's
+noise, and gradient steps move the two only slowly, together.
 
 Reflected light is linear in albedo. So the best albedo for a given roughness is known without steps
 (variable projection, Golub and Pereyra 1973). A few times in a fit, many samples of some pixels are
@@ -49,6 +48,7 @@ from .piece_variation import expected_albedo, with_all_variation, with_expected_
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
 from .search_samples import SearchSamples
+from .seen_pieces import SeenPieces
 from .state import State
 from .step import TrainingStep, without_garbage_collection
 
@@ -89,6 +89,7 @@ class RoughnessSearch:
         times = 0 if self._field is None else search.times
         self._places = np.sort(np.linspace(search.last, search.first, times))
         self.made = 0  # for how many of the places roughness was searched
+        self.searched = 0  # how often it was
 
     def passed(self, done: float) -> int:
         """How many places of searches lie before a fraction of the fit, or at it."""
@@ -122,7 +123,7 @@ class RoughnessSearch:
         if not len(self._places) or not self._size(step, done):
             return rates
         search = self._config.roughness_search
-        factor = search.rate_between if self.made else search.rate_before
+        factor = search.rate_between if self.searched else search.rate_before
         return rates | {"roughness": rates["roughness"] * factor}
 
     def _size(self, step: int, done: float) -> tuple[int, int] | None:
@@ -165,11 +166,11 @@ class RoughnessSearch:
             with without_garbage_collection():
                 passed = self.passed(done)
                 # The first one is of an L_θ that is not there yet.
-                part = 1 / max(1, passed - 1) if self.made else 1.0
+                part = 1 / max(1, self.searched)
                 last = passed == len(self._places)
                 each = -(-pixels // self._ranks.size)
                 samples = self._search(state, number, (each, spp), part, last)
-                self.made = passed
+                self.made, self.searched = passed, self.searched + 1
                 return samples
         except (RuntimeError, MemoryError) as error:
             if not lacks_memory(error):
@@ -185,9 +186,9 @@ class RoughnessSearch:
 
         Args:
             size: pixels of this rank, and samples of each.
-            part: of the way to what is found that is gone.
-            last: whether albedo is told how much it varies within pieces, too: later steps that
-                learn it do not get back what is taken from it.
+            part: fraction of the way to move from the current values to those found.
+            last: whether to shrink the variation of albedo within pieces, too: later steps do not
+                recover what that removes.
         """
         search, materials, field = (
             self._config.roughness_search,
@@ -223,9 +224,9 @@ class RoughnessSearch:
             curves = Curves.of(rows, search.cells, search.colours, albedo, ranks, shown)
             own = self._config.material_settings["roughness"].learning_rate
             found = searched(field, curves, search, search.rate * own, ranks)
-            for key, x in found.items():
-                before = dr.detach(state.phi[f"roughness.{key}"])
-                found[key] = dr.lerp(before, self._of_first(x), part)
+            before = {key: dr.detach(state.phi[f"roughness.{key}"]) for key in found}
+            found = averaged(field, curves, (before, found), part, ranks)
+            found = {key: self._of_first(x) for key, x in found.items()}
             changed = {f"roughness.{key}": x for key, x in found.items()}
             if last and search.pixels_as_one and albedo:
                 with holding(field, found):
@@ -266,6 +267,33 @@ def searched(
             found = with_expected_variation(field, curves, found, settings, ranks)
             found = with_expected_levels(field, curves, found, settings, ranks)
     return found
+
+
+def averaged(
+    field: Field,
+    curves: Curves,
+    both: tuple[dict[str, Any], dict[str, Any]],
+    part: float,
+    ranks: Ranks | None = None,
+) -> dict[str, Any]:
+    """Numbers that points share, between those of before and those that were found.
+
+    Outputs are products of some of them: the level of each piece is put where both levels have it.
+
+    Args:
+        field: of roughness, with numbers of pieces.
+        curves: of the pieces that were searched.
+        both: the numbers of before, and those that were found.
+        part: fraction of the way to move from those of before to those that were found.
+        ranks: that have a part of the curves each; None: there is one.
+    """
+    before, found = both
+    if part == 1:
+        return found
+    mixed = {key: dr.lerp(before[key], found[key], part) for key in found}
+    seen = [SeenPieces(field, curves.point, curves.pieces, x, ranks) for x in (*both, mixed)]
+    first, last, now = (each.middles(curves.shown)[0] for each in seen)
+    return mixed | seen[-1].raised(first + part * (last - first) - now)
 
 
 def descend(

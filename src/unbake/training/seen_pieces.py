@@ -18,7 +18,7 @@ from ..ranks import Ranks
 
 #: A value of the field is no nearer to its bounds.
 _NEAREST = 1e-6
-#: The chance that a curve tells nothing, for what no variance knows.
+#: Probability that a curve is meaningless, for errors that no variance accounts for.
 _ASTRAY = 1e-6
 
 

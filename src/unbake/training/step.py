@@ -31,7 +31,7 @@ from .problem import Problem
 from .state import State
 from .told_scale import shows_environment
 
-#: Pixels that tell the loss of black pictures.
+#: Pixels from which the loss of all-black images is estimated.
 _OF_BLACK = 1 << 15
 #: The largest gradient whose square is finite in single precision, with some room.
 _LARGEST_GRADIENT = 1e18
@@ -238,7 +238,7 @@ class TrainingStep:
         return self.batch_loss.epsilon
 
     def loss_of_black(self) -> float:
-        """About the photometric loss of black pictures."""
+        """An estimate of the photometric loss of all-black images."""
         _, colours = self.pixels.draw(self.config.seed, _OF_BLACK).read()
         target = colours[:, :3].astype(np.float64)
         smoothed = self.config.loss_reference == "smoothed"

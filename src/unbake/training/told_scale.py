@@ -1,4 +1,4 @@
-"""Whether photographs tell the scale between albedo and light, where both are unknown.
+"""Whether photographs determine the scale of albedo and light, where both are unknown.
 
 They do where they show the environment itself, directly or in mirrors and glass: its radiance is
 then that of pixels. Where none shows it, the scale is a convention (`regularizers.py`).
@@ -56,7 +56,7 @@ def shows_environment(problem: Problem, config: FitConfig, pixels: PixelSource) 
 
 
 def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:
-    """Whether the mean albedo of a data set may be held, as far as is known without a problem.
+    """Whether a fit may have to fix the mean albedo, judged from the data set alone.
 
     Mirrors and glass are not looked at.
 

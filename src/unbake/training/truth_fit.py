@@ -19,7 +19,7 @@ from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..fields.arrays import from_numpy
-from ..quantities import channels_of
+from ..quantities import QUANTITIES, channels_of
 from ..transport.vertex import find_vertex
 from .problem import Problem, problem_of
 from .state import State
@@ -81,10 +81,26 @@ class TrueMaps:
             )
         return TrueMaps(views, names, np.concatenate(numbers), np.concatenate(values))
 
-    def means(self) -> dict[str, np.ndarray]:
-        """The mean of each quantity over all pixels, shape (channels,)."""
-        mean = self.values.mean(0, dtype=np.float64)
-        return {name: mean[part] for name, part in channels_of(self.names).items()}
+
+def true_means(dataset: Dataset, quantities: Sequence[str]) -> dict[str, np.ndarray]:
+    """The mean of each quantity over what its true maps of training views show, (channels,).
+
+    Those that no pixel of any map shows are left out.
+
+    Raises:
+        UserError: an image cannot be read.
+    """
+    found = {}
+    for name in known_quantities(dataset, quantities):
+        total, count = np.zeros(QUANTITIES[name].channels), 0
+        for view in dataset.train:
+            truth = GroundTruth.of(view, [name])
+            if truth is not None:
+                total += truth.values[name][truth.known].sum(0, dtype=np.float64)
+                count += int(truth.known.sum())
+        if count:
+            found[name] = total / count
+    return found
 
 
 def known_quantities(dataset: Dataset, quantities: Sequence[str]) -> tuple[str, ...]:

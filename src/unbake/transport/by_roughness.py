@@ -1,11 +1,13 @@
 """Pixels as functions of the roughness of what they see, from one set of samples (ours).
 
 At x₁ the light that T(L_θ) gathers is sampled once. The BSDF is then evaluated for several values
-of roughness, and with albedo as it is and none, because reflected light is linear in albedo:
+of roughness, and with albedo as it is and half of it, because reflected light is linear in albedo
+(transmitted light is not, where `spec_trans` is not zero: it is taken to be):
 
     pixel(r, g) ≈ S(r) + g · D(r)
 
 where S is what is reflected without albedo, D what albedo adds, and g a factor of the albedo. The
+tint of highlights (`spec_tint`) is the hue of the albedo, which no factor changes, and is in S. The
 samples are the same for all r, so that what differs between two values of r has little noise.
 """
 
@@ -29,6 +31,8 @@ from .operator import attach_albedo, mixture_at
 from .path_sample import reflected_radiance
 from .vertex import Scattering, SceneView, Vertex, evaluate, find_vertex, mis_weight
 
+#: Factor of the albedo with which reflected light is told apart from what albedo adds.
+_HALF = 0.5
 #: Roughness of the lobe that looks for highlights sharper than those that the BSDF has by now.
 _SHARP = 0.2
 
@@ -132,11 +136,14 @@ def by_roughness(
         lights = _lights(scene_view, radiance, guide, x, material, sampler)
         for number, node in enumerate(nodes):
             r = dr.opaque(mi.Float, node)
-            plain = whole = _reflected(x, lights, material, r, dr.opaque(mi.Float, 1))
+            whole = _reflected(x, lights, material, r, dr.opaque(mi.Float, 1))
+            coloured = dr.zeros(mi.Color3f, dr.width(whole))
             if "albedo" in material:
-                plain = _reflected(x, lights, material, r, dr.opaque(mi.Float, 0))
-            dr.eval(plain, whole)
-            for name, values in moments(plain, whole - plain, spp).items():
+                half = _reflected(x, lights, material, r, dr.opaque(mi.Float, _HALF))
+                coloured = (whole - half) / (1 - _HALF)
+            plain = whole - coloured
+            dr.eval(plain, coloured)
+            for name, values in moments(plain, coloured, spp).items():
                 rows[name][:, number] = values[chosen]
     return chosen, rows
 
@@ -256,7 +263,7 @@ def _lights(
     own = _carrying(x, material, roughness)
     sharp = _carrying(x, material, dr.minimum(roughness, _SHARP))
     opacity = x.opacity if scene_view.has_chains else mi.Float(1)
-    solid = dr.rcp(opacity)
+    inv_opacity = dr.rcp(opacity)
     mixture = None
     if guide is not None:
         guide.prepare()
@@ -264,15 +271,15 @@ def _lights(
 
     def density(wo: mi.Vector3f) -> mi.Float:
         """That of both samples of direction together."""
-        found = bsdf.pdf(ctx, own, wo, active) * solid
+        found = bsdf.pdf(ctx, own, wo, active) * inv_opacity
         if mixture is not None:
             found = mixture.pdf(found, x.si.to_world(wo))
-        return found + bsdf.pdf(ctx, sharp, wo, active) * solid
+        return found + bsdf.pdf(ctx, sharp, wo, active) * inv_opacity
 
     ds, light = sample_emitter(scene, own, sampler.next_2d(), active, scene_view.pierced)
     towards, lit = x.si.to_local(ds.d), active & (ds.pdf != 0)
     weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, density(towards)))
-    found = [_Light(towards, lit, dr.select(lit, light * weight * solid, 0))]
+    found = [_Light(towards, lit, dr.select(lit, light * weight * inv_opacity, 0))]
     for si, guided_too in ((own, mixture), (sharp, None)):
         number, square = sampler.next_1d(), sampler.next_2d()
         guided = mi.Bool(False)
@@ -294,7 +301,7 @@ def _lights(
         y = attach_albedo(scene_view, find_vertex(scene_view, ray, on, sampler, origin=origin))
         incident = y.emitted + y.throughput * reflected_radiance(radiance, y)[0]
         # Values of cut-outs have their opacity in them, by which they were met.
-        found.append(_Light(wo, on, dr.select(on, incident * solid / pdf, 0)))
+        found.append(_Light(wo, on, dr.select(on, incident * inv_opacity / pdf, 0)))
     evaluate(sampler, found)
     return found
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 def as_weight(loss: mi.Float, least: float, largest: float) -> mi.Float:
     """A loss between bounds, to multiply a term by: no gradients, and 0 where it is not finite.
 
-    A loss that is not finite is told by itself.
+    The step reports a loss that is not finite itself, so the weight need not.
     """
     loss = dr.detach(loss)
     return dr.select(dr.isfinite(loss), dr.clip(loss, least, largest), 0)

@@ -16,7 +16,7 @@ from ..errors import require_name
 
 @dataclass(frozen=True)
 class Attached:
-    """Which edges of a term pass gradients."""
+    """Which inputs of a term pass gradients."""
 
     scene: bool = False  #: materials at the vertices where light scatters, and lights, to φ
     lhs: bool = False  #: L_θ on the left-hand side, to θ

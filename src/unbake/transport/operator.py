@@ -77,12 +77,13 @@ def bounce(
     """
     scene, si, bsdf, active = scene_view.scene, vertex.si, vertex.bsdf, vertex.valid
     ctx = mi.BSDFContext()
-    # A cut-out stopped the ray with probability `opacity`, so that only its material scatters here.
-    # Mitsuba scales that material's value and density by the opacity, and samples it where the
-    # first random number is below the opacity. (A context without the `Null` lobe does the
-    # opposite of what it should: it lets every ray pass.)
+    # A cut-out stopped the ray with probability `opacity`, so its material scatters as if it were
+    # opaque. Mitsuba 3.9.1 scales that material's value and density by the opacity: `inv_opacity`
+    # undoes it, and in value / density it cancels. Mitsuba samples the material where the first
+    # random number is below the opacity, hence `number * opacity`. (A context without the `Null`
+    # lobe does the opposite of what it should: it lets every ray pass.)
     opacity = vertex.opacity if scene_view.has_chains else mi.Float(1)
-    solid = dr.rcp(opacity)
+    inv_opacity = dr.rcp(opacity)
     mixture = None if guide is None else mixture_at(guide, vertex)
 
     # -------------------------------- Emitter sampling --------------------------------
@@ -90,11 +91,11 @@ def bounce(
     ds, em_weight = sample_emitter(scene, si, sampler.next_2d(), active, scene_view.pierced)
     active_em = active & (ds.pdf != 0)
     bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
-    pdf_em = bsdf_pdf_em * solid
+    pdf_em = bsdf_pdf_em * inv_opacity
     if mixture is not None:
         pdf_em = mixture.pdf(pdf_em, ds.d)
     mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_em))
-    direct = dr.select(active_em, bsdf_em * em_weight * mis_em * solid, 0)
+    direct = dr.select(active_em, bsdf_em * em_weight * mis_em * inv_opacity, 0)
 
     # -------------------------- Detached sampling of directions -----------------------
 
@@ -122,14 +123,14 @@ def bounce(
         value, own = bsdf.eval_pdf(ctx, si, wo, goes_on & ~delta)
         with dr.suspend_grad():
             goes_on &= delta | (dr.max(dr.detach(value)) > 0)
-            choice = Choice(mixture.cell, ray.d, dr.detach(own) * solid)
+            choice = Choice(mixture.cell, ray.d, dr.detach(own) * inv_opacity)
             pdf = dr.select(delta, pdf, mixture.pdf(choice.pdf, ray.d) * opacity)
     smooth = value * dr.select(pdf > 0, dr.rcp(pdf), 0)
     weight = dr.select(goes_on, dr.select(delta, bs_weight, smooth), 0)
 
     # Evaluated together here: each reduction further on would compute them again.
     evaluate(sampler, direct, weight, ray, goes_on, pdf, delta, choice)
-    origin = Scattering(dr.detach(si), pdf * solid, delta)
+    origin = Scattering(dr.detach(si), pdf * inv_opacity, delta)
     following = find_vertex(scene_view, ray, goes_on, sampler, origin=origin)
     return Bounce(direct, weight, following, choice)
 

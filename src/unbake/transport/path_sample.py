@@ -54,18 +54,20 @@ class PathSample:
 
 @dataclass(frozen=True)
 class Requirements:
-    """Which pieces of a path sample a method uses, and which of them pass gradients.
+    """What `trace` computes for a method, and which of it passes gradients.
 
-    Vertices are given by number: 1 is x₁. Only what is listed is computed. `requirements` in
-    `objective.py` makes the list from a method's terms.
+    There are two sets of paths, one and the same unless `trace` gets a subset: those of the image,
+    with `bounces` bounces and then L_θ, and those that train L_θ, with at least `residuals`
+    bounces. Vertices are given by number: 1 is x₁. `requirements` in `objective.py` derives all
+    of this from a method's terms.
     """
 
-    bounces: int  #: k, of the image; they pass gradients to φ
-    residuals: int = 0  #: bounces of the samples that L_θ learns from
-    attached: frozenset[int] = frozenset()  #: vertices of these where L_θ passes gradients to θ
-    constant: frozenset[int] = frozenset()  #: vertices of these where L_θ is a constant
+    bounces: int  #: k, bounces of the image's paths; they pass gradients to φ
+    residuals: int = 0  #: bounces that the terms read of the paths that train L_θ
+    attached: frozenset[int] = frozenset()  #: where L_θ on those paths passes gradients to θ
+    constant: frozenset[int] = frozenset()  #: where L_θ on those paths is read without gradients
     image_attached: bool = False  #: whether L_θ at the end of the image's paths passes gradients
-    differentiable: frozenset[int] = frozenset()  #: further vertices with gradients to φ
+    differentiable: frozenset[int] = frozenset()  #: vertices beyond k with gradients to φ
     pair: bool = False  #: a second, independent bounce from x₁, with gradients to φ
     pair_attached: bool = False  #: whether L_θ at its end passes gradients to θ
 
@@ -111,7 +113,7 @@ def trace(
         requirements: what to compute.
         hide_emitters: whether cameras see neither environment nor area emitters.
         subset: the samples that L_θ learns from; None: all.
-        guide: where bounces look for light beside where BSDFs scatter, as it was assigned.
+        guide: path guiding, mixed with BSDF sampling; None: BSDF sampling alone.
 
     Raises:
         ValueError: a radiance field is needed and there is none.

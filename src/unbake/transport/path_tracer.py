@@ -34,7 +34,7 @@ def path_traced(
         seed: of all random numbers.
         max_depth: number of bounces followed, plus one (Mitsuba's meaning: 1 is emission only).
             Specular interactions are not counted.
-        rr_depth: bounces after which Russian roulette may end a path.
+        rr_depth: number of the first bounce, from 1, that Russian roulette may take away.
 
     Returns:
         Linear RGB radiance, one lane a ray.

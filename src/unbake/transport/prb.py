@@ -15,7 +15,8 @@ import mitsuba as mi
 from ..fields.materials import Materials, carry, carrying
 from .vertex import behind_area_emitters, evaluate
 
-#: What `materials_along_paths` passes over.
+#: Computes what `RayFlags.All` does, but compares unequal to it, so that `materials_along_paths`
+#: leaves these interactions without a material.
 _WITHOUT_MATERIAL = mi.RayFlags.All | mi.RayFlags.Minimal
 
 
@@ -63,7 +64,8 @@ def materials_along_paths(materials: Materials | None) -> Iterator[None]:
             carry(si, materials.evaluate(si, si.is_valid(), "coopvec"))
         return si
 
-    # The one call that is made in Python at each vertex, and before its BSDF is asked.
+    # `prb` of Mitsuba 3.9.1 computes one interaction per vertex with `RayFlags.All`, in Python
+    # and before it asks the BSDF; it computes all others with `RayFlags.Minimal`.
     mi.PreliminaryIntersection3f.compute_surface_interaction = with_material
     try:
         with carrying():

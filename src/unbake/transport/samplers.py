@@ -45,10 +45,10 @@ class SamplerContext:
         spp: camera samples a pixel.
         bounces: k, after which the image takes L_θ.
         max_depth: longest path in bounces, plus one, of methods that follow paths to their end.
-        rr_depth: bounces of these before Russian roulette.
-        planned_gain: how much more than in the first batch their surfaces may come to reflect.
-        read_by_scene: gives the present arrays that the scene's textures and emitters read.
-        guide: where bounces look for light beside where BSDFs scatter; None: nowhere else.
+        rr_depth: where roulette begins; see `PathLimits` and `path_replay` for how each counts.
+        planned_gain: factor by which surfaces may come to reflect more than in the first batch.
+        read_by_scene: returns the current arrays that the scene's textures and emitters read.
+        guide: path guiding, mixed with BSDF sampling; None: BSDF sampling alone.
     """
 
     method: Method
@@ -192,7 +192,7 @@ class BounceSampler:
 
 
 class _WholePathSampler(ABC):
-    """Paths to their end: their image is all that there is.
+    """Follows paths to their end; serves the photometric term alone.
 
     Raises:
         UserError: the method has terms that are not of the image alone.

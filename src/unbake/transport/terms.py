@@ -95,7 +95,7 @@ class Term:
             raise ValueError(f"{self.name}: vertices are numbered from 1")
 
     def check(self, attached: Attached) -> None:
-        """Check that the term has the edges that are attached: an edge it lacks trains nothing.
+        """Check that the term reads each attached input: one that it does not read trains nothing.
 
         Raises:
             UserError: it lacks one.
@@ -181,8 +181,8 @@ def prior_extra(x: TermInputs) -> mi.Float:
 def lhs_loss(x: TermInputs) -> mi.Float:
     """The squared error of the radiance field seen directly.
 
-    L_θ is radiance of the scene. What is unknown of the camera is a constant here: only pictures of
-    materials and lights train it.
+    L_θ is scene radiance. The camera's unknowns are constants here: only the photometric term
+    trains them.
 
     Paper: Eq. 14, Sec. 4.3.
     """

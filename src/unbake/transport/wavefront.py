@@ -19,8 +19,8 @@ import mitsuba as mi
 from .operator import attach_material, bounce
 from .vertex import SceneView, Vertex, evaluate, find_vertex
 
-#: Lanes that are kept free for batches with more survivors than the first: factors without Russian
-#: roulette, where the scene's shape decides, and with it, where materials that grow brighter do.
+#: Headroom for batches with more survivors than the first, as factors on the lanes: without Russian
+#: roulette, where geometry decides, and with it, where brighter materials add survivors.
 _RESERVE, _RESERVE_OF_ROULETTE = 1.1, 1.5
 #: Widths are the first one divided by powers of this number's square root: few sizes, few kernels.
 _STEPS_AN_OCTAVE = 2
@@ -37,7 +37,8 @@ _MOST_LIKELY = 0.95
 #: without roulette, and with an albedo of 0.7 to 0.99 and 0.84.
 _FAVOUR = 3.0
 
-#: How often the wavefront has been narrowed by √2 before each bounce.
+#: How often the wavefront has been narrowed by √2 in all before each bounce. Not its widths: the
+#: batch that plans may be smaller than that of a step.
 Plan = tuple[int, ...]
 
 
@@ -167,9 +168,9 @@ def _width(level: int, lanes: int) -> int:
 
 
 def _by_halves(lanes: int, spp: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The order in which all first halves of pixels come before all second ones, and the way back.
+    """Sort lanes by half of their pixel's samples: the permutation, and its inverse.
 
-    The two share no lane and no sum, so that what is narrowed in one does not depend on the other.
+    Roulette treats the halves separately, so they stay independent, as split halves require.
     """
     half = spp // 2
     lane = dr.arange(mi.UInt32, lanes)
