@@ -374,6 +374,7 @@ def test_the_help_of_fit_tells_what_the_presets_say(unbake):
         (("--method", "prb", "--max-depth", "1"), "--max-depth: must be 2 or more for the"),
         (("--method", "ad-pt", "--max-depth", "10000"), "--max-depth: must be 256 or less for the"),
         (("--steps", "3", "--seconds", "4"), "--steps: cannot be given together with --seconds"),
+        (("--pose-sigma", "2"), "--pose-sigma: no pose or lens is refined that could be uncertain"),
         (("--preset", "cpu", "--settings", "a.toml"), "--preset: cannot be given together"),
         (("--settings", "none.toml"), "none.toml: the file does not exist"),
     ],

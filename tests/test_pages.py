@@ -131,10 +131,9 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     assert found in page
     words = " ".join(page.split())
     assert "over 2 seeds; fits of `prb` take 30 s." in words
-    assert "Ours and `no-prior` are searched too" not in words
     assert "| two passes, as in Mitsuba | no |" in words
     assert "as many camera samples as `prb` traces in" in words
-    assert "`untrained` is no method" in words and "Behind the door" not in words
+    assert "`untrained` is not a method" in words and "Behind the door" not in words
     assert "`rivals-demo.json`" not in page
 
 

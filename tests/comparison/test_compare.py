@@ -95,6 +95,30 @@ def test_two_methods_side_by_side(compare, tmp_path):
     assert "all pairs" in page and "Validation during training" not in page
 
 
+def test_kernels_are_compiled_before_the_clock_of_a_fit_starts(
+    cornell, tiny, tmp_path, unbake, monkeypatch
+):
+    calls = []
+
+    def compiled(dataset, configs, **_):
+        calls.extend(f"compile {config.method}" for config in configs)
+
+    def fitted(data, out, settings, **words):
+        calls.append(f"fit {settings.method}")
+        return loop.fit(data, out, settings, **words)
+
+    monkeypatch.setattr(module, "compile_kernels", compiled)
+    monkeypatch.setattr(module, "fit", fitted)
+    words = ("compare", cornell, "--methods", "ours", "direct", "--out", tmp_path / "out")
+    words += ("--settings", tiny, "--seconds", 0.1, "--score-seconds", 0, "--evaluate-spp", 2)
+    assert unbake(*words).status == 0
+    methods = ("compile ours", "fit ours", "compile direct", "fit direct")
+    assert calls == ["fit direct", *methods], "the untrained fields come first"
+    calls.clear()
+    assert unbake(*words).status == 0
+    assert not [call for call in calls if call.startswith("compile")], "nothing is left to do"
+
+
 def test_only_the_method_differs_and_what_belongs_to_it(compare, tmp_path):
     assert compare("ours", "direct", steps=2).status == 0
     ours, direct = (

@@ -24,7 +24,7 @@ from unbake.evaluation.yardsticks import (
 from unbake.imaging.pictures import read_exr, write_exr
 from unbake.training import truth_fit
 from unbake.training.loop import fit
-from unbake.training.truth_fit import TrueMaps
+from unbake.training.truth_fit import true_means
 
 FEW = EvaluationSettings(spp=2, max_depth=3, train_views=0)
 KEYS = ["albedo_psnr", "roughness_psnr"]
@@ -129,9 +129,7 @@ def test_the_constant_is_the_mean_of_the_true_maps(data, untrained):
         channels = 3 if name == "albedo" else 1
         maps = [read_exr(v.truth[name]).reshape(-1, 4) for v in dataset.train]
         counted = np.concatenate([rows[rows[:, 3] >= 1, :channels] for rows in maps])
-        assert TrueMaps.load(dataset, [name]).means()[name] == pytest.approx(
-            counted.mean(0, dtype=float)
-        )
+        assert true_means(dataset, [name])[name] == pytest.approx(counted.mean(0, dtype=float))
         held = read_exr(view.truth[name]).reshape(-1, 4)
         errors = held[held[:, 3] >= 1, :channels] - counted.mean(0)
         expected = -10 * np.log10(np.square(errors).mean())

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import unbake.experiments.scene_fits as scene_fits_module
 from unbake.config import FitConfig, read_toml
+from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.experiments import Name, experiment, fig6, load
 from unbake.experiments.experiment import (
@@ -273,30 +273,6 @@ def test_a_spread_is_of_the_values_that_are_known():
     assert plus_minus(row, "x", 0, 100) == "150 ± 71" and plus_minus(row, "z") is None
 
 
-def test_kernels_of_new_fits_are_compiled_before_their_clock_starts(tmp_path, monkeypatch):
-    calls = []
-
-    def compared(*_, **__):
-        calls.append("compare")
-        row = {"heldout": {}, "steps": 1}
-        return {"untrained": row, "methods": {"ours": row, "prb": row}}
-
-    monkeypatch.setattr(scene_fits_module, "compare", compared)
-    monkeypatch.setattr(
-        scene_fits_module,
-        "compile_kernels",
-        lambda _, configs: calls.append([(c.method, c.seed) for c in configs]),
-    )
-    monkeypatch.setattr(type(STAIRCASE), "captured", lambda *_: tmp_path)
-    monkeypatch.setattr(RunFolder, "metrics", lambda _: {"per_view": []})
-    for seconds, compiled in ((5.0, [[("ours", 1), ("prb", 1)]]), (0.0, [])):
-        calls.clear()
-        config = FitConfig(seconds=seconds)
-        fits = SceneFits(STAIRCASE, ["ours", "prb"], config, spp=1, seeds=(0, 1))
-        assert fits.fitted(context(tmp_path), 1).keys() == {"untrained", "ours", "prb"}
-        assert calls == [*compiled, "compare"]
-
-
 def test_a_few_steps_of_each_method_are_taken_to_compile_them(cornell, tiny, monkeypatch):
     steps = []
     real = TrainingStep.__call__
@@ -308,7 +284,7 @@ def test_a_few_steps_of_each_method_are_taken_to_compile_them(cornell, tiny, mon
     monkeypatch.setattr(TrainingStep, "__call__", counted)
     shared = read_toml(tiny)
     configs = [dataclasses.replace(shared, method=method) for method in ("ours", "direct")]
-    compile_kernels(cornell, configs)
+    compile_kernels(Dataset.load(cornell), configs)
     assert steps == [(method, number) for method in ("ours", "direct") for number in range(3)]
 
 

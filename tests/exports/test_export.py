@@ -505,6 +505,48 @@ def test_materials_keep_what_they_have_beside_textures(tmp_path):
     assert plastic["extensions"] == {"KHR_materials_ior": {"ior": pytest.approx(1.6)}}
 
 
+PANE = """<scene version="3.0.0">
+  <shape type="rectangle" id="floor"><bsdf type="diffuse"/></shape>
+  <shape type="rectangle" id="pane"><bsdf type="thindielectric"/></shape>
+  <shape type="sphere" id="lens"><bsdf type="dielectric"/></shape>
+  <shape type="cube" id="helper"><bsdf type="null"/></shape>
+  <shape type="disk" id="lamp"><bsdf type="null"/><emitter type="area"/></shape></scene>"""
+
+
+def test_panes_have_two_sides_and_mere_boundaries_are_left_out(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "scene.xml").write_text(PANE)
+    data = grey_data(scene / "scene.xml", tmp_path / "data")
+    fit(data, tmp_path / "run", replace(tiny_fields("grid"), method="direct", steps=0))
+    options = {"texels": 2.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["gltf", "usd"], **options)
+    note = "glTF and usd have no surfaces that nobody sees (null): without helper"
+    assert note in manifest["notes"]
+    made = document_of(tmp_path / "out" / "scene.glb")
+    sides = {
+        mesh["name"]: made["materials"][mesh["primitives"][0]["material"]]["doubleSided"]
+        for mesh in made["meshes"]
+    }
+    assert sides == {"floor": False, "pane": True, "lens": False, "lamp": False}
+    stage = Usd.Stage.Open(str(tmp_path / "out" / "usd" / "scene.usdc"))
+    meshes = {p.GetDisplayName(): UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)}
+    assert {name: mesh.GetDoubleSidedAttr().Get() for name, mesh in meshes.items()} == sides
+
+
+@pytest.mark.parametrize(
+    ("up", "told"), [((0, 0, 1), None), ((0, 1, 0), None), ((0, -1, 0), "−y"), ((1, 0, 0), "+x")]
+)
+def test_an_up_that_no_format_can_say_is_told(up, told):
+    eyes = [(2.0, 1.9, 1.8), (-2.1, 1.7, 2.2), (1.8, -2.2, 1.9)]
+    cameras = [LookAt(eye, (0, 0, 0), up, 40.0).camera(8, 8) for eye in eyes]
+    views = tuple(View(str(i), "train", c, Path("a.exr"), {}) for i, c in enumerate(cameras))
+    note = exporting._turned(Dataset(Path(), Path("scene.xml"), "visible", views, {}, None))
+    assert note is None if told is None else f"up is {told} by the cameras" in note
+
+
 def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
     from pxr import Usd, UsdShade
 

@@ -197,7 +197,7 @@ def test_a_run_that_went_on_after_its_evaluation_is_told(made, tmp_path: Path, s
     assert text.count(told) == 1 and "unbake evaluate" not in text  # nothing else was saved
     (run / "checkpoints" / "step-000008000").mkdir(parents=True)
     text = _words(write_report(made[1], tmp_path / "saved.html").read_text())
-    assert f"{told}; run `unbake evaluate ours` again" in text
+    assert re.search(re.escape(f"{told}; run `unbake evaluate ") + r"\S*/ours` again", text)
 
 
 @pytest.mark.parametrize("why", ["nothing learned", "worse than untrained"])
@@ -545,6 +545,19 @@ def test_lights_alone_are_the_title_and_leave_out_columns_of_materials(made, tmp
     assert "Lights recovered in room" in text and "light recovered" in _words(text)
     numbers = _section(text, "numbers")
     assert "Rendering" in numbers and "Albedo" not in numbers and "Roughness" not in numbers
+
+
+def test_means_over_other_views_are_not_compared(made, tmp_path: Path):
+    def fewer(metrics: dict) -> None:
+        last = [row for row in metrics["per_view"] if row["split"] == "train"][-1]
+        metrics["per_view"].remove(last)
+
+    note = "Means over training views are of other views in some runs than in others"
+    text = _section(write_report(made[1], tmp_path / "same.html").read_text(), "numbers")
+    assert note not in text and text.count('class="n best') == 6
+    _edit(made[1][0], fewer)
+    text = _section(write_report(made[1], tmp_path / "other.html").read_text(), "numbers")
+    assert note in text and text.count('class="n best') == 3, "of held-out views alone"
 
 
 def test_an_aligned_albedo_has_its_column(made, tmp_path: Path):

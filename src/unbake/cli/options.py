@@ -96,13 +96,22 @@ def _require_envmap(envmap: Path | None, values: dict[str, Any]) -> None:
 
 
 def with_length(settings: config.FitConfig, values: dict[str, Any]) -> config.FitConfig:
-    """Settings with the options that were given; steps or seconds take the place of each other."""
+    """Settings with the options that were given; steps or seconds take the place of each other.
+
+    Raises:
+        UserError: options do not fit together, or the settings refuse them.
+    """
     if "steps" in values:
         exclude("seconds", {"steps": values["steps"]} if "seconds" in values else {})
         settings = dataclasses.replace(settings, seconds=0.0)
     if values.get("seconds") == 0:
         raise UserError("must be more than 0", "--seconds", "--steps 0 trains nothing")
-    return with_options(settings, values)
+    chosen = with_options(settings, values)
+    if "pose-sigma" in values and not chosen.camera.of_places:
+        what = "no pose or lens is refined that could be uncertain"
+        remedy = "Give --poses refined or --intrinsics refined, too"
+        raise UserError(what, "--pose-sigma", remedy)
+    return chosen
 
 
 def exclude(option: str, others: dict[str, object]) -> None:

@@ -305,7 +305,7 @@ class _Search:
         lights = [name for name in config.unknowns if name not in QUANTITIES]
         if config.seconds and (record["best"] is None or any(map(self._missing, record["trials"]))):
             variants = [replace(config, estimator=name) for name in _estimators(config)]
-            compile_kernels(self._dataset.folder, variants)
+            compile_kernels(self._dataset, variants)
         searched = [*reversed(materials), *lights, *self._schedule]
         estimators = _estimators(config)
         best = best_trial(searched, estimators, self._score)

@@ -28,7 +28,7 @@ from ..imaging.metrics import mean_psnr
 from ..io import read_object, write_json
 from ..quantities import QUANTITIES
 from ..training.problem import Problem
-from ..training.truth_fit import TrueMaps, TruthFit, known_quantities
+from ..training.truth_fit import TruthFit, known_quantities, true_means
 from ..training.validation import GroundTruth, MaterialBuffers, psnr_keys
 from .settings import EvaluationSettings
 
@@ -86,9 +86,7 @@ def find_yardsticks(dataset: Dataset, config: FitConfig, heldout: Sequence[Seen]
     Raises:
         UserError: a true map cannot be read.
     """
-    means = {}
-    if known_quantities(dataset, config.quantities):
-        means = TrueMaps.load(dataset, config.quantities).means()
+    means = true_means(dataset, config.quantities)
     initial = {name: np.array([QUANTITIES[name].initial]) for name in config.quantities}
     return Yardsticks(
         find_ceiling(dataset, config),
@@ -197,6 +195,10 @@ def told_yardsticks(scores: Mapping[str, Any], found: Mapping[str, Any]) -> list
         if result is None or not any(value is not None for value in known.values()):
             continue
         top = known["ceiling"]
+        if f"{key}_aligned" in scores:  # photographs leave its scale open
+            every = ", ".join(f"{kind} {x:.2f}" for kind, x in known.items() if x is not None)
+            lines.append(f"{name} at its true scale: {every} dB")
+            continue
         if top is None:
             told = ", ".join(f"{_SCORES_OF[kind]} {value:.2f} dB" for kind, value in rest)
             lines.append(f"{name}: {told}")

@@ -22,7 +22,6 @@ from ..imaging.pictures import block_means, montage, read_exr, shown
 from ..quantities import DEFAULT_QUANTITIES, QUANTITIES
 from ..report.display import require_same_size, rgb
 from ..training.defaults import with_defaults
-from ..training.fresh_fit import compile_kernels
 from ..training.run_folder import RunFolder
 from ..training.validation import psnr_keys
 from .experiment import ExperimentContext
@@ -191,9 +190,6 @@ class SceneFits:
         self, context: ExperimentContext, out: Path, methods: Sequence[str], config: FitConfig
     ) -> Findings:
         data, variants = self.scene.captured(context), [MethodVariant.of(name) for name in methods]
-        if config.seconds:
-            new = [v.settings(config) for v in variants if not RunFolder(out / v.name).exists]
-            compile_kernels(data, new)
         evaluation = EvaluationSettings(spp=self.spp, train_views=0)
         result = compare(
             data,

@@ -22,6 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ..dataset.camera import up_of
 from ..dataset.views import Dataset
 from ..errors import UserError, collected, named, raise_together
 from ..imaging.pictures import write_exr
@@ -261,15 +262,22 @@ def _write(
             masks[one.atlas.name] = f"unobserved/{write_mask(out / 'unobserved', stem, one)}"
     if environment is not None:
         write_exr(out / _ENVIRONMENT, environment)
+    visible = [part for part in found.parts if part.is_shown]
+    others = [name for name in formats if name in ("gltf", "usd")]
+    if others and len(visible) < len(found.parts):
+        hidden = named([part.name for part in found.parts if not part.is_shown])
+        notes.append(f"glTF and usd have no surfaces that nobody sees (null): without {hidden}")
+    if others and (turned := _turned(dataset)) is not None:
+        notes.append(turned)
     if "gltf" in formats:
-        write_glb(out / "scene.glb", found.scene, found.parts, shown, lights)
+        write_glb(out / "scene.glb", found.scene, visible, shown, lights)
         if environment is not None:
             what = "scene.glb has no environment, as glTF has none"
             notes.append(f"{what}: it is {_ENVIRONMENT}")
     if "usd" in formats:
         (out / "usd").mkdir()
         beside = None if environment is None else f"../{_ENVIRONMENT}"
-        write_usd(out / "usd", found.scene, found.parts, shown, lights, beside, _up(dataset))
+        write_usd(out / "usd", found.scene, visible, shown, lights, beside, _up(dataset))
     if "mitsuba" in formats:
         (out / "mitsuba").mkdir()
         # The scene's own stays as it is.
@@ -290,8 +298,18 @@ def _write(
 
 def _up(dataset: Dataset) -> str:
     """Which axis is up by the cameras, as OpenUSD calls it."""
-    up = np.sum([view.camera.to_world[:3, 1] for view in dataset.train], axis=0)
+    up = up_of([view.camera for view in dataset.train])
     return "Z" if abs(up[2]) > abs(up[1]) else "Y"
+
+
+def _turned(dataset: Dataset) -> str | None:
+    """A note where up is an axis that neither glTF nor OpenUSD can say; None where it is not."""
+    up = up_of([view.camera for view in dataset.train])
+    axis = int(np.abs(up).argmax())
+    if axis > 0 and up[axis] > 0:
+        return None
+    told = f"{'−' if up[axis] < 0 else '+'}{'xyz'[axis]}"
+    return f"up is {told} by the cameras, which glTF and usd cannot say: turn what they show"
 
 
 # ------------------------------------------------------------------------------------- the manifest
@@ -369,7 +387,8 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
     if varying:
         notes.append(f"lights of varying strength are dark in glTF and usd: {', '.join(varying)}")
     if not any(one.learned for one in baked):
-        notes.append("the run learned no materials: all textures are the scene's own")
+        what = "the run learned no materials: all textures are the scene's own"
+        notes.append(f"{what}, sampled anew; a larger --texels keeps more of them")
     return notes
 
 

@@ -176,7 +176,7 @@ def write_glb(
             triangles = part.triangles
             strength = None if part.emitter is None else glow.get(part.emitter)
             material = plain_material(document, scene, part, strength)
-        material["doubleSided"] = part.two_sided
+        material["doubleSided"] = part.two_sided or part.is_pane
         key = json.dumps(material, sort_keys=True)
         if key not in materials:
             materials[key] = document.add("materials", material)

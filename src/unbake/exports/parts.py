@@ -37,6 +37,8 @@ class Part:
     instanced: bool  #: it stands in a group, which instances place
     dropped: int  #: triangles without an area, which were left out
     pieces: np.ndarray | None = None  #: (m, 3) of each triangle, as `Pieces.of` tells them
+    is_pane: bool = False  #: thin glass, which both sides show
+    is_shown: bool = True  #: it is no mere boundary, which pictures do not show
 
     @property
     def is_optimized(self) -> bool:
@@ -147,6 +149,8 @@ def _described(scene: ParsedScene, node: int, materials: Mapping[int, int]) -> P
         exact=True,
         instanced=False,
         dropped=0,
+        is_pane="thindielectric" in plugins,
+        is_shown=emitter is not None or bsdf is None or nodes[bsdf].props.plugin_name() != "null",
     )
 
 

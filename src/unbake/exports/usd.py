@@ -144,7 +144,7 @@ class _Writer:
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners))
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreateDoubleSidedAttr(part.two_sided)
+        mesh.CreateDoubleSidedAttr(part.two_sided or part.is_pane)
         box = np.stack([positions.min(0), positions.max(0)])
         mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(box))
         if triangles.normals is not None:

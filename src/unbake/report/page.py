@@ -125,6 +125,7 @@ def _numbers(runs: list[EvaluatedRun]) -> dict[str, Any]:
         "yardsticks": scores.yardstick_rows(runs),
         "measures": scores.YARDSTICKS,
         "similar": scores.similar_rows(runs),
+        "uneven": scores.uneven_splits(runs),
         "definitions": definitions(runs),
     }
 

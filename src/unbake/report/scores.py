@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import Any
 
@@ -51,13 +52,40 @@ def _has_number(run: EvaluatedRun, key: str) -> bool:
     )
 
 
+def uneven_splits(runs: list[EvaluatedRun]) -> list[str]:
+    """The splits whose means are over other views in some runs than in others."""
+    found = []
+    for split in SHOWN_SPLITS:
+        views = [
+            frozenset(row["name"] for row in run.metrics["per_view"] if row.get("split") == split)
+            for run in runs
+        ]
+        found += [split] if len(set(views)) > 1 else []
+    return found
+
+
+def _marked(
+    runs: list[EvaluatedRun],
+    split: str,
+    key: str,
+    write: Callable[[float | None], str],
+    choose: display.Choice = max,
+) -> list[dict[str, Any]]:
+    """The means of a score as text, the best of them marked where all are over the same views."""
+    values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+    marked = display.marked(values, write, choose)
+    if split in uneven_splits(runs):
+        return [cell | {"best": False} for cell in marked]
+    return marked
+
+
 def score_rows(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
     """One row a run: for each split and quantity its mean PSNR, the best of each column marked."""
     columns = []
     for split, key in ((split, key) for split in SHOWN_SPLITS for key in psnr_columns(runs)):
         values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
         tops = [_ceiling(run, key) if split == "heldout" else None for run in runs]
-        marked = display.marked(values, display.decibels)
+        marked = _marked(runs, split, key, display.decibels)
         columns.append(
             [c | {"gap": _gap(*pair)} for c, *pair in zip(marked, values, tops, strict=True)]
         )
@@ -77,6 +105,9 @@ def score_rows(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
 
 
 def _ceiling(run: EvaluatedRun, key: str) -> float | None:
+    """The ceiling of a score; None also where photographs leave the scale of albedo open."""
+    if f"{key}_aligned" in (run.metrics.get("heldout") or {}):
+        return None
     found = run.metrics.get("yardsticks") or {}
     return display.number((found.get("ceiling") or {}).get(key))
 
@@ -95,8 +126,7 @@ def similar_rows(runs: list[EvaluatedRun]) -> list[tuple[EvaluatedRun, list[dict
     """
     columns = []
     for split, (key, _, choose) in product(SHOWN_SPLITS, SIMILAR):
-        values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
-        columns.append(display.marked(values, display.fraction, choose))
+        columns.append(_marked(runs, split, key, display.fraction, choose))
     if all(cell["text"] == display.DASH for column in columns for cell in column):
         return []
     return [(run, list(row)) for run, row in zip(runs, zip(*columns, strict=True), strict=True)]

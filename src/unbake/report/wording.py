@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -41,6 +42,9 @@ def nothing_learned(run: EvaluatedRun) -> str | None:
     aligned = display.number(found.get("albedo_psnr_aligned"))
     if aligned is not None:
         scores["albedo_psnr"] = aligned
+        # Untrained albedo is a constant: once aligned, the best one.
+        constant = (run.metrics.get("yardsticks") or {}).get("constant") or {}
+        before = before | {"albedo_psnr": constant.get("albedo_psnr", before.get("albedo_psnr"))}
     pairs = [(scores[key], display.number(before.get(key))) for key in keys]
     known = [(score, first) for score, first in pairs if score is not None and first is not None]
     below = known and all(score < first for score, first in known)
@@ -75,7 +79,7 @@ def _outdated(run: EvaluatedRun) -> list[str]:
     written = run.folder.written_checkpoints()
     if not written or written[0] == run.folder.checkpoint(int(steps)):
         return [told]
-    return [f"{told}; run `unbake evaluate {run.label}` again"]
+    return [f"{told}; run `unbake evaluate {shlex.quote(str(run.folder.path))}` again"]
 
 
 def _trend(run: EvaluatedRun) -> list[str]:
