@@ -45,7 +45,7 @@ from unbake.errors import UserError  # noqa: E402
 from unbake.evaluation.evaluate import evaluate  # noqa: E402
 from unbake.evaluation.rendering import relight  # noqa: E402
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings  # noqa: E402
-from unbake.experiments.commands import unbake  # noqa: E402
+from unbake.experiments.commands import compile_fit, unbake  # noqa: E402
 from unbake.experiments.seeds import across_seeds  # noqa: E402
 from unbake.imaging.pictures import (  # noqa: E402
     fitting_exposure,
@@ -160,14 +160,16 @@ def fit(
 ) -> None:
     """Fit a method to photographs, for so many steps or seconds; `untrained` takes no step."""
     name, until = ("steps", 0) if method == UNTRAINED else stop
-    options = ["--method", "ours" if method == UNTRAINED else method, f"--{name}", until]
+    options = ["--method", "ours" if method == UNTRAINED else method]
     options += [] if batch is None else ["--batch", batch]
+    if name == "seconds":
+        compile_fit(data, *options)
     # What was cut off is done again.
     unfinished = run.with_name(f"{run.name}-unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
     # A fit that learned nothing fails, and is judged as it is; one that left no run fails here.
     with contextlib.suppress(UserError):
-        unbake("fit", data, "--out", unfinished, "--seed", seed, *options)
+        unbake("fit", data, "--out", unfinished, "--seed", seed, *options, f"--{name}", until)
     unfinished.rename(run)
 
 

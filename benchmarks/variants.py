@@ -4,7 +4,8 @@
         [--seeds 0 1 2] [--steps 2400 | --seconds 120] [--methods ours] [--go-on]
 
 The fits of a seed follow each other, and the file is written after each fit. With --go-on, fits
-that it has already are kept: those of the first seeds, of each data set, method and settings.
+that it has already are kept: those of the first seeds, of each data set, method and settings. Fits
+of a time are preceded by one of three steps, that their kernels are compiled.
 Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over held-out views, with those of
 the untrained fields and of the best constants; seconds are those of training.
 """
@@ -24,7 +25,7 @@ import here
 from unbake import backend
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
-from unbake.experiments.commands import unbake
+from unbake.experiments.commands import compile_fit, unbake
 from unbake.experiments.seeds import across_seeds
 from unbake.io import write_json
 from unbake.machine import machine
@@ -54,6 +55,7 @@ def main() -> None:
         "machine": machine(),
         "length": dict([stop]),
         "data": {data.name: described(data) for data in args.data},
+        "settings": {file.stem: file.read_text(encoding="utf-8") for file in args.settings},
     }
     found = started(args.out, about, args.seeds) if args.go_on else {}
     kinds = list(product(args.data, args.methods, args.settings))
@@ -119,6 +121,8 @@ def fit(
         log = Path(folder) / "log.txt"
         words = ["fit", data, "--out", run, "--settings", settings, "--method", method]
         words += ["--seed", seed, f"--{stop[0]}", stop[1]]
+        if stop[0] == "seconds":
+            compile_fit(data, "--settings", settings, "--method", method, log=log)
         # A fit that learned nothing fails, and is judged as it is: one that left no run is told by
         # the evaluation.
         with contextlib.suppress(UserError):

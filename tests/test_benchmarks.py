@@ -525,6 +525,42 @@ def test_the_export_of_a_large_room_is_measured(repository, tmp_path):
     assert found["own_coordinates"] >= 4 and found["cost"]["peak_mb"] > 50
 
 
+def test_variants_go_on_where_they_ended_and_are_not_mixed_with_others(
+    benchmarks, cornell, tiny, tmp_path, monkeypatch
+):
+    main, made, out = benchmarks("variants")["main"], [], tmp_path / "out.json"
+
+    def fit(data, settings, method, seed, stop):
+        if len(made) == 3 and "--go-on" not in sys.argv:
+            raise KeyboardInterrupt
+        made.append((method, seed))
+        score = 20.0 + seed + (method == "prb")
+        scores = dict.fromkeys(("albedo_psnr", "roughness_psnr", "render_psnr"), score)
+        return scores | {"steps": stop[1], "samples": 1, "seconds": 1.0}
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["variants.py", *map(str, words)])
+        main()
+
+    monkeypatch.setitem(main.__globals__, "fit", fit)
+    settings = tmp_path / "settings.toml"
+    settings.write_text(tiny.read_text())
+    words = ["--data", cornell, "--settings", settings, "--methods", "ours", "prb"]
+    words += ["--seeds", 0, 1, "--steps", 5, "--out", out]
+    with pytest.raises(KeyboardInterrupt):
+        run(*words)
+    assert read(out)["seeds"] == [0] and [len(row["runs"]) for row in read(out)["rows"]] == [2, 1]
+    run(*words, "--go-on")
+    assert made == [("ours", 0), ("prb", 0), ("ours", 1), ("prb", 1)]
+    ours, prb = read(out)["rows"]
+    assert read(out)["seeds"] == ours["seeds"] == prb["seeds"] == [0, 1]
+    assert (ours["albedo_psnr"], prb["albedo_psnr"]) == (20.5, 21.5)
+    assert ours["albedo_psnr_sd"] == pytest.approx(0.5**0.5)
+    settings.write_text(settings.read_text() + "\n# others\n")
+    with pytest.raises(SystemExit, match="settings"):
+        run(*words, "--go-on")
+
+
 @pytest.mark.slow
 def test_other_scenes_are_compared_under_other_light(repository, cornell, tmp_path):
     words = ["--steps", 2, "--spp", 2, "--true-spp", 4, "--resolution", 8, "--batch", 64]

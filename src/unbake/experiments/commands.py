@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -22,6 +23,8 @@ from .jobs import Job, JobRunner, Outcome, Unfinished
 
 #: Seconds that a command has to write what it needs to continue, after SIGTERM.
 _GRACE = 120.0
+#: Steps after which those of a fit compile nothing any more.
+_COMPILING = 3
 #: Seconds between looks for a signal: one that another thread of this process received does not end
 #: the wait by itself.
 _LOOK = 0.5
@@ -32,6 +35,18 @@ _STOPPED = {status for n in STOPPING for status in (128 + n, -n)}
 def unbake(*words: object, until: float | None = None, log: Path | None = None) -> None:
     """Run a command of `unbake` with this interpreter; see `command`."""
     command([sys.executable, "-m", "unbake", *words], until=until, log=log)
+
+
+def compile_fit(data: Path, *words: object, log: Path | None = None) -> None:
+    """Take the first steps of a fit and drop them, so that its kernels are in Dr.Jit's cache.
+
+    Else the first of several fits of a given time would pay for all.
+
+    Args:
+        words: options of `unbake fit`, but for the length.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        unbake("fit", data, "--out", Path(folder) / "run", *words, "--steps", _COMPILING, log=log)
 
 
 def command(
