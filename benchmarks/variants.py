@@ -4,8 +4,8 @@
         [--seeds 0 1 2] [--steps 2400 | --seconds 120] [--methods ours] [--go-on]
 
 The fits of a seed follow each other, and the file is written after each fit. With --go-on, fits
-that it has already are kept: those of the first seeds, of each data set, method and settings. Fits
-of a time are preceded by one of three steps, that their kernels are compiled.
+that it has already are kept: those of the first seeds, of each data set, method and settings. A fit
+of a given time follows one of three steps, which compiles its kernels.
 Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over held-out views, with those of
 the untrained fields and of the best constants; seconds are those of training.
 """

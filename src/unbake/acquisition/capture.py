@@ -267,11 +267,11 @@ class _Source:
             change_light(parsed, self.light, self.allow_outside, tell)
         return parsed
 
-    def instance(self, *, merge: bool = True) -> mi.Scene:
+    def instance(self) -> mi.Scene:
         """The same with opaque BSDFs turned into `principled`."""
         parsed = self.parsed(lambda line: None)
         edit.to_principled(parsed)
-        return parsed.instantiate(merge=merge)
+        return parsed.instantiate()
 
 
 def _copy_scene(

@@ -259,9 +259,13 @@ def _check_masks(result: DataCheck) -> None:
         result.warn("masks", what, named(bare), remedy)
 
 
-def _enlarged(mask: np.ndarray, camera: Camera) -> np.ndarray:
-    """A mask of blocks as one of pixels; a remainder at the edges is False."""
-    return _in_pixels(mask, camera, mode="constant")
+def _enlarged(
+    mask: np.ndarray, camera: Camera, rest: Literal["constant", "edge"] = "constant"
+) -> np.ndarray:
+    """A mask of blocks as one of pixels; a remainder at the edges is False, or as beside it."""
+    shape, block = (camera.height, camera.width), block_of(camera)
+    large = mask.repeat(block, 0).repeat(block, 1)
+    return np.pad(large, [(0, s - n) for s, n in zip(shape, large.shape, strict=True)], rest)
 
 
 def _counted(view: CheckedView) -> np.ndarray | None:
@@ -270,14 +274,7 @@ def _counted(view: CheckedView) -> np.ndarray | None:
     None: all.
     """
     some = view.small.alpha > 0
-    return None if some.all() else _in_pixels(some, view.view.camera, mode="edge").ravel()
-
-
-def _in_pixels(mask: np.ndarray, camera: Camera, mode: Literal["constant", "edge"]) -> np.ndarray:
-    """A mask of blocks as one of pixels; `mode` is NumPy's, of the remainder at the edges."""
-    shape, block = (camera.height, camera.width), block_of(camera)
-    large = mask.repeat(block, 0).repeat(block, 1)
-    return np.pad(large, [(0, s - n) for s, n in zip(shape, large.shape, strict=True)], mode)
+    return None if some.all() else _enlarged(some, view.view.camera, rest="edge").ravel()
 
 
 # ------------------------------------------------------------------------------------------- poses

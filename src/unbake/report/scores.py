@@ -65,27 +65,25 @@ def uneven_splits(runs: list[EvaluatedRun]) -> list[str]:
 
 
 def _marked(
-    runs: list[EvaluatedRun],
-    split: str,
-    key: str,
+    values: list[float | None],
     write: Callable[[float | None], str],
     choose: display.Choice = max,
+    *,
+    alike: bool,
 ) -> list[dict[str, Any]]:
-    """The means of a score as text, the best of them marked where all are over the same views."""
-    values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
-    marked = display.marked(values, write, choose)
-    if split in uneven_splits(runs):
-        return [cell | {"best": False} for cell in marked]
-    return marked
+    """Means as text, the best of them marked where all are over the same views (`alike`)."""
+    return [
+        cell | {"best": cell["best"] and alike} for cell in display.marked(values, write, choose)
+    ]
 
 
 def score_rows(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
     """One row a run: for each split and quantity its mean PSNR, the best of each column marked."""
-    columns = []
+    columns, uneven = [], uneven_splits(runs)
     for split, key in ((split, key) for split in SHOWN_SPLITS for key in psnr_columns(runs)):
         values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
         tops = [_ceiling(run, key) if split == "heldout" else None for run in runs]
-        marked = _marked(runs, split, key, display.decibels)
+        marked = _marked(values, display.decibels, alike=split not in uneven)
         columns.append(
             [c | {"gap": _gap(*pair)} for c, *pair in zip(marked, values, tops, strict=True)]
         )
@@ -124,9 +122,10 @@ def similar_rows(runs: list[EvaluatedRun]) -> list[tuple[EvaluatedRun, list[dict
 
     Empty where no run has them, as after an evaluation by an earlier version.
     """
-    columns = []
+    columns, uneven = [], uneven_splits(runs)
     for split, (key, _, choose) in product(SHOWN_SPLITS, SIMILAR):
-        columns.append(_marked(runs, split, key, display.fraction, choose))
+        values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
+        columns.append(_marked(values, display.fraction, choose, alike=split not in uneven))
     if all(cell["text"] == display.DASH for column in columns for cell in column):
         return []
     return [(run, list(row)) for run, row in zip(runs, zip(*columns, strict=True), strict=True)]

@@ -22,8 +22,7 @@ def checked_scene(parsed: ParsedScene, *, lit: bool) -> tuple[mi.Scene | None, l
         pictures that no surface and no light has, values that meshes lack, nothing to fit, no
         light.
     """
-    faults: list[UserError] = []
-    edit.to_principled(parsed, faults)
+    _, faults = edit.turned_principled(parsed)
     faults += value_faults(parsed)
     try:
         scene = parsed.instantiate(merge=False)

@@ -40,17 +40,12 @@ _PROPERTIES = {
 _NO_SURFACES = ("instance", "merge", "shapegroup")
 
 
-def to_principled(scene: ParsedScene, faults: list[UserError] | None = None) -> int:
+def to_principled(scene: ParsedScene) -> int:
     """Turn every `diffuse` and rough plastic BSDF into `principled`, as the paper did (Sec. 6).
 
     Diffuse becomes roughness 0.9; rough plastic keeps its colour, with roughness √α, the perceptual
     roughness of the same microfacet width. Shapes without a BSDF are diffuse to Mitsuba, and share
     a new one.
-
-    Args:
-        scene: whose nodes are changed.
-        faults: what is wrong is added to it, but for numbers out of range, which `value_faults`
-            tells; None: it is raised.
 
     Returns:
         The number of BSDFs changed.
@@ -59,16 +54,24 @@ def to_principled(scene: ParsedScene, faults: list[UserError] | None = None) -> 
         UserError: some have a property that their plugin does not know, no width that is a number,
             or a number out of range; it tells all of them.
     """
-    found: list[UserError] = [] if faults is None else faults
+    nodes = [n for n in scene.state.nodes if n.props.plugin_name() == "principled"]
+    wrong = [fault for node in nodes for fault in _range_faults(scene, node)]
+    changed, faults = turned_principled(scene)
+    raise_together([*wrong, *faults])
+    return changed
+
+
+def turned_principled(scene: ParsedScene) -> tuple[int, list[UserError]]:
+    """As `to_principled`: the number of BSDFs changed, and what is wrong with those to be changed.
+
+    Numbers of those that are `principled` already are not looked at; see `values.value_faults`.
+    """
+    faults: list[UserError] = []
     changed = 0
     for node in scene.state.nodes:
-        if faults is None and node.props.plugin_name() == "principled":
-            found += _range_faults(scene, node)
-        with collected(found):
+        with collected(faults):
             changed += _made_principled(scene, node)
-    if faults is None:
-        raise_together(found)
-    return changed + _give_bare_shapes_a_bsdf(scene)
+    return changed + _give_bare_shapes_a_bsdf(scene), faults
 
 
 def _made_principled(scene: ParsedScene, node: mi.parser.SceneNode) -> bool:
