@@ -103,6 +103,18 @@ def tiny_fields(representation="neural", radiance="neural") -> FitConfig:
 # ------------------------------------------------------------------------------------ rays
 
 
+def globe(around: int, up: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and triangles of a sphere of radius 1; at a seam two vertices are at each place."""
+    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, around + 1), np.linspace(-1, 1, up + 1))
+    r = np.sqrt(1 - z**2)
+    positions = np.stack([r * np.cos(angle), r * np.sin(angle), z], -1).reshape(-1, 3)
+    positions[around :: around + 1] = positions[:: around + 1]
+    corner = (np.arange(up)[:, None] * (around + 1) + np.arange(around)).ravel()
+    across = corner + around + 2
+    quads = np.stack([corner, corner + 1, across, corner, across, across - 1], 1)
+    return positions, quads.reshape(-1, 3)
+
+
 def built_in_cameras(name: str, size: int, views: int = 1) -> list[Camera]:
     """Training cameras of a built-in scene, `size` pixels square."""
     return [

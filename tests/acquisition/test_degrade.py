@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
+from support import globe
 
 from unbake.acquisition.decimate import decimated
 from unbake.acquisition.degrade import degrade, displacement, response
@@ -183,15 +184,13 @@ def test_a_mesh_that_cannot_be_written_is_told_and_nothing_is_left(cornell, tmp_
 
 def test_large_meshes_lose_triangles(cornell, degraded, monkeypatch):
     pytest.importorskip("pycolmap", reason="fewer triangles need pycolmap")
-    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.linspace(-1, 1, 17))
-    r = np.sqrt(1 - z**2)
-    globe = np.stack([r * np.cos(angle), r * np.sin(angle), z], -1).reshape(-1, 3)
-    corner = (np.arange(16)[:, None] * 33 + np.arange(32)).ravel()
-    quads = np.stack([corner, corner + 1, corner + 34, corner, corner + 34, corner + 33], 1)
-    few = mi.traverse(decimated(globe, quads.reshape(-1, 3), 0.1))
+    few = mi.traverse(decimated(*globe(32, 16), 0.1))
     assert len(few["faces"]) // 3 == pytest.approx(102, abs=10)
-    points = np.array(few["vertex_positions"]).reshape(-1, 3)
+    points, normals = (
+        np.array(few[name]).reshape(-1, 3) for name in ("vertex_positions", "vertex_normals")
+    )
     assert np.linalg.norm(points, axis=1) == pytest.approx(1, abs=0.06)
+    assert (points * normals).sum(1) == pytest.approx(1, abs=0.08), "smooth"
     # In a data set, whose boxes are otherwise too small
     monkeypatch.setattr("unbake.acquisition.degrade.FEWEST", 10)
     dataset, truth = degraded(decimate=0.5)

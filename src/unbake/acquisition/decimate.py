@@ -9,14 +9,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..scene.triangles import write_mesh
+from ..scene.triangles import creased, mesh_of, write_mesh
 
 #: Meshes with fewer triangles stay as they are: a box has no tenth.
 FEWEST = 64
 
 
 def decimated(positions: np.ndarray, faces: np.ndarray, share: float) -> mi.Mesh:
-    """A mesh of about so many of its triangles; it has neither normals nor texture coordinates.
+    """A mesh of about so many of its triangles; it has new normals, and no texture coordinates.
 
     Args:
         positions: (n, 3).
@@ -40,4 +40,7 @@ def decimated(positions: np.ndarray, faces: np.ndarray, share: float) -> mi.Mesh
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
         write_mesh(before, joined, places.reshape(-1)[faces])
         pycolmap.simplify_mesh(before, after, options)
-        return mi.load_dict({"type": "ply", "filename": str(after)})
+        params = mi.traverse(mi.load_dict({"type": "ply", "filename": str(after)}))
+    positions = np.array(params["vertex_positions"]).reshape(-1, 3)
+    vertices, faces, normals = creased(positions, np.array(params["faces"]).reshape(-1, 3))
+    return mesh_of(positions[vertices], faces, normals)

@@ -20,7 +20,7 @@ from ..errors import UserError, named, printable
 from ..io import array, number, read_object, require_file
 from ..scene.meshes import HEADER, check_mesh
 from ..scene.normals import repaired
-from ..scene.triangles import write_mesh
+from ..scene.triangles import creased, write_mesh
 from .faults import Faults
 
 #: Suffixes of the meshes that are read.
@@ -55,7 +55,7 @@ class Part:
         name: unique, of letters, digits, dashes and underscores.
         positions: (n, 3) float64, in the frame of the file.
         faces: (m, 3) indices.
-        normals: (n, 3) of unit length as the file has them; None: facets.
+        normals: (n, 3) of unit length as the file has them; None: it has none.
         uv: (n, 2), v upwards, as in OBJ and most PLY files; None where the file has none.
     """
 
@@ -79,9 +79,16 @@ class Part:
         return replace(self, positions=self.positions @ linear.T + matrix[:3, 3], normals=normals)
 
     def write(self, file: Path) -> None:
-        """Write it as binary PLY for Mitsuba, to which v = 0 is the first row of an image."""
+        """Write it as binary PLY for Mitsuba, to which v = 0 is the first row of an image.
+
+        Without normals it is smooth, but at creases.
+        """
+        positions, faces, normals = self.positions, self.faces, self.normals
         uv = None if self.uv is None else self.uv * (1, -1) + (0, 1)
-        write_mesh(file, self.positions, self.faces, self.normals, uv)
+        if normals is None:
+            vertices, faces, normals = creased(positions, faces)
+            positions, uv = positions[vertices], None if uv is None else uv[vertices]
+        write_mesh(file, positions, faces, normals, uv)
 
 
 def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
@@ -153,8 +160,6 @@ def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Pa
         part.write(folder / "meshes" / f"{part.name}.ply")
         shape = _add(root, "shape", type="ply", id=shape_of_it)
         _add(shape, "string", name="filename", value=f"meshes/{part.name}.ply")
-        if part.normals is None:
-            _add(shape, "boolean", name="face_normals", value="true")
         _add(shape, "ref", name="bsdf", id=sides_of_it)
     ElementTree.indent(root, space="    ")
     file = folder / "scene.xml"

@@ -9,6 +9,11 @@ import numpy as np
 
 from ..io import write_atomically
 
+#: Triangles that meet at less than this angle, in degrees, are of one smooth surface.
+SMOOTH = 60.0
+#: Normals that are equal in so many decimals are one.
+_DECIMALS = 5
+
 
 def mesh_of(
     positions: np.ndarray,
@@ -81,6 +86,59 @@ def normal_sums(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     for corner in faces.T:
         np.add.at(sums, corner, np.cross(b - a, c - a))
     return sums
+
+
+def creased(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Normals for a mesh that has none: smooth, but at creases.
+
+    A corner of a triangle has the mean normal of those triangles at its place that are turned by
+    less than `SMOOTH` against its own one, weighted by their angles there (Thürmer and Wüthrich
+    1998). Vertices at one place are taken as one, and a vertex with several normals becomes several
+    ones.
+
+    Args:
+        positions: (n, 3).
+        faces: (m, 3) indices.
+
+    Returns:
+        Of each new vertex the number of its old one, (k,); faces (m, 3), indices of new ones; and
+        their normals, (k, 3) float32 of length 1.
+    """
+    corners = positions[faces].astype(np.float64)
+    ahead, behind = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
+    across = np.cross(ahead[:, 0], behind[:, 0])
+    area = np.linalg.norm(across, axis=1, keepdims=True)
+    of_faces = across / np.where(area > 0, area, 1)
+    doubled = np.linalg.norm(np.cross(ahead, behind), axis=2)
+    weight = np.arctan2(doubled, (ahead * behind).sum(2)).ravel()
+    place = _numbered(*positions.T)[1][faces].ravel()
+    # Corners in the order of their places, each with those that follow at the same one.
+    order = np.argsort(place, kind="stable")
+    place, face = place[order], order // 3
+    own = weight[order, None] * of_faces[face]
+    sums, first, apart = own.copy(), np.arange(len(place)), 0
+    while len(first):
+        apart += 1
+        first = first[: np.searchsorted(first, len(place) - apart)]
+        first = first[place[first + apart] == place[first]]
+        cosine = (of_faces[face[first]] * of_faces[face[first + apart]]).sum(1)
+        smooth = first[cosine > np.cos(np.radians(SMOOTH))]
+        sums[smooth] += own[smooth + apart]
+        sums[smooth + apart] += own[smooth]
+    normals = np.empty((len(order), 3), np.float32)
+    normals[order] = unit(sums)
+    kept, new = _numbered(*np.round(normals.T, _DECIMALS), faces.ravel())
+    return faces.ravel()[kept], new.reshape(faces.shape), normals[kept]
+
+
+def _numbered(*columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first row of each kind, and the kind of each row (n,), where columns have shape (n,)."""
+    order = np.lexsort(columns)
+    new = np.ones(len(order), bool)
+    new[1:] = np.any([column[order][1:] != column[order][:-1] for column in columns], axis=0)
+    kind = np.empty(len(order), np.int64)
+    kind[order] = np.cumsum(new) - 1
+    return order[new], kind
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,0 +1,123 @@
+"""Of which objects the error of albedo is that a coarse mesh makes.
+
+    python benchmarks/mesh_errors.py --data DATA --out FILE.json [--keep 1 0.1] [--steps 1200]
+
+The meshes of a rendered data set keep a share of their triangles (`unbake degrade --decimate`), and
+a fit with default settings follows. The squared error of the albedo of its held-out views is told
+by what the true scene shows there: shape by shape, numbered as in the scene file, those with the
+largest part of it first. A share of 1 is the mesh as it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import here
+
+import numpy as np
+from cameras import EVALUATION, about_data
+
+from unbake import backend
+from unbake.acquisition.degrade import degrade
+from unbake.acquisition.settings import DegradeSettings
+from unbake.dataset.data_folder import DataFolder
+from unbake.dataset.views import Dataset
+from unbake.experiments.commands import unbake
+from unbake.imaging.pictures import read_exr
+from unbake.io import write_json
+from unbake.machine import machine
+from unbake.scene.parse import parse
+from unbake.training.run_folder import RunFolder
+
+#: Shapes that are told.
+MOST = 8
+
+
+def main() -> None:
+    """Fit, print the shapes, and write the result."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="data set")
+    parser.add_argument("--keep", type=float, nargs="+", default=[1.0, 0.1])
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    args = parser.parse_args()
+    backend.activate()
+    about = {"machine": machine(), **about_data(args.data)}
+    about |= {"steps": args.steps, "seed": args.seed}
+    rows: list[dict[str, Any]] = []
+    for share in args.keep:
+        rows.append({"decimate": share} | by_shape(args.data, share, args.steps, args.seed))
+        print(rows[-1], flush=True)
+        write_json(args.out, about | {"rows": rows})
+
+
+def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
+    """The error of all pixels in dB, and what part of it is of which shapes."""
+    from unbake.evaluation.evaluate import evaluate  # this needs the variant
+
+    known = Dataset.load(data)
+    with tempfile.TemporaryDirectory() as folder:
+        coarse, run = data, Path(folder) / "run"
+        if share < 1:
+            coarse = Path(folder) / "data"
+            settings = DegradeSettings(decimate=share, seed=seed)
+            degrade(data, coarse, settings, tell=lambda line: None)
+        words = ["--steps", steps, "--seed", seed]
+        unbake("fit", coarse, "--out", run, *words, log=Path(folder) / "log.txt")
+        evaluate(run, EVALUATION, tell=lambda line: None)
+        picture = partial(RunFolder(run).picture, "heldout", quantity="albedo")
+        fitted = [read_exr(picture(view=view.name)) for view in known.heldout]
+    truth = DataFolder(data)
+    true = [read_exr(truth.truth("albedo", view.name)) for view in known.heldout]
+    seen = [image.reshape(-1, image.shape[-1])[:, :3] for image in (*true, *fitted)]
+    true, fitted = (np.concatenate(part) for part in (seen[: len(true)], seen[len(true) :]))
+    shapes, triangles = shapes_of(known)
+    counted = np.isfinite(true).all(1)
+    error, shapes = np.square(true - fitted).mean(1)[counted], shapes[counted]
+    count = len(triangles) + 1  # first, what meets nothing
+    sums, pixels = (np.bincount(shapes + 1, x, count)[1:] for x in (error, None))
+    found = [
+        {
+            "shape": int(shape),
+            "triangles": triangles[shape],
+            "pixels": float(pixels[shape] / len(error)),
+            "error": float(sums[shape] / error.sum()),
+            "albedo_psnr": float(-10 * np.log10(sums[shape] / pixels[shape])),
+            "true": float(true[counted][shapes == shape].mean()),
+            "fitted": float(fitted[counted][shapes == shape].mean()),
+        }
+        for shape in np.argsort(-sums)[:MOST]
+    ]
+    return {"albedo_psnr": float(-10 * np.log10(error.mean())), "shapes": found}
+
+
+def shapes_of(dataset: Dataset) -> tuple[np.ndarray, list[int]]:
+    """The number of the shape at the centre of each held-out pixel, or -1; triangles of shapes."""
+    import drjit as dr
+    import mitsuba as mi
+
+    scene = parse(dataset.scene, dataset.root).instantiate(merge=False)
+    found = []
+    for view in dataset.heldout:
+        camera = view.camera
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        right, up = (x - camera.cx) / camera.fl_x, (camera.cy - y) / camera.fl_y
+        local = np.stack([right, up, -np.ones_like(x)], -1).reshape(-1, 3)
+        towards = mi.Vector3f((local @ camera.to_world[:3, :3].T).T.astype(np.float32))
+        origin = dr.zeros(mi.Point3f, x.size) + mi.Point3f(camera.to_world[:3, 3].tolist())
+        hit = scene.ray_intersect(mi.Ray3f(origin, dr.normalize(towards))).shape
+        number = np.full(x.size, -1)
+        for place, shape in enumerate(scene.shapes()):
+            number[np.array(hit == mi.ShapePtr(shape))] = place
+        found.append(number)
+    counts = [shape.face_count() if shape.is_mesh() else 0 for shape in scene.shapes()]
+    return np.concatenate(found), counts
+
+
+if __name__ == "__main__":
+    main()
