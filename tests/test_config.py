@@ -346,7 +346,7 @@ roughness_smoothness = 2.0
 def test_settings_of_format_1_mean_the_same_today(number):
     old = from_toml(number + FORMAT_1)
     # What a user gives has the defaults of today, and what a run has those of its time.
-    assert old == from_toml(FORMAT_2 if number else FORMAT_2.replace("format = 2", "format = 5"))
+    assert old == from_toml(FORMAT_2 if number else FORMAT_2.replace("format = 2", "format = 6"))
     assert old.materials["albedo"]["neural"] == NetworkConfig(
         dataclasses.replace(preset("paper").materials["albedo"]["neural"].grid, levels=3),
         width=11,
@@ -359,7 +359,7 @@ def test_settings_of_format_1_mean_the_same_today(number):
 
 
 def test_keys_that_are_absent_today_are_those_of_the_preset():
-    assert from_toml("format = 5\n") == preset("cpu") != from_toml("format = 2\n")
+    assert from_toml("format = 6\n") == preset("cpu") != from_toml("format = 2\n")
 
 
 def test_the_radiance_field_has_no_pieces():
@@ -368,7 +368,7 @@ def test_the_radiance_field_has_no_pieces():
 
 
 def test_fields_of_earlier_runs_do_not_leak():
-    text = to_toml(preset("cpu")).replace("format = 5", "format = 2")
+    text = to_toml(preset("cpu")).replace("format = 6", "format = 2")
     lines = [line for line in text.splitlines() if not line.startswith("leak = ")]
     found = [from_toml(x).radiance["neural"].leak for x in (text, "\n".join(lines))]
     assert found == [LEAK, 0]
@@ -380,13 +380,13 @@ def test_earlier_runs_go_by_the_background_where_the_scale_is_open():
     text = to_toml(preset("cpu"))
     lines = [line for line in text.splitlines() if not line.startswith("scale_told_by = ")]
     assert len(lines) < len(text.splitlines())
-    old = "\n".join(lines).replace("format = 5", "format = 4")
+    old = "\n".join(lines).replace("format = 6", "format = 4")
     found = [from_toml(x).lighting.scale_told_by for x in (text, "\n".join(lines), old)]
     assert found == ["pixels", "pixels", "background"]
 
 
 def test_a_setting_that_is_no_more_is_passed_over_in_runs_alone():
-    text = to_toml(preset("cpu")).replace("format = 5", "format = 2")
+    text = to_toml(preset("cpu")).replace("format = 6", "format = 2")
     assert "\n[camera]\n" in text
     old = text.replace("\n[camera]\n", "\n[camera]\nsmoothness = 0.25\n")
     assert from_toml(old) == from_toml(text)
@@ -405,8 +405,8 @@ def test_a_file_without_a_format_may_have_keys_of_today():
     ("text", "message"),
     [
         (
-            "format = 6",
-            r"format: was written by a newer unbake \(format 6; .* up to 5\). Update unbake",
+            "format = 7",
+            r"format: was written by a newer unbake \(format 7; .* up to 6\). Update unbake",
         ),
         ("format = true", "format: 'format' is True, not a positive whole number"),
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),

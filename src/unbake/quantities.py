@@ -100,7 +100,7 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
                         "width": 16,
                         "hidden": 1,
                         "learning_rate": 0.004,
-                        "pieces": {"most": 4096, "colours": 6, "variation": True},
+                        "pieces": {"most": 4096, "colours": 6, "own_colours": 4, "variation": True},
                     },
                     "grid": {"cells": 16, "learning_rate": 0.025},
                     "triplane": {"base_resolution": 8, "width": 16, "learning_rate": 0.004},

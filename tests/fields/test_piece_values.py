@@ -24,7 +24,8 @@ from unbake.quantities import QUANTITIES
 
 LANES = 300
 SMALL = PieceConfig(most=5, brightnesses=4, gain=3.0)
-COLOURED = replace(SMALL, colours=3)
+SHARED = replace(SMALL, colours=3)
+COLOURED = replace(SHARED, own_colours=2)
 VARIED = replace(COLOURED, variation=True)
 NETWORK = NetworkConfig(GridConfig(2, 2, 8), width=8, hidden=1, pieces=COLOURED)
 ENGINES = ("tensor", "coopvec", *(["fused"] if can_record_layout() else []))
@@ -81,6 +82,38 @@ def test_values_between_brightnesses_are_between_theirs():
         np.array(table.evaluate(points(level**2))[0]) for level in (1 / 3, 0.5, 2 / 3)
     )
     np.testing.assert_allclose(middle, (low + high) / 2, atol=1e-5)
+
+
+def test_colours_of_a_piece_are_linear_between_corners_that_it_has_by_itself():
+    table = PieceValues(replace(SMALL, own_colours=2), 1)
+    values = randomised(table)
+    values["pieces.0"] = values["pieces.0"] * 0
+    table.assign(values)
+    # As square roots, halfway between corners along green, and at one along red and blue.
+    colour = (0.25, 0.75**2, 1.0)
+    (found,) = table.evaluate(points(colour, number=3, strength=0.5))
+    corners = np.array(values["own_colours.0"]).reshape(5, 3, 3, 3)  # piece, blue, green, red
+    wanted = SMALL.gain * (corners[3, 2, 1, 1] + corners[3, 2, 2, 1]) / 2
+    np.testing.assert_allclose(np.array(found), wanted, atol=1e-5)
+    dr.backward(dr.sum(found))
+    reached = np.array(dr.grad(values["own_colours.0"])).reshape(5, 3, 3, 3)
+    assert set(np.flatnonzero(reached.any(axis=(1, 2, 3)))) == {3}
+    (unknown,) = table.evaluate(points(colour, number=3, strength=0.0))
+    np.testing.assert_array_equal(np.array(unknown), 0)
+
+
+def test_deviations_are_those_of_the_pieces_that_are_asked_for():
+    table = PieceValues(COLOURED, 1)
+    values = randomised(table)
+    found = table.deviations(points(number=dr.arange(mi.UInt32, LANES) % 2 + 1, strength=0.5))
+    own = np.array(found["own_colours"]).reshape(5, 27)
+    wanted = COLOURED.gain * np.array(values["own_colours.0"]).reshape(5, 27)
+    np.testing.assert_allclose(own[1:3], wanted[1:3], rtol=1e-6)
+    np.testing.assert_array_equal(own[[0, 3, 4]], 0)
+    pieces = np.array(found["pieces"]).reshape(5, SMALL.brightnesses)
+    wanted = 0.5 * COLOURED.gain * np.array(values["pieces.0"]).reshape(5, SMALL.brightnesses)
+    np.testing.assert_allclose(pieces[1:3], wanted[1:3], rtol=1e-6)
+    np.testing.assert_array_equal(pieces[[0, 3, 4]], 0)
 
 
 def test_weak_pieces_count_less():
@@ -191,7 +224,7 @@ def test_numbers_that_are_not_learned_change_nothing_by_themselves():
 
 
 def test_colours_are_shared_by_all_pieces():
-    table = PieceValues(COLOURED, 1)
+    table = PieceValues(SHARED, 1)
     values = randomised(table)
     values["pieces.0"] *= 0
     table.assign(values)
@@ -205,7 +238,7 @@ def test_colours_are_shared_by_all_pieces():
 
 
 def test_colours_between_corners_have_values_between():
-    table = PieceValues(COLOURED, 1)
+    table = PieceValues(SHARED, 1)
     values = randomised(table)
     values["pieces.0"] *= 0
     table.assign(values)
@@ -268,7 +301,14 @@ def test_sizes_tell_the_memory():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"most": -1}, {"brightnesses": 0}, {"gain": 0.0}, {"network": 0.0}, {"colours": -1}],
+    [
+        {"most": -1},
+        {"brightnesses": 0},
+        {"gain": 0.0},
+        {"network": 0.0},
+        {"colours": -1},
+        {"own_colours": 17},
+    ],
 )
 def test_sizes_out_of_range_are_refused(wrong):
     with pytest.raises(UserError, match=next(iter(wrong))):
@@ -300,10 +340,13 @@ def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
     assert most(now) == FitConfig().materials["roughness"]["neural"].pieces.most > 0
     assert most("steps = 5") == most(now)
     assert most("materials.roughness.neural.pieces.most = 7") == 7
-    old = now.replace("format = 5", "format = 2")
+    old = now.replace("format = 6", "format = 2")
     before = re.sub(r"\[materials\.roughness\.neural\.pieces\]\n(.+\n)+", "", old)
     assert before != old
     assert most(before) == 0
     assert most(before.replace("format = 2\n", "")) == 0
     assert pieces("steps = 5").colours > 0
+    assert pieces("steps = 5").own_colours > 0
+    older = re.sub("(?m)^own_colours = .+\n", "", now.replace("format = 6", "format = 5"))
+    assert pieces(older) == replace(pieces(now), own_colours=0)
     assert pieces(re.sub("(?m)^colours = .+\n", "", old)) == replace(pieces(now), colours=0)

@@ -117,5 +117,5 @@ def test_runs_of_before_go_on_without_a_guide(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text(text)
     assert read_toml(file).guide.cells == GuideConfig().cells
-    file.write_text(text.replace(table, "").replace("format = 5", "format = 2"))
+    file.write_text(text.replace(table, "").replace("format = 6", "format = 2"))
     assert read_toml(file).guide.cells == 0

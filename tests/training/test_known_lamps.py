@@ -82,4 +82,4 @@ def test_a_furnace_of_lamps_alone_is_fitted(built_in):
 def test_runs_begun_earlier_go_on_with_what_they_fitted():
     for version in (1, 2, 3, 4):
         assert from_toml(f'format = {version}\npreset = "cpu"\n').lamps == "fitted"
-    assert from_toml('format = 5\npreset = "cpu"\n').lamps == "known"
+    assert from_toml('format = 6\npreset = "cpu"\n').lamps == "known"

@@ -237,7 +237,7 @@ def test_older_runs_stay_at_what_is_most_probable(tmp_path):
     text = to_toml(FitConfig())
     file.write_text(text)
     assert read_toml(file).roughness_search == SEARCH
-    old = text.replace("format = 5", "format = 2").splitlines()
+    old = text.replace("format = 6", "format = 2").splitlines()
     kept = [x for x in old if not x.startswith("pixels_as_one")]
     file.write_text("\n".join(kept))
     assert read_toml(file).roughness_search == replace(SEARCH, pixels_as_one=0)

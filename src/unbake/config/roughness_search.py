@@ -27,10 +27,12 @@ class RoughnessSearchConfig:
     steps: int = 300  #: of Adam, on what was sampled
     rate: float = 1.25  #: of these, as a multiple of the field's own
     #: Expected standard deviations, before bounds: of what a piece has of its own, between its
-    #: neighbouring brightnesses, and between neighbouring colours of what all pieces share
+    #: neighbouring brightnesses, between neighbouring colours of what all pieces share, and of what
+    #: a piece has of its own for a colour
     piece_spread: float = 1.5
     brightness_spread: float = 0.25
     colour_spread: float = 1.0
+    own_colour_spread: float = 0.3
     #: Pixels of a piece that tell as much of its level as one would by itself, as their errors have
     #: a part in common; 0: pieces stay at what is most probable
     pixels_as_one: float = 3.0
@@ -54,5 +56,5 @@ class RoughnessSearchConfig:
         ranges |= {"rate": (POSITIVE, 1e4), "rate_before": (0, 1e4), "rate_between": (0, 1e4)}
         ranges |= {"pixels_as_one": (0, 1e6), "pixels_at_most": (0, 1 << 30)}
         ranges |= {"like_colours": (1e-3, 1e3), "one_roughness": (0, 1), "one_albedo": (0, 1)}
-        spreads = ("piece_spread", "brightness_spread", "colour_spread")
+        spreads = ("piece_spread", "brightness_spread", "colour_spread", "own_colour_spread")
         require_ranges(self, ranges | dict.fromkeys(spreads, (POSITIVE, 1e6)))

@@ -90,7 +90,8 @@ class Field(Protocol):
         Returns:
             `pieces`: the numbers of these pieces, beside what others have, too; `brightnesses`:
             differences between those of a piece that follow each other; `colours`: the same of what
-            all pieces share. Here none.
+            all pieces share; `own_colours`: what these pieces have for colours, beside all of it.
+            Here none.
         """
         return {}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -30,7 +31,8 @@ class PieceValues:
     number at one pace, however little is known of it. What they have instead is a table by colour
     that all pieces share: what is of one colour is often of one material, too. It is a grid over
     the square roots of linear RGB albedo, linear between its corners. Numbers of pieces are added
-    to it, for what differs between pieces of one colour.
+    to it, for what differs between pieces of one colour. For what differs between colours of a
+    piece, such as those of its tiles, each piece may have such a grid of its own, too.
 
     What differs within a piece may be noise. So a piece may have a factor of all that it has beside
     its own numbers. No gradient reaches it: searches of roughness find it. Where numbers are not
@@ -49,14 +51,22 @@ class PieceValues:
         if settings.colours:
             self._colours = DenseGrid(DenseGridConfig(settings.colours), FieldSpec(outputs))
         self._factors = dr.opaque(mi.Float, 1, settings.most) if settings.variation else None
+        self._own_colours = [
+            dr.opaque(mi.Float, 0, settings.most * settings.own_corners) for _ in range(outputs)
+        ]
 
     def parameters(self) -> dict[str, mi.Float]:
-        """`pieces.0`, …: the numbers of each output; if there are any, `colours`, `variation`."""
+        """The numbers of each output, `pieces.0`, …; what there is of others.
+
+        Those are `colours`, the factors `variation`, and `own_colours.0`, … of each output.
+        """
         found = {f"pieces.{i}": values for i, values in enumerate(self._values)}
         if self._colours is not None:
             found["colours"] = self._colours.parameters()["corners"]
         if self._factors is not None:
             found["variation"] = self._factors
+        if self._settings.own_colours:
+            found |= {f"own_colours.{i}": values for i, values in enumerate(self._own_colours)}
         return found
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
@@ -66,6 +76,9 @@ class PieceValues:
             self._colours.assign({"corners": parameters["colours"]})
         if self._factors is not None:
             self._factors = parameters["variation"]
+        if self._settings.own_colours:
+            numbers = range(len(self._own_colours))
+            self._own_colours = [parameters[f"own_colours.{i}"] for i in numbers]
 
     def evaluate(
         self, point: SurfacePoint, beside: Sequence[mi.Float] | None = None
@@ -85,19 +98,23 @@ class PieceValues:
         albedo = mi.Color3f(0.25) if point.albedo is None else dr.detach(point.albedo)
         number = dr.minimum(point.piece.number, self._settings.most - 1)
         others = list(beside or [mi.Float(0)] * len(self._values))
+        colour = mi.Point3f([dr.sqrt(bounded(channel, 0, 1)) for channel in albedo])
+        tables = []
         if self._colours is not None:
-            colour = mi.Point3f([dr.sqrt(bounded(channel, 0, 1)) for channel in albedo])
-            shared = self._colours.evaluate(SurfacePoint(colour))
-            others = [
-                dr.fma(self._settings.gain, x, y) for x, y in zip(shared, others, strict=True)
-            ]
+            tables.append(self._colours.evaluate(SurfacePoint(colour)))
+        if self._settings.own_colours:
+            known = point.piece.strength > 0
+            tables.append([dr.select(known, x, 0) for x in self._of_colour(number, colour)])
+        gain = self._settings.gain
+        for table in tables:
+            others = [dr.fma(gain, x, y) for x, y in zip(table, others, strict=True)]
         if self._factors is not None:
             factor = dr.gather(mi.Float, dr.detach(self._factors), number)
             factor = dr.select(point.piece.strength > 0, factor, 1)  # 0: nothing is known of it
             others = [factor * x for x in others]
-        gain = self._settings.gain * point.piece.strength
         own = self._own(number, dr.mean(albedo))
-        return [dr.fma(gain, x, y) for x, y in zip(own, others, strict=True)]
+        weight = gain * point.piece.strength
+        return [dr.fma(weight, x, y) for x, y in zip(own, others, strict=True)]
 
     def _own(self, number: mi.UInt32, mean: mi.Float) -> list[mi.Float]:
         """The numbers of pieces where the mean of linear RGB albedo is so much, an output each."""
@@ -113,6 +130,25 @@ class PieceValues:
         for values in tables:
             low, high = (dr.gather(mi.Float, values, first + i) for i in (0, 1))
             found.append(dr.fma(share, high - low, low))
+        return found
+
+    def _of_colour(self, number: mi.UInt32, colour: mi.Point3f) -> list[mi.Float]:
+        """The numbers of pieces for a colour, as square roots of linear RGB, an output each."""
+        cells, tables = self._settings.own_colours, self._own_colours
+        if not self._settings.learned:
+            tables = [dr.detach(values) for values in tables]
+        side, at = cells + 1, colour * cells
+        below = dr.minimum(mi.Point3u(at), cells - 1)
+        share = at - mi.Point3f(below)
+        first = ((number * side + below.z) * side + below.y) * side + below.x
+        apart = [(z * side + y) * side + x for z, y, x in product((0, 1), repeat=3)]
+        found = []
+        for values in tables:
+            corners = [dr.gather(mi.Float, values, first + offset) for offset in apart]
+            for part in share:
+                pairs = zip(corners[::2], corners[1::2], strict=True)
+                corners = [dr.lerp(low, high, part) for low, high in pairs]
+            found += corners
         return found
 
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
@@ -133,6 +169,11 @@ class PieceValues:
             found["brightnesses"] = [differences(v, here, 1) for v in of_pieces]
         if self._colours is not None:
             found["colours"] = [gain * x for x in self._colours.differences()]
+        if self._settings.own_colours:
+            corners = self._settings.own_corners
+            here = dr.arange(mi.UInt32, self._settings.most * corners) // corners
+            seen = dr.gather(mi.Float, strength, here) > 0
+            found["own_colours"] = [dr.select(seen, gain * x, 0) for x in self._own_colours]
         return {name: dr.concat(arrays) for name, arrays in found.items()}
 
     def raised(self, piece: Piece, by: mi.Float) -> dict[str, mi.Float]:
@@ -178,5 +219,6 @@ class PieceValues:
     def features(self) -> int:
         """Numbers that are looked up at a point."""
         outputs = len(self._values)
-        own = min(self._settings.brightnesses, 2) + (8 if self._colours is not None else 0)
+        grids = (self._colours is not None) + bool(self._settings.own_colours)
+        own = min(self._settings.brightnesses, 2) + 8 * grids
         return own * outputs + (0 if self._factors is None else 1)

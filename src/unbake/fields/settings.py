@@ -96,6 +96,7 @@ class PieceConfig:
     network: float = 0.2  #: how much slower the network learns beside pieces
     #: Cells along each channel of a table by colour of the albedo, which all pieces share; 0: none
     colours: int = 0
+    own_colours: int = 0  #: the same of a table that each piece has by itself; 0: none
     #: Whether each piece has a factor of what it has from the network and from colours, which
     #: searches find
     variation: bool = False
@@ -104,7 +105,8 @@ class PieceConfig:
     across_slivers: bool = True
 
     def __post_init__(self) -> None:
-        sizes = {"most": (0, 1 << 20), "brightnesses": (1, 64), "colours": (0, 64)}
+        sizes = {"most": (0, 1 << 20), "brightnesses": (1, 64)}
+        sizes |= {"colours": (0, 64), "own_colours": (0, 16)}
         require_ranges(self, sizes | {"gain": (POSITIVE, 1e4), "network": (POSITIVE, 1.0)})
 
     def numbers(self, outputs: int) -> int:
@@ -113,7 +115,12 @@ class PieceConfig:
             return 0
         grid = features_of(outputs) * (self.colours + 1) ** 3 if self.colours else 0
         factors = self.most if self.variation else 0
-        return outputs * self.brightnesses * self.most + grid + factors
+        return outputs * (self.brightnesses + self.own_corners) * self.most + grid + factors
+
+    @property
+    def own_corners(self) -> int:
+        """Of the table by colour that each piece has by itself."""
+        return (self.own_colours + 1) ** 3 if self.own_colours else 0
 
 
 @dataclass(frozen=True)

@@ -328,6 +328,7 @@ def descend(
         "pieces": settings.piece_spread,
         "brightnesses": settings.brightness_spread,
         "colours": settings.colour_spread,
+        "own_colours": settings.own_colour_spread,
     }
     weights = {key: dr.opaque(mi.Float, x**-2 / curves.total) for key, x in spreads.items()}
     share = dr.width(curves.losses) // len(NODES) * ranks.size / curves.total
