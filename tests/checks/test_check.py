@@ -99,6 +99,23 @@ def test_vertex_normals_that_are_not_numbers_are_told(spoilt, unbake):
     assert "hint: " in outcome.out and "geometry   hint" in outcome.out
 
 
+def test_meshes_that_are_smooth_across_sharp_edges_are_told(spoilt):
+    data = spoilt("cornell")
+    scene = data.folder / data.content["scene"]
+    places = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 2]])
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    write_mesh(scene.parent / "tent.ply", places, faces, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    text, tent = scene.read_text(), (
+        '<shape type="ply"><string name="filename" value="tent.ply"/>{}'
+        '<bsdf type="twosided"><bsdf type="principled"/></bsdf></shape></scene>'
+    )  # fmt: skip
+    for kind, told in (("", 1), ('<boolean name="face_normals" value="true"/>', 0)):
+        scene.write_text(text.replace("</scene>", tent.format(kind)))
+        hints = found(data.folder, "normals")
+        assert [hint.level for hint in hints] == ["hint"] * told
+        assert all("edges were round" in hint.what for hint in hints)
+
+
 def test_a_scene_that_no_fit_can_use_is_told(spoilt):
     """Neither light nor a material that could be fitted, both at once."""
     data = spoilt("cornell")

@@ -54,7 +54,8 @@ def test_engines_agree_with_pieces(outputs):
         np.testing.assert_allclose(values, results[0][0], atol=2e-5)
         for key, gradient in gradients.items():
             np.testing.assert_allclose(gradient, results[0][1][key], atol=2e-3, err_msg=key)
-    assert all(np.abs(g).max() > 0 for g in results[0][1].values())
+    reached = {key for key, gradient in results[0][1].items() if np.abs(gradient).max() > 0}
+    assert reached == {key for key in results[0][1] if not key.startswith("own_colours")}
 
 
 def test_untrained_pieces_change_nothing():
@@ -91,7 +92,7 @@ def test_colours_of_a_piece_are_linear_between_corners_that_it_has_by_itself():
     table.assign(values)
     # As square roots, halfway between corners along green, and at one along red and blue.
     colour = (0.25, 0.75**2, 1.0)
-    (found,) = table.evaluate(points(colour, number=3, strength=0.5))
+    (found,) = table.evaluate(points(colour, number=3, strength=0.5), searching=True)
     corners = np.array(values["own_colours.0"]).reshape(5, 3, 3, 3)  # piece, blue, green, red
     wanted = SMALL.gain * (corners[3, 2, 1, 1] + corners[3, 2, 2, 1]) / 2
     np.testing.assert_allclose(np.array(found), wanted, atol=1e-5)
@@ -199,7 +200,18 @@ def test_no_gradient_reaches_factors():
     values = randomised(network)
     dr.backward(dr.sum(network.evaluate(points())[0]))
     reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
-    assert reached == values.keys() - {"variation"}
+    assert reached == values.keys() - {"variation", "own_colours.0"}
+
+
+def test_searches_move_colours_of_pieces_and_steps_do_not():
+    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
+    values = randomised(network)
+    at = points()
+    found = network.with_shared(network.beside_shared(at), at)
+    np.testing.assert_allclose(np.array(found), np.array(network.evaluate(at)), atol=1e-5)
+    dr.backward(dr.sum(found[0]))
+    assert np.abs(np.array(dr.grad(values["own_colours.0"]))).max() > 0
+    assert np.abs(np.array(dr.grad(values["variation"]))).max() == 0
 
 
 def test_numbers_that_are_not_learned_change_nothing_by_themselves():
@@ -278,7 +290,8 @@ def test_roughness_does_not_pull_albedo():
     material = materials.evaluate(surface(materials), mi.Bool(True))
     dr.backward(dr.sum(material["roughness"]))
     reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
-    assert reached == {k for k in values if k.startswith("roughness.")}
+    of_roughness = {k for k in values if k.startswith("roughness.")}
+    assert reached == of_roughness - {"roughness.own_colours.0"}
 
 
 def test_roughness_alone_has_pieces():
@@ -307,7 +320,7 @@ def test_sizes_tell_the_memory():
         {"gain": 0.0},
         {"network": 0.0},
         {"colours": -1},
-        {"own_colours": 17},
+        {"own_colours": 13},
     ],
 )
 def test_sizes_out_of_range_are_refused(wrong):

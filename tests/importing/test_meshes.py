@@ -12,7 +12,7 @@ from layouts import quiet, write_blender, write_nerfstudio
 from unbake.errors import UserError
 from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.import_data import import_data
-from unbake.importing.meshes import TO_Z_UP, read_parts, write_scene
+from unbake.importing.meshes import TO_Z_UP, Part, read_parts, write_scene
 from unbake.importing.settings import ImportSettings
 from unbake.scene.edit import material_names
 from unbake.scene.parse import parse
@@ -312,3 +312,17 @@ def test_texture_coordinates_are_those_that_mitsuba_reads_of_an_obj_file(suffix,
     assert ours.keys() == theirs.keys()
     for corner, found in ours.items():
         np.testing.assert_allclose(found, theirs[corner], atol=1e-6)
+
+
+def test_texture_coordinates_follow_vertices_that_get_several_normals(tmp_path):
+    box = trimesh.creation.box((1, 2, 3))
+    uv = np.random.default_rng(0).random((8, 2))
+    part = Part("box", np.array(box.vertices), np.array(box.faces), None, uv)
+    part.write(tmp_path / "box.ply")
+    (found,) = parts_of(tmp_path / "box.ply")
+    assert len(found.positions) == 24
+    corners = found.faces.ravel()
+    places = np.abs(found.positions[corners, None] - box.vertices).sum(2).argmin(1)
+    np.testing.assert_array_equal(places, box.faces.ravel())
+    # To Mitsuba, v = 0 is the first row of an image.
+    np.testing.assert_allclose(found.uv[corners] * (1, -1) + (0, 1), uv[places], atol=1e-6)

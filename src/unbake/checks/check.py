@@ -37,6 +37,7 @@ from ..dataset.views import Dataset, View, fitted, read_masked
 from ..errors import UserError, collected, named, printable
 from ..scene import free_space
 from ..scene.checked import checked_scene
+from ..scene.normals import turned_share
 from ..scene.parse import parse
 from .pictures import PictureFacts, blurred, percentage, picture_facts
 
@@ -47,6 +48,8 @@ _CLIPPED, _CLIPPED_IN_ALL, _CLIPPED_AND_TOLD = 0.05, 0.01, 0.25
 _BLACK, _BLACK_IN_ALL = 0.6, 0.3
 #: Share of the surface that no view sees, above which it is told.
 _UNSEEN = 0.3
+#: Share of the surface whose normals may be turned away from it.
+_TURNED = 0.05
 #: Cameras farther away than so many diagonals of the scene are doubtful.
 _FAR = 20.0
 #: Distance of cameras, in diagonals of the scene, and difference of the matrix of their axes, up to
@@ -178,6 +181,12 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
     if parsed.repaired_normals:
         what = f"vertex normals that are not numbers: {parsed.repaired_normals}"
         remedy = "Normals of the triangles take their place. Compute them anew if you want others"
+        where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
+        result.add(Finding("hint", "normals", what, where, remedy))
+    turned = turned_share(scene)
+    if turned > _TURNED:
+        what = f"{100 * turned:.0f} % of the surface is shaded as if its edges were round"
+        remedy = "Give these meshes normals of their own, or their shapes 'face_normals'"
         where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
         result.add(Finding("hint", "normals", what, where, remedy))
     if parsed.media:

@@ -137,6 +137,8 @@ class Field(Protocol):
     def with_shared(self, beside: list[mi.Float], point: SurfacePoint) -> list[mi.Float]:
         """`evaluate`, given the part that stays: only shared parameters are looked up again.
 
+        Gradients reach all of these, also those that only searches move.
+
         Args:
             beside: from `beside_shared` of the same points.
         """

@@ -98,7 +98,7 @@ class Network(Field):
     ) -> list[mi.Float]:
         """Evaluate the network; the caller masks points outside of [0,1]³ or not finite."""
         features = [*self.grid(list(point.position)), *extra]
-        return self.with_shared(self.perceptron.evaluate(features, engine), point)
+        return self._with_shared(self.perceptron.evaluate(features, engine), point)
 
     def beside_shared(self, point: SurfacePoint) -> list[mi.Float]:
         """The network's part."""
@@ -106,10 +106,15 @@ class Network(Field):
 
     def with_shared(self, beside: list[mi.Float], point: SurfacePoint) -> list[mi.Float]:
         """The network's part and the numbers of pieces and colours."""
+        return self._with_shared(beside, point, searching=True)
+
+    def _with_shared(
+        self, beside: list[mi.Float], point: SurfacePoint, *, searching: bool = False
+    ) -> list[mi.Float]:
         if self.pieces is None:
             return beside
         beside = [dr.fma(self._pace, x, self._first) for x in beside]
-        outputs = self.pieces.evaluate(point, beside)
+        outputs = self.pieces.evaluate(point, beside, searching=searching)
         return [sigmoid(x, self._least_slope) for x in outputs] if self._bounded else outputs
 
     def cost(self) -> Cost:

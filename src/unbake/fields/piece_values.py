@@ -31,11 +31,14 @@ class PieceValues:
     number at one pace, however little is known of it. What they have instead is a table by colour
     that all pieces share: what is of one colour is often of one material, too. It is a grid over
     the square roots of linear RGB albedo, linear between its corners. Numbers of pieces are added
-    to it, for what differs between pieces of one colour. For what differs between colours of a
-    piece, such as those of its tiles, each piece may have such a grid of its own, too.
+    to it, for what differs between pieces of one colour.
+
+    For what differs between colours of a piece, such as those of its tiles, each piece may have
+    such a grid of its own, too. These are many numbers, and steps would fill them with noise: only
+    searches of roughness move them, which say what is to be expected of them.
 
     What differs within a piece may be noise. So a piece may have a factor of all that it has beside
-    its own numbers. No gradient reaches it: searches of roughness find it. Where numbers are not
+    its numbers by brightness. No gradient reaches it: searches find it. Where numbers are not
     learned, either, a piece is as it would be without until a search changes it.
 
     Args:
@@ -81,7 +84,11 @@ class PieceValues:
             self._own_colours = [parameters[f"own_colours.{i}"] for i in numbers]
 
     def evaluate(
-        self, point: SurfacePoint, beside: Sequence[mi.Float] | None = None
+        self,
+        point: SurfacePoint,
+        beside: Sequence[mi.Float] | None = None,
+        *,
+        searching: bool = False,
     ) -> list[mi.Float]:
         """One number for each output; where the albedo is not told, all are taken as mid-grey.
 
@@ -89,6 +96,7 @@ class PieceValues:
             point: where.
             beside: what outputs are without pieces and colours, to which these are added. The
                 factor of a piece is of that, too.
+            searching: whether gradients reach what only searches move.
 
         Raises:
             ValueError: the piece is not told.
@@ -104,7 +112,8 @@ class PieceValues:
             tables.append(self._colours.evaluate(SurfacePoint(colour)))
         if self._settings.own_colours:
             known = point.piece.strength > 0
-            tables.append([dr.select(known, x, 0) for x in self._of_colour(number, colour)])
+            own = self._of_colour(number, colour, searching=searching)
+            tables.append([dr.select(known, x, 0) for x in own])
         gain = self._settings.gain
         for table in tables:
             others = [dr.fma(gain, x, y) for x, y in zip(table, others, strict=True)]
@@ -132,10 +141,12 @@ class PieceValues:
             found.append(dr.fma(share, high - low, low))
         return found
 
-    def _of_colour(self, number: mi.UInt32, colour: mi.Point3f) -> list[mi.Float]:
+    def _of_colour(
+        self, number: mi.UInt32, colour: mi.Point3f, *, searching: bool
+    ) -> list[mi.Float]:
         """The numbers of pieces for a colour, as square roots of linear RGB, an output each."""
         cells, tables = self._settings.own_colours, self._own_colours
-        if not self._settings.learned:
+        if not searching:
             tables = [dr.detach(values) for values in tables]
         side, at = cells + 1, colour * cells
         below = dr.minimum(mi.Point3u(at), cells - 1)

@@ -1,4 +1,4 @@
-"""Vertex normals that are not numbers.
+"""Vertex normals that are not numbers, or not those of the surface.
 
 Simplified scans have vertices whose triangles have no area. Programs that make normals of them
 divide zero by zero, and Mitsuba takes what a file holds. A ray that hits a triangle there has a
@@ -15,6 +15,9 @@ from .triangles import normal_sums, unit
 
 #: Lengths of normals may differ from 1 by this much.
 _OFF = 0.1
+#: Vertex normals are turned away from a triangle where they are so by this mean angle, in degrees:
+#: those of a ball of twenty triangles are not, and those of a box that is smooth at its edges are.
+TURNED = 40.0
 
 
 def repair_normals(scene: mi.Scene) -> int:
@@ -47,6 +50,33 @@ def repair_normals(scene: mi.Scene) -> int:
         params.update()
         count += int(broken.sum())
     return count
+
+
+def turned_share(scene: mi.Scene) -> float:
+    """The share of the surface whose vertex normals are turned away from it by `TURNED` or more.
+
+    Mitsuba makes normals for meshes whose files have none, smooth across every edge: a box is
+    shaded as if it were round.
+    """
+    turned = whole = 0.0
+    for shape in met_shapes(scene):
+        if not shape.is_mesh():
+            continue
+        positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+        corners = positions[np.array(shape.faces_buffer()).reshape(-1, 3)]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(across, axis=1)
+        whole += area.sum()
+        if not shape.has_vertex_normals() or shape.has_face_normals():
+            continue
+        normals = np.array(shape.vertex_normals_buffer(), np.float64).reshape(-1, 3)
+        normals = normals[np.array(shape.faces_buffer()).reshape(-1, 3)]
+        cosine = (
+            np.abs(np.einsum("fi,fci->fc", across, normals)) / np.maximum(area, 1e-300)[:, None]
+        )
+        angle = np.degrees(np.arccos(np.minimum(cosine, 1))).mean(1)
+        turned += area[angle > TURNED].sum()
+    return turned / max(whole, 1e-300)
 
 
 def repaired(

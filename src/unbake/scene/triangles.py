@@ -9,8 +9,12 @@ import numpy as np
 
 from ..io import write_atomically
 
-#: Triangles that meet at less than this angle, in degrees, are of one smooth surface.
-SMOOTH = 60.0
+#: Triangles whose normals are less than this angle apart, in degrees, are of one smooth surface.
+SMOOTH = 50.0
+#: Triangles whose height is no more than so many roundings of their corners are slivers.
+_SLIVER = 4.0
+#: Corners whose normals are found at once.
+_AT_ONCE = 1 << 20
 #: Normals that are equal in so many decimals are one.
 _DECIMALS = 5
 
@@ -91,10 +95,10 @@ def normal_sums(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def creased(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
     """Normals for a mesh that has none: smooth, but at creases.
 
-    A corner of a triangle has the mean normal of those triangles at its place that are turned by
-    less than `SMOOTH` against its own one, weighted by their angles there (Thürmer and Wüthrich
+    A corner of a triangle has the mean normal of those triangles at its place whose normals are
+    less than `SMOOTH` apart from its own one, weighted by their angles there (Thürmer and Wüthrich
     1998). Vertices at one place are taken as one, and a vertex with several normals becomes several
-    ones.
+    ones. Neighbours that face opposite sides meet at a crease. Slivers have no say.
 
     Args:
         positions: (n, 3).
@@ -104,31 +108,44 @@ def creased(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
         Of each new vertex the number of its old one, (k,); faces (m, 3), indices of new ones; and
         their normals, (k, 3) float32 of length 1.
     """
-    corners = positions[faces].astype(np.float64)
-    ahead, behind = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
-    across = np.cross(ahead[:, 0], behind[:, 0])
-    area = np.linalg.norm(across, axis=1, keepdims=True)
-    of_faces = across / np.where(area > 0, area, 1)
-    doubled = np.linalg.norm(np.cross(ahead, behind), axis=2)
-    weight = np.arctan2(doubled, (ahead * behind).sum(2)).ravel()
+    positions = np.asarray(positions, np.float32)
+    of_faces, angles = _normals_and_angles(positions, faces)
     place = _numbered(*positions.T)[1][faces].ravel()
-    # Corners in the order of their places, each with those that follow at the same one.
-    order = np.argsort(place, kind="stable")
-    place, face = place[order], order // 3
-    own = weight[order, None] * of_faces[face]
-    sums, first, apart = own.copy(), np.arange(len(place)), 0
-    while len(first):
-        apart += 1
-        first = first[: np.searchsorted(first, len(place) - apart)]
-        first = first[place[first + apart] == place[first]]
-        cosine = (of_faces[face[first]] * of_faces[face[first + apart]]).sum(1)
-        smooth = first[cosine > np.cos(np.radians(SMOOTH))]
-        sums[smooth] += own[smooth + apart]
-        sums[smooth + apart] += own[smooth]
-    normals = np.empty((len(order), 3), np.float32)
-    normals[order] = unit(sums)
+    normals = np.zeros((faces.size, 3), np.float32)
+    # Corners that count, in the order of their places; those of a place are in one part.
+    order = np.flatnonzero(np.repeat(of_faces.any(1), 3))
+    order = order[np.argsort(place[order], kind="stable")]
+    starts = np.flatnonzero(np.diff(place[order], prepend=-1))
+    cuts = np.searchsorted(starts, np.arange(_AT_ONCE, len(order), _AT_ONCE)) - 1
+    for part in np.split(order, np.unique(starts[cuts])):
+        own, unit_normals = angles[part, None] * of_faces[part // 3], of_faces[part // 3]
+        sums, first, apart = own.copy(), np.arange(len(part)), 0
+        while len(first):
+            apart += 1
+            first = first[: np.searchsorted(first, len(part) - apart)]
+            first = first[place[part[first + apart]] == place[part[first]]]
+            cosine = (unit_normals[first] * unit_normals[first + apart]).sum(1)
+            near = first[cosine > np.cos(np.radians(SMOOTH))]
+            sums[near] += own[near + apart]
+            sums[near + apart] += own[near]
+        normals[part] = sums
+    normals = unit(normals)
     kept, new = _numbered(*np.round(normals.T, _DECIMALS), faces.ravel())
     return faces.ravel()[kept], new.reshape(faces.shape), normals[kept]
+
+
+def _normals_and_angles(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals of triangles, (m, 3), zero of slivers, and angles at their corners, (3 m,)."""
+    corners = [positions[column].astype(np.float64) for column in faces.T]
+    sides = [corners[(i + 1) % 3] - corners[i] for i in range(3)]
+    across = np.cross(sides[0], sides[1])
+    area = np.linalg.norm(across, axis=1)
+    lengths = np.stack([np.linalg.norm(side, axis=1) for side in sides])
+    size = np.abs(positions).max(initial=0)
+    known = area > _SLIVER * np.finfo(np.float32).eps * size * lengths.max(0)
+    normals = np.where(known[:, None], across, 0) / np.where(known, area, 1)[:, None]
+    dots = [-(sides[i] * sides[i - 1]).sum(1) for i in range(3)]
+    return normals, np.arctan2(area, np.stack(dots)).T.ravel()
 
 
 def _numbered(*columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
