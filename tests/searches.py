@@ -12,7 +12,7 @@ SMALL = NetworkConfig(
     GridConfig(levels=2, table_log2=8, base_resolution=2),
     width=8,
     hidden=1,
-    pieces=PieceConfig(most=64, colours=2),
+    pieces=PieceConfig(most=64, colours=2, own_colours=2),
 )
 
 

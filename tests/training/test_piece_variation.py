@@ -322,7 +322,7 @@ def test_fields_without_factors_stay():
     curves = Curves.of(rows, 2, 6, albedo=True)
     numbers = {key: field.parameters()[key] for key in field.shared()}
     found = with_expected_variation(field, curves, numbers, SEARCH)
-    assert set(found) == {"pieces.0", "colours"}
+    assert set(found) == {"pieces.0", "colours", "own_colours.0"}
     for key, x in numbers.items():
         np.testing.assert_array_equal(np.array(found[key].array), np.array(x.array))
 

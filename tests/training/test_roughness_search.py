@@ -275,7 +275,7 @@ def test_a_field_descends_to_the_true_roughness_of_each_piece():
     rows = made_up(noise=0.02)
     rows["weight"] /= 0.02**2
     field, found, value = descended(rows)
-    assert set(found) == set(field.shared()) == {"pieces.0", "colours"}
+    assert set(found) == set(field.shared()) == {"pieces.0", "colours", "own_colours.0"}
     for piece, true in enumerate((0.24, 0.55)):
         assert value[rows["piece"] == piece].mean() == pytest.approx(true, abs=0.04)
 
@@ -299,6 +299,23 @@ def test_pieces_of_which_photographs_tell_little_are_like_the_others():
 
     assert apart(1e4) == pytest.approx(0.55 - 0.24, abs=0.05)
     assert apart(1e-4) < 0.05 < apart(1e-4, piece_spread=1e3, brightness_spread=1e3)
+
+
+def test_colours_of_a_piece_differ_as_far_as_they_are_expected_to():
+    rows = made_up()
+    odd = rows["piece"] == 1
+    rows["piece"] = 0
+    rows["albedo"] = np.where(odd[:, None], (0.4, 0.7, 0.4), (0.6, 0.3, 0.6))  # equally bright
+    rows["weight"] *= 1e4
+
+    def apart(own, shared):
+        spreads = {"own_colour_spread": own, "colour_spread": shared, "brightness_spread": 1e-4}
+        _, _, value = descended(rows, **spreads)
+        return value[odd].mean() - value[~odd].mean()
+
+    assert apart(1e3, 1e-4) == pytest.approx(0.55 - 0.24, abs=0.05)
+    assert apart(1e-4, 1e3) == pytest.approx(0.55 - 0.24, abs=0.05)
+    assert abs(apart(1e-4, 1e-4)) < 0.05
 
 
 @pytest.mark.parametrize(("albedo", "largest"), [(0.1, 3.0), (0.8, 1.25), (0.99, 1.05)])
@@ -353,7 +370,7 @@ def test_searches_come_at_their_places_and_steps_hardly_move_roughness(built_in)
     assert search.rates(rates, 50, 0.5) == {"albedo": 1.0, "roughness": 0.0}
     assert samples == np.prod(search._size(4, 0.5))
     moved = {k for k, x in state.phi.items() if (np.array(x.array) != before[k]).any()}
-    assert moved == {"roughness.pieces.0", "roughness.colours"}
+    assert moved == {f"roughness.{key}" for key in ("pieces.0", "colours", "own_colours.0")}
 
 
 def test_what_later_searches_find_is_averaged(built_in, monkeypatch):
