@@ -5,13 +5,15 @@
 The meshes of a rendered data set keep a share of their triangles (`unbake degrade --decimate`), and
 a fit with default settings follows. The squared error of the albedo of its held-out views is told
 by what the true scene shows there: shape by shape, numbered as in the scene file, those with the
-largest part of it first. A share of 1 is the mesh as it was.
+largest part of it first. `hidden` is the share of its pixels where the coarse mesh has another
+shape. A share of 1 is the mesh as it was.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,7 @@ from unbake import backend
 from unbake.acquisition.degrade import degrade
 from unbake.acquisition.settings import DegradeSettings
 from unbake.dataset.data_folder import DataFolder
-from unbake.dataset.views import Dataset
+from unbake.dataset.views import Dataset, View
 from unbake.experiments.commands import unbake
 from unbake.imaging.pictures import read_exr
 from unbake.io import write_json
@@ -63,10 +65,13 @@ def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
     known = Dataset.load(data)
     with tempfile.TemporaryDirectory() as folder:
         coarse, run = data, Path(folder) / "run"
+        shapes, triangles = shapes_of(known.heldout, known)
+        there = shapes
         if share < 1:
             coarse = Path(folder) / "data"
             settings = DegradeSettings(decimate=share, seed=seed)
-            degrade(data, coarse, settings, tell=lambda line: None)
+            worse = degrade(data, coarse, settings, tell=lambda line: None)
+            there, _ = shapes_of(known.heldout, worse)
         words = ["--steps", steps, "--seed", seed]
         unbake("fit", coarse, "--out", run, *words, log=Path(folder) / "log.txt")
         evaluate(run, EVALUATION, tell=lambda line: None)
@@ -76,9 +81,9 @@ def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
     true = [read_exr(truth.truth("albedo", view.name)) for view in known.heldout]
     seen = [image.reshape(-1, image.shape[-1])[:, :3] for image in (*true, *fitted)]
     true, fitted = (np.concatenate(part) for part in (seen[: len(true)], seen[len(true) :]))
-    shapes, triangles = shapes_of(known)
     counted = np.isfinite(true).all(1)
-    error, shapes = np.square(true - fitted).mean(1)[counted], shapes[counted]
+    error = np.square(true - fitted).mean(1)[counted]
+    shapes, there = shapes[counted], there[counted]
     count = len(triangles) + 1  # first, what meets nothing
     sums, pixels = (np.bincount(shapes + 1, x, count)[1:] for x in (error, None))
     found = [
@@ -88,6 +93,7 @@ def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
             "pixels": float(pixels[shape] / len(error)),
             "error": float(sums[shape] / error.sum()),
             "albedo_psnr": float(-10 * np.log10(sums[shape] / pixels[shape])),
+            "hidden": float((there != shapes)[shapes == shape].mean()),
             "true": float(true[counted][shapes == shape].mean()),
             "fitted": float(fitted[counted][shapes == shape].mean()),
         }
@@ -96,14 +102,14 @@ def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
     return {"albedo_psnr": float(-10 * np.log10(error.mean())), "shapes": found}
 
 
-def shapes_of(dataset: Dataset) -> tuple[np.ndarray, list[int]]:
-    """The number of the shape at the centre of each held-out pixel, or -1; triangles of shapes."""
+def shapes_of(views: Sequence[View], dataset: Dataset) -> tuple[np.ndarray, list[int]]:
+    """The number of the shape at the centre of each pixel, or -1; triangles of all shapes."""
     import drjit as dr
     import mitsuba as mi
 
     scene = parse(dataset.scene, dataset.root).instantiate(merge=False)
     found = []
-    for view in dataset.heldout:
+    for view in views:
         camera = view.camera
         y, x = np.mgrid[: camera.height, : camera.width] + 0.5
         right, up = (x - camera.cx) / camera.fl_x, (camera.cy - y) / camera.fl_y
