@@ -76,14 +76,11 @@ def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
         unbake("fit", coarse, "--out", run, *words, log=Path(folder) / "log.txt")
         evaluate(run, EVALUATION, tell=lambda line: None)
         picture = partial(RunFolder(run).picture, "heldout", quantity="albedo")
-        fitted = [read_exr(picture(view=view.name)) for view in known.heldout]
-    truth = DataFolder(data)
-    true = [read_exr(truth.truth("albedo", view.name)) for view in known.heldout]
-    seen = [image.reshape(-1, image.shape[-1])[:, :3] for image in (*true, *fitted)]
-    true, fitted = (np.concatenate(part) for part in (seen[: len(true)], seen[len(true) :]))
+        fitted = colours([picture(view=view.name) for view in known.heldout])
+    true = colours([DataFolder(data).truth("albedo", view.name) for view in known.heldout])
     counted = np.isfinite(true).all(1)
-    error = np.square(true - fitted).mean(1)[counted]
-    shapes, there = shapes[counted], there[counted]
+    true, fitted, shapes, there = (x[counted] for x in (true, fitted, shapes, there))
+    error = np.square(true - fitted).mean(1)
     count = len(triangles) + 1  # first, what meets nothing
     sums, pixels = (np.bincount(shapes + 1, x, count)[1:] for x in (error, None))
     found = [
@@ -94,35 +91,35 @@ def by_shape(data: Path, share: float, steps: int, seed: int) -> dict[str, Any]:
             "error": float(sums[shape] / error.sum()),
             "albedo_psnr": float(-10 * np.log10(sums[shape] / pixels[shape])),
             "hidden": float((there != shapes)[shapes == shape].mean()),
-            "true": float(true[counted][shapes == shape].mean()),
-            "fitted": float(fitted[counted][shapes == shape].mean()),
+            "true": float(true[shapes == shape].mean()),
+            "fitted": float(fitted[shapes == shape].mean()),
         }
         for shape in np.argsort(-sums)[:MOST]
     ]
     return {"albedo_psnr": float(-10 * np.log10(error.mean())), "shapes": found}
 
 
+def colours(files: Sequence[Path]) -> np.ndarray:
+    """The pixels of all pictures, (n, 3)."""
+    return np.concatenate([read_exr(file)[..., :3].reshape(-1, 3) for file in files])
+
+
 def shapes_of(views: Sequence[View], dataset: Dataset) -> tuple[np.ndarray, list[int]]:
     """The number of the shape at the centre of each pixel, or -1; triangles of all shapes."""
-    import drjit as dr
+    import drjit as dr  # these need the variant
     import mitsuba as mi
 
+    from unbake.dataset.small_views import pixel_rays
+    from unbake.scene.free_space import as_ray
+
     scene = parse(dataset.scene, dataset.root).instantiate(merge=False)
-    found = []
-    for view in views:
-        camera = view.camera
-        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-        right, up = (x - camera.cx) / camera.fl_x, (camera.cy - y) / camera.fl_y
-        local = np.stack([right, up, -np.ones_like(x)], -1).reshape(-1, 3)
-        towards = mi.Vector3f((local @ camera.to_world[:3, :3].T).T.astype(np.float32))
-        origin = dr.zeros(mi.Point3f, x.size) + mi.Point3f(camera.to_world[:3, 3].tolist())
-        hit = scene.ray_intersect(mi.Ray3f(origin, dr.normalize(towards))).shape
-        number = np.full(x.size, -1)
-        for place, shape in enumerate(scene.shapes()):
-            number[np.array(hit == mi.ShapePtr(shape))] = place
-        found.append(number)
+    rays = as_ray(*pixel_rays([view.camera for view in views]))
+    hit = scene.ray_intersect(rays).shape
+    number = np.full(dr.width(rays), -1)
+    for place, shape in enumerate(scene.shapes()):
+        number[np.array(hit == mi.ShapePtr(shape))] = place
     counts = [shape.face_count() if shape.is_mesh() else 0 for shape in scene.shapes()]
-    return np.concatenate(found), counts
+    return number, counts
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from safetensors.numpy import load_file
 
 from unbake.acquisition import built_in
 from unbake.config import FitConfig, GridConfig, NetworkConfig, RegularizationConfig, update
+from unbake.config.migration import FORMAT
 from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.fields.materials import Material
@@ -98,6 +99,13 @@ def tiny_fields(representation="neural", radiance="neural") -> FitConfig:
         },
     )
     return replace(small, representation=representation, radiance_representation=radiance)
+
+
+def of_format(text: str, version: int) -> str:
+    """A settings file that unbake writes today, as if it were of an earlier format."""
+    now = f"format = {FORMAT}\n"
+    assert text.count(now) == 1
+    return text.replace(now, f"format = {version}\n")
 
 
 # ------------------------------------------------------------------------------------ rays

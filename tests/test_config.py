@@ -8,6 +8,7 @@ import typing
 from pathlib import Path
 
 import pytest
+from support import of_format
 
 from unbake.config import (
     BitmapConfig,
@@ -368,7 +369,7 @@ def test_the_radiance_field_has_no_pieces():
 
 
 def test_fields_of_earlier_runs_do_not_leak():
-    text = to_toml(preset("cpu")).replace("format = 6", "format = 2")
+    text = of_format(to_toml(preset("cpu")), 2)
     lines = [line for line in text.splitlines() if not line.startswith("leak = ")]
     found = [from_toml(x).radiance["neural"].leak for x in (text, "\n".join(lines))]
     assert found == [LEAK, 0]
@@ -380,13 +381,13 @@ def test_earlier_runs_go_by_the_background_where_the_scale_is_open():
     text = to_toml(preset("cpu"))
     lines = [line for line in text.splitlines() if not line.startswith("scale_told_by = ")]
     assert len(lines) < len(text.splitlines())
-    old = "\n".join(lines).replace("format = 6", "format = 4")
+    old = of_format("\n".join(lines), 4)
     found = [from_toml(x).lighting.scale_told_by for x in (text, "\n".join(lines), old)]
     assert found == ["pixels", "pixels", "background"]
 
 
 def test_a_setting_that_is_no_more_is_passed_over_in_runs_alone():
-    text = to_toml(preset("cpu")).replace("format = 6", "format = 2")
+    text = of_format(to_toml(preset("cpu")), 2)
     assert "\n[camera]\n" in text
     old = text.replace("\n[camera]\n", "\n[camera]\nsmoothness = 0.25\n")
     assert from_toml(old) == from_toml(text)

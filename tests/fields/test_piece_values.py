@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import randomised, seeded
+from support import of_format, randomised, seeded
 
 from unbake.config import FitConfig, from_toml, to_toml
 from unbake.errors import UserError
@@ -353,13 +353,13 @@ def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
     assert most(now) == FitConfig().materials["roughness"]["neural"].pieces.most > 0
     assert most("steps = 5") == most(now)
     assert most("materials.roughness.neural.pieces.most = 7") == 7
-    old = now.replace("format = 6", "format = 2")
+    old = of_format(now, 2)
     before = re.sub(r"\[materials\.roughness\.neural\.pieces\]\n(.+\n)+", "", old)
     assert before != old
     assert most(before) == 0
     assert most(before.replace("format = 2\n", "")) == 0
     assert pieces("steps = 5").colours > 0
     assert pieces("steps = 5").own_colours > 0
-    older = re.sub("(?m)^own_colours = .+\n", "", now.replace("format = 6", "format = 5"))
+    older = re.sub("(?m)^own_colours = .+\n", "", of_format(now, 5))
     assert pieces(older) == replace(pieces(now), own_colours=0)
     assert pieces(re.sub("(?m)^colours = .+\n", "", old)) == replace(pieces(now), colours=0)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import seeded, tiny_fields
+from support import of_format, seeded, tiny_fields
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
@@ -117,5 +117,5 @@ def test_runs_of_before_go_on_without_a_guide(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text(text)
     assert read_toml(file).guide.cells == GuideConfig().cells
-    file.write_text(text.replace(table, "").replace("format = 6", "format = 2"))
+    file.write_text(of_format(text.replace(table, ""), 2))
     assert read_toml(file).guide.cells == 0

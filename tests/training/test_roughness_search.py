@@ -21,6 +21,7 @@ from support import (
     interrupt_at,
     needs_mpi,
     nothing_compiled,
+    of_format,
     randomised,
 )
 
@@ -442,7 +443,7 @@ def test_a_search_waits_for_a_state_that_may_stay(cornell, tmp_path, unbake, mon
 
 def test_steps_of_older_runs_move_roughness_as_before():
     text = to_toml(FitConfig())
-    old = text.replace("format = 6", "format = 2")
+    old = of_format(text, 2)
     kept = "\n".join(x for x in old.splitlines() if not x.startswith("rate_before"))
     found = [from_toml(x).roughness_search.rate_before for x in (text, kept)]
     assert found == [FitConfig().roughness_search.rate_before, 1]
@@ -684,5 +685,5 @@ def test_older_runs_and_the_papers_settings_do_not_search(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text(text)
     assert read_toml(file).roughness_search == SEARCH
-    file.write_text(text.replace(table, "").replace("format = 6", "format = 2"))
+    file.write_text(of_format(text.replace(table, ""), 2))
     assert read_toml(file).roughness_search.times == 0

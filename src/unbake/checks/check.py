@@ -178,21 +178,19 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         result.findings += [replace(f, check="scene") for f in _grouped(faults, dataset.folder)]
         _check_files(result, dataset, clip_negative)
         return
+    where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
     if parsed.repaired_normals:
         what = f"vertex normals that are not numbers: {parsed.repaired_normals}"
         remedy = "Normals of the triangles take their place. Compute them anew if you want others"
-        where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
         result.add(Finding("hint", "normals", what, where, remedy))
     turned = turned_share(scene)
     if turned > _TURNED:
         what = f"{100 * turned:.0f} % of the surface is shaded as if its edges were round"
         remedy = "Give these meshes normals of their own, or their shapes 'face_normals'"
-        where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
         result.add(Finding("hint", "normals", what, where, remedy))
     if parsed.media:
         what = f"participating media, which are left out: {parsed.media}"
         remedy = "Fog and murky glass go into the materials behind them"
-        where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
         result.add(Finding("hint", "media", what, where, remedy))
     cameras = [small_camera(view.camera) for view in dataset.views]
     for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):

@@ -15,7 +15,7 @@ from ..fields.pieces import Pieces
 from ..fields.shapes import PlacedShape, placed_shapes
 from ..scene import edit
 from ..scene.parse import ParsedScene, parse
-from ..scene.triangles import unit
+from ..scene.triangles import doubled_normals, unit
 from .tessellate import TESSELLATED, Triangles, tessellated
 
 #: By which a shape that was made is found among the nodes.
@@ -226,9 +226,8 @@ def _as_shaded(triangles: Triangles) -> Triangles:
     """
     if triangles.normals is None:
         return triangles
-    a, b, c = (triangles.positions[corner].astype(np.float64) for corner in triangles.faces.T)
     shading = triangles.normals[triangles.faces].sum(1)
-    against = (np.cross(b - a, c - a) * shading).sum(1) < 0
+    against = (doubled_normals(triangles.positions, triangles.faces) * shading).sum(1) < 0
     faces = np.where(against[:, None], triangles.faces[:, ::-1], triangles.faces)
     return replace(triangles, faces=np.ascontiguousarray(faces))
 

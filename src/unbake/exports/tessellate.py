@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene.triangles import unit
+from ..scene.triangles import doubled_normals, unit
 
 #: Around a circle, and from pole to pole.
 _AROUND, _ALONG = 128, 64
@@ -50,8 +50,7 @@ class Triangles:
 
     def areas(self) -> np.ndarray:
         """The areas of the triangles, (m,) float64."""
-        a, b, c = np.moveaxis(self.positions[self.faces].astype(np.float64), 1, 0)
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        return np.linalg.norm(doubled_normals(self.positions, self.faces), axis=1) / 2
 
 
 def tessellated(plugin: str) -> Triangles:

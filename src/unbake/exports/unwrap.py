@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..scene.parse import ParsedScene
-from ..scene.triangles import mesh_of
+from ..scene.triangles import doubled_normals, mesh_of, numbered
 from .parts import Part, unique_names
 from .tessellate import Triangles
 
@@ -203,8 +203,7 @@ def surface_points(
         Positions (count, 3), float64, and texture coordinates (count, 2), float32.
     """
     positions, faces, uv = joined(placed)
-    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas = np.linalg.norm(doubled_normals(positions, faces), axis=1)
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(faces), count, p=areas / areas.sum())
     weights = _barycentric(rng, count)
@@ -315,16 +314,11 @@ def _split(part: Part, corners: np.ndarray) -> Placed:
     keys = np.empty((mesh.faces.size, 3), np.uint32)
     keys[:, 0] = mesh.faces.ravel()
     keys[:, 1:] = np.ascontiguousarray(corners.reshape(-1, 2), np.float32).view(np.uint32)
-    order = np.lexsort(keys.T)
-    new = np.ones(len(keys), bool)
-    new[1:] = (keys[order[1:]] != keys[order[:-1]]).any(1)
-    number = np.empty(len(keys), np.uint32)
-    number[order] = np.cumsum(new) - 1
-    first = order[new]
+    first, number = numbered(*keys.T)
     old = keys[first, 0]
     split = Triangles(
         mesh.positions[old],
-        number.reshape(-1, 3),
+        number.astype(np.uint32).reshape(-1, 3),
         None if mesh.normals is None else mesh.normals[old],
         corners.reshape(-1, 2)[first].astype(np.float32).clip(0, 1),
     )

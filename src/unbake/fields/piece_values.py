@@ -33,7 +33,7 @@ class PieceValues:
     the square roots of linear RGB albedo, linear between its corners. Numbers of pieces are added
     to it, for what differs between pieces of one colour.
 
-    For what differs between colours of a piece, such as those of its tiles, each piece may have
+    For what differs between colours of a piece, such as those of stripes, each piece may have
     such a grid of its own, too. These are many numbers, and steps would fill them with noise: only
     searches of roughness move them, which say what is to be expected of them.
 
@@ -112,8 +112,8 @@ class PieceValues:
             tables.append(self._colours.evaluate(SurfacePoint(colour)))
         if self._settings.own_colours:
             known = point.piece.strength > 0
-            own = self._of_colour(number, colour, searching=searching)
-            tables.append([dr.select(known, x, 0) for x in own])
+            of_piece = self._of_colour(number, colour, searching=searching)
+            tables.append([dr.select(known, x, 0) for x in of_piece])
         gain = self._settings.gain
         for table in tables:
             others = [dr.fma(gain, x, y) for x, y in zip(table, others, strict=True)]

@@ -174,7 +174,7 @@ def _pieces(corners: np.ndarray, across_slivers: bool) -> tuple[np.ndarray, np.n
     places = [of_corners.ravel().take(corner) for corner in within.T]
     one, other = _neighbours(places, rank)
     joined = np.zeros(0, np.int64), np.zeros(0, np.int64)
-    if across_slivers and (sliver := _slivers(np.stack([a, b, c]), double)).any():
+    if across_slivers and (sliver := slivers(np.stack([a, b, c]), double)).any():
         one, other, joined = _across(sliver, one, other, places, rank)
     # Neighbouring triangles may be turned to opposite sides.
     cosine = np.abs((normals.take(one, 0) * normals.take(other, 0)).sum(1))
@@ -208,7 +208,7 @@ def _neighbours(corners: list[np.ndarray], rank: np.ndarray) -> tuple[np.ndarray
     return triangle[:-1][same], triangle[1:][same]
 
 
-def _slivers(corners: np.ndarray, double: np.ndarray) -> np.ndarray:
+def slivers(corners: np.ndarray, double: np.ndarray) -> np.ndarray:
     """Whether triangles are as thin as single precision rounds, so that their normals say nothing.
 
     Args:

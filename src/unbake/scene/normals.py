@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.shapes import met_shapes
-from .triangles import normal_sums, unit
+from .triangles import doubled_normals, normal_sums, unit
 
 #: Lengths of normals may differ from 1 by this much.
 _OFF = 0.1
@@ -63,17 +63,15 @@ def turned_share(scene: mi.Scene) -> float:
         if not shape.is_mesh():
             continue
         positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-        corners = positions[np.array(shape.faces_buffer()).reshape(-1, 3)]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+        across = doubled_normals(positions, faces)
         area = np.linalg.norm(across, axis=1)
         whole += area.sum()
         if not shape.has_vertex_normals() or shape.has_face_normals():
             continue
-        normals = np.array(shape.vertex_normals_buffer(), np.float64).reshape(-1, 3)
-        normals = normals[np.array(shape.faces_buffer()).reshape(-1, 3)]
-        cosine = (
-            np.abs(np.einsum("fi,fci->fc", across, normals)) / np.maximum(area, 1e-300)[:, None]
-        )
+        normals = np.array(shape.vertex_normals_buffer(), np.float64).reshape(-1, 3)[faces]
+        along = np.abs(np.einsum("fi,fci->fc", across, normals))
+        cosine = along / np.maximum(area, 1e-300)[:, None]
         angle = np.degrees(np.arccos(np.minimum(cosine, 1))).mean(1)
         turned += area[angle > TURNED].sum()
     return turned / max(whole, 1e-300)

@@ -7,12 +7,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from ..fields.pieces import slivers
 from ..io import write_atomically
 
 #: Triangles whose normals are less than this angle apart, in degrees, are of one smooth surface.
 SMOOTH = 50.0
-#: Triangles whose height is no more than so many roundings of their corners are slivers.
-_SLIVER = 4.0
 #: Corners whose normals are found at once.
 _AT_ONCE = 1 << 20
 #: Normals that are equal in so many decimals are one.
@@ -85,11 +84,21 @@ def normal_sums(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
         positions: (n, 3).
         faces: (m, 3) indices.
     """
-    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
-    sums = np.zeros((len(positions), 3))
+    sums, normals = np.zeros((len(positions), 3)), doubled_normals(positions, faces)
     for corner in faces.T:
-        np.add.at(sums, corner, np.cross(b - a, c - a))
+        np.add.at(sums, corner, normals)
     return sums
+
+
+def doubled_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals of triangles, as long as twice their areas; (m, 3) float64.
+
+    Args:
+        positions: (n, 3).
+        faces: (m, 3) indices.
+    """
+    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
+    return np.cross(b - a, c - a)
 
 
 def creased(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -110,7 +119,7 @@ def creased(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
     """
     positions = np.asarray(positions, np.float32)
     of_faces, angles = _normals_and_angles(positions, faces)
-    place = _numbered(*positions.T)[1][faces].ravel()
+    place = numbered(*positions.T)[1][faces].ravel()
     normals = np.zeros((faces.size, 3), np.float32)
     # Corners that count, in the order of their places; those of a place are in one part.
     order = np.flatnonzero(np.repeat(of_faces.any(1), 3))
@@ -130,7 +139,7 @@ def creased(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
             sums[near + apart] += own[near]
         normals[part] = sums
     normals = unit(normals)
-    kept, new = _numbered(*np.round(normals.T, _DECIMALS), faces.ravel())
+    kept, new = numbered(*np.round(normals.T, _DECIMALS), faces.ravel())
     return faces.ravel()[kept], new.reshape(faces.shape), normals[kept]
 
 
@@ -140,16 +149,21 @@ def _normals_and_angles(positions: np.ndarray, faces: np.ndarray) -> tuple[np.nd
     sides = [corners[(i + 1) % 3] - corners[i] for i in range(3)]
     across = np.cross(sides[0], sides[1])
     area = np.linalg.norm(across, axis=1)
-    lengths = np.stack([np.linalg.norm(side, axis=1) for side in sides])
-    size = np.abs(positions).max(initial=0)
-    known = area > _SLIVER * np.finfo(np.float32).eps * size * lengths.max(0)
+    known = ~slivers(np.stack([corner.T for corner in corners]), area)
     normals = np.where(known[:, None], across, 0) / np.where(known, area, 1)[:, None]
     dots = [-(sides[i] * sides[i - 1]).sum(1) for i in range(3)]
     return normals, np.arctan2(area, np.stack(dots)).T.ravel()
 
 
-def _numbered(*columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first row of each kind, and the kind of each row (n,), where columns have shape (n,)."""
+def numbered(*columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Kinds of equal rows.
+
+    Args:
+        columns: of the rows, (n,) each; kinds are in the order of the last one, then of others.
+
+    Returns:
+        The first row of each kind, and the kind of each row, (n,).
+    """
     order = np.lexsort(columns)
     new = np.ones(len(order), bool)
     new[1:] = np.any([column[order][1:] != column[order][:-1] for column in columns], axis=0)
