@@ -248,6 +248,33 @@ def test_fireflies_and_noise_are_no_explosion(begun):
     assert progress.rate == 1
 
 
+@pytest.mark.parametrize("steps", [3, 25])
+def test_a_first_step_of_next_to_nothing_is_no_measure(begun, steps):
+    """In a dim room paths of the first step may all miss the lamp: the loss is noise."""
+    dog, _, progress, read = watching(begun)
+    for _ in range(1 if steps == 3 else 3):
+        losses = [0.1] * steps
+        if not progress.step:
+            losses[0] = 1e-4
+        assert read(losses, last=steps == 3) == []
+    assert dog.trusts and progress.rate == 1
+
+
+def test_three_steps_are_too_few_to_be_judged(begun):
+    dog, _, _, read = watching(begun)
+    assert read([1e-4, 1e4, 1e4], last=True) == [] and dog.trusts
+    _, state, _, read = watching(begun)
+    spoil(state, "albedo")
+    with pytest.raises(UserError, match="not finite"):
+        read([0.5] * 3, last=True)
+
+
+def test_a_fit_that_explodes_from_the_start_goes_back(begun):
+    _, _, progress, read = watching(begun)
+    told = read([0.5, *[1e4] * 19]) + read(1e4)
+    assert len(told) == 1 and "the loss rose" in told[0] and progress.rate == SLOWER
+
+
 def test_steps_without_a_finite_loss_are_counted_and_too_many_end_the_fit(begun, monkeypatch):
     monkeypatch.setattr(watchdog_module, "diagnose", lambda *_: "the culprit")
     dog, _, progress, _ = watching(begun)

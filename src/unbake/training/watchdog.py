@@ -24,7 +24,7 @@ GIVE_UP_AFTER = 100
 #: which single fireflies do not count.
 EXPLOSION = 30.0
 #: Steps that a median has at least. A reading may have fewer, such as the last one of a fit: those
-#: before it are counted as well.
+#: before it are counted as well. Nothing is said of the loss of fewer.
 _FEWEST_STEPS = 5
 #: Readings that say how high the loss was lately, and how many there must be.
 _LATELY, _FEWEST = 25, 3
@@ -77,7 +77,7 @@ class Watchdog:
         self._good: deque[tuple[int, Snapshot]] = deque(maxlen=2)
         self._good.append((progress.step, state.snapshot()))
         self._readings = self._suspicious = self._in_a_row = 0
-        self._first = math.nan  # the loss of the first step
+        self._first = math.nan  # the loss of an untrained fit
         self._cause = ""
 
     @property
@@ -107,9 +107,10 @@ class Watchdog:
         level = self._level(readings)
         broken = self._state.broken()
         if math.isnan(self._first):
-            self._first = abs(_total(readings[0]))
+            self._first = self._untrained(readings[0])
         usual = median(self._lately) if len(self._lately) >= _FEWEST else EXPLOSION * self._first
-        if broken or level > EXPLOSION * usual:
+        known = len(self._last_losses) >= _FEWEST_STEPS
+        if broken or (known and level > EXPLOSION * usual):
             self._suspicious += 1
             if broken or last or self._suspicious > 1:
                 what = f"{', '.join(broken)} has numbers that are not finite"
@@ -191,6 +192,14 @@ class Watchdog:
         if not losses:
             return math.nan
         return median(losses if len(losses) >= _FEWEST_STEPS else self._last_losses)
+
+    def _untrained(self, first: Reading) -> float:
+        """The loss from which a fit begins, at least that of black images.
+
+        The first step alone does not tell: in a dim room its pixels may all be next to black.
+        """
+        loss = abs(_total(first))
+        return max(self._step.loss_of_black(), loss) if PHOTOMETRIC in first else loss
 
     def _note_untrained(self, readings: Sequence[Reading]) -> None:
         """Note the losses of photographs in the first steps, when next to nothing was learned.
