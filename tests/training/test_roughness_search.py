@@ -449,11 +449,15 @@ def test_steps_of_older_runs_move_roughness_as_before():
     assert found == [FitConfig().roughness_search.rate_before, 1]
 
 
-def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):
+@pytest.mark.parametrize(("times", "second"), [(2, 0.8), (3, 0.6)])
+def test_from_the_second_search_on_albedo_varies_as_photographs_tell(
+    times, second, built_in, monkeypatch
+):
     defaults = FitConfig().materials
     pieces = {name: defaults[name]["neural"].pieces for name in ("albedo", "roughness")}
     fields = {name: {"neural": replace(SMALL, pieces=pieces[name])} for name in pieces}
-    config = replace(SETTINGS, materials=SETTINGS.materials | fields)
+    searches = replace(SETTINGS.roughness_search, times=times)
+    config = replace(SETTINGS, materials=SETTINGS.materials | fields, roughness_search=searches)
     problem, _, step, state = started(built_in, config)
     search = RoughnessSearch(problem, config, step, Ranks())
 
@@ -470,10 +474,10 @@ def test_the_last_search_tells_how_much_albedo_varies(built_in, monkeypatch):
         return expected_albedo(*args)
 
     monkeypatch.setattr(roughness_search, "expected_albedo", seen)
-    assert search.search_if_due(0.8, state, 8)
+    assert search.search_if_due(second, state, 8)
     assert 0.1 < factors("albedo").min() < 1
     # As many as the pixels of the search, of which fewer show one piece alone.
-    assert len(shown[0]) == search._size(8, 0.8)[0]
+    assert len(shown[0]) == search._size(8, second)[0]
 
 
 def test_fits_of_few_samples_do_not_search(built_in):

@@ -167,9 +167,9 @@ class RoughnessSearch:
                 passed = self.passed(done)
                 # The first one is of an L_θ that is not there yet.
                 part = 1 / max(1, self.searched)
-                last = passed == len(self._places)
+                settled = self.searched > 0 or passed == len(self._places)
                 each = -(-pixels // self._ranks.size)
-                samples = self._search(state, number, (each, spp), part, last)
+                samples = self._search(state, number, (each, spp), part, settled)
                 self.made, self.searched = passed, self.searched + 1
                 return samples
         except (RuntimeError, MemoryError) as error:
@@ -180,15 +180,15 @@ class RoughnessSearch:
             raise UserError(what, "roughness_search.pixels", remedy) from None
 
     def _search(
-        self, state: State, number: int, size: tuple[int, int], part: float, last: bool
+        self, state: State, number: int, size: tuple[int, int], part: float, settled: bool
     ) -> int:
         """The search after a step.
 
         Args:
             size: pixels of this rank, and samples of each.
             part: fraction of the way to move from the current values to those found.
-            last: whether to shrink the variation of albedo within pieces, too: later steps do not
-                recover what that removes.
+            settled: whether to shrink the variation of albedo within pieces, too: later steps
+                recover little of what that removes, where albedo is not there yet.
         """
         search, materials, field = (
             self._config.roughness_search,
@@ -228,7 +228,7 @@ class RoughnessSearch:
             found = averaged(field, curves, (before, found), part, ranks)
             found = {key: self._of_first(x) for key, x in found.items()}
             changed = {f"roughness.{key}": x for key, x in found.items()}
-            if last and search.pixels_as_one and albedo:
+            if settled and search.pixels_as_one and albedo:
                 with holding(field, found):
                     now = roughness_of(field, points(rows, albedo)).numpy()
                 told = expected_albedo(materials["albedo"], rows, now, search, shown)
