@@ -260,6 +260,22 @@ def test_a_first_step_of_next_to_nothing_is_no_measure(begun, steps):
     assert dog.trusts and progress.rate == 1
 
 
+def test_dim_steps_that_are_read_alone_are_no_measure(begun):
+    dog, _, progress, read = watching(begun, steps=1)
+    for loss in (1e-4, 1e-4, 1e-4, *[0.1] * 9):
+        assert read(loss) == []
+    assert dog.trusts and progress.rate == 1
+
+
+def test_a_fit_that_goes_on_is_judged_by_its_own_loss(begun, monkeypatch):
+    monkeypatch.setattr(TrainingStep, "loss_of_black", lambda _: 1.0)
+    for number, told in ((0, 0), (400, 1)):
+        _, _, progress, read = watching(begun)
+        progress.step = number
+        lines = read(1e-3) + read(10.0) + read(10.0)
+        assert len(lines) == told, "10 is much beside 0.001, and little beside black images"
+
+
 def test_three_steps_are_too_few_to_be_judged(begun):
     dog, _, _, read = watching(begun)
     assert read([1e-4, 1e4, 1e4], last=True) == [] and dog.trusts

@@ -43,7 +43,7 @@ class RoughnessSearchConfig:
     like_colours: float = 0.1
     #: How probable it is, before photographs are seen, that a piece has one roughness
     one_roughness: float = 0.7
-    #: The same of albedo, which keeps an eighth of what was found, to be learned on
+    #: The same of albedo, which keeps an eighth of what was found at least, to be learned on
     one_albedo: float = 0.7
     #: Of the fit's steps before the first search, and after it, as multiples of the field's own
     rate_before: float = 0.25

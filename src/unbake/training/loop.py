@@ -307,6 +307,7 @@ class _Training:
         try:
             samples = self._search.search_if_due(self._fraction, state, progress.step)
         except UserError:  # the state is that of before: a search leaves what it finds at its end
+            progress.searches = self._search.passed(self._fraction)  # it is not tried again
             self._saving.save(state, progress)
             raise
         if samples:  # on all ranks

@@ -33,6 +33,9 @@ from .seen_pieces import SeenPieces, chances, normalized, values_of
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
 #: The same of albedo, of what it has by now: steps go on to learn it, its level by what is left.
 ALBEDO_PARTS = np.arange(1, 9) / 8
+#: A piece whose albedo has less of its variation keeps that: two searches have taken away the rest,
+#: and others, of a fit that was made longer, know no more of it.
+_LITTLE = 0.99 * ALBEDO_PARTS[0]
 
 
 def with_expected_variation(
@@ -81,6 +84,8 @@ def expected_albedo(
 ) -> dict[str, Any]:
     """Let each piece vary in its albedo as much as is to be expected of it, about its median.
 
+    Another search takes its part of what is left, down to a 64th of all.
+
     Args:
         field: of albedo.
         rows: of `row_type`, whose weights are inverse variances, from all ranks.
@@ -103,7 +108,7 @@ def expected_albedo(
     )
     parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo, settings)
     present = np.array(factors)[np.array(seen.pieces.number)]
-    return seen.varied(about, np.maximum(parts * present, PARTS[0]))
+    return seen.varied(about, np.where(present < _LITTLE, present, parts * present))
 
 
 def _expected(

@@ -18,8 +18,8 @@ tell little, too. So the most probable ones are sought: squared errors are in un
 variance, which the pixels themselves tell, by how bright they are, and numbers of one piece, or of
 like colours, are expected to differ as little as the settings say. Each piece then varies as much
 as is to be expected of it (`piece_variation.py`), and moves to the roughness that is
-(`piece_levels.py`); in the last search, albedo varies so, too. From the second search on, the mean
-of what they find is kept.
+(`piece_levels.py`). The first search is of an L_θ and an albedo that are not there yet: from the
+second one on, the mean of what they find is kept, and albedo varies as is to be expected, too.
 
 After the first search steps leave roughness alone, and before it they move it slowly: what noise
 does to it differs within a piece, and a search starts from there.
@@ -167,6 +167,7 @@ class RoughnessSearch:
                 passed = self.passed(done)
                 # The first one is of an L_θ that is not there yet.
                 part = 1 / max(1, self.searched)
+                # Steps recover little of what is taken away from albedo too early.
                 settled = self.searched > 0 or passed == len(self._places)
                 each = -(-pixels // self._ranks.size)
                 samples = self._search(state, number, (each, spp), part, settled)
@@ -187,8 +188,7 @@ class RoughnessSearch:
         Args:
             size: pixels of this rank, and samples of each.
             part: fraction of the way to move from the current values to those found.
-            settled: whether to shrink the variation of albedo within pieces, too: later steps
-                recover little of what that removes, where albedo is not there yet.
+            settled: whether the variation of albedo within pieces is shrunk, too.
         """
         search, materials, field = (
             self._config.roughness_search,

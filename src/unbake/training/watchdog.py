@@ -77,7 +77,7 @@ class Watchdog:
         self._good: deque[tuple[int, Snapshot]] = deque(maxlen=2)
         self._good.append((progress.step, state.snapshot()))
         self._readings = self._suspicious = self._in_a_row = 0
-        self._first = math.nan  # the loss of an untrained fit
+        self._first = math.nan  # the loss with which this watch began
         self._cause = ""
 
     @property
@@ -106,11 +106,13 @@ class Watchdog:
         told = self._count_skipped(readings, last)
         level = self._level(readings)
         broken = self._state.broken()
+        enough = len(self._lately) >= _FEWEST
+        known = enough or len(self._last_losses) >= _FEWEST_STEPS
         if math.isnan(self._first):
-            self._first = self._untrained(readings[0])
-        usual = median(self._lately) if len(self._lately) >= _FEWEST else EXPLOSION * self._first
-        known = len(self._last_losses) >= _FEWEST_STEPS
-        if broken or (known and level > EXPLOSION * usual):
+            self._first = self._beginning(readings, level if known else math.nan)
+        usual = median(self._lately) if enough else self._first
+        most = EXPLOSION * usual * (1 if enough else EXPLOSION)
+        if broken or (known and level > most):
             self._suspicious += 1
             if broken or last or self._suspicious > 1:
                 what = f"{', '.join(broken)} has numbers that are not finite"
@@ -120,7 +122,7 @@ class Watchdog:
             return told
         self._suspicious = 0
         self._readings += 1
-        if math.isfinite(level):
+        if known and math.isfinite(level):
             self._lately.append(level)
         if self._readings % _BETWEEN_SNAPSHOTS == 0:
             self._good.append((self._progress.step, self._state.snapshot()))
@@ -193,13 +195,19 @@ class Watchdog:
             return math.nan
         return median(losses if len(losses) >= _FEWEST_STEPS else self._last_losses)
 
-    def _untrained(self, first: Reading) -> float:
-        """The loss from which a fit begins, at least that of black images.
+    def _beginning(self, readings: Sequence[Reading], level: float) -> float:
+        """The loss from which a fit begins, at least that of black images, or goes on.
 
         The first step alone does not tell: in a dim room its pixels may all be next to black.
+
+        Args:
+            readings: the first ones.
+            level: how high their loss is; NaN while too few are known.
         """
-        loss = abs(_total(first))
-        return max(self._step.loss_of_black(), loss) if PHOTOMETRIC in first else loss
+        first = readings[0]
+        if self._progress.step > len(readings) or PHOTOMETRIC not in first:
+            return level
+        return max(self._step.loss_of_black(), abs(_total(first)))
 
     def _note_untrained(self, readings: Sequence[Reading]) -> None:
         """Note the losses of photographs in the first steps, when next to nothing was learned.
