@@ -175,6 +175,25 @@ def test_a_fit_looks_for_the_same_on_its_views(turned, spoilt):
     assert told in str(finding)
 
 
+def test_views_are_found_without_counting_pixels(spoilt, monkeypatch):
+    """A number of NumPy is found in a range by counting: minutes for photographs of full size."""
+    dataset = Dataset.load(spoilt("cornell").save())
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    asked = []
+
+    class Numbers:
+        start = 0
+
+        def __contains__(self, number):
+            asked.append(type(number))
+            return True
+
+    photographs = Photographs.load(dataset, False)
+    monkeypatch.setattr(type(photographs), "pixels", Numbers())
+    quick_findings(scene, dataset.train, photographs)
+    assert asked and set(asked) == {int}
+
+
 @pytest.mark.slow
 def test_a_fit_does_not_doubt_good_data(captured):
     for name in ("cornell", "still"):

@@ -36,9 +36,12 @@ from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
 from unbake.imaging.coded import encode
 from unbake.imaging.pictures import write_exr
-from unbake.importing.faults import ImportFaults
+from unbake.importing.faults import Faults, ImportFaults
+from unbake.importing.frames import read_one_file
 from unbake.importing.import_data import import_data
+from unbake.importing.meshes import TO_Z_UP
 from unbake.importing.settings import ImportSettings
+from unbake.importing.source import Reading
 from unbake.scene.edit import material_names
 from unbake.scene.free_space import trace
 from unbake.scene.parse import parse
@@ -81,7 +84,7 @@ def test_an_applied_transform_may_stay(captured, nerfstudio, meshes, tmp_path):
     settings = ImportSettings(keep_applied_transform=True, holdout=0)
     with pytest.raises(UserError, match="no photograph sees the mesh") as caught:
         import_data(nerfstudio, tmp_path / "data", meshes, settings, tell=quiet)
-    assert "--keep-applied-transform" in caught.value.remedy
+    assert "--keep-applied-transform" not in caught.value.remedy
     assert not (tmp_path / "data").exists()
     poses = [view.camera.to_world.tolist()[:3] for view in captured.views]
 
@@ -90,6 +93,9 @@ def test_an_applied_transform_may_stay(captured, nerfstudio, meshes, tmp_path):
             frame["transform_matrix"] = pose
 
     change(nerfstudio, put_back)
+    with pytest.raises(UserError, match="no photograph sees the mesh") as caught:
+        import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    assert "--keep-applied-transform" in caught.value.remedy
     import_data(nerfstudio, tmp_path / "data", meshes, settings, tell=quiet)
     same_as_captured(captured, tmp_path / "data")
 
@@ -847,6 +853,77 @@ def test_an_angle_of_a_frame_stands_before_a_focal_length_at_the_top(
     same_as_captured(captured, tmp_path / "data")
 
 
+def test_intrinsics_may_be_texts(captured, nerfstudio, meshes, tmp_path):
+    """As nerfstudio writes what RealityCapture tells."""
+    change(nerfstudio, lambda c: [f.update(k1="0.0", p2="0") for f in c["frames"]])
+    change(nerfstudio, lambda c: c.update(fl_x=str(c["fl_x"])))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    same_as_captured(captured, tmp_path / "data")
+    change(nerfstudio, lambda c: [f.update(k1="much") for f in c["frames"]])
+    with pytest.raises(ImportFaults, match="'k1' is not a number"):
+        import_data(nerfstudio, tmp_path / "other", meshes, tell=quiet)
+
+
+def test_a_size_with_a_fraction_is_that_of_the_picture(captured, nerfstudio, meshes, tmp_path):
+    """As Blender-NeRF writes it of a part of the resolution."""
+    change(nerfstudio, lambda c: c.update(w=16.4, h=16.8))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    same_as_captured(captured, tmp_path / "data")
+    for size in (17.5, float("nan")):
+        change(nerfstudio, set_top("w", size))
+        with pytest.raises(ImportFaults):
+            import_data(nerfstudio, tmp_path / "other", meshes, tell=quiet)
+
+
+def test_a_scale_of_cameras_is_taken_out(captured, nerfstudio, meshes, tmp_path):
+    """Blender renders the same with it."""
+
+    def scale(content):
+        pose = np.array(content["frames"][1]["transform_matrix"])
+        pose[:3, :3] *= (2.0, 3.0, 0.5)
+        content["frames"][1]["transform_matrix"] = pose.tolist()
+
+    change(nerfstudio, scale)
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    assert any(line.startswith("poses have a scale, which is taken out:") for line in told)
+    found = Dataset.load(tmp_path / "data").views
+    for mine, theirs in zip(found, captured.views, strict=True):
+        np.testing.assert_allclose(mine.camera.to_world, theirs.camera.to_world, atol=1e-6)
+
+
+def test_other_masks_take_the_place_of_missing_ones(nerfstudio, meshes, tmp_path):
+    change(nerfstudio, lambda c: [f.update(mask_path="../gone.png") for f in c["frames"]])
+    for frame in json.loads((nerfstudio / "transforms.json").read_text())["frames"]:
+        name = Path(frame["file_path"]).name
+        save(np.full((16, 16), 255, np.uint8), tmp_path / "masks" / name)
+    told, masks = [], tmp_path / "masks"
+    import_data(nerfstudio, tmp_path / "data", meshes, masks=masks, tell=told.append)
+    assert "3 with masks" in told[0]
+    with pytest.raises(ImportFaults, match=r"gone\.png"):
+        import_data(nerfstudio, tmp_path / "other", meshes, tell=quiet)
+
+
+def test_test_frames_are_held_out(captured, nerfstudio, meshes, tmp_path):
+    """As ScanNet++ has them, beside `frames`."""
+    change(nerfstudio, without_lists)
+    change(nerfstudio, lambda c: c.update(test_frames=[c["frames"].pop(1)]))
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=quiet)
+    splits = {view.name: view.split for view in Dataset.load(tmp_path / "data").views}
+    names = [view.name for view in captured.views]
+    assert splits == {names[0]: "train", names[1]: "heldout", names[2]: "train"}
+
+
+def test_cameras_that_older_nerfstudio_turned_are_told(nerfstudio, tmp_path):
+    (nerfstudio / "colmap" / "sparse" / "0").mkdir(parents=True)
+    for keys, count in ((("applied_transform",), 1), ((), 0)):
+        folder = tmp_path / f"source{count}"
+        shutil.copytree(nerfstudio, folder)
+        change(folder, lambda c, keys=keys: [c.pop(key) for key in keys])
+        found = read_one_file(folder / "transforms.json", Reading(), Faults())
+        assert sum("older nerfstudio" in note for note in found.notes) == count
+
+
 def test_an_angle_that_contradicts_a_focal_length_is_told(nerfstudio, meshes, tmp_path):
     top = json.loads((nerfstudio / "transforms.json").read_text())
     angle = 2 * float(np.arctan(0.5 * top["w"] / top["fl_x"]))
@@ -936,7 +1013,10 @@ def test_the_commands_of_the_guide_run(
 ):
     program, command, source, *words = shlex.split(BLOCKS[name])
     monkeypatch.chdir(tmp_path)
-    as_one(meshes, Path(words[words.index("--mesh") + 1]))
+    mesh = trimesh.util.concatenate([trimesh.load_mesh(part) for part in meshes])
+    if name == "blender":  # as its exporter turns it
+        mesh.apply_transform(np.linalg.inv(TO_Z_UP))
+    mesh.export(Path(words[words.index("--mesh") + 1]))
     if name == "nerfstudio":
         nerfstudio.rename(source)
     elif name == "blender":

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 from layouts import APERTURE, ISO, SECONDS, quiet, write_json
+from PIL import Image
 
 from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
@@ -147,6 +148,17 @@ def test_camera_raw_takes_the_place_of_photographs(captured, project, meshes, tm
     exposures = [view.exposure for view in views]
     assert exposures == pytest.approx([0.5, 1, 2], rel=1e-3)
     assert any("(2.0 stops apart), by EXIF" in line for line in told)
+
+
+def test_camera_raw_beside_its_photograph_is_told(project, meshes, tmp_path):
+    Image.fromarray(np.full((SIZE, SIZE, 3), 128, np.uint8)).save(project / "jpg" / "1.jpg")
+    told = []
+    settings = ImportSettings(holdout=0)
+    import_data(project, tmp_path / "data", meshes, settings, tell=told.append)
+    (line,) = (line for line in told if "is not read" in line)
+    assert "camera RAW beside its photograph is not read (1): jpg/1.jpg; move it" in line
+    names = [view.image.name for view in Dataset.load(tmp_path / "data").views]
+    assert names == ["0.exr", "1.jpg", "2.exr"]
 
 
 def test_edges_that_photographs_lack_are_cut_off(captured, meshes, tmp_path):

@@ -58,13 +58,14 @@ def _small_views(
     views: Sequence[View], photographs: Photographs, numbers: Sequence[int]
 ) -> list[SmallView]:
     """Views in rising order, each made small by the process that holds it."""
-    first = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)])
+    # Numbers of Python: whether one of NumPy is in a range is found by counting all that it has.
+    first = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)]).tolist()
 
     def own() -> np.ndarray:
         found = [np.zeros((0, _CHANNELS), np.float32)]
         for i in numbers:
             if first[i] in photographs.pixels:
-                view = _small_view(views[i], photographs, int(first[i]), int(first[i + 1]))
+                view = _small_view(views[i], photographs, first[i], first[i + 1])
                 rows = np.dstack([view.rgb, view.alpha, view.clipped]).reshape(-1, _CHANNELS)
                 found.append(rows.astype(np.float32))
         return np.concatenate(found)

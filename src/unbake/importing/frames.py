@@ -15,11 +15,13 @@ from ..dataset.camera_files import camera_from_frame, with_top
 from ..dataset.data_folder import TRANSFORMS
 from ..errors import UserError, named, printable
 from ..imaging.headers import CODED_SUFFIXES
-from ..io import array, number, read_object, text
+from ..io import array, number, read_object, require_file, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
 from .source import Reading, Shot, Source, ends_of, find_image, image_header, suited
 
+#: What is said of cameras that were put back.
+BEFORE_APPLIED = "frame before 'applied_transform'"
 #: What the layout with one file is called, for people.
 NERFSTUDIO = "nerfstudio"
 #: The files of a folder with one file a split, and our names of the splits.
@@ -46,9 +48,19 @@ _INSTANT_NGP = (
     f"{TRANSFORMS} may be of instant-ngp, whose colmap2nerf.py turns and scales cameras unless it "
     "is run with --keep_colmap_coords: a mesh of COLMAP does not fit then"
 )
+_TURNED_ONCE = (
+    f"{TRANSFORMS} has no 'applied_transform': older nerfstudio turned the cameras of COLMAP and "
+    "did not say so. For a mesh of COLMAP, add to the file: "
+    '"applied_transform": [[0,1,0,0],[1,0,0,0],[0,0,-1,0]]'
+)
 #: The difference of two focal lengths of one camera, relative, that is more than rounding.
 _CONTRADICTS = 0.01
+#: A pose whose axes are so much longer or shorter than 1 has a scale; shorter ones are no pose.
+_ROUNDING, _LEAST_SCALE = 1e-3, 1e-6
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_LENGTHS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+#: The list of held-out frames beside `frames`, as ScanNet++ has it.
+_TEST_FRAMES = "test_frames"
 
 
 def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
@@ -70,6 +82,8 @@ def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
     back, notes = _taken_back(top, file, reading.keep_applied_transform, faults)
     splits = _listed_splits(top, file, faults)
     shots = _read_frames(file, top, reading, None, faults)
+    if top.get(_TEST_FRAMES):
+        shots += _read_frames(file, top, reading, "heldout", faults, _TEST_FRAMES)
     placed = [
         Shot(
             shot.name,
@@ -174,10 +188,11 @@ def _read_frames(
     reading: Reading,
     split: str | None,
     faults: Faults,
+    key: str = "frames",
 ) -> list[Shot]:
-    frames, shots = top.get("frames"), []
+    frames, shots = top.get(key), []
     if not isinstance(frames, list) or not frames:
-        faults.add("'frames' is not a list of frames", file.name)
+        faults.add(f"{key!r} is not a list of frames", file.name)
         return []
     for index, frame in enumerate(frames):
         place = f"{file.name}: frame {index}"
@@ -205,19 +220,18 @@ def _shot(
         if not reading.has(image, name):
             return None
         header = image_header(image)
-        lens = _lens(with_top(top, frame), header.width, header.height, name)
+        told = _as_numbers(with_top(top, frame))
+        lens = _lens(told, header.width, header.height, name)
         if _contradicts(top, frame, lens):
             reading.contradicting.append(name)
         lens = suited(lens, image)
     with faults.collected(f"{file.name}: {name}"):
-        pose = _pose(frame, name)
+        pose, scaled = _pose(frame, name)
+        if scaled:
+            reading.scaled.append(name)
     if "mask_path" in frame:
         with faults.collected(frame["mask_path"]):
-            said = text(frame, "mask_path", name)
-            mask = _named_file(file.parent, said, reading)[1]
-            if mask.suffix.lower() not in CODED_SUFFIXES:
-                raise UserError("the mask is no PNG, JPEG or TIFF file", mask, "Convert it to PNG")
-            image_header(mask)
+            mask = _own_mask(file.parent, frame, name, reading)
     if image is None or lens is None or pose is None:
         return None
     with faults.collected(f"{file.name}: {name}"):
@@ -227,6 +241,22 @@ def _shot(
         name + image.suffix if image.name == f"{PurePosixPath(name).name}{image.suffix}" else name
     )
     return Shot(short.removeprefix("./"), split, image, lens, pose, mask)
+
+
+def _own_mask(folder: Path, frame: dict[str, Any], name: str, reading: Reading) -> Path | None:
+    """The mask that a frame names; None where it is missing and others may take its place."""
+    said = text(frame, "mask_path", name)
+    try:
+        mask = _named_file(folder, said, reading)[1]
+        require_file(mask, "mask")
+    except UserError:
+        if reading.other_masks:
+            return None
+        raise
+    if mask.suffix.lower() not in CODED_SUFFIXES:
+        raise UserError("the mask is no PNG, JPEG or TIFF file", mask, "Convert it to PNG")
+    image_header(mask)
+    return mask
 
 
 def _own_split(frame: dict[str, Any]) -> str | None:
@@ -268,13 +298,40 @@ def _image(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
     return name, next((file for file in files if file.is_file()), files[0])
 
 
-def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
-    """Camera to world, (4, 4); some programs leave out the last row."""
+def _pose(frame: dict[str, Any], where: str) -> tuple[np.ndarray, bool]:
+    """Camera to world, (4, 4), and whether a scale was taken out; some leave out the last row.
+
+    Blender's cameras may have a scale, by which it renders nothing else.
+    """
     rows = frame.get("transform_matrix")
     if isinstance(rows, list) and len(rows) == 3:
         frame = {"transform_matrix": [*rows, [0, 0, 0, 1]]}
-    pose = array(frame, "transform_matrix", (4, 4), where)
-    return np.array(Camera(pose, 1, 1, 0, 0, 1, 1).to_world)
+    pose = np.array(array(frame, "transform_matrix", (4, 4), where), np.float64)
+    lengths = np.linalg.norm(pose[:3, :3], axis=0)
+    scaled = bool(np.isfinite(lengths).all() and lengths.min() > _LEAST_SCALE)
+    scaled &= bool(np.abs(lengths - 1).max() > _ROUNDING)
+    if scaled:
+        pose[:3, :3] /= lengths
+    return np.array(Camera(pose, 1, 1, 0, 0, 1, 1).to_world), scaled
+
+
+def _as_numbers(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a lens; nerfstudio writes as texts what RealityCapture tells."""
+    found = dict(keys)
+    for key in (*_DISTORTION, *_LENGTHS):
+        if isinstance(found.get(key), str):
+            with suppress(ValueError):
+                found[key] = float(found[key])
+    return found
+
+
+def _whole(plain: Mapping[str, Any], width: int, height: int) -> dict[str, int]:
+    """The size of an image where its camera tells it with a fraction, which Blender leaves off."""
+    w, h = plain.get("w"), plain.get("h")
+    known = isinstance(w, int | float) and isinstance(h, int | float)
+    if known and 0 <= w - width < 1 and 0 <= h - height < 1:
+        return {"w": width, "h": height}
+    return {}
 
 
 def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
@@ -291,6 +348,7 @@ def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
         if not 1 / 3 < middle / width < 2 / 3:
             what = f"'cx' is {middle:g}, and the image has {width} pixels across"
             raise UserError(what, where, "Give 'w' and 'h', the size that the camera is for")
+    plain |= _whole(plain, width, height)
     camera = camera_from_frame(plain, {}, where)
     values = {k: number(dict(keys), k, where) for k in _DISTORTION if k in keys}
     k1, k2, k3, k4, k5, k6, p1, p2 = (values.get(k, 0.0) for k in _DISTORTION)
@@ -337,7 +395,9 @@ def _taken_back(
 
     if "applied_transform" not in top and "applied_scale" not in top:
         # instant-ngp writes the key; its script turns and scales what COLMAP found by default.
-        return same, (_INSTANT_NGP,) if "aabb_scale" in top else ()
+        if "aabb_scale" in top:
+            return same, (_INSTANT_NGP,)
+        return same, (_TURNED_ONCE,) if (file.parent / "colmap").is_dir() else ()
     if keep:
         return same, ()
     applied, scale = np.eye(4), 1.0
@@ -363,7 +423,7 @@ def _taken_back(
         return undo @ pose
 
     moved = not np.allclose(applied, np.eye(4)) or scale != 1
-    note = f"cameras are in the frame before 'applied_transform' of {TRANSFORMS}"
+    note = f"cameras are in the {BEFORE_APPLIED} of {TRANSFORMS}"
     return back, (note,) if moved else ()
 
 

@@ -23,11 +23,11 @@ from ..scene.parse import parse, write
 from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
-from .frames import NERFSTUDIO, SPLIT_FILES, read_one_file, read_split_files
+from .frames import BEFORE_APPLIED, SPLIT_FILES, read_one_file, read_split_files
 from .lens import WIDEST
 from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
 from .photographs import check_pictures
-from .raw import for_sensor, raw_balances
+from .raw import for_sensor, is_raw, raw_balances
 from .rooms import is_room, read_room
 from .settings import ImportSettings
 from .source import Reading, Shot, Source, masks_in, orientation
@@ -93,6 +93,7 @@ def import_data(
         allow_outside,
         settings.keep_applied_transform,
         settings.leave_out_missing,
+        masks is not None,
     )
     found = _found(source, reading, None if masks is None else Path(masks), faults)
     given = [Path(mesh) for mesh in meshes] or ([] if found.mesh is None else [found.mesh])
@@ -155,7 +156,7 @@ def _found(source: Path, reading: Reading, masks: Path | None, faults: Faults) -
     if reading.missing and not found.shots and not faults:
         faults.add("no photograph of the source exists", found.kind, "--images names their folder")
     found = masks_in(found, masks, reading, faults)
-    told = (*_scaled(found.shots), *_turned(found.shots))
+    told = (*_scaled(found.shots), *_turned(found.shots), *_raw_beside(found.shots))
     return replace(found, notes=(*found.notes, *reading.notes(), *told))
 
 
@@ -293,6 +294,18 @@ def _turned(shots: Sequence[Shot]) -> list[str]:
     return [f"the EXIF of {len(names)} photographs {told}: {named(names)}"]
 
 
+def _raw_beside(shots: Sequence[Shot]) -> list[str]:
+    """A note of photographs whose camera RAW lies beside them, and so is not read."""
+    folders = {shot.image.parent for shot in shots if not shot.raw}
+    files = (file for folder in folders if folder.is_dir() for file in folder.iterdir())
+    raw = {file.with_suffix("") for file in files if is_raw(file)}
+    names = [shot.name for shot in shots if not shot.raw and shot.image.with_suffix("") in raw]
+    if not names:
+        return []
+    what = f"camera RAW beside its photograph is not read ({len(names)}): {named(names)}"
+    return [f"{what}; move it to a folder of its own, and name that with --images"]
+
+
 def _straightening(shots: Sequence[Shot]) -> list[str]:
     """Notes of photographs whose lens is not taken out as a whole."""
     narrowed = [shot.name for shot in shots if shot.lens.narrowed]
@@ -369,7 +382,7 @@ def _shares_seen(scene: mi.Scene, source: Source, parts: Sequence[Part]) -> np.n
     if not seen.any():
         mesh, stand = _box(_corners(parts)), _box(_origins(source.shots))
         remedy = "Mesh and cameras must be in one frame and unit"
-        if source.kind == NERFSTUDIO:
+        if any(BEFORE_APPLIED in note for note in source.notes):
             remedy += (
                 "; --keep-applied-transform leaves nerfstudio's cameras in the frame of their file"
             )

@@ -80,16 +80,20 @@ class Reading:
         allow_outside: read files that lie outside of their folder.
         keep_applied_transform: leave cameras in the frame of nerfstudio's file.
         leave_out_missing: go on without photographs that do not exist.
+        other_masks: masks that frames name may be missing: others take their place.
         missing: names of those that were left out; `has` adds to it.
         contradicting: names of those whose focal length and angle of view are not of one camera.
+        scaled: names of those whose pose has a scale, which is taken out.
     """
 
     images: Path | None = None
     allow_outside: bool = False
     keep_applied_transform: bool = False
     leave_out_missing: bool = False
+    other_masks: bool = False
     missing: list[str] = field(default_factory=list)
     contradicting: list[str] = field(default_factory=list)
+    scaled: list[str] = field(default_factory=list)
 
     def has(self, image: Path, name: str) -> bool:
         """Whether there is a photograph; false where it is missing and left out.
@@ -120,6 +124,8 @@ class Reading:
                 "warning: focal length (fl_x, fl_y) and angle of view (camera_angle_x, "
                 f"camera_angle_y) differ, the first is taken: {names}. Remove the wrong one"
             )
+        if self.scaled:
+            notes.append(f"poses have a scale, which is taken out: {named(sorted(self.scaled))}")
         return tuple(notes)
 
 
