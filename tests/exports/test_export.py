@@ -537,14 +537,29 @@ def test_panes_have_two_sides_and_mere_boundaries_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("up", "told"), [((0, 0, 1), None), ((0, 1, 0), None), ((0, -1, 0), "−y"), ((1, 0, 0), "+x")]
+    ("up", "told"), [((0, 0, 1), None), ((0, 1, 0), None), ((0, -1, 0), "−y"), ((-1, 0, 0), "−x")]
 )
-def test_an_up_that_no_format_can_say_is_told(up, told):
+def test_gltf_stands_upright_and_usd_tells_what_it_cannot_say(up, told):
     eyes = [(2.0, 1.9, 1.8), (-2.1, 1.7, 2.2), (1.8, -2.2, 1.9)]
     cameras = [LookAt(eye, (0, 0, 0), up, 40.0).camera(8, 8) for eye in eyes]
     views = tuple(View(str(i), "train", c, Path("a.exr"), {}) for i, c in enumerate(cameras))
-    note = exporting._turned(Dataset(Path(), Path("scene.xml"), "visible", views, {}, None))
+    dataset = Dataset(Path(), Path("scene.xml"), "visible", views, {}, None)
+    note = exporting._turned(dataset)
     assert note is None if told is None else f"up is {told} by the cameras" in note
+    document = Document()
+    names = [document.add("nodes", {"name": "part"}) for _ in range(2)]
+    document.json["scenes"][0]["nodes"] += names
+    document.turn(exporting._up_axis(dataset))
+    nodes, (*tops,) = document.json["nodes"], document.json["scenes"][0]["nodes"]
+    if up == (0, 1, 0):
+        assert tops == names and len(nodes) == 2
+        return
+    (top,) = (nodes[number] for number in tops)
+    x, y, z, w = top["rotation"]
+    about = np.array([x, y, z])
+    turned = up + 2 * np.cross(about, np.cross(about, up) + w * np.array(up))
+    np.testing.assert_allclose(turned, (0, 1, 0), atol=1e-12)
+    assert top["children"] == names and x * x + y * y + z * z + w * w == pytest.approx(1)
 
 
 def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
@@ -611,6 +626,50 @@ def test_plain_materials_are_as_rough_as_mitsuba_s(plugin, given, alpha, tmp_pat
     found = read_parts(tmp_path / "scene.xml", tmp_path)
     material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
     assert material["pbrMetallicRoughness"]["roughnessFactor"] == pytest.approx(alpha**0.5)
+
+
+ETA, K = np.array((4.37, 2.92, 1.65)), np.array((5.21, 4.23, 3.75))
+OF_ALUMINIUM = (
+    f'<rgb name="eta" value="{", ".join(map(str, ETA))}"/>'
+    f'<rgb name="k" value="{", ".join(map(str, K))}"/>'
+)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "given", "colour"),
+    [
+        ("roughconductor", OF_ALUMINIUM, ((ETA - 1) ** 2 + K**2) / ((ETA + 1) ** 2 + K**2)),
+        ("conductor", '<string name="material" value="none"/>', (1, 1, 1)),
+        ("conductor", '<rgb name="specular_reflectance" value="0.5, 0.4, 0.2"/>', (0.5, 0.4, 0.2)),
+        (
+            "dielectric",
+            '<rgb name="specular_transmittance" value="0.2, 0.9, 0.3"/>',
+            (0.2, 0.9, 0.3),
+        ),
+        ("dielectric", "", (1, 1, 1)),
+        ("conductor", TEXTURE.replace("alpha", "specular_reflectance"), (0.9, 0.9, 0.9)),
+    ],
+)
+def test_known_metal_and_glass_have_mitsuba_s_colours(plugin, given, colour, tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        f'''<scene version="3.0.0"><shape type="rectangle"><bsdf type="{plugin}">{given}</bsdf>
+          </shape><emitter type="constant"/></scene>'''
+    )
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
+    made = material["pbrMetallicRoughness"]["baseColorFactor"]
+    assert made == pytest.approx([*colour, 1], abs=1e-3)
+
+
+def test_known_glass_has_the_index_of_its_name(tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0"><shape type="rectangle"><bsdf type="dielectric">
+          <string name="int_ior" value="diamond"/></bsdf></shape><emitter type="constant"/>
+        </scene>"""
+    )
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
+    assert material["extensions"]["KHR_materials_ior"]["ior"] == pytest.approx(2.419, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["usd", "mitsuba"])
@@ -729,11 +788,13 @@ assert not [name for name in sys.modules if name.startswith("unbake")]
 """
 
 
-def test_mitsuba_alone_renders_what_was_recovered(exported, tmp_path):
+@pytest.mark.parametrize("colours", ["rgb", "spectral"])
+def test_mitsuba_alone_renders_what_was_recovered(colours, exported, tmp_path):
+    variant = mi.variant().replace("rgb", colours)
     scene, picture = exported.folder / "mitsuba" / "scene.xml", tmp_path / "picture.npy"
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     done = subprocess.run(
-        [sys.executable, "-c", RENDER, mi.variant(), str(scene), str(picture)],
+        [sys.executable, "-c", RENDER, variant, str(scene), str(picture)],
         env=environment, cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -28,6 +29,7 @@ from ..errors import UserError, collected, named, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
+from ..scene.emitters import ENVIRONMENTS, STRENGTHS
 from ..training.grid_sizes import surface_seen
 from ..training.problem import known_materials
 from ..training.recovered import Recovered, load_run
@@ -62,7 +64,7 @@ _LAYERS = {
 _COARSE = "without --texels, textures are as dense as it takes", "a larger --texels keeps more"
 
 _CONVENTIONS = {
-    "axes": "those of the scene, unchanged; glTF takes +y as up, and lengths as metres",
+    "axes": "those of the scene; a node of glTF turns up to +y; it takes lengths as metres",
     "texture coordinates": "(0, 0) is the corner of the first texel of the first row of an image, "
     "in Mitsuba and in glTF",
     "roughness": "perceptual: GGX alpha = roughness squared",
@@ -267,10 +269,10 @@ def _write(
     if others and len(visible) < len(found.parts):
         hidden = named([part.name for part in found.parts if not part.is_shown])
         notes.append(f"glTF and usd have no surfaces that nobody sees (null): without {hidden}")
-    if others and (turned := _turned(dataset)) is not None:
+    if "usd" in formats and (turned := _turned(dataset)) is not None:
         notes.append(turned)
     if "gltf" in formats:
-        write_glb(out / "scene.glb", found.scene, visible, shown, lights)
+        write_glb(out / "scene.glb", found.scene, visible, shown, lights, _up_axis(dataset))
         if environment is not None:
             what = "scene.glb has no environment, as glTF has none"
             notes.append(f"{what}: it is {_ENVIRONMENT}")
@@ -296,6 +298,13 @@ def _write(
     return _Written(files, masks, notes)
 
 
+def _up_axis(dataset: Dataset) -> np.ndarray:
+    """The axis of the scene that is up by the cameras, or next to it: a unit vector (3,)."""
+    up = up_of([view.camera for view in dataset.train])
+    axis = int(np.abs(up).argmax())
+    return np.sign(up[axis]) * np.eye(3)[axis]
+
+
 def _up(dataset: Dataset) -> str:
     """Which axis is up by the cameras, as OpenUSD calls it."""
     up = up_of([view.camera for view in dataset.train])
@@ -303,13 +312,13 @@ def _up(dataset: Dataset) -> str:
 
 
 def _turned(dataset: Dataset) -> str | None:
-    """A note where up is an axis that neither glTF nor OpenUSD can say; None where it is not."""
-    up = up_of([view.camera for view in dataset.train])
+    """A note where up is an axis that OpenUSD cannot say; None where it can."""
+    up = _up_axis(dataset)
     axis = int(np.abs(up).argmax())
     if axis > 0 and up[axis] > 0:
         return None
     told = f"{'−' if up[axis] < 0 else '+'}{'xyz'[axis]}"
-    return f"up is {told} by the cameras, which glTF and usd cannot say: turn what they show"
+    return f"up is {told} by the cameras, which usd cannot say: turn what it shows"
 
 
 # ------------------------------------------------------------------------------------- the manifest
@@ -408,7 +417,17 @@ def _without_place(
         plugins = {nodes[i].props.plugin_name() for i in inside}
         for plugin in filter(plugins.__contains__, _LAYERS):
             lost.setdefault(_LAYERS[plugin], []).append(part.name)
-    return [f"glTF and usd have no {name}: left out of {named(of)}" for name, of in lost.items()]
+    told = [f"glTF and usd have no {name}: left out of {named(of)}" for name, of in lost.items()]
+    inside = [nodes[i] for i in found.scene.reachable(0)]
+    emitters = [node.props for node in inside if node.type == mi.ObjectType.Emitter]
+    others = [
+        props.id() or props.plugin_name()
+        for props in emitters
+        if props.plugin_name() not in (*STRENGTHS, *ENVIRONMENTS)
+    ]
+    if others:
+        told.append(f"glTF and usd have no such lights, left out: {named(others)}")
+    return told
 
 
 def _of_lamps(found: Parts, formats: Sequence[Format], learned: Sequence[str]) -> list[str]:

@@ -1,7 +1,8 @@
 """The scene as one binary glTF 2.0 file: a node for each part, textures and lights inside of it.
 
 Texture coordinates are the same in Mitsuba and in glTF: (0, 0) is the corner of the first texel of
-the first row. Axes and units stay those of the scene; glTF takes +y as up and metres.
+the first row. Positions and units are those of the scene. glTF takes +y as up, and metres: a node
+around all others turns the axis that is up in the scene to +y.
 
 Source: Khronos, glTF 2.0 specification; KHR_lights_punctual, KHR_materials_emissive_strength,
 KHR_materials_transmission, KHR_materials_ior, KHR_materials_clearcoat.
@@ -17,6 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
@@ -42,6 +45,8 @@ _PLASTIC = "plastic"
 _ALPHA = 0.1
 _SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
 
+#: The node that turns the scene, where its up is not +y.
+UPRIGHT = "upright"
 #: Bytes that the header of a file can tell.
 LARGEST = 2**32 - 1
 
@@ -64,6 +69,19 @@ class Document:
         entries = self.json.setdefault(kind, [])
         entries.append(entry)
         return len(entries) - 1
+
+    def turn(self, up: np.ndarray) -> None:
+        """Put a node around all that there is, which turns an axis (3,) of the scene to +y."""
+        y = np.array([0.0, 1.0, 0.0])
+        half = np.array([*np.cross(up, y), 1 + up @ y])
+        if not half.any():  # the opposite of +y: half a turn about x
+            half = np.array([1.0, 0.0, 0.0, 0.0])
+        if half[3] == 2:  # +y already
+            return
+        rotation = (half / np.linalg.norm(half)).tolist()
+        top = self.json["scenes"][0]
+        node = {"name": UPRIGHT, "rotation": rotation, "children": top["nodes"]}
+        top["nodes"] = [self.add("nodes", node)]
 
     def use(self, extension: str) -> str:
         """Declare an extension."""
@@ -149,6 +167,7 @@ def write_glb(
     parts: Sequence[Part],
     baked: Sequence[Baked],
     lights: Sequence[Light],
+    up: np.ndarray,
 ) -> None:
     """Write parts, their materials and the lights.
 
@@ -159,6 +178,7 @@ def write_glb(
         baked: textures of the others.
         lights: point, spot and directional lights are written as such, area lights as emission of
             their parts; environments are left out, as glTF knows none.
+        up: the axis of the scene that is up, a unit vector (3,).
     """
     document = Document()
     placed = {id(p.part): (p.triangles, b) for b in baked for p in b.atlas.placed}
@@ -185,6 +205,7 @@ def write_glb(
     for light in lights:
         if light.plugin in _SPOTS and light.strength is not None:
             _add_light(document, light)
+    document.turn(up)
     document.write(path)
 
 
@@ -248,12 +269,13 @@ def plain_material(
     elif glass := next((props[k] for k in _GLASS if k in props), None):
         factors["roughnessFactor"] = _roughness(glass, "roughdielectric")
         transmission = document.use("KHR_materials_transmission")
+        factors["baseColorFactor"] = [*_colour(glass.get("specular_transmittance", 1.0), 1.0), 1.0]
         material["extensions"] = {transmission: {"transmissionFactor": 1.0}}
         material["extensions"] |= _refraction(document, glass, 1.5046)
     elif metal := next((props[k] for k in _CONDUCTORS if k in props), None):
         factors["metallicFactor"] = 1.0
         factors["roughnessFactor"] = _roughness(metal, "roughconductor")
-        factors["baseColorFactor"] = [*_colour(metal.get("specular_reflectance", None)), 1.0]
+        factors["baseColorFactor"] = [*_head_on(metal), 1.0]
     elif plastic := props.get(_PLASTIC):
         factors["roughnessFactor"] = 0.0
         colour = _colour(plastic.get("diffuse_reflectance", 0.5), default=0.5)
@@ -266,10 +288,28 @@ def plain_material(
 
 
 def _refraction(document: Document, props: Any, default: float) -> dict[str, Any]:
-    """The index of refraction of a known BSDF, if it is a number."""
+    """The index of refraction of a known BSDF: a number, or the name of what Mitsuba knows."""
     ior = props.get("int_ior", default)
+    if isinstance(ior, str):
+        eta = mi.traverse(mi.load_dict({"type": "dielectric", "int_ior": ior, "ext_ior": 1.0}))
+        ior = float(np.ravel(np.array(eta["eta"]))[0])
     known = isinstance(ior, float) and ior >= 1
     return {document.use("KHR_materials_ior"): {"ior": ior}} if known else {}
+
+
+def _head_on(metal: Any) -> list[float]:
+    """What a conductor reflects at a right angle, linear RGB; grey where textures tell it."""
+    props = mi.Properties("conductor")
+    for key in ("material", "eta", "k", "specular_reflectance"):
+        if key in metal:
+            if isinstance(metal[key], mi.Properties.ResolvedReference):
+                return _colour(None)
+            props[key] = metal[key]
+    bsdf = mi.PluginManager.instance().create_object(props)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0, 0, 1)
+    _, reflected = bsdf.sample(mi.BSDFContext(), si, 0, mi.Point2f(0))
+    return _colour(np.ravel(np.array(reflected)))
 
 
 def _roughness(props: Any, rough: str) -> float:

@@ -17,8 +17,8 @@ from ..scene.emitters import (
 from ..scene.parse import ParsedScene
 from ..training.problem import Problem
 
-#: Rows of the picture of an environment, at least.
-ROWS = 256
+#: Rows of the picture of an environment, at least, and at most where the scene has one of more.
+ROWS, _MOST_ROWS = 256, 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,12 @@ def environment_picture(problem: Problem) -> np.ndarray | None:
     if problem.environment is not None:
         return problem.environment.to_latlong(max(ROWS, 2 * problem.environment.resolution))
     scene = problem.scene_view.scene
-    return None if scene.environment() is None else environment_latlong(scene, ROWS)
+    environment = scene.environment()
+    if environment is None:
+        return None
+    parameters = mi.traverse(environment)
+    own = parameters["data"].shape[0] if "data" in parameters else 0
+    return environment_latlong(scene, max(ROWS, min(own, _MOST_ROWS)))
 
 
 def _cone(props: mi.Properties) -> tuple[float, float]:

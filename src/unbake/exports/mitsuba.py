@@ -163,7 +163,9 @@ def _replace_textures(
     nodes = scene.principled_indices()
     for name in baked.learned:
         values = baked.values[name]
-        texture = _bitmap(scene, folder / _TEXTURES / f"{stem}_{name}.exr", as_image(values))
+        file = folder / _TEXTURES / f"{stem}_{name}.exr"
+        colour = QUANTITIES[name].display == "colour"
+        texture = _bitmap(scene, file, as_image(values), colour=colour)
         for number in baked.atlas.materials:
             props = scene.state.nodes[copies.get(nodes[number], nodes[number])].props
             props[QUANTITIES[name].slot] = mi.Properties.ResolvedReference(texture)
@@ -219,7 +221,7 @@ def _move_others(
                 if (pixels == pixels[..., :1]).all():
                     pixels = pixels[..., 0]
                 file = folder / _TEXTURES / f"{stem}_texture-{len(moved)}.exr"
-                moved[old, colour] = _bitmap(scene, file, pixels)
+                moved[old, colour] = _bitmap(scene, file, pixels, colour=colour)
             props = scene.state.nodes[i].props
             props[key] = mi.Properties.ResolvedReference(moved[old, colour])
     return notes
@@ -232,14 +234,18 @@ def _is_anisotropic(props: mi.Properties) -> bool:
     return props.get("alpha_u", None) != props.get("alpha_v", None)
 
 
-def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray) -> int:
-    """Write an image and append a texture of it; the number of the texture's node."""
+def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray, *, colour: bool) -> int:
+    """Write an image and append a texture of it; the number of the texture's node.
+
+    Args:
+        colour: whether it is one of light, which spectral variants convert, and not of numbers.
+    """
     write_exr(file, values)
     node = mi.parser.SceneNode()
     node.type = mi.ObjectType.Texture
     node.props.set_plugin_name("bitmap")
     node.props["filename"] = str(file)
-    node.props["raw"] = True
+    node.props["raw"] = not colour
     node.props["wrap_mode"] = "clamp"
     return scene.append(node)
 

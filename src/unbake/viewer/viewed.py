@@ -76,7 +76,8 @@ class ViewedData:
     def _open(self, dataset: Dataset, scene: mi.Scene, pieces: Pieces | None = None) -> None:
         self.dataset = dataset
         self._scene = scene
-        parts = read_parts(dataset.scene, dataset.root, pieces).parts
+        every = read_parts(dataset.scene, dataset.root, pieces).parts
+        parts = [part for part in every if part.is_shown]
         cameras, hidden = [view.camera for view in dataset.train], dataset.background == "hidden"
         views = Views(scene, cameras, hide_emitters=hidden)
         self.surface: Surface = make_surface(parts, views)
@@ -162,9 +163,10 @@ class ViewedData:
         Raises:
             UserError: an image cannot be read.
         """
-        row = [Picture("photograph", tonemap(_photograph(view), exposure))]
+        photograph, _ = _small(_photograph(view), view.camera)
+        row = [Picture("photograph", tonemap(photograph, exposure))]
         if choice in view.truth:
-            truth = _truth(view, choice)
+            truth, _ = _small(_truth(view, choice), view.camera)
             row.append(Picture(f"true {choice}", shown(truth, QUANTITIES[choice].display)))
         return [row]
 
