@@ -328,10 +328,10 @@ def _as_numbers(keys: Mapping[str, Any]) -> dict[str, Any]:
 def _whole(plain: Mapping[str, Any], width: int, height: int) -> dict[str, int]:
     """The size of an image where its camera tells it with a fraction, which Blender leaves off."""
     w, h = plain.get("w"), plain.get("h")
-    known = isinstance(w, int | float) and isinstance(h, int | float)
-    if known and 0 <= w - width < 1 and 0 <= h - height < 1:
-        return {"w": width, "h": height}
-    return {}
+    if not (isinstance(w, int | float) and isinstance(h, int | float)):
+        return {}
+    fits = 0 <= w - width < 1 and 0 <= h - height < 1
+    return {"w": width, "h": height} if fits else {}
 
 
 def _lens(keys: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
