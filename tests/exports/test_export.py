@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import drjit as dr
@@ -28,6 +29,7 @@ from unbake.exports import gltf
 from unbake.exports.bake import WANTED, Baker, own_textures
 from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
+from unbake.exports.lights import environment_picture
 from unbake.exports.mitsuba import write_scene
 from unbake.exports.observed import Views, filled, training_views
 from unbake.exports.parts import parsed_principled, read_parts
@@ -602,6 +604,16 @@ def test_constants_beyond_what_any_material_has_are_limited(given, ior, tmp_path
     assert 0 <= found.clearcoat <= 1 and 0 < found.clearcoat_roughness <= 0.1**0.5 + 1e-9
 
 
+def plain(plugin, given, folder):
+    """The glTF material of a known BSDF with these parameters."""
+    (folder / "scene.xml").write_text(
+        f'''<scene version="3.0.0"><shape type="rectangle"><bsdf type="{plugin}">{given}</bsdf>
+          </shape><emitter type="constant"/></scene>'''
+    )
+    found = read_parts(folder / "scene.xml", folder)
+    return gltf.plain_material(Document(), found.scene, found.parts[0], None)
+
+
 TEXTURE = '<texture type="checkerboard" name="alpha"/>'
 WIDTHS = '<float name="alpha_u" value="{}"/><float name="alpha_v" value="{}"/>'
 
@@ -619,12 +631,7 @@ WIDTHS = '<float name="alpha_u" value="{}"/><float name="alpha_v" value="{}"/>'
     ],
 )
 def test_plain_materials_are_as_rough_as_mitsuba_s(plugin, given, alpha, tmp_path):
-    (tmp_path / "scene.xml").write_text(
-        f'''<scene version="3.0.0"><shape type="rectangle"><bsdf type="{plugin}">{given}</bsdf>
-          </shape><emitter type="constant"/></scene>'''
-    )
-    found = read_parts(tmp_path / "scene.xml", tmp_path)
-    material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
+    material = plain(plugin, given, tmp_path)
     assert material["pbrMetallicRoughness"]["roughnessFactor"] == pytest.approx(alpha**0.5)
 
 
@@ -651,24 +658,13 @@ OF_ALUMINIUM = (
     ],
 )
 def test_known_metal_and_glass_have_mitsuba_s_colours(plugin, given, colour, tmp_path):
-    (tmp_path / "scene.xml").write_text(
-        f'''<scene version="3.0.0"><shape type="rectangle"><bsdf type="{plugin}">{given}</bsdf>
-          </shape><emitter type="constant"/></scene>'''
-    )
-    found = read_parts(tmp_path / "scene.xml", tmp_path)
-    material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
+    material = plain(plugin, given, tmp_path)
     made = material["pbrMetallicRoughness"]["baseColorFactor"]
     assert made == pytest.approx([*colour, 1], abs=1e-3)
 
 
 def test_known_glass_has_the_index_of_its_name(tmp_path):
-    (tmp_path / "scene.xml").write_text(
-        """<scene version="3.0.0"><shape type="rectangle"><bsdf type="dielectric">
-          <string name="int_ior" value="diamond"/></bsdf></shape><emitter type="constant"/>
-        </scene>"""
-    )
-    found = read_parts(tmp_path / "scene.xml", tmp_path)
-    material = gltf.plain_material(Document(), found.scene, found.parts[0], None)
+    material = plain("dielectric", '<string name="int_ior" value="diamond"/>', tmp_path)
     assert material["extensions"]["KHR_materials_ior"]["ior"] == pytest.approx(2.419, abs=1e-3)
 
 
@@ -1091,6 +1087,26 @@ def test_layers_of_materials_that_are_left_out_are_told(kind, tmp_path):
     }
     lost = [f"glTF and usd have no {name}: left out of {of}" for name, of in told.items()]
     assert sorted(notes) == ([] if kind == "mitsuba" else sorted(lost))
+
+
+@pytest.mark.parametrize("kind", ["gltf", "mitsuba"])
+def test_lights_that_other_formats_do_not_have_are_told(kind, tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0"><shape type="rectangle"><bsdf type="principled"/></shape>
+          <emitter type="projector" id="beamer"><texture type="checkerboard" name="irradiance"/>
+          </emitter><emitter type="point"/><emitter type="constant"/></scene>"""
+    )
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    told = ["glTF and usd have no such lights, left out: beamer"] if kind == "gltf" else []
+    assert exporting._without_place(found, [], [kind], []) == told
+
+
+@pytest.mark.parametrize(("rows", "kept"), [(16, 256), (400, 400), (1100, 1024)])
+def test_the_picture_of_a_known_environment_is_about_as_large(rows, kept):
+    picture = mi.Bitmap(np.ones((rows, 2 * rows, 3), np.float32))
+    scene = mi.load_dict({"type": "scene", "light": {"type": "envmap", "bitmap": picture}})
+    problem = SimpleNamespace(environment=None, scene_view=SimpleNamespace(scene=scene))
+    assert environment_picture(problem).shape == (kept, 2 * kept, 3)
 
 
 @pytest.mark.parametrize("lamps", ["known", "fitted"])

@@ -1002,9 +1002,12 @@ BLOCKS = dict(
 )
 
 
-def as_one(meshes, file):
+def as_one(meshes, file, *, y_up=False):
     """All meshes as one file of a format that the suffix of its name tells."""
-    trimesh.util.concatenate([trimesh.load_mesh(mesh) for mesh in meshes]).export(file)
+    mesh = trimesh.util.concatenate([trimesh.load_mesh(mesh) for mesh in meshes])
+    if y_up:
+        mesh.apply_transform(np.linalg.inv(TO_Z_UP))
+    mesh.export(file)
 
 
 @pytest.mark.parametrize("name", ["nerfstudio", "blender", "colmap"])
@@ -1013,10 +1016,8 @@ def test_the_commands_of_the_guide_run(
 ):
     program, command, source, *words = shlex.split(BLOCKS[name])
     monkeypatch.chdir(tmp_path)
-    mesh = trimesh.util.concatenate([trimesh.load_mesh(part) for part in meshes])
-    if name == "blender":  # as its exporter turns it
-        mesh.apply_transform(np.linalg.inv(TO_Z_UP))
-    mesh.export(Path(words[words.index("--mesh") + 1]))
+    # Blender's exporter turns up to +y.
+    as_one(meshes, Path(words[words.index("--mesh") + 1]), y_up=name == "blender")
     if name == "nerfstudio":
         nerfstudio.rename(source)
     elif name == "blender":

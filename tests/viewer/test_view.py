@@ -28,6 +28,7 @@ from unbake.io import write_text
 from unbake.training.checkpoint import Progress, save_checkpoint
 from unbake.training.recovered import open_run
 from unbake.training.run_folder import RunFolder
+from unbake.viewer import viewed as viewed_module
 from unbake.viewer.dependencies import require_viser
 from unbake.viewer.glb import before_tone_mapping
 from unbake.viewer.surface import make_surface
@@ -107,6 +108,22 @@ def test_a_data_set_shows_its_true_materials_and_photographs(cornell):
     assert photograph.pixels.shape == truth.pixels.shape == (16, 16, 3)
     assert photograph.pixels.std() > 5
     assert digest(cornell) == before
+
+
+def test_photographs_of_a_data_set_are_made_small(cornell, monkeypatch):
+    monkeypatch.setattr(viewed_module, "LONGEST", 8)
+    viewed = ViewedData(cornell)
+    ((photograph, truth),) = viewed.pictures(viewed.dataset.train[0], "albedo")
+    assert photograph.pixels.shape == truth.pixels.shape == (8, 8, 3)
+
+
+def test_surfaces_that_nobody_sees_are_not_shown(cornell, tmp_path):
+    shutil.copytree(cornell, tmp_path / "data")
+    file = tmp_path / "data" / "scene" / "scene.xml"
+    box = '<shape type="cube" id="helper"><bsdf type="null"/></shape></scene>'
+    file.write_text(file.read_text().replace("</scene>", box))
+    shown = ViewedData(tmp_path / "data").surface
+    assert len(shown.positions) == len(ViewedData(cornell).surface.positions)
 
 
 def test_a_run_shows_what_was_recovered_and_its_error(run):

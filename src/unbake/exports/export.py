@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -29,7 +28,7 @@ from ..errors import UserError, collected, named, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
-from ..scene.emitters import ENVIRONMENTS, STRENGTHS
+from ..scene.emitters import ENVIRONMENTS, STRENGTHS, names_besides
 from ..training.grid_sizes import surface_seen
 from ..training.problem import known_materials
 from ..training.recovered import Recovered, load_run
@@ -418,14 +417,7 @@ def _without_place(
         for plugin in filter(plugins.__contains__, _LAYERS):
             lost.setdefault(_LAYERS[plugin], []).append(part.name)
     told = [f"glTF and usd have no {name}: left out of {named(of)}" for name, of in lost.items()]
-    inside = [nodes[i] for i in found.scene.reachable(0)]
-    emitters = [node.props for node in inside if node.type == mi.ObjectType.Emitter]
-    others = [
-        props.id() or props.plugin_name()
-        for props in emitters
-        if props.plugin_name() not in (*STRENGTHS, *ENVIRONMENTS)
-    ]
-    if others:
+    if others := names_besides(found.scene, (*STRENGTHS, *ENVIRONMENTS)):
         told.append(f"glTF and usd have no such lights, left out: {named(others)}")
     return told
 

@@ -11,6 +11,7 @@ from ..scene.emitters import (
     ENVIRONMENTS,
     emitter_nodes,
     environment_latlong,
+    environment_rows,
     named_emitters,
     placement,
 )
@@ -84,9 +85,8 @@ def environment_picture(problem: Problem) -> np.ndarray | None:
     environment = scene.environment()
     if environment is None:
         return None
-    parameters = mi.traverse(environment)
-    own = parameters["data"].shape[0] if "data" in parameters else 0
-    return environment_latlong(scene, max(ROWS, min(own, _MOST_ROWS)))
+    rows = min(environment_rows(environment), _MOST_ROWS)
+    return environment_latlong(scene, max(ROWS, rows))
 
 
 def _cone(props: mi.Properties) -> tuple[float, float]:

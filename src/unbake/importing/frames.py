@@ -20,8 +20,6 @@ from .faults import Faults
 from .lens import Lens, fisheye, opencv
 from .source import Reading, Shot, Source, ends_of, find_image, image_header, suited
 
-#: What is said of cameras that were put back.
-BEFORE_APPLIED = "frame before 'applied_transform'"
 #: What the layout with one file is called, for people.
 NERFSTUDIO = "nerfstudio"
 #: The files of a folder with one file a split, and our names of the splits.
@@ -90,13 +88,14 @@ def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
             _listed(shot.name, splits) or shot.split,
             shot.image,
             shot.lens,
-            back(shot.to_world),
+            shot.to_world if back is None else back(shot.to_world),
             shot.mask,
         )
         for shot in shots
     ]
     kept, left_out = _of_lists(placed, splits)
-    return Source(NERFSTUDIO, kept, (*notes, *_unknown_names(top, splits), *left_out))
+    told = (*notes, *_unknown_names(top, splits), *left_out)
+    return Source(NERFSTUDIO, kept, told, put_back=back is not None)
 
 
 def _of_lists(
@@ -387,19 +386,18 @@ def _contradicts(top: Mapping[str, Any], frame: Mapping[str, Any], lens: Lens) -
 
 def _taken_back(
     top: dict[str, Any], file: Path, keep: bool, faults: Faults
-) -> tuple[Callable[[np.ndarray], np.ndarray], tuple[str, ...]]:
-    """What puts poses back into the frame before `applied_transform`, and a note of it."""
+) -> tuple[Callable[[np.ndarray], np.ndarray] | None, tuple[str, ...]]:
+    """What puts poses back into the frame before `applied_transform`, and a note of it.
 
-    def same(pose: np.ndarray) -> np.ndarray:
-        return pose
-
+    None: they stay.
+    """
     if "applied_transform" not in top and "applied_scale" not in top:
         # instant-ngp writes the key; its script turns and scales what COLMAP found by default.
         if "aabb_scale" in top:
-            return same, (_INSTANT_NGP,)
-        return same, (_TURNED_ONCE,) if (file.parent / "colmap").is_dir() else ()
+            return None, (_INSTANT_NGP,)
+        return None, (_TURNED_ONCE,) if (file.parent / "colmap").is_dir() else ()
     if keep:
-        return same, ()
+        return None, ()
     applied, scale = np.eye(4), 1.0
     with faults.collected(file.name):
         if "applied_transform" in top:
@@ -413,8 +411,8 @@ def _taken_back(
         scale = number(top, "applied_scale", file.name) if "applied_scale" in top else 1.0
         if scale <= 0:
             raise UserError("'applied_scale' is not positive")
-    if faults:
-        return same, ()
+    if faults or (np.allclose(applied, np.eye(4)) and scale == 1):
+        return None, ()
     undo = np.linalg.inv(applied)
 
     def back(pose: np.ndarray) -> np.ndarray:
@@ -422,9 +420,7 @@ def _taken_back(
         pose[:3, 3] /= scale
         return undo @ pose
 
-    moved = not np.allclose(applied, np.eye(4)) or scale != 1
-    note = f"cameras are in the {BEFORE_APPLIED} of {TRANSFORMS}"
-    return back, (note,) if moved else ()
+    return back, (f"cameras are in the frame before 'applied_transform' of {TRANSFORMS}",)
 
 
 def _listed_splits(top: dict[str, Any], file: Path, faults: Faults) -> dict[PurePosixPath, str]:

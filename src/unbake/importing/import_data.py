@@ -23,7 +23,7 @@ from ..scene.parse import parse, write
 from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
-from .frames import BEFORE_APPLIED, SPLIT_FILES, read_one_file, read_split_files
+from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import WIDEST
 from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
 from .photographs import check_pictures
@@ -382,7 +382,7 @@ def _shares_seen(scene: mi.Scene, source: Source, parts: Sequence[Part]) -> np.n
     if not seen.any():
         mesh, stand = _box(_corners(parts)), _box(_origins(source.shots))
         remedy = "Mesh and cameras must be in one frame and unit"
-        if any(BEFORE_APPLIED in note for note in source.notes):
+        if source.put_back:
             remedy += (
                 "; --keep-applied-transform leaves nerfstudio's cameras in the frame of their file"
             )

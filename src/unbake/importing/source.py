@@ -140,6 +140,7 @@ class Source:
         notes: what the user should know of how it was read.
         mesh: the file of the geometry, where it belongs to the layout.
         masks: the folder of masks, where it belongs to the layout.
+        put_back: cameras were put back into the frame before nerfstudio's `applied_transform`.
     """
 
     kind: str
@@ -147,6 +148,7 @@ class Source:
     notes: tuple[str, ...] = ()
     mesh: Path | None = None
     masks: Path | None = None
+    put_back: bool = False
 
 
 def image_header(path: Path) -> ImageHeader:

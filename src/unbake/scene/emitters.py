@@ -64,11 +64,16 @@ def fits_environment(scene: ParsedScene) -> bool:
 
 def lights_besides(scene: ParsedScene, plugins: Collection[str]) -> int:
     """The number of emitters that are of none of these plugins, and not black."""
+    return len(names_besides(scene, plugins))
+
+
+def names_besides(scene: ParsedScene, plugins: Collection[str]) -> list[str]:
+    """The ids of emitters as of `lights_besides`, or their plugins."""
     pairs = zip(emitter_nodes(scene), named_emitters(scene), strict=True)
     black = {i for i, named in pairs if named.strength == (0.0, 0.0, 0.0)}
     nodes = {i: scene.state.nodes[i] for i in scene.reachable(0) if i not in black}
-    found = [n.props.plugin_name() for n in nodes.values() if n.type == mi.ObjectType.Emitter]
-    return sum(name not in plugins for name in found)
+    found = [n.props for n in nodes.values() if n.type == mi.ObjectType.Emitter]
+    return [p.id() or p.plugin_name() for p in found if p.plugin_name() not in plugins]
 
 
 def placement(props: mi.Properties) -> np.ndarray:
@@ -155,8 +160,14 @@ def _samples_along(environment: mi.Emitter, height: int) -> int:
     usual = max(1, min(16, 1024 // height))
     if any(key.endswith("sun_scale") for key in params.keys()):  # noqa: SIM118
         return max(usual, math.ceil(_SUN_ROWS / height))
-    rows = params["data"].shape[0] if "data" in params else 0
+    rows = environment_rows(environment)
     return max(usual, min(math.ceil(rows / height), math.ceil(_MOST_ROWS / height)))
+
+
+def environment_rows(environment: mi.Emitter) -> int:
+    """Rows of an environment's picture, 0 of one that has none."""
+    params = mi.traverse(environment)
+    return params["data"].shape[0] if "data" in params else 0
 
 
 def require_emitters(scene: mi.Scene, path: Path) -> None:
