@@ -35,6 +35,7 @@ from unbake.imaging.pictures import read_exr, write_exr
 from unbake.report.page import write_report
 from unbake.scene.parse import parse
 from unbake.training import first_gains as first_gains_module
+from unbake.training.cameras import Cameras
 from unbake.training.first_gains import (
     SharedPoints,
     _partners,
@@ -781,3 +782,20 @@ def test_the_command_line_says_what_is_unknown(unbake, unknown, tiny, tmp_path):
     assert settings.camera == CameraConfig("per-image", "common")
     refused = unbake("fit", unknown, "--out", tmp_path / "other", "--exposures", "free")
     assert refused.status == 2 and "--exposures" in refused.err
+
+
+def test_an_estimate_that_is_not_finite_does_not_turn_off_the_exposure_of_its_view(cornell):
+    view = Dataset.load(cornell).heldout[0]
+    rng = np.random.default_rng(1)
+    radiance = rng.uniform(0.2, 1, (50, 3))
+    model = SimpleNamespace(
+        white_balance="none",
+        parameters=lambda: {"exposure.log": None},
+        common_gain=lambda: np.ones(3),
+        light=lambda x: x,
+    )
+    cameras = Cameras(model, ())
+    photograph = 3 * view.exposure * radiance
+    radiance[7] = np.nan
+    np.testing.assert_allclose(cameras.gain(view, radiance, photograph), 3)
+    np.testing.assert_array_equal(cameras.gain(view, radiance * np.nan, photograph), 1)

@@ -1,6 +1,7 @@
 """Previews: one picture of what is learned above the truth, and lines for the log."""
 
 import dataclasses
+import errno
 import io
 import json
 import math
@@ -19,6 +20,7 @@ from unbake.dataset.lighting import ROWS, true_environment
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.imaging.pictures import tonemap
+from unbake.training import preview as preview_module
 from unbake.training.checkpoint import Progress
 from unbake.training.monitor import Monitor
 from unbake.training.preview import Preview
@@ -77,6 +79,28 @@ def test_without_truth_the_environment_is_shown_alone(still, tmp_path):
     assert picture(tmp_path / "out").shape == (ROWS + 2 * GAP, 2 * ROWS + 2 * GAP, 3)
 
 
+def test_a_large_photograph_has_a_small_preview(still, tmp_path, monkeypatch):
+    """Photographs are fitted at full size. What is seen of them in a picture need not be."""
+    monkeypatch.setattr(preview_module, "_LONGEST", SIZE // 3)
+    bare = tmp_path / "bare"
+    shutil.copytree(still, bare, ignore=shutil.ignore_patterns("truth"))
+    rendered = []
+    plain = preview_module.MaterialBuffers.of
+
+    def counted(problem, views, *rest, **more):
+        rendered.extend((view.camera.width, view.camera.height) for view in views)
+        return plain(problem, views, *rest, **more)
+
+    monkeypatch.setattr(preview_module.MaterialBuffers, "of", counted)
+    preview(bare, "materials", tmp_path / "small")
+    assert rendered == [(5, 5)]
+    assert picture(tmp_path / "small").shape == (5 + 2 * GAP, 2 * 5 + 3 * GAP, 3)
+    # Truth is compared at its own size, and shown at a part of it.
+    _, lines = preview(still, "materials", tmp_path / "true")
+    assert rendered[1:] == [(SIZE, SIZE)] and "albedo_psnr" in lines[0]["validation"]
+    assert picture(tmp_path / "true").shape == (2 * 4 + 3 * GAP, 2 * 4 + 3 * GAP, 3)
+
+
 def test_materials_and_environment_share_a_sheet(still, tmp_path):
     _, lines = preview(still, "materials+lighting", tmp_path)
     sheet = picture(tmp_path)
@@ -133,3 +157,37 @@ def test_a_fit_beyond_its_time_is_done_and_no_more(tmp_path):
     with Monitor(tmp_path / "log.jsonl", Console(file=said, width=200), 2.0) as monitor:
         monitor.record(4.0, entry)
     assert said.getvalue().startswith("100 %") and said.getvalue().endswith(" 0 s left\n")
+
+
+class SmallDisk:
+    """A file on a disk with room for some bytes."""
+
+    def __init__(self, file, room):
+        self.file, self.room = file, room
+
+    def write(self, content):
+        part = content[: self.room]
+        if not part:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.room -= len(part)
+        return self.file.write(part)
+
+    def close(self):
+        self.file.close()
+
+
+def test_lines_of_the_log_wait_for_room_on_the_disk(tmp_path):
+    log, said = tmp_path / "log.jsonl", io.StringIO()
+    wanted = []
+    with Monitor(log, Console(file=said, width=200), 100) as monitor:
+        disk = monitor._file = SmallDisk(monitor._file, room=100)
+        for step in range(400):  # some 20 kB: more than a buffer holds
+            monitor.note(step, step / 8, f"line {step}", say=False)
+            wanted.append({"step": step, "seconds": step / 8, "note": f"line {step}"})
+        assert len(monitor.failures) == 1 and log.stat().st_size == 100
+        disk.room = 1 << 20
+        monitor.note(400, 50.0, "there is room again", say=False)
+        assert not monitor.failures
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert lines[:400] == wanted and lines[400]["step"] == 400
+    assert said.getvalue().count("the log cannot be written") == 1

@@ -233,8 +233,34 @@ def test_short_readings_show_an_explosion_when_it_lasts(begun):
     _, _, progress, read = watching(begun, steps=1)
     for _ in range(8):
         assert read(0.5) == []
-    told = [line for _ in range(5) for line in read(1e3)]
+    told = [line for _ in range(8) for line in read(1e3)]
     assert len(told) == 1 and "the loss rose" in told[0] and progress.rate == SLOWER
+
+
+def test_a_passing_rise_is_not_judged_twice_by_the_same_steps(begun):
+    """A reading of one step follows, where an error is due: its median is that of before."""
+    dog, _, progress, read = watching(begun)
+    for _ in range(4):
+        read(0.5)
+    assert read(1e3) == [] and not dog.trusts
+    assert read([0.5]) == read([0.5] * 2) == [] and not dog.trusts
+    assert read([0.5] * 2) == [] and dog.trusts and progress.rate == 1
+
+
+def test_a_fit_that_is_stopped_in_an_explosion_keeps_the_state_of_before(begun):
+    dog, state, progress, read = watching(begun)
+    before = numbers(state)
+    for _ in range(4):
+        read(0.5)
+    assert dog.settle() == []
+    key = next(iter(state.phi))
+    spoiled = mi.TensorXf if dr.is_tensor_v(state.phi[key]) else mi.Float
+    state.phi[key] = spoiled(dr.detach(state.phi[key]) + 1)
+    assert read(1e3) == []
+    (line,) = dog.settle()
+    assert "saved is the state of step 0" in line and dog.trusts and progress.rate == 1
+    for a, b in zip(before, numbers(state), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_fireflies_and_noise_are_no_explosion(begun):

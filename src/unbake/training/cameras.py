@@ -62,8 +62,11 @@ class Cameras:
         limit = np.inf if view.clipped is None else view.clipped
         light = model.light(photograph.astype(np.float64)).reshape(-1, 3) / view.exposure
         expected = radiance.astype(np.float64).reshape(-1, 3) * common
-        bright = [x > _DARK * x.mean() for x in (light, expected)]
-        told = bright[0] & bright[1] & (photograph.reshape(-1, 3) < limit)
+        finite = np.isfinite(light).all(-1) & np.isfinite(expected).all(-1)
+        if not finite.any():
+            return common
+        bright = [x > _DARK * x[finite].mean() for x in (light, expected)]
+        told = finite[:, None] & bright[0] & bright[1] & (photograph.reshape(-1, 3) < limit)
         ratios = np.log(np.where(told, light, 1)) - np.log(np.where(told, expected, 1))
         own = model.white_balance == "per-image" and told.any(0).all()
         if own:

@@ -236,7 +236,8 @@ class _Training:
                 progress.step += 1
                 progress.samples += config.samples_per_step
                 # It does not wait for the machine, so that slow steps are saved in time, too.
-                save = self._saving.due(time.perf_counter() - self._clock)
+                # A state that may be taken back is not saved, and not read sooner for it.
+                save = self._watchdog.trusts and self._saving.due(time.perf_counter() - self._clock)
                 # What depends on a clock is the same on all ranks from here on: as rank 0 says.
                 measure = ranks.leads and self._errors.due(progress)
                 stopped, save, measure = ranks.any(bool(stop), save, measure)
@@ -263,7 +264,7 @@ class _Training:
                 self._measure(entry, scores=rated, errors=measure or ended)
                 self._saving.require_held()
                 monitor.record(_done(config, progress), entry)
-                self._watch(readings, ended=ended)
+                self._watch(readings, ended=ended, stopped=stopped)
                 ranks.announce()  # again, where ranks told each other something since
                 failures = self._keep(save=save, last=last)
                 self._start_clock()
@@ -333,15 +334,18 @@ class _Training:
         if errors:
             self._errors.measure(begun.state, entry, begun.progress)
 
-    def _watch(self, readings: list[dict[str, float]], *, ended: bool) -> None:
+    def _watch(self, readings: list[dict[str, float]], *, ended: bool, stopped: bool) -> None:
         """Let the watchdog look at the last steps. If it gives up, the last good state is saved.
 
         Args:
             ended: whether the fit ends with these.
+            stopped: whether it was stopped before its end.
         """
         progress, monitor = self._begun.progress, self._monitor
         try:
-            for line in self._watchdog.read(readings, last=ended):
+            told = self._watchdog.read(readings, last=ended)
+            told += self._watchdog.settle() if stopped else []
+            for line in told:
                 monitor.note(progress.step, progress.seconds, line)
         except UserError as error:
             monitor.note(progress.step, progress.seconds, str(error), say=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from contextlib import suppress
+from io import FileIO
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -33,8 +33,8 @@ class Monitor:
     """Shows progress and appends to the log; a context manager.
 
     A bar with loss terms, samples/s, time left and memory on a terminal, plain lines elsewhere.
-    Lines of the log that cannot be written, on a full disk, wait for the next one; `failures` tells
-    of those that were not written in the end.
+    Lines of the log that cannot be written, on a full disk, wait for room; `failures` tells of
+    those that were not written in the end.
 
     Args:
         log: the file to append to.
@@ -49,7 +49,8 @@ class Monitor:
         self._events = events
         self.failures: list[UserError] = []
         self._path = log
-        self._file: IO[str]  # opened by `__enter__`
+        self._file: FileIO  # opened by `__enter__`
+        self._unwritten = b""
         self._console = console
         self._total = total
         self._last_line = -QUIET_SECONDS
@@ -64,7 +65,7 @@ class Monitor:
         self._task = self._bar.add_task("compiling the first step …", total=total)
 
     def __enter__(self) -> Monitor:
-        self._file = open(self._path, "a", encoding="utf-8")
+        self._file = open(self._path, "ab", buffering=0)
         self._bar.start()
         return self
 
@@ -72,8 +73,7 @@ class Monitor:
         self._bar.stop()
         if self._events is not None:
             self._events.close()
-        with suppress(OSError):  # it is in `failures`
-            self._file.close()
+        self._file.close()
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
@@ -144,10 +144,11 @@ class Monitor:
         known = {k: v for k, v in entry.items() if not isinstance(v, float) or math.isfinite(v)}
         rounded = {k: round(v, 7) if isinstance(v, float) else v for k, v in known.items()}
         told, self.failures = self.failures, []
+        self._unwritten += (json.dumps(rounded, allow_nan=False) + "\n").encode()
         try:
-            self._file.write(json.dumps(rounded, allow_nan=False) + "\n")
-            self._file.flush()
-        except OSError as error:  # what was not written stays in the file's buffer
+            while self._unwritten:  # a disk may have room for a part of it
+                self._unwritten = self._unwritten[self._file.write(self._unwritten) :]
+        except OSError as error:
             what = f"the log cannot be written ({error.strerror})"
             self.failures = [UserError(what, self._path, "Make room")]
             if not told:

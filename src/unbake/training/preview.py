@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,10 @@ from .problem import Problem
 from .run_folder import RunFolder, require_no_link
 from .validation import SAMPLES, GroundTruth, MaterialBuffers
 
+#: Longer side of a picture in pixels, at most: a photograph may have 24 million, and a preview of
+#: all of them would take longer than many steps.
+_LONGEST = 512
+
 
 class Preview:
     """Shows the unknowns: materials in one view, a held-out one if there is any; light as a whole.
@@ -26,9 +31,11 @@ class Preview:
     def __init__(self, problem: Problem, dataset: Dataset, run: RunFolder) -> None:
         self._problem = problem
         self._run = run
-        self._view: View = (dataset.heldout or dataset.train)[0]
+        view: View = (dataset.heldout or dataset.train)[0]
         materials = problem.materials
-        self._truth = None if materials is None else GroundTruth.of(self._view, materials)
+        self._truth = None if materials is None else GroundTruth.of(view, materials)
+        # Truth is compared pixel by pixel. Where there is none, a smaller picture is rendered.
+        self._view = _small(view) if self._truth is None else view
         known = None
         if problem.environment is not None:
             known = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
@@ -69,11 +76,24 @@ class Preview:
     def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:
         """Pictures of them and of the truth; PSNRs where there is truth."""
         (seen,) = MaterialBuffers.of(self._problem, [self._view], SAMPLES, seed=0)
-        tiles = [[shown(value, QUANTITIES[name].display) for name, value in seen.values.items()]]
+        every = -(-max(seen.coverage.shape) // _LONGEST)
+
+        def tile(value: np.ndarray, name: str) -> np.ndarray:
+            return shown(value[::every, ::every], QUANTITIES[name].display)
+
+        tiles = [[tile(value, name) for name, value in seen.values.items()]]
         if self._truth is None:
             return tiles, {}
-        nothing = np.full((*seen.coverage.shape, 3), 128, np.uint8)
-        true = {n: shown(v, QUANTITIES[n].display) for n, v in self._truth.values.items()}
+        nothing = np.full((*seen.coverage[::every, ::every].shape, 3), 128, np.uint8)
+        true = {name: tile(value, name) for name, value in self._truth.values.items()}
         tiles.append([true.get(name, nothing) for name in seen.values])
         scores = {k: v for k, v in seen.psnr(self._truth).items() if v is not None}
         return tiles, {"split": self._view.split} | scores if scores else {}
+
+
+def _small(view: View) -> View:
+    """A view with pixels as large as its picture needs them."""
+    camera = view.camera
+    factor = min(1.0, _LONGEST / max(camera.width, camera.height))
+    size = (max(1, round(side * factor)) for side in (camera.width, camera.height))
+    return replace(view, camera=camera.rescaled(*size))

@@ -76,7 +76,7 @@ class Watchdog:
         self._last_losses: deque[float] = deque(maxlen=_FEWEST_STEPS)
         self._good: deque[tuple[int, Snapshot]] = deque(maxlen=2)
         self._good.append((progress.step, state.snapshot()))
-        self._readings = self._suspicious = self._in_a_row = 0
+        self._readings = self._suspicious = self._since = self._in_a_row = 0
         self._first = math.nan  # the loss with which this watch began
         self._cause = ""
 
@@ -112,8 +112,12 @@ class Watchdog:
             self._first = self._beginning(readings, level if known else math.nan)
         usual = median(self._lately) if enough else self._first
         most = EXPLOSION * usual * (1 if enough else EXPLOSION)
+        self._since += len(readings)
+        if self._suspicious and self._since < _FEWEST_STEPS and not (broken or last):
+            return told  # the median is still that of the steps that were suspicious
         if broken or (known and level > most):
             self._suspicious += 1
+            self._since = 0
             if broken or last or self._suspicious > 1:
                 what = f"{', '.join(broken)} has numbers that are not finite"
                 if not broken:
@@ -127,6 +131,22 @@ class Watchdog:
         if self._readings % _BETWEEN_SNAPSHOTS == 0:
             self._good.append((self._progress.step, self._state.snapshot()))
         return told
+
+    def settle(self) -> list[str]:
+        """Go back to the last good state, if the present one is not trusted, in a fit that stops.
+
+        A single reading is too little to call the fit diverged: the rates stay.
+
+        Returns:
+            What is to be told.
+        """
+        if self.trusts:
+            return []
+        number, snapshot = self._good[0]
+        self._state.restore(snapshot)
+        self._suspicious = 0
+        what = "the loss had risen far above what it was lately"
+        return [f"step {self._progress.step}: {what}; saved is the state of step {number}"]
 
     def keep(self) -> None:
         """Go back no further than to the present state, as one that a search has found.
