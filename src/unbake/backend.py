@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from unbake.errors import UserError
+from unbake.threads import usable_cores
 
 LLVM_MINIMUM = 17
 """Oldest LLVM accepted, as a major version: 15 aborts in tensor mode (cannot select fmaximum)."""
@@ -363,5 +364,4 @@ def share_cores(processes: int, least: int = 2) -> None:
     """
     import drjit as dr
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    dr.set_thread_count(max(least, (cores or 1) // processes))
+    dr.set_thread_count(max(least, usable_cores() // processes))

@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from unbake import backend
+from unbake.threads import usable_cores
 
 _GIB = 1024**3
 _PROBE_SECONDS = 180
@@ -157,7 +158,7 @@ def _gpu() -> Row:
 
 
 def _resources() -> tuple[Row, ...]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = usable_cores()
     free = shutil.disk_usage(Path.cwd()).free
     return (
         Row("cores", f"{cores} ({platform.machine()})"),

@@ -1,11 +1,15 @@
 """Photographs: the same in memory and in a mapped file, which is made once and never stale."""
 
+import errno
 import json
 import os
 import shutil
 import time
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -13,10 +17,11 @@ import pytest
 from PIL import Image
 
 from unbake import memory
-from unbake.dataset import decoding
+from unbake.dataset import decoded_file, decoding
 from unbake.dataset import photographs as module
 from unbake.dataset.camera import Camera
 from unbake.dataset.hot_pixels import told_hot_pixels, without_hot_pixels
+from unbake.dataset.image_files import PIXEL_BYTES
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.dataset.views import Dataset, SensorNoise, View
@@ -50,6 +55,12 @@ def dataset(tmp_path):
 def on_disk(monkeypatch):
     """Every data set is too large for memory."""
     monkeypatch.setattr(module, "IN_MEMORY", 0)
+
+
+def leave_for_a_view(dataset, monkeypatch):
+    """Leave the memory that decoding a view takes, but none for the table of all."""
+    pixels = WIDTH * HEIGHT
+    monkeypatch.setattr(memory, "free_bytes", lambda: (PIXEL_BYTES + 8) * pixels)
 
 
 def rgba(dataset):
@@ -373,6 +384,7 @@ def test_no_room_for_the_file_is_told_in_one_line(dataset, on_disk, monkeypatch)
 
     made = dataset()
     monkeypatch.setattr(os, "posix_fallocate", full)
+    leave_for_a_view(made, monkeypatch)
     with pytest.raises(UserError, match=r"cannot be written .No space left") as caught:
         Photographs.load(made, False)
     assert "Make room" in caught.value.remedy
@@ -383,9 +395,118 @@ def test_a_disk_that_is_too_small_is_told_with_both_numbers(dataset, on_disk, mo
     made = dataset()
     usage = shutil.disk_usage(made.folder)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100))
+    leave_for_a_view(made, monkeypatch)
     with pytest.raises(UserError, match=r"take 0\.0 GB, 0\.0 GB are free"):
         Photographs.load(made, False)
     assert not (made.folder / ".cache").exists()
+
+
+@pytest.mark.parametrize("why", ["read-only", "full"])
+def test_what_cannot_be_written_goes_to_memory_if_there_is_plenty(
+    dataset, on_disk, monkeypatch, why
+):
+    """Data sets of a cluster or a container lie in folders that nobody writes to."""
+    made = dataset()
+    wanted = Photographs.load(made, False)
+    shutil.rmtree(made.folder / ".cache")
+    if why == "full":
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=100))
+    else:
+
+        def refuse(*arguments, **named):
+            raise OSError(errno.EROFS, "Read-only file system")
+
+        monkeypatch.setattr(decoded_file, "locked", refuse)
+    found = Photographs.load(made, False)
+    assert found.bytes and not (made.folder / ".cache").exists()
+    for a, b in ((found.table, wanted.table), (found.chosen, wanted.chosen)):
+        np.testing.assert_array_equal(a, b)
+    assert found.mean == wanted.mean
+
+
+def test_a_file_that_is_there_needs_no_memory(dataset, on_disk, monkeypatch):
+    made = dataset()
+    wanted = Photographs.load(made, False)
+    monkeypatch.setattr(memory, "free_bytes", lambda: 100)
+    monkeypatch.setattr(decoded_file, "free_bytes", lambda: 100)  # so that nothing is read ahead
+    found = Photographs.load(made, False)
+    np.testing.assert_array_equal(found.table, wanted.table)
+
+
+def test_a_data_set_may_be_called_by_any_path(dataset, on_disk, monkeypatch):
+    """What is decoded once serves fits in this folder and in others, and where it was moved."""
+    made = dataset()
+    Photographs.load(made, False)
+    monkeypatch.setattr(decoding, "read_masked", None)
+    for place, name in ((made.folder.parent, made.folder.name), (made.folder, ".")):
+        monkeypatch.chdir(place)
+        views = [replace(view, image=Path(name) / view.image.name) for view in made.views]
+        Photographs.load(replace(made, folder=Path(name), views=views), False)
+    moved = made.folder.rename(made.folder.with_name("moved"))
+    views = [replace(view, image=moved / view.image.name) for view in made.views]
+    Photographs.load(replace(made, folder=moved, views=views), False)
+
+
+def test_files_of_code_values_are_decoded_at_once(tmp_path, monkeypatch):
+    rng, views = np.random.default_rng(2), []
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, WIDTH, HEIGHT)
+    for i in range(9):
+        image = tmp_path / f"{i}.png"
+        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)).save(image)
+        views.append(View(f"{i}", "train", camera, image, {}, encoding="srgb"))
+    made = Dataset(tmp_path, tmp_path / "s.xml", "hidden", views, {}, None)
+    at_once = []
+    plain = decoding.in_order
+
+    def counted(work, arguments, count):
+        at_once.append(count)
+        return plain(work, arguments, count)
+
+    monkeypatch.setattr(decoding, "in_order", counted)
+    monkeypatch.setattr(decoding, "usable_cores", lambda: 4)
+    several = Photographs.load(made, False)
+    monkeypatch.setattr(decoding, "usable_cores", lambda: 1)
+    alone = Photographs.load(made, False)
+    assert at_once == [4, 1]
+    for a, b in ((several.table, alone.table), (several.chosen, alone.chosen)):
+        np.testing.assert_array_equal(a, b)
+    assert several.mean == alone.mean
+
+
+@pytest.mark.parametrize("noise", [None, SensorNoise(0.01, 0.02)])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(("height", "width"), [(300, 31), (65, 9), (1, 1), (3, 200)])
+def test_bands_of_a_photograph_are_those_of_the_whole(height, width, masked, noise):
+    rng = np.random.default_rng(3)
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, width, height)
+    rgb = rng.random((height * width, 3), dtype=np.float32)
+    counted = rng.random(height * width) > 0.3 * masked
+    found = np.empty_like(rgb)
+    decoding._put_reference(found, rgb, counted, camera, noise)
+    weight = counted.astype(np.float32).reshape(height, width, 1)
+    with np.errstate(invalid="ignore"):
+        whole = decoding._reference(rgb.reshape(height, width, 3), weight, noise)
+    np.testing.assert_array_equal(found, whole.reshape(-1, 3))
+
+
+def test_decoding_takes_no_more_memory_than_it_asks_for(tmp_path):
+    width, height = 800, 600
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, width, height)
+    codes = np.random.default_rng(1).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    Image.fromarray(codes).save(tmp_path / "0.jpg", subsampling=2)
+    Image.fromarray(codes[..., 0]).save(tmp_path / "mask.png")
+    view = View("0", "train", camera, tmp_path / "0.jpg", {}, encoding="srgb", exposure=2.0)
+    view = replace(view, mask=tmp_path / "mask.png", noise=SensorNoise(0.001, 0.01))
+    made = Dataset(tmp_path, tmp_path / "s.xml", "visible", [view], {}, None)
+    plan = decoding.Plan.of(made, False, 6, 1)
+    table = np.empty((width * height, 6), np.float32)
+    plan.decode_into(table, made.train)  # modules are imported
+    tracemalloc.start()
+    try:
+        plan.decode_into(table, made.train)
+        assert tracemalloc.get_traced_memory()[1] < PIXEL_BYTES * width * height
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_refused_image_leaves_nothing_behind(dataset, on_disk):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from unbake.dataset.camera import Camera
-from unbake.dataset.decoding import fill, stretch
+from unbake.dataset.decoding import fill_rows, joined, stretch
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource, _Places, crop_edges, largest_crop
 from unbake.errors import UserError
@@ -446,7 +446,15 @@ def test_numbers_of_pixels_to_train_on_take_eight_bytes_each_while_they_are_read
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 50, edge, edge)
     image = (camera, np.zeros((edge**2, 3), np.float32), np.ones(edge**2, bool), None)
     table = np.zeros((views * edge**2, 3), np.float32)
-    made, peak = with_peak(lambda: fill(table, [image] * views, True))
-    assert made.chosen.dtype == np.uint32
-    assert np.array_equal(made.chosen, np.arange(len(table)))
+
+    def filled():
+        for start in range(0, len(table), edge**2):
+            yield fill_rows(table[start : start + edge**2], image, True, start)
+
+    (chosen, _), peak = with_peak(lambda: joined(filled(), True))
+    assert chosen.dtype == np.uint32 and np.array_equal(chosen, np.arange(len(table)))
     assert peak < 9.5 * len(table)
+    # Where a file takes them, no more than those of a view.
+    kept = []
+    _, peak = with_peak(lambda: joined(filled(), True, lambda x: kept.append(x[0])))
+    assert kept == list(range(0, len(table), edge**2)) and peak < 1.5 * len(table)

@@ -16,7 +16,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from ..imaging.windows import mean_of_counted
+from ..imaging.windows import bands, mean_of_counted
 from .camera import Camera
 from .views import SensorNoise
 
@@ -53,16 +53,19 @@ def without_clipped_noise(
         The same photograph where noise is not known, has no part that is the same for all light, or
         was not clipped: a value is below zero.
     """
-    if sensor is None or not sensor.read or not counted.any() or (rgb[counted] < 0).any():
+    if sensor is None or not sensor.read or not counted.any() or ((rgb < 0).any(1) & counted).any():
         return rgb
     shape = (camera.height, camera.width, -1)
-    weight = counted.astype(np.float32).reshape(shape)
+    image, weight = rgb.reshape(shape), counted.astype(np.float32).reshape(shape)
     light, clipped = _means(sensor)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is infinite is no dark mean
-        mean = mean_of_counted(rgb.reshape(shape), weight, RADIUS).reshape(rgb.shape)
-        added = mean - np.interp(mean, clipped, light)
-    dark = (mean < clipped[-1]) & (rgb < limit)
-    return rgb - np.where(dark, added, 0).astype(np.float32)
+    found = np.empty_like(image)
+    for band, needed, made in bands(camera.height, RADIUS):
+        with np.errstate(over="ignore", invalid="ignore"):  # what is infinite is no dark mean
+            mean = mean_of_counted(image[needed], weight[needed], RADIUS)[made]
+            added = mean - np.interp(mean, clipped, light)
+        dark = (mean < clipped[-1]) & (image[band] < limit)
+        found[band] = image[band] - np.where(dark, added, 0).astype(np.float32)
+    return found.reshape(rgb.shape)
 
 
 def _means(sensor: SensorNoise) -> tuple[np.ndarray, np.ndarray]:

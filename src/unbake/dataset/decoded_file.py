@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import math
+import mmap
 import os
 import shutil
 import stat
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,20 +20,61 @@ import numpy as np
 
 from ..errors import UserError
 from ..io import locked, read_object, remove_unfinished, temporary_beside, write_json
+from ..memory import free_bytes
 from .clipped_noise import BRIGHT
 from .clipped_noise import RADIUS as BLACK_RADIUS
 from .data_folder import DataFolder
 from .decoding import PEAK, RADIUS, WITH_BLURRED, Decoded, Plan, Totals
 
+#: Share of the free memory up to which the system is to read ahead in a mapped file.
+_FITTING = 0.5
 
-def in_file(plan: Plan) -> Decoded:
-    """All views in a file that is made where it is missing, or made from other images."""
-    dataset, views = plan.dataset, plan.dataset.train
-    data = DataFolder(dataset.folder, dataset.allow_outside)
+
+class Unwritable(Exception):
+    """Why the file cannot be made, and what would help."""
+
+    def __init__(self, why: UserError) -> None:
+        super().__init__(str(why))
+        self.why = why
+
+
+def in_file(plan: Plan, decode: Callable[..., tuple[np.ndarray | None, Totals]]) -> Decoded:
+    """All views in a file that is made where it is missing, or made from other images.
+
+    Args:
+        plan: of all views.
+        decode: called as `Plan.decode_into`, without its plan, where the file is made.
+
+    Raises:
+        Unwritable: there is no room for it, or the folder cannot be written to.
+        UserError: of `decode`, or of files in the place of the folder's own ones.
+    """
+    data = DataFolder(plan.dataset.folder, plan.dataset.allow_outside)
+    key = _key(plan, data)
+    data.require_own_cache()
+    found = _find_cache(data, key)
+    if found is not None:
+        return found
+    try:
+        with locked(data.path) as alone:
+            # Another fit may have made it meanwhile
+            return _find_cache(data, key) or _write_cache(data, plan, key, decode, sweep=alone)
+    except OSError as error:
+        why = UserError(
+            f"the decoded photographs cannot be written ({error.strerror})",
+            data.cache,
+            f"They take {_size(key) / 1e9:.1f} GB. Make room, or the folder writable",
+        )
+        raise Unwritable(why) from None
+
+
+def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
+    """What the file is made of."""
+    views, folder = plan.dataset.train, data.path
     # Which view has which mask counts, too.
-    masks = [[] if view.mask is None else _stamps([view.mask]) for view in views]
+    masks = [[] if view.mask is None else _stamps([view.mask], folder) for view in views]
     key = {
-        "images": _stamps([view.image for view in views]),
+        "images": _stamps([view.image for view in views], folder),
         "pixels": sum(plan.sizes),
         "columns": plan.columns,
         "clip_negative": plan.clip_negative,
@@ -51,25 +93,18 @@ def in_file(plan: Plan) -> Decoded:
         key["reference"] = {"of": "others", "peaks": PEAK}
         if any(view.clipped is not None for view in views):
             key["clipped"] = [view.clipped for view in views]
-    data.require_own_cache()
-    found = _find_cache(data, key)
-    if found is not None:
-        return found
-    try:
-        with locked(data.path) as alone:
-            # Another fit may have made it meanwhile
-            return _find_cache(data, key) or _write_cache(data, plan, key, sweep=alone)
-    except OSError as error:
-        raise UserError(
-            f"the decoded photographs cannot be written ({error.strerror})",
-            data.cache,
-            f"They take {_size(key) / 1e9:.1f} GB. Make room, or the folder writable",
-        ) from None
+    return key
 
 
-def _stamps(files: Sequence[Path]) -> list[list[Any]]:
-    """The names of files and when they were written."""
-    return [[str(file), file.stat().st_mtime_ns] for file in files if file.is_file()]
+def _stamps(files: Sequence[Path], folder: Path) -> list[list[Any]]:
+    """The names of files, and their size and time; in a folder, however it is called."""
+    root, found = folder.resolve(), []
+    for file in files:
+        if file.is_file():
+            path, about = file.resolve(), file.stat()
+            name = path.relative_to(root) if path.is_relative_to(root) else path
+            found.append([os.fspath(name), about.st_size, about.st_mtime_ns])
+    return found
 
 
 def _chooses(key: dict[str, Any]) -> bool:
@@ -116,10 +151,24 @@ def _mapped(path: Path, stamp: list[int], kind: type, shape: tuple[int, ...]) ->
     """An array in a file, if it is the one that has this stamp; a `ValueError` otherwise."""
     if _stamp(path) != stamp:
         raise ValueError(path)
-    array = np.load(path, mmap_mode="r")
+    array = _read_only(path)
     # Another fit may have replaced the file in between
     if _stamp(path) != stamp or array.dtype != kind or array.shape != shape:
         raise ValueError(path)
+    return array
+
+
+def _read_only(path: Path) -> np.ndarray:
+    """The array of a file, mapped.
+
+    Of a file that memory has no room for, the system reads what is asked for alone, and not what
+    stands around it: pixels are drawn at random, and each would bring some hundred thousand bytes.
+    """
+    array = np.load(path, mmap_mode="r")
+    free = free_bytes()
+    mapped = getattr(array, "_mmap", None)
+    if free is not None and array.nbytes > _FITTING * free and mapped is not None:
+        mapped.madvise(mmap.MADV_RANDOM)
     return array
 
 
@@ -129,7 +178,14 @@ def _stamp(path: Path) -> list[int] | None:
     return [found.st_size, found.st_mtime_ns] if stat.S_ISREG(found.st_mode) else None
 
 
-def _write_cache(data: DataFolder, plan: Plan, key: dict[str, Any], *, sweep: bool) -> Decoded:
+def _write_cache(
+    data: DataFolder,
+    plan: Plan,
+    key: dict[str, Any],
+    decode: Callable[..., tuple[np.ndarray | None, Totals]],
+    *,
+    sweep: bool,
+) -> Decoded:
     """Decode photographs into new files, which then take their names.
 
     Files are never written anew in place: other fits may have mapped them, and those that map a
@@ -141,6 +197,7 @@ def _write_cache(data: DataFolder, plan: Plan, key: dict[str, Any], *, sweep: bo
     data.cache.mkdir(exist_ok=True)
     files = data.cached_photographs, data.cached_foreground
     table_file, foreground_file = map(temporary_beside, files)
+    numbers_file = temporary_beside(data.cached_foreground)  # until their count is known
     try:
         if sweep:
             remove_unfinished(data.cache)
@@ -151,47 +208,60 @@ def _write_cache(data: DataFolder, plan: Plan, key: dict[str, Any], *, sweep: bo
         shape = (key["pixels"], key["columns"])
         table = np.lib.format.open_memmap(table_file, "w+", np.float32, shape)
         _reserve(table_file)
-        made = plan.decode_into(table, plan.dataset.train)
+        stored: dict[str, Any] = {"key": key}
+        if _chooses(key):
+            with numbers_file.open("xb") as numbers:
+                _, totals = decode(table, plan.dataset.train, keep=numbers.write)
+            stored |= _write_numbers(numbers_file, foreground_file, sum(totals.counts))
+        else:
+            _, totals = decode(table, plan.dataset.train)
         table.flush()
-        # A mapping that was written to stays in memory as a whole, and others look at a part.
-        made = replace(made, table=np.load(table_file, mmap_mode="r"))
-        del table
-        stored = {"key": key, **asdict(made.totals), "table": _stamp(table_file)}
-        if made.chosen is not None:
-            with foreground_file.open("xb") as file:
-                np.save(file, made.chosen)
-                file.flush()
-                os.fsync(file.fileno())
-            stored |= {
-                "foreground": _stamp(foreground_file),
-                "foreground_pixels": len(made.chosen),
-            }
-            made = replace(made, chosen=np.load(foreground_file, mmap_mode="r"))
+        del table  # a mapping that was written to stays in memory as a whole
+        stored |= {**asdict(totals), "table": _stamp(table_file)}
+        if _chooses(key):
             foreground_file.rename(data.cached_foreground)
         table_file.rename(data.cached_photographs)
         # The key is written last: without it the rest is taken for unfinished.
         write_json(data.cache_key, stored, durable=True)
     finally:
-        for file in (table_file, foreground_file):
+        for file in (table_file, foreground_file, numbers_file):
             file.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             data.cache.rmdir()  # if nothing was made
+    made = _find_cache(data, key)
+    if made is None:
+        what = "the decoded photographs are not as they were written"
+        raise UserError(what, data.cache, "Delete the folder, and look at the disk")
     return made
 
 
+def _write_numbers(numbers: Path, path: Path, count: int) -> dict[str, Any]:
+    """Make an array of numbers in a file, and return what is stored of it.
+
+    Args:
+        numbers: a file with nothing else.
+        path: of the array.
+        count: of the numbers.
+    """
+    header = {"descr": "<u4", "fortran_order": False, "shape": (count,)}
+    with path.open("xb") as file, numbers.open("rb") as source:
+        np.lib.format.write_array_header_1_0(file, header)
+        shutil.copyfileobj(source, file)
+        file.flush()
+        os.fsync(file.fileno())
+    return {"foreground": _stamp(path), "foreground_pixels": count}
+
+
 def _size(key: dict[str, Any]) -> int:
-    """Bytes that the files take at most."""
-    return 4 * key["pixels"] * (key["columns"] + _chooses(key))
+    """Bytes that the files take at most; numbers of pixels lie there twice for a moment."""
+    return 4 * key["pixels"] * (key["columns"] + 2 * _chooses(key))
 
 
 def _require_disk(folder: Path, need: int) -> None:
     free = shutil.disk_usage(folder).free
     if need > free:
-        raise UserError(
-            f"the decoded photographs take {need / 1e9:.1f} GB, {free / 1e9:.1f} GB are free",
-            folder,
-            "Make room, or use fewer or smaller images",
-        )
+        what = f"the decoded photographs take {need / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
+        raise Unwritable(UserError(what, folder, "Make room, or use fewer or smaller images"))
 
 
 def _reserve(path: Path) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, final
 
 import numpy as np
 
 from ..errors import UserError
-from ..imaging.windows import around, mean_of_counted
+from ..imaging.windows import around, bands, mean_of_counted
+from ..memory import free_bytes
+from ..threads import in_order, usable_cores
 from .camera import Camera
 from .clipped_noise import without_clipped_noise
-from .hot_pixels import without_hot_pixels
+from .hot_pixels import HotPixels, without_hot_pixels
+from .image_files import PIXEL_BYTES
 from .shares import dealt
 from .views import Dataset, SensorNoise, View, fitted, read_masked
 
@@ -20,9 +23,14 @@ from .views import Dataset, SensorNoise, View, fitted, read_masked
 COLUMNS, WITH_BLURRED = 3, 6
 #: Half the edge of the blur, in pixels.
 RADIUS = 2
+#: Rows above and below a pixel that its reference depends on: the mean of pixels that do not count
+#: stands for them in the response of `_NOISE`, whose squares have a mean, too.
+_REACH = 2 * RADIUS + 1
 #: A mask whose response to constant and to linear images is zero, and has the variance of the noise
 #: (Immerkær 1996, Fast Noise Variance Estimation).
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
+#: Share of the free memory that views may take which are decoded at once.
+_OF_FREE = 0.5
 #: So many standard deviations of known noise are no peak.
 PEAK = 3.0
 #: An image with its camera: linear RGB, shape (pixels, 3), and whether pixels count, (pixels,);
@@ -106,29 +114,67 @@ class Plan:
         """Whether there are pixels that are not trained on, in any view."""
         return self.hidden or any(view.mask is not None for view in self.dataset.train)
 
-    def decode_into(self, table: np.ndarray, views: Sequence[View], first: int = 0) -> Decoded:
+    def decode_into(
+        self,
+        table: np.ndarray,
+        views: Sequence[View],
+        first: int = 0,
+        *,
+        processes: int = 1,
+        keep: Callable[[np.ndarray], None] | None = None,
+    ) -> tuple[np.ndarray | None, Totals]:
         """Put the images of views into a table, but for what is too bright in them.
+
+        Several are decoded at once, as many as there are cores and there is memory for.
 
         Args:
             first: number of the first pixel of the table.
+            processes: that decode on this machine.
+            keep: takes the numbers of the pixels to train on, view after view; None: they are
+                returned, if there are any.
+
+        Returns:
+            `Decoded.chosen` and `Decoded.totals`.
         """
-        hot_pixels: list[dict[str, Any]] = []
 
-        def images() -> Iterator[Image]:
-            for view in views:
-                pixels, mask = read_masked(view, self.clip_negative)
-                counted = fitted(pixels, mask, self.dataset.background).ravel()
-                pixels, camera = pixels.reshape(-1, 4), view.camera
-                pixels, found = without_hot_pixels(pixels, counted, view.name, camera.width)
-                if found is not None:
-                    hot_pixels.append(asdict(found))
-                noise = None if view.noise is None else view.noise.divided(view.exposure)
-                radiance = _in_radiance(pixels, view)
-                rgb = without_clipped_noise(radiance[:, :3], counted, camera, noise, view.limit)
-                yield camera, rgb, counted, noise
+        def image(view: View) -> tuple[Image, HotPixels | None]:
+            pixels, mask = read_masked(view, self.clip_negative)
+            counted = fitted(pixels, mask, self.dataset.background).ravel()
+            pixels, camera = pixels.reshape(-1, 4), view.camera
+            pixels, found = without_hot_pixels(pixels, counted, view.name, camera.width)
+            noise = None if view.noise is None else view.noise.divided(view.exposure)
+            radiance = _in_radiance(pixels, view)
+            rgb = without_clipped_noise(radiance[:, :3], counted, camera, noise, view.limit)
+            return (camera, rgb, counted, noise), found
 
-        made = fill(table, images(), self.chooses, first)
-        return replace(made, totals=replace(made.totals, hot_pixels=hot_pixels))
+        def put(view: View, start: int) -> Filled:
+            shown, found = image(view)
+            stop = start + len(shown[1])
+            filled = fill_rows(table[start:stop], shown, self.chooses, first + start)
+            return filled if found is None else replace(filled, hot_pixels=asdict(found))
+
+        sizes = [view.camera.width * view.camera.height for view in views]
+        starts = np.cumsum([0, *sizes])[:-1].tolist()
+        at_once = _at_once(views, processes)
+        made = in_order(put, list(zip(views, starts, strict=True)), at_once)
+        return joined(made, self.chooses, keep)
+
+
+def _at_once(views: Sequence[View], processes: int) -> int:
+    """How many views are decoded at once.
+
+    Files of radiance are read one after the other: Mitsuba reads each in threads of its own, and
+    two of them may wait for each other.
+
+    Args:
+        processes: that decode on this machine.
+    """
+    if any(view.encoding != "srgb" for view in views):
+        return 1
+    largest = max((view.camera.width * view.camera.height for view in views), default=1)
+    free, cores = free_bytes(), usable_cores() // processes
+    fitting = cores if free is None else int(_OF_FREE * free / (processes * PIXEL_BYTES * largest))
+    return max(1, min(len(views), cores, fitting))
 
 
 def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:
@@ -166,33 +212,81 @@ def stretch(chosen: np.ndarray, start: int, stop: int) -> slice:
     return slice(*np.searchsorted(chosen, ends).tolist())
 
 
-def fill(table: np.ndarray, images: Iterable[Image], some: bool, first: int = 0) -> Decoded:
-    """Put images into a table one after the other; blurred, too, if it has room for that.
+@final
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """What is told of a view that was put into a table.
 
     Args:
-        some: whether there are pixels that do not count.
-        first: number of the first pixel of the table.
+        sum: of the pixels to train on and their channels.
+        count: of the pixels to train on.
+        numbers: of these, where not all are; uint32.
+        hot_pixels: as `HotPixels` has them, if there are any.
     """
-    start, sums, counts, seen = 0, [], [], []
-    for camera, rgb, counted, noise in images:
-        stop = start + len(rgb)
-        table[start:stop, :3] = rgb
-        if table.shape[1] == WITH_BLURRED:
-            # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
-            with np.errstate(over="ignore", invalid="ignore"):
-                table[start:stop, 3:] = _reference(rgb, counted, camera, noise)
-        sums.append(float((rgb[counted] if some else rgb).sum(dtype=np.float64)))
-        counts.append(int(counted.sum()) if some else len(rgb))
-        if some:
-            seen.append((first + start + np.flatnonzero(counted)).astype(np.uint32))
-        start = stop
-    chosen = np.concatenate(seen) if some else None
-    return Decoded(table, chosen, Totals(sums, counts, []))
+
+    sum: float
+    count: int
+    numbers: np.ndarray | None
+    hot_pixels: dict[str, Any] | None = None
 
 
-def _reference(
-    rgb: np.ndarray, counts: np.ndarray, camera: Camera, sensor: SensorNoise | None
-) -> np.ndarray:
+def fill_rows(rows: np.ndarray, image: Image, some: bool, first: int) -> Filled:
+    """Put an image into rows of a table; blurred, too, if these have room for that.
+
+    Args:
+        some: whether there are pixels that do not count, in any image.
+        first: number of the first pixel.
+    """
+    camera, rgb, counted, noise = image
+    rows[:, :3] = rgb
+    if rows.shape[1] == WITH_BLURRED:
+        _put_reference(rows[:, 3:], rgb, counted, camera, noise)
+    if not some:
+        return Filled(float(rgb.sum(dtype=np.float64)), len(rgb), None)
+    numbers = (first + np.flatnonzero(counted)).astype(np.uint32)
+    return Filled(float(rgb[counted].sum(dtype=np.float64)), len(numbers), numbers)
+
+
+def joined(
+    made: Iterable[Filled], some: bool, keep: Callable[[np.ndarray], None] | None = None
+) -> tuple[np.ndarray | None, Totals]:
+    """The numbers and the totals of views that were put into a table one after the other.
+
+    Args:
+        some: whether there are pixels that do not count, in any image.
+        keep: takes the numbers view after view; None: they are returned, if there are any.
+    """
+    totals, held = Totals([], [], []), []
+    for filled in made:
+        totals.sums.append(filled.sum)
+        totals.counts.append(filled.count)
+        if filled.hot_pixels is not None:
+            totals.hot_pixels.append(filled.hot_pixels)
+        if filled.numbers is not None:
+            (keep or held.append)(filled.numbers)
+    chosen = np.concatenate(held) if some and keep is None else None
+    return chosen, totals
+
+
+def _put_reference(
+    out: np.ndarray,
+    rgb: np.ndarray,
+    counts: np.ndarray,
+    camera: Camera,
+    sensor: SensorNoise | None,
+) -> None:
+    """What `_reference` makes of a view, put into rows of a table; other arguments as there."""
+    shape = (camera.height, camera.width, -1)
+    image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
+    for band, needed, made in bands(camera.height, _REACH):
+        # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = _reference(image[needed], weight[needed], sensor)[made]
+        rows = slice(band.start * camera.width, band.stop * camera.width)
+        out[rows] = found.reshape(-1, 3)
+
+
+def _reference(image: np.ndarray, weight: np.ndarray, sensor: SensorNoise | None) -> np.ndarray:
     """The radiance that errors of a pixel are relative to (ours).
 
     √(mean² + noise² + peak²): the mean of those of the 5 x 5 pixels around each one that count; the
@@ -204,13 +298,14 @@ def _reference(
     a peak is what exceeds them by more than noise does: one pixel of nine is the brightest.
 
     Args:
-        rgb: of one view, linear, shape (pixels, 3).
-        counts: whether a pixel counts, shape (pixels,). Background that is hidden is black, and
-            says nothing about the noise of the foreground.
+        image: linear RGB of one view, or of some of its rows, shape (rows, columns, 3).
+        weight: 1 where a pixel counts, else 0, shape (rows, columns, 1). Background that is hidden
+            is black, and says nothing about the noise of the foreground.
         sensor: whose noise it is; None: it is told from the neighbours of a pixel.
+
+    Returns:
+        Of the shape of the image; right where `_REACH` rows above and below are known, too.
     """
-    shape = (camera.height, camera.width, -1)
-    image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
     mean = mean_of_counted(image, weight, RADIUS, others=sensor is not None)
     mean = np.where(np.isnan(mean), image, mean)
     # Pixels that do not count are no peaks, and no noise is told from them.
@@ -225,7 +320,7 @@ def _reference(
         noise = sensor.variance(mean)
         second += PEAK * np.sqrt(noise)
     peak = np.maximum(known - second, 0)
-    return np.sqrt(mean**2 + noise + peak**2).reshape(rgb.shape)
+    return np.sqrt(mean**2 + noise + peak**2)
 
 
 def _noise_around(image: np.ndarray, weight: np.ndarray) -> np.ndarray:

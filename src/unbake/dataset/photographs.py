@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from operator import add
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from ..errors import UserError
 from ..memory import require_memory
 from ..ranks import Ranks
 from .camera import Camera
-from .decoded_file import in_file
-from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Totals, fill
+from .decoded_file import Unwritable, in_file
+from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Totals, fill_rows, joined
 from .hot_pixels import HotPixels
 from .image_files import PIXEL_BYTES
 from .noise_at_black import found_noise
@@ -169,11 +169,13 @@ class Photographs:
             smoothed: keep a blurred copy, too.
         """
         table = np.empty((len(rgb), WITH_BLURRED if smoothed else COLUMNS), np.float32)
-        images = [
-            (camera, pixels[:, :3], (pixels[:, 3] > 0) | (not foreground_only), None)
-            for camera, pixels in zip(cameras, _split(cameras, np.c_[rgb, alpha]), strict=True)
-        ]
-        return _with_level(_made(fill(table, images, foreground_only)))
+        bounds = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
+        made = []
+        for camera, start, stop in zip(cameras, bounds, bounds[1:], strict=False):
+            counted = (alpha[start:stop] > 0) | (not foreground_only)
+            image = camera, rgb[start:stop], counted, None
+            made.append(fill_rows(table[start:stop], image, foreground_only, int(start)))
+        return _with_level(_made(Decoded(table, *joined(made, foreground_only))))
 
     @staticmethod
     def load(
@@ -235,14 +237,34 @@ def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
     most = int(np.diff(first).max())
     bounds = (plan.first_views, first)
     own, pixels = (slice(*each[rank : rank + 2].tolist()) for each in bounds)
-    # Views are decoded one after the other
-    held = min(4 * plan.columns * most, IN_MEMORY)
-    need = here * (PIXEL_BYTES * max(plan.sizes) + held + 8 * most * plan.chooses)
-    require_memory(need, "the photographs need", remedy, folder)
-    if 4 * plan.columns * most > IN_MEMORY:
-        return in_file(plan).part(own, pixels, {view.name for view in views[own]})
+    table_bytes = 4 * plan.columns * most
+    unwritable = None
+
+    def require(held: int) -> None:
+        """Memory for what stays, and for the largest view beside it."""
+        need = here * (PIXEL_BYTES * max(plan.sizes) + held)
+        require_memory(need, "the photographs need", remedy, folder)
+
+    def decode(*args: Any, **more: Any) -> tuple[np.ndarray | None, Totals]:
+        require(0)  # which nobody needs who finds the file
+        return plan.decode_into(*args, **more)
+
+    if table_bytes > IN_MEMORY:
+        try:
+            decoded = in_file(plan, decode)
+            return decoded.part(own, pixels, {view.name for view in views[own]})
+        except Unwritable as error:
+            unwritable = error.why
+    # Numbers of pixels to train on are joined from those of the views.
+    held = table_bytes + 8 * most * plan.chooses
+    try:
+        # What was to lie in a file leaves as much to the fit as it takes.
+        require(held if unwritable is None else 2 * held)
+    except UserError as error:
+        raise unwritable or error from None
     table = np.empty((pixels.stop - pixels.start, plan.columns), np.float32)
-    return plan.decode_into(table, views[own], pixels.start)
+    found = plan.decode_into(table, views[own], pixels.start, processes=here)
+    return Decoded(table, *found)
 
 
 def _made(
@@ -275,7 +297,3 @@ def _with_level(photographs: Photographs) -> Photographs:
     if len(lit) and lit.max() > (most := LAMP * np.median(lit)):
         level = float(np.minimum(values, most).mean())
     return replace(photographs, level=level if level > 0 else photographs.mean)
-
-
-def _split(cameras: Sequence[Camera], pixels: np.ndarray) -> list[np.ndarray]:
-    return np.split(pixels, np.cumsum([c.width * c.height for c in cameras])[:-1])

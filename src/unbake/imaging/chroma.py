@@ -10,16 +10,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from .windows import bands
+
 #: Corrections of colour towards the means; more bring back as much noise of the file.
 _CORRECTIONS = 2
 #: Brightness, [0,1], below which colour is not divided by it.
 _DARK = 0.03
+#: Rows that are made at once, and rows above and below that they depend on: each correction looks
+#: at a block more than the one before. Both are even.
+_ROWS, _REACH = 128, 16
 #: Code of Cb and Cr that is grey.
 _GREY = 128
 
 
 def with_sharp_colour(codes: np.ndarray, across: int, down: int) -> np.ndarray:
     """An image whose colour has a lower resolution than its brightness, with edges in its colour.
+
+    It is made in bands of rows: their numbers stay in the caches of a core.
 
     Args:
         codes: Y, Cb and Cr as decoded with smooth colour ("fancy upsampling" of libjpeg),
@@ -30,38 +37,69 @@ def with_sharp_colour(codes: np.ndarray, across: int, down: int) -> np.ndarray:
     Returns:
         RGB, (H, W, 3) uint8.
     """
+    rgb = np.empty_like(codes)
+    for band, needed, made in bands(len(codes), _REACH, _ROWS):
+        rgb[band] = _sharp(codes[needed], across, down)[made]
+    return rgb
+
+
+def _sharp(codes: np.ndarray, across: int, down: int) -> np.ndarray:
+    """The same of some rows of an image, of which the first is even."""
     height, width = codes.shape[:2]
     steps, padding = (down, across), [(0, -height % down), (0, -width % across), (0, 0)]
-    padded = np.pad(codes, padding, mode="edge").astype(np.float32)
-    y, smooth = padded[..., :1], padded[..., 1:] - np.float32(_GREY)
-    means = _means_in_file(_means(smooth, steps), steps)
-    sharp = y * _smooth(means / np.maximum(_means(y, steps), 255 * _DARK), steps)
-    for _ in range(_CORRECTIONS):
-        sharp += _smooth(means - _means(sharp, steps), steps)
+    planes = np.moveaxis(np.pad(codes, padding, mode="edge"), 2, 0).astype(np.float32)
+    y, lowest = planes[0], np.float32(255 * _DARK)
+    y_means = np.maximum(_means(y, steps), lowest)
+    blue, red = (
+        _sharp_plane(plane - np.float32(_GREY), y, y_means, steps)[:height, :width]
+        for plane in planes[1:]
+    )
+    y = y[:height, :width] + np.float32(0.5)
     # ITU-R BT.601, as JFIF has it
-    blue, red = sharp[:height, :width, 0], sharp[:height, :width, 1]
-    rgb = np.empty((height, width, 3), np.float32)
-    rgb[...] = y[:height, :width]
-    rgb[..., 0] += 1.402 * red
-    rgb[..., 1] -= 0.344136 * blue + 0.714136 * red
-    rgb[..., 2] += 1.772 * blue
-    return np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
+    rgb = (
+        y + np.float32(1.402) * red,
+        y - np.float32(0.344136) * blue - np.float32(0.714136) * red,
+        y + np.float32(1.772) * blue,
+    )
+    return np.stack([np.clip(x, 0, 255).astype(np.uint8) for x in rgb], -1)
+
+
+def _sharp_plane(
+    smooth: np.ndarray, y: np.ndarray, y_means: np.ndarray, steps: tuple[int, int]
+) -> np.ndarray:
+    """Cb or Cr with the edges of Y, and with the means of the file.
+
+    Args:
+        smooth: less the code of grey, (H, W) as the others; sides are multiples of the steps.
+        y: brightness.
+        y_means: of blocks, at least the darkest that is divided by.
+        steps: rows and columns of a block.
+    """
+    means = _means_in_file(_means(smooth, steps), steps)
+    sharp = y * _smooth(means / y_means, steps)
+    # Corrections are smooth: what is left after each is known without making its picture.
+    left = means - _means(sharp, steps)
+    corrections = left
+    for _ in range(_CORRECTIONS - 1):
+        left = left - _means_of_smooth(left, steps)
+        corrections = corrections + left
+    return sharp + _smooth(corrections, steps)
 
 
 def _means_in_file(wanted: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
     """The colour that a file has, of whose smooth copy these are the means."""
     found = wanted
     for _ in range(_CORRECTIONS):
-        found = found + wanted - _means(_smooth(found, steps), steps)
+        found = found + wanted - _means_of_smooth(found, steps)
     return found
 
 
 def _means(image: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
     """Means of blocks of pixels."""
-    for axis, step in enumerate(steps):
-        if step == 2:
-            even, odd = _every_second(image, axis)
-            image = np.float32(0.5) * (even + odd)
+    if steps[0] == 2:
+        image = np.float32(0.5) * (image[::2] + image[1::2])
+    if steps[1] == 2:
+        image = np.float32(0.5) * (image[:, ::2] + image[:, 1::2])
     return image
 
 
@@ -69,22 +107,26 @@ def _smooth(means: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
     """Linear interpolation between the middles of blocks, as libjpeg has it."""
     for axis, step in enumerate(steps):
         if step == 2:
-            shape = list(means.shape)
-            shape[axis] *= 2
-            found = np.empty(shape, means.dtype)
-            even, odd = _every_second(found, axis)
-            even[...] = odd[...] = np.float32(0.75) * means
-            # The first and the last block have no neighbour on one side.
-            inner, outer = (slice(None),) * axis, np.float32(0.25) * means
-            even[(*inner, slice(1, None))] += outer[(*inner, slice(None, -1))]
-            even[(*inner, slice(1))] += outer[(*inner, slice(1))]
-            odd[(*inner, slice(None, -1))] += outer[(*inner, slice(1, None))]
-            odd[(*inner, slice(-1, None))] += outer[(*inner, slice(-1, None))]
-            means = found
+            before, after = _neighbours(means, axis)
+            near = np.float32(0.75) * means
+            pairs = (near + np.float32(0.25) * before, near + np.float32(0.25) * after)
+            # Rows follow each other as wholes, columns take turns
+            means = np.stack(pairs, axis + 1).reshape(
+                [side * (2 if i == axis else 1) for i, side in enumerate(means.shape)]
+            )
     return means
 
 
-def _every_second(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Views of the even and of the odd rows, or columns."""
-    inner = (slice(None),) * axis
-    return image[(*inner, slice(0, None, 2))], image[(*inner, slice(1, None, 2))]
+def _means_of_smooth(means: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
+    """`_means` of what `_smooth` makes of an image."""
+    for axis, step in enumerate(steps):
+        if step == 2:
+            before, after = _neighbours(means, axis)
+            means = np.float32(0.75) * means + np.float32(0.125) * (before + after)
+    return means
+
+
+def _neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """The image moved by one pixel along an axis, either way; the edge is its own neighbour."""
+    padded = np.pad(image, [(1, 1) if i == axis else (0, 0) for i in range(2)], mode="edge")
+    return (padded[:-2], padded[2:]) if axis == 0 else (padded[:, :-2], padded[:, 2:])

@@ -16,6 +16,7 @@ from ..io import require_file
 from .chroma import with_sharp_colour
 from .headers import HeaderError, read_header
 from .srgb import from_srgb, to_srgb
+from .windows import bands
 
 #: Formats that Pillow may try, by its names: it knows some that start other programs.
 _FORMATS = ("PNG", "JPEG", "TIFF")
@@ -88,8 +89,11 @@ def decode(codes: np.ndarray) -> np.ndarray:
     """
     table = _table(np.iinfo(codes.dtype).max)
     colours = codes.shape[2] - (codes.shape[2] in (2, 4))
-    pixels = np.ones((*codes.shape[:2], 4), np.float32)
-    pixels[..., :3] = table[codes[..., :colours]]
+    pixels = np.empty((*codes.shape[:2], 4), np.float32)
+    pixels[..., 3] = 1
+    for band, _, _ in bands(len(codes), 0):
+        # Every code is in the table: "clip" only spares the question
+        pixels[band, :, :3] = table.take(codes[band, :, :colours], mode="clip")
     if colours < codes.shape[2]:
         pixels[..., 3] = codes[..., -1] / np.float32(np.iinfo(codes.dtype).max)
         pixels[..., :3] *= pixels[..., 3:]

@@ -9,6 +9,25 @@ from typing import Literal
 import numpy as np
 
 Beyond = Literal["edge", "constant"]
+#: Rows that are made at once: what they need stays in the caches of a core.
+_ROWS = 64
+
+
+def bands(height: int, reach: int, rows: int = _ROWS) -> Iterator[tuple[slice, slice, slice]]:
+    """A picture in bands of rows, for what looks at neighbours of each pixel.
+
+    Args:
+        height: of the picture.
+        reach: rows above and below a pixel that are looked at.
+        rows: of a band.
+
+    Yields:
+        The rows of a band; those that it needs; and where the band lies in these.
+    """
+    for start in range(0, height, rows):
+        stop = min(start + rows, height)
+        first = max(0, start - reach)
+        yield slice(start, stop), slice(first, stop + reach), slice(start - first, stop - first)
 
 
 def mean_of_counted(
