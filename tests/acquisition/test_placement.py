@@ -233,6 +233,32 @@ def test_a_wall_in_front_of_a_camera_is_no_ground(origin):
     assert free_space.up_axis(house).tolist() == [0, 1, 0]
 
 
+@pytest.mark.parametrize("up", [1, 2, 0])
+def test_without_a_camera_what_all_stands_on_is_the_ground(up):
+    """Imported scenes have no camera, and Blender's have z up: the ground is not the scene."""
+    normal = np.eye(3)[up]
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 0], list(normal), list(np.roll(normal, 1)))
+    ground = {"type": "rectangle", "to_world": to_world.scale(60), "bsdf": MATTE}
+    ball = {"type": "sphere", "center": list(normal), "bsdf": MATTE}
+    found = scene(ball=ball, ground=ground)
+    low, high, diagonal = free_space.extent(found)
+    np.testing.assert_allclose([low, high], [normal - 1, normal + 1], atol=1e-4)
+    assert diagonal == pytest.approx(math.sqrt(12))
+
+
+def test_meters_on_surfaces_have_no_rays_and_say_nothing():
+    """They measure what falls on a shape: Mitsuba cannot be asked what they see."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    meter = {"type": "irradiancemeter", "film": film}
+    ball = {"type": "sphere", "bsdf": MATTE, "meter": meter}
+    found = scene(ball=ball, sensor=sensor((0, 0, 5), (0, 0, 0)))
+    assert len(found.sensors()) == 2
+    assert free_space.up_axis(found).tolist() == [0, 1, 0]
+    np.testing.assert_allclose(free_space.sensor_eyes(found), [[0, 0, 5]], atol=1e-3)
+    assert len(free_space.sensor_probes(found, 0))
+    assert not is_room(found)
+
+
 def test_up_is_told_by_a_camera_and_not_by_a_light_meter():
     to_world = mi.ScalarTransform4f().look_at([3, 0, 0], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}

@@ -101,6 +101,22 @@ def test_a_copy_has_the_names_of_shapes(name, parse, tmp_path):
     assert again.instantiate(merge=False).shapes()
 
 
+def test_a_copy_may_have_dollars_in_its_names(parse, tmp_path):
+    """As converters of FBX write them: to Mitsuba a dollar begins a parameter, unless escaped."""
+    mesh, copy = mi.load_dict({"type": "cube"}), tmp_path / "copy"
+    mesh.write_ply(str(tmp_path / "box $5.ply"))
+    copy.mkdir()
+    scene = parse(
+        r"""<shape type="ply" id="n_\$AssimpFbx\$_R">
+        <string name="filename" value="box \$5.ply"/>
+        <bsdf type="diffuse" id="a \$ b"/></shape>"""
+    )
+    again = scenes.parse(scenes.write(scene, copy))
+    names = {node.props.id() for node in again.state.nodes}
+    assert {"n_$AssimpFbx$_R", "a $ b"} <= names
+    assert again.instantiate(merge=False).shapes()
+
+
 def test_no_two_nodes_of_a_copy_have_one_name(parse, tmp_path):
     scene = parse("".join(f'<shape type="sphere" id="{name}"/>' for name in "abc"))
     for node in scene.state.nodes:

@@ -93,8 +93,8 @@ def test_a_large_photograph_has_a_small_preview(still, tmp_path, monkeypatch):
 
     monkeypatch.setattr(preview_module.MaterialBuffers, "of", counted)
     preview(bare, "materials", tmp_path / "small")
-    assert rendered == [(5, 5)]
-    assert picture(tmp_path / "small").shape == (5 + 2 * GAP, 2 * 5 + 3 * GAP, 3)
+    assert rendered == [(4, 4)]
+    assert picture(tmp_path / "small").shape == (4 + 2 * GAP, 2 * 4 + 3 * GAP, 3)
     # Truth is compared at its own size, and shown at a part of it.
     _, lines = preview(still, "materials", tmp_path / "true")
     assert rendered[1:] == [(SIZE, SIZE)] and "albedo_psnr" in lines[0]["validation"]

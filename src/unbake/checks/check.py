@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import mitsuba as mi
 import numpy as np
@@ -342,11 +342,14 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
     axes = np.array([c.to_world[:3, :3] for c in cameras]).reshape(-1, 9)
     lenses = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras])
     pairs: dict[tuple[str, str], list[str]] = {}  # by what is wrong, and the remedy
+    alike: dict[Any, list[int]] = {}  # views by their file
     for i, one in enumerate(result.views):
         posed = np.abs(origins[:i] - origins[i]).max(axis=1, initial=0) <= _SAME
         posed &= np.abs(axes[:i] - axes[i]).max(axis=1, initial=0) <= _SAME
         twice = posed & (lenses[:i] == lenses[i]).all(axis=1)
-        for j, other in enumerate(result.views[:i]):
+        before = alike.setdefault(one.facts.digest, [])
+        for j in sorted({*before, *np.flatnonzero(twice).tolist()}):
+            other = result.views[j]
             pair = f"{printable(other.view.name)} and {printable(one.view.name)}"
             if one.facts.digest == other.facts.digest:
                 if not one.small.rgb.any():  # black, which is told as such
@@ -356,7 +359,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
                 )
                 remedy = "Remove one of them" if posed[j] else "Correct 'file_path' of one of them"
                 pairs.setdefault((what, remedy), []).append(pair)
-            elif twice[j]:
+            else:
                 bracket = _apart(one.view.exposure, other.view.exposure)
                 same_split = one.view.split == other.view.split
                 if bracket and same_split:
@@ -366,6 +369,7 @@ def _check_duplicates(result: DataCheck, diagonal: float) -> None:
                 remedy = "Correct the pose of one, or leave one out"
                 remedy = "Give all of a bracket the same 'split'" if bracket else remedy
                 pairs.setdefault((what, remedy), []).append(pair)
+        before.append(i)
     result.duplicates = sum(map(len, pairs.values()))
     for (what, remedy), names in pairs.items():
         result.warn("duplicates", what, named(names), remedy)

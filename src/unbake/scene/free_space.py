@@ -27,6 +27,8 @@ SMALL_OBJECT = 0.15
 _RAY_OFFSET = 1e-4
 #: Thickness of flat shapes, as a fraction of their largest extent.
 _FLAT = 0.01
+#: Upward directions, axis and sign, as they are likely: of most scenes, of Blender, of COLMAP.
+_WAYS_UP = ((1, 1.0), (2, 1.0), (1, -1.0), (2, -1.0), (0, 1.0), (0, -1.0))
 #: Up to which sine above or below the horizon a camera looks level, and from which on up.
 _LEVEL, _UPWARDS = 0.01, 0.1
 
@@ -91,7 +93,7 @@ def extent(scene: mi.Scene, *, lamps: bool = True) -> tuple[np.ndarray, np.ndarr
         return bounds(scene)
     corners = _corners(kept)
     extents = np.ptp(corners, axis=1)
-    level = extents @ np.abs(up_axis(scene)) < _FLAT * extents.max(axis=1)
+    level = extents[:, _level_axis(scene)] < _FLAT * extents.max(axis=1)
     rest = corners[~level]
     if len(rest):
         size = np.ptp(rest.reshape(-1, 3), axis=0).max()
@@ -110,7 +112,7 @@ def up_axis(scene: mi.Scene) -> np.ndarray:
     are perpendicular where the x axis is a coordinate axis, too. A camera that would look level or
     up then may as well look down, steeply or straight: where there is a ground decides.
     """
-    up, sensors = np.zeros(3), scene.sensors()
+    up, sensors = np.zeros(3), _with_rays(scene)
     if not sensors:
         up[1] = 1.0
         return up
@@ -127,6 +129,19 @@ def up_axis(scene: mi.Scene) -> np.ndarray:
             axis = other
     up[axis] = signs[axis]
     return up
+
+
+def _level_axis(scene: mi.Scene) -> int:
+    """The axis that a ground is perpendicular to.
+
+    Imported scenes have no sensor, and many have z up: there it is the one along which all stands
+    on something flat, y first.
+    """
+    if not _with_rays(scene):
+        for axis, sign in _WAYS_UP:
+            if _has_ground(scene, axis, sign):
+                return axis
+    return int(np.argmax(np.abs(up_axis(scene))))
 
 
 def _has_ground(scene: mi.Scene, axis: int, sign: float) -> bool:
@@ -147,6 +162,11 @@ def _corners(shapes: Iterable[mi.Shape]) -> np.ndarray:
     found = [(*box.min, *box.max) for box in (shape.bbox() for shape in shapes)]
     corners = np.array(found, dtype=np.float64).reshape(-1, 2, 3)
     return corners[np.isfinite(corners).all(axis=(1, 2))]
+
+
+def _with_rays(scene: mi.Scene) -> list[mi.Sensor]:
+    """The scene's sensors but for those of surfaces, which have no rays that could be asked for."""
+    return [sensor for sensor in scene.sensors() if sensor.get_shape() is None]
 
 
 def _is_camera(sensor: mi.Sensor) -> bool:
@@ -404,7 +424,7 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
     """
     rng = np.random.default_rng(seed)
     probes = [np.empty((0, 3))]
-    for sensor in scene.sensors():
+    for sensor in _with_rays(scene):
         film = mi.Point2f(rng.random((2, PROBES)).astype(np.float32))
         probes.append(probes_along(scene, *_view_rays(scene, sensor, film), rng))
     return np.concatenate(probes)
@@ -412,7 +432,7 @@ def sensor_probes(scene: mi.Scene, seed: int) -> np.ndarray:
 
 def sensor_eyes(scene: mi.Scene) -> np.ndarray:
     """Where the scene's own sensors stand, (n, 3); perspective cameras alone, if there are any."""
-    sensors = scene.sensors()
+    sensors = _with_rays(scene)
     sensors = sensors[:: max(1, len(sensors) // PROBES)]
     middle = mi.Point2f(0.5)
     found = [np.empty((0, 3))]

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _LEAST, _LARGEST = 0.05, 20.0
 #: How a translation along x alone is written, by which transforms are found again.
 _MARK = re.compile(r'<translate x="(\d+)"/>')
+#: A parameter of a scene.
+_DECLARED = re.compile(r'<default name="(\w+)"')
 #: A property that shapes have while they are written, by which they are found again.
 _NUMBER = "unbake number"
 #: Ids that nobody chose: of Mitsuba, and of its add-on for Blender.
@@ -65,7 +67,8 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
             props[key] = value
         for props in named:
             del props[_NUMBER]
-    if not marks and not named:
+    text = file.read_text(encoding="utf-8")
+    if not marks and not named and "$" not in text:
         return
     found: set[int] = set()
 
@@ -76,12 +79,22 @@ def write_nodes(scene: ParsedScene, file: Path) -> None:
         found.add(mark)
         return f'<matrix value="{marks[mark]}"/>'
 
-    text = _MARK.sub(exact, file.read_text(encoding="utf-8"))
+    text = _MARK.sub(exact, text)
     if found != marks.keys():
         raise RuntimeError("Mitsuba writes transforms in an unknown way")
     if named:
         text = _with_ids(text, [props.id() for props in named])
-    file.write_text(text, encoding="utf-8")
+    file.write_text(_with_own_dollars(text), encoding="utf-8")
+
+
+def _with_own_dollars(text: str) -> str:
+    """A scene's XML with dollars of names escaped: they do not begin a parameter.
+
+    Mitsuba writes names as they are, beside some parameters of its own, which it declares.
+    """
+    declared = "|".join(map(re.escape, _DECLARED.findall(text)))
+    own = rf"(?!(?:{declared})\b)" if declared else ""
+    return re.sub(rf"\${own}", r"\$", text)
 
 
 def _is_named(node: Any) -> bool:

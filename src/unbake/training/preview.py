@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset.lighting import ROWS, true_environment
+from ..dataset.small_views import block_of, small_camera
 from ..dataset.views import Dataset, View
 from ..imaging.pictures import montage, shown, tonemap, write_png
 from ..quantities import QUANTITIES
@@ -35,7 +36,8 @@ class Preview:
         materials = problem.materials
         self._truth = None if materials is None else GroundTruth.of(view, materials)
         # Truth is compared pixel by pixel. Where there is none, a smaller picture is rendered.
-        self._view = _small(view) if self._truth is None else view
+        small = replace(view, camera=small_camera(view.camera, _LONGEST))
+        self._view = small if self._truth is None else view
         known = None
         if problem.environment is not None:
             known = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
@@ -76,7 +78,7 @@ class Preview:
     def _materials(self) -> tuple[list[list[np.ndarray]], dict[str, Any]]:
         """Pictures of them and of the truth; PSNRs where there is truth."""
         (seen,) = MaterialBuffers.of(self._problem, [self._view], SAMPLES, seed=0)
-        every = -(-max(seen.coverage.shape) // _LONGEST)
+        every = block_of(self._view.camera, _LONGEST)
 
         def tile(value: np.ndarray, name: str) -> np.ndarray:
             return shown(value[::every, ::every], QUANTITIES[name].display)
@@ -89,11 +91,3 @@ class Preview:
         tiles.append([true.get(name, nothing) for name in seen.values])
         scores = {k: v for k, v in seen.psnr(self._truth).items() if v is not None}
         return tiles, {"split": self._view.split} | scores if scores else {}
-
-
-def _small(view: View) -> View:
-    """A view with pixels as large as its picture needs them."""
-    camera = view.camera
-    factor = min(1.0, _LONGEST / max(camera.width, camera.height))
-    size = (max(1, round(side * factor)) for side in (camera.width, camera.height))
-    return replace(view, camera=camera.rescaled(*size))
