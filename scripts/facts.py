@@ -26,6 +26,7 @@ from unbake.config import PAPER_DEPTH  # noqa: E402
 from unbake.evaluation.convergence import WINDOW  # noqa: E402
 from unbake.experiments.seeds import plus_minus  # noqa: E402
 from unbake.experiments.tables import markdown  # noqa: E402
+from unbake.machine import same_machine  # noqa: E402
 
 Row = dict[str, Any]
 
@@ -284,7 +285,7 @@ class Facts:
         machine = self.result("rivals-demo")["machine"]
         for file in sorted(self.results.glob("*.json")):
             result = self.result(file.stem)
-            if isinstance(result.get("steps"), list) and result["machine"] == machine:
+            if isinstance(result.get("steps"), list) and same_machine(result["machine"], machine):
                 return file.stem
         raise Unfounded(f"{self.results}: no steps of {machine}. `{made_by('machine')}` makes them")
 

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import fields
@@ -28,7 +29,7 @@ from unbake.config import (
 )
 from unbake.errors import UserError
 from unbake.fields import registry
-from unbake.imaging.pictures import read_exr
+from unbake.imaging.pictures import read_exr, write_exr
 from unbake.solver.settings import SolveSettings
 from unbake.training.monitor import SHORT
 from unbake.transport.methods import METHODS
@@ -250,7 +251,7 @@ def test_several_processes_are_refused_by_commands_that_do_not_share_work(
     monkeypatch.setenv("PMI_SIZE", "3")
     monkeypatch.setitem(sys.modules, "mpi4py", None)
     assert unbake(*command.split(), "--help").status == 0
-    monkeypatch.setattr("tyro.extras.subcommand_cli_from_dict", called)
+    monkeypatch.setattr("tyro.cli", called)
     outcome = unbake(*command.split())
     refused = f"error: 3 processes were started, and unbake {command} takes one. Run it without "
     assert outcome.status == 2 and outcome.err.count("\n") == 1
@@ -562,3 +563,63 @@ def test_usage_shows_where_a_command_writes_to(unbake):
     for command in ("capture", "fit", "solve", "render", "relight", "export"):
         usage = " ".join(unbake(command, "--help").out.split("\n\n")[0].split())
         assert "-o PATH" in usage, command
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("fit", "data", "--out", "run", "--steps", "1e3"), "a whole number, not '1e3'"),
+        (("bench", "step", "--steps", "ten"), "a whole number, not 'ten'"),
+        (("compare", "d", "--methods", "prb", "-o", "o", "--score-seconds", "x"), "a number, not"),
+        (("fit", "data", "--out", ""), "is empty: give . for the present folder"),
+        (("report", "run", "--out="), "is empty: give . for the present folder"),
+        (("bench", "step", "--out", ""), "is empty: give . for the present folder"),
+    ],
+)
+def test_a_word_that_is_no_value_is_told_in_plain_words(words, told, unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = unbake(*words)
+    assert outcome.status == 2 and not list(tmp_path.iterdir())
+    text = " ".join(re.sub("│", " ", outcome.err).split())
+    command = " ".join(words[: 1 + (words[0] == "bench")])
+    assert told in text and f"unbake {command} --help" in text
+    assert "None" not in text and "invalid literal" not in text
+
+
+def test_a_run_that_goes_on_keeps_what_negative_pixels_are(unbake, tmp_path):
+    outcome = unbake("fit", "data", "--out", tmp_path, "--resume", "--clip-negative")
+    told = "error: --clip-negative: cannot be given together with --resume\n"
+    assert outcome.status == 2 and outcome.err == told
+
+
+def test_the_help_of_compare_tells_what_each_method_has_of_its_own(unbake):
+    text = " ".join(re.sub("│", " ", unbake("compare", "--help").out).split())
+    paragraph = text.partition("are the same for all. ")[2].partition(" are each method's own")[0]
+    for told in ("rates", "decay", "estimator", "warm-up", "beta2", "bounces", "slope"):
+        assert told in paragraph
+    assert "if that is more than 0, else 5; with 0 there are no scores" in text
+
+
+def test_pages_that_cannot_be_written_are_told_before_the_work(unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("unbake.report.page.write_report", None)
+    monkeypatch.setattr("unbake.checks.check.check_data", None)
+    for words in (("report", "run"), ("data", "check", "data")):
+        outcome = unbake(*words, "--out", ".")
+        assert outcome.status == 2 and outcome.err.count("\n") == 1
+        assert "the page cannot be written (there is a folder)" in outcome.err
+
+
+def test_commands_in_remedies_are_as_a_shell_takes_them(unbake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = unbake("report", "my run", "--out", "page.html")
+    assert outcome.status == 2 and "unbake evaluate 'my run'" in outcome.err
+
+
+def test_a_copy_of_negative_photographs_is_refused_in_its_own_words(unbake, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data", ignore=lambda *_: [".cache"])
+    image = data / "images" / "train_000.exr"
+    write_exr(image, -1 - read_exr(image))
+    outcome = unbake("degrade", data, "--out", tmp_path / "out", "--seed", 1)
+    assert outcome.status == 2 and "pixels are negative" in outcome.err
+    assert "--clip-negative" not in outcome.err and "Write the image again" in outcome.err

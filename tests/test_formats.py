@@ -95,6 +95,26 @@ def test_a_run_of_the_first_version_goes_on(first, run, unbake):
     assert json.loads(run.origin_file.read_text())["format"] == 2  # as this version writes it
 
 
+def test_samples_of_both_passes_count_in_runs_of_the_first_version(first, run, unbake):
+    """Its checkpoints count those of one pass."""
+    assert load_run(run.path).progress.samples == 60 * 32 * 4
+    text = run.config_file.read_text()
+    run.config_file.write_text(text.replace('estimator = "auto"', 'estimator = "two-pass"'))
+    samples = 2 * 60 * 32 * 4
+    assert load_run(run.path).progress.samples == samples
+    assert evaluate(run.path, EVALUATED, tell=lambda line: None)["samples"] == samples
+    outcome = unbake("fit", first / "data", "--out", run.path, "--resume", "--steps", 64)
+    assert outcome.status == 0, outcome.err
+    assert load_run(run.path).progress.samples == samples + 4 * 2 * 32 * 4
+
+
+def test_the_command_for_a_run_whose_data_are_gone_is_quoted(first):
+    shutil.rmtree(first / "data")
+    run = (first / "run").rename(first / "my run")
+    with pytest.raises(UserError, match=rf"unbake fit DATA --out '{run}' --resume$"):
+        load_run(run)
+
+
 def test_settings_of_the_first_version_are_told_beside_new_ones(run, tmp_path):
     new = RunFolder(tmp_path / "new")
     new.write_settings(run.settings())

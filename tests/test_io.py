@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from unbake import io
-from unbake.config import from_toml
+from unbake.config import from_toml, read_toml
 from unbake.errors import UserError
 from unbake.formats import check_format
 from unbake.io import (
@@ -20,6 +20,9 @@ from unbake.io import (
     read_text,
     relative,
     remove_unfinished,
+    require_writable_file,
+    require_writable_folder,
+    unfinished,
     write_atomically,
     write_json,
     write_text,
@@ -49,6 +52,11 @@ def test_a_full_disk_leaves_the_old_file_and_is_told_in_short(tmp_path, monkeypa
         write_text(file, "new", durable=True)
     assert str(caught.value) == f"{file}: the file cannot be written (No space left on device)"
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
+
+
+def test_settings_of_windows_may_begin_with_the_mark_of_their_byte_order(tmp_path):
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbfsteps = 7\n")
+    assert read_toml(tmp_path / "a.toml").steps == 7
 
 
 def test_numbers_that_json_lacks_leave_no_file(tmp_path):
@@ -215,3 +223,54 @@ def test_an_empty_folder_is_filled_and_nothing_is_left_of_a_failure(tmp_path, mo
     with filled_folder(tmp_path / "new" / "folder") as folder:
         write_text(folder / "a.txt", "a")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["folder"]
+
+
+@pytest.mark.parametrize("check", [require_writable_file, lambda path: write_text(path, "text")])
+def test_a_folder_is_no_name_of_a_file(check, tmp_path, monkeypatch):
+    """`.` has no name, which ended in a traceback after the work was done."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "link").symlink_to("a")
+    for path in (Path(), Path(".."), Path("/"), Path("a"), Path("link")):
+        with pytest.raises(UserError, match=r"\(there is a folder\). Give the name of a file"):
+            check(path)
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "link"}
+
+
+def test_whether_a_file_can_be_written_is_told_before_and_nothing_is_left(tmp_path):
+    file = tmp_path / "new" / "folder" / "a.json"
+    require_writable_file(file)
+    require_writable_folder(file.parent)
+    assert not list(tmp_path.iterdir())
+    write_text(file, "old")
+    require_writable_file(file)
+    require_writable_folder(file.parent)
+    assert file.read_text() == "old" and list(file.parent.iterdir()) == [file]
+    with pytest.raises(UserError, match=r"b\.json: the page cannot be written \(\w+"):
+        require_writable_file(file / "b.json", "page")
+    with pytest.raises(UserError, match=r"a\.json: is not a folder. Give another --out"):
+        require_writable_folder(file)
+    with pytest.raises(UserError, match=r"b: the folder cannot be written \(\w+"):
+        require_writable_folder(file / "b")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="there is a pipe or a device"):
+        require_writable_file(tmp_path / "pipe")
+
+
+def test_unfinished_files_are_those_of_one_file_alone(tmp_path):
+    def die(path):
+        found.append(path.name)
+        path.write_text("half")
+        raise Killed
+
+    class Killed(BaseException):
+        pass
+
+    found, file = [], tmp_path / "a.json"
+    assert unfinished(tmp_path / "none" / "a.json") == []
+    with pytest.raises(Killed):
+        write_atomically(file, die)
+    left = tmp_path / found[0]
+    for name in (left.name, ".a.json.17.tmp", ".a.json.tmp", ".b.json.17.tmp", ".a.json.x.tmp"):
+        (tmp_path / name).write_text("half")
+    assert {path.name for path in unfinished(file)} == {left.name, ".a.json.17.tmp"}

@@ -6,15 +6,27 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support import MPIEXEC, needs_mpi
+from support import MPIEXEC, needs_mpi, on_ranks, tiny_fields
 
 from unbake import ranks as module
+from unbake.config import CameraConfig
+from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.ranks import SIZES, Agreed, Ranks, alone, started
+from unbake.scene.parse import parse
+from unbake.training import first_gains as gains_module
+from unbake.training import plausibility
+from unbake.training.checkpoint import Progress
+from unbake.training.diagnosis import diagnose
+from unbake.training.first_gains import begin_cameras, shared_points
+from unbake.training.loop import _log_entry
+from unbake.training.problem import pixels_of, problem_of
+from unbake.training.step import Replay
 
 
 class Request:
@@ -512,3 +524,122 @@ def test_a_process_that_ranks_start_is_none_of_them(monkeypatch):
     found = alone()
     assert found["PATH_OF_MINE"] == "here" and not set(SIZES) & set(found)
     assert not any(name.startswith("PMI") for name in found)
+
+
+# ------------------------------------------------------------ what all decide as the first one does
+
+
+class Machines:
+    """Changes what a function of a module returns on the second of two ranks, as another CPU may.
+
+    Ranks are threads here: `on_ranks` calls `of` first.
+    """
+
+    def __init__(self, monkeypatch):
+        self._monkeypatch, self._here = monkeypatch, threading.local()
+
+    def of(self, ranks):
+        self._here.rank = ranks.rank
+
+    def differ(self, where, name, change):
+        whole = getattr(where, name)
+
+        def changed(*args, **more):
+            found = whole(*args, **more)
+            return change(found) if getattr(self._here, "rank", 0) else found
+
+        self._monkeypatch.setattr(where, name, changed)
+
+
+@pytest.fixture
+def machines(monkeypatch):
+    return Machines(monkeypatch)
+
+
+def moved(found):
+    points, normals, valid = found
+    return points + 0.05, normals, valid & (np.arange(len(valid)) % 7 > 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"), [("_points", moved), ("_visible", np.zeros_like)], ids=["hits", "shadows"]
+)
+def test_ranks_whose_rays_differ_look_at_the_same_points(name, change, cornell, machines):
+    dataset = Dataset.load(cornell)
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    machines.differ(gains_module, name, change)
+
+    def shared(ranks):
+        machines.of(ranks)
+        pixels = pixels_of(dataset, tiny_fields(), clip_negative=False, ranks=ranks)
+        found = shared_points(scene, dataset.train, pixels)
+        return [found.point, found.views, found.radius2, found.logs, found.bound, found.whole]
+
+    (alone,) = on_ranks(1, shared)
+    assert len(alone[0]) > 40
+    for found in on_ranks(2, shared):
+        for here, there in zip(found, alone, strict=True):
+            np.testing.assert_array_equal(here, there)
+
+
+@pytest.mark.parametrize("deals", [True, False])
+def test_ranks_whose_sums_differ_begin_with_the_same_exposures(deals, cornell, machines):
+    dataset = Dataset.load(cornell)
+    config = replace(tiny_fields(), camera=CameraConfig(exposure="per-image"))
+    problems = [problem_of(dataset, config, 0.2) for _ in range(3)]
+    machines.differ(gains_module, "first_gains", lambda gains: gains * [[1], [1 + 1e-6]])
+
+    def begun(ranks):
+        machines.of(ranks)
+        problem = problems[2 if ranks.size == 1 else ranks.rank]
+        dealt = ranks if deals else None
+        pixels = pixels_of(dataset, config, clip_negative=False, ranks=dealt)
+        assert begin_cameras(problem, dataset, pixels, ranks) is None
+        return np.array(problem.camera.parameters()["exposure.log"])
+
+    (alone,) = on_ranks(1, begun)
+    assert (alone != 0).any()
+    for found in on_ranks(2, begun):
+        np.testing.assert_array_equal(found, alone)
+
+
+@pytest.mark.parametrize("doubts", [[], ["train_000"]])
+def test_ranks_whose_rays_differ_check_the_same(doubts, cornell, machines, monkeypatch):
+    dataset = Dataset.load(cornell)
+    problem = problem_of(dataset, tiny_fields(), 0.2)
+    monkeypatch.setattr(plausibility, "check_cameras", lambda *_: doubts)
+    machines.differ(plausibility, "check_cameras", lambda names: [] if names else ["train_001"])
+
+    def told(ranks):
+        machines.of(ranks)
+        pixels = pixels_of(dataset, tiny_fields(), clip_negative=False, ranks=ranks)
+        return plausibility.data_warnings(dataset, pixels, problem)
+
+    first, second = on_ranks(2, told)
+    assert len(first) == len(doubts) and len(second) == 1 - len(doubts)
+
+
+@pytest.mark.parametrize(("bad", "told"), [([1], "train_001"), ([0, 1], "train_000"), ([], None)])
+def test_a_pixel_of_any_rank_explains_a_skipped_step(bad, told):
+    def cause(ranks):
+        image = np.full((4, 3), 0.5)
+        image[2] = np.nan if ranks.rank in bad else 0.5
+        colours, numbers = np.full((4, 3), 0.25), np.arange(4) + 10 * ranks.rank
+        terms = {"photometric": float(image.sum())}
+        replay = Replay(terms, [], numbers, image, colours, image - colours)
+        step = SimpleNamespace(
+            ranks=ranks, replay=lambda *_: replay, place=lambda pixel: (pixel // 10, pixel % 10, 3)
+        )
+        return diagnose(step, None, 5, ["train_000", "train_001"])
+
+    first, second = on_ranks(2, cause)
+    assert first == second
+    if told is None:
+        assert first == "the loss was not finite, and is by now"
+    else:
+        assert f"view {told}, pixel (2, 3): rendered nan nan nan" in first
+
+
+def test_a_step_that_one_rank_of_four_skipped_counts_as_one():
+    readings = [{"photometric": 0.5, "skipped": share} for share in (0.25, 0.0, 1.0, 0.25)]
+    assert _log_entry(readings, Progress(), 0.01)["skipped"] == 3

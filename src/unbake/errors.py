@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import shlex
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -104,6 +106,12 @@ def named(names: Sequence[object], most: int = _TOLD) -> str:
     """Names of views, files and the like, printable; of many the first ones."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(map(printable, names[:most])) + more
+
+
+def quoted(path: str | os.PathLike[str]) -> str:
+    """A path, quoted for a shell, as a word of a command that is told."""
+    text = os.fspath(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
 def _escaped(character: str) -> str:

@@ -9,6 +9,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -50,13 +51,11 @@ def write_atomically(
         what: what the file is, for the error message.
 
     Raises:
-        UserError: the folder cannot be made or written, or the name is that of a pipe or a device,
-            which a file would replace, such as `/dev/null`.
+        UserError: the folder cannot be made or written, or the name is that of a folder, or of a
+            pipe or a device, which a file would replace, such as `/dev/null`.
     """
     path = Path(path)
-    if _is_device(path):
-        said = f"the {what} cannot be written (there is a pipe or a device)"
-        raise UserError(said, path, "Give another name")
+    _require_name_of_file(path, what)
     temporary = temporary_beside(path)
 
     def remove() -> None:
@@ -76,6 +75,57 @@ def write_atomically(
             raise UserError(f"the {what} cannot be written ({reason})", path) from error
 
 
+def require_writable_file(path: Path, what: str = "file") -> None:
+    """Raise the error that `write_atomically` would end in, before the work for it is done.
+
+    Nothing is left behind; arguments as of `write_atomically`.
+
+    Raises:
+        UserError: there is a folder, a pipe or a device, or the folder of the file cannot be made
+            or written.
+    """
+    path = Path(path)
+    _require_name_of_file(path, what)
+    _require_room(temporary_beside(path), path, what)
+
+
+def require_writable_folder(folder: Path) -> None:
+    """Raise a `UserError` unless files can be written to a folder, new or not; none is left."""
+    folder = Path(folder)
+    require_utf8(folder, "folder")
+    if folder.exists() and not folder.is_dir():
+        raise UserError("is not a folder", folder, "Give another --out")
+    _require_room(temporary_beside(folder / "file"), folder, "folder")
+
+
+def _require_room(temporary: Path, where: Path, what: str) -> None:
+    """Write a temporary file and remove it, with the folders that are made for it."""
+    remove_parents = removed_with_parents(temporary)
+
+    def remove() -> None:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        remove_parents()
+
+    with cleaned_up(remove):
+        try:
+            temporary.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(b"\n")
+        except OSError as error:
+            said = f"the {what} cannot be written ({error.strerror or error})"
+            raise UserError(said, where, "Give another --out, or make room there") from None
+
+
+def _require_name_of_file(path: Path, what: str) -> None:
+    """Refuse a name that no file can take: of a folder, such as `.`, or of a device."""
+    if not path.name or path.is_dir():
+        said = f"the {what} cannot be written (there is a folder)"
+        raise UserError(said, path, "Give the name of a file")
+    if _is_device(path):
+        said = f"the {what} cannot be written (there is a pipe or a device)"
+        raise UserError(said, path, "Give another name")
+
+
 def _is_device(path: Path) -> bool:
     """Whether there is something else than a file or a folder; links are followed."""
     try:
@@ -91,9 +141,18 @@ def temporary_beside(path: Path) -> Path:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete the temporary files that a killed `write_atomically` left in a folder."""
+    """Delete the temporary files that a killed `write_atomically` left in a folder of our own."""
     for temporary in folder.glob(".*.tmp"):
         temporary.unlink(missing_ok=True)
+
+
+def unfinished(path: Path) -> list[Path]:
+    """The temporary files that a killed `write_atomically` left of one file, and no others."""
+    if not path.parent.is_dir():
+        return []
+    # Version 0.1 had the number of the process in them.
+    form = re.compile(rf"\.{re.escape(path.name[:40])}\.([0-9a-f]{{16}}|[0-9]{{1,10}})\.tmp")
+    return [found for found in path.parent.iterdir() if form.fullmatch(found.name)]
 
 
 def require_new_folder(out: Path) -> None:

@@ -135,6 +135,8 @@ QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
 )
 
 DEFAULT_QUANTITIES = ("albedo", "roughness")
+#: The score of albedo after alignment, where photographs leave its scale open.
+ALIGNED = "albedo_psnr_aligned"
 
 #: Numbers a surface point can carry to its BSDF, in two vectors of Mitsuba's interaction.
 CARRIED = 6

@@ -135,7 +135,7 @@ def test_the_estimator_is_searched_where_paths_are_followed(rates, tiny, tmp_pat
     monkeypatch.setattr(
         module,
         "compile_kernels",
-        lambda _, configs: compiled.append([c.estimator for c in configs]),
+        lambda _, configs, **__: compiled.append([c.estimator for c in configs]),
     )
     assert rates("prb", seconds=5).status == 0
     assert compiled == [["two-pass", "all-pairs"]], "before the first trial's clock starts"
@@ -235,6 +235,60 @@ def test_light_is_judged_too(unknown, key, name, unbake, tiny, tmp_path):
     assert search["unknown"] == unknown and set(search["best"]["factors"]) == {name}
     assert all(trial["score"] == trial[key] for trial in search["trials"])
     assert {0.4, 1.0, 2.5} <= {trial["factors"][name] for trial in search["trials"]}
+
+
+def test_albedo_whose_scale_is_open_is_judged_after_alignment(
+    rates, unbake, tiny, tmp_path, monkeypatch
+):
+    data = tmp_path / "data"
+    small = ("--views", 2, "--held-out", 1, "--resolution", 12, "--spp", 4, "--max-depth", 4)
+    assert unbake("capture", "still", "--out", data, *small).status == 0
+    both = tmp_path / "both.toml"
+    light = "[lighting]\nresolution = 8\n"
+    both.write_text('unknown = "materials+lighting"\n' + tiny.read_text() + light)
+    monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
+    assert rates("direct", data=data, settings=both).status == 0
+    (search,) = searches(tmp_path)
+    for row in (search["untrained"], *search["trials"]):
+        assert row["albedo_psnr"] is not None
+        keys = ("albedo_psnr_aligned", "roughness_psnr", "relight_psnr")
+        judged = [row[key] for key in keys if row[key] is not None]
+        assert len(judged) >= 2 and row["score"] == pytest.approx(sum(judged) / len(judged))
+    # An earlier version judged by plain albedo: such fits are read, and not mixed with others.
+    file = tmp_path / "rates.json"
+    content = json.loads(file.read_text())
+    for row in (content["searches"][0]["untrained"], *content["searches"][0]["trials"]):
+        for fit in (row, *row["per_seed"]):
+            del fit["albedo_psnr_aligned"]
+    file.write_text(json.dumps(content))
+    outcome = rates("direct", data=data, settings=both, extra=("--seeds", 0, 1))
+    assert outcome.status == 2 and "differs in scores, which are of albedo before" in outcome.err
+    assert found_defaults(content)["direct"]
+
+
+@pytest.mark.parametrize("out", [".", "there/rates.json"])
+def test_a_file_that_cannot_be_written_is_told_before_the_search(
+    out, unbake, cornell, tiny, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").write_text("a file")
+    monkeypatch.setattr(module, "bench_rates", None)
+    words = ("--data", cornell, "--methods", "direct", "--settings", tiny, "--out", out)
+    outcome = unbake("bench", "rates", *words)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "the file cannot be written" in outcome.err
+
+
+def test_negative_pixels_are_taken_as_zero_where_that_is_asked_for(
+    rates, cornell, tmp_path, monkeypatch
+):
+    data = shutil.copytree(cornell, tmp_path / "data", ignore=lambda *_: [".cache"])
+    image = data / "images" / "train_000.exr"
+    write_exr(image, -1 - read_exr(image))
+    monkeypatch.setattr(module, "_learn", lambda fit: (1, 0.1))
+    outcome = rates("direct", data=data)
+    assert outcome.status == 2 and "Pass --clip-negative" in outcome.err
+    assert rates("direct", data=data, extra=("--clip-negative",)).status == 0
 
 
 def test_a_method_that_fails_is_recorded(rates, tmp_path, monkeypatch):

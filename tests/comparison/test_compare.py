@@ -450,6 +450,45 @@ def test_runs_of_several_machines_are_told(compare, tmp_path, monkeypatch):
     assert [rows[name]["machines"] for name in ("direct", "ours")] == [[own], [other]]
 
 
+def test_other_numbers_of_threads_are_other_machines(compare, tmp_path, monkeypatch):
+    assert compare("direct", steps=2).status == 0
+    own = machine()
+    other = own | {"threads": own["threads"] + 1}
+    monkeypatch.setattr(loop, "machine", lambda: other)
+    outcome = compare("direct", "ours", steps=2)
+    assert outcome.status == 0 and "several machines or numbers of threads" in outcome.out
+    # A record of before the number was kept says nothing of it.
+    run = RunFolder(tmp_path / "out" / "direct")
+    del own["threads"]
+    run.write_origin(dataclasses.replace(run.origin(), machines=(own,)))
+    outcome = compare("direct", "ours", steps=2)
+    assert outcome.status == 0 and "several machines" not in outcome.out
+    assert run.origin().on(other) == run.origin()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_any_work(compare, tmp_path, monkeypatch):
+    (tmp_path / "out").write_text("a file")
+    monkeypatch.setattr(module.Dataset, "load", None)
+    outcome = compare("direct", steps=2)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "out: is not a folder. Give another --out" in outcome.err
+
+
+def test_untrained_fields_that_fail_are_a_part_that_failed(compare, tmp_path, monkeypatch):
+    real = module.fit
+
+    def failing(data, run, config, **named):
+        if not config.steps:
+            raise UserError("out of memory")
+        return real(data, run, config, **named)
+
+    monkeypatch.setattr(module, "fit", failing)
+    assert compare("direct", steps=2).status == 1
+    found = result(tmp_path)
+    assert found["untrained"]["error"] == "out of memory"
+    assert "error" not in found["methods"]["direct"]
+
+
 def test_no_run_is_written_through_a_link(compare, tmp_path):
     victim = tmp_path / "victim"
     victim.mkdir()

@@ -115,3 +115,17 @@ def test_long_names_are_folded_rather_than_cut():
     assert ["".join(cell.strip() for cell in column) for column in zip(*rows, strict=True)] == [
         *names.values()
     ]
+
+
+def test_numbers_are_never_cut():
+    means = {"render_psnr": 20.51, "albedo_psnr": 12.52, "albedo_psnr_aligned": 31.73}
+    means |= {"roughness_psnr": 21.24, "metallic_psnr": 33.35}
+    length = {"steps": 2400, "seconds": 5612.0, "milliseconds_per_step": 2338.5}
+    row = length | {"samples_per_second": 561234.0, "heldout": means}
+    numbers = ["20.51", "12.52", "31.73", "21.24", "33.35", "2400", "5612 s", "2338.5", "561234"]
+    for width in (40, 80, 120, 200):
+        text = printed(print_comparison, compared({"ad-pt-neural-split-halves": row}), width)
+        assert "…" not in text
+        assert all(f" {number} │" in text for number in numbers), width
+        if width >= 120:
+            assert max(map(len, text.splitlines())) <= width

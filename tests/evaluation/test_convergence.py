@@ -146,3 +146,24 @@ def test_the_table_of_benchmarks_and_the_comparison_agree_on_the_time_to_quality
     assert "| albedo | 2 dB below | 19.0 dB | 74 s | 10 s | 7.4 |" in table(end, runs)
     end["methods"]["prb"]["score"] = curve((0, 10), (90, 22.5))
     assert "| albedo | at its end | 22.5 dB | 90 s | not in 1 of 1 runs |  |" in table(end, runs)
+
+
+def test_albedo_whose_scale_is_open_races_after_alignment():
+    def log(plain, aligned):
+        pairs = zip(plain, aligned, strict=True)
+        scores = [{"albedo_psnr": p, "albedo_psnr_aligned": a} for p, a in pairs]
+        return [{"step": i, "seconds": i, "score": s} for i, s in enumerate(scores)]
+
+    curves = {"a": score_curve(log((5, 9), (10, 20))), "b": score_curve(log((6, 30), (10, 15)))}
+    assert curves["a"][1]["albedo_psnr"] == 9 and curves["a"][1]["albedo_psnr_aligned"] == 20
+    targets = time_to_quality(curves)
+    assert {target.quantity for target in targets} == {"aligned albedo"}
+    first = {target.run: target.psnr for target in targets if not target.below}
+    assert first == {"a": 20, "b": 15}
+    assert targets[0].seconds == {"a": 1, "b": None}
+    # Beside a run whose albedo has a scale, each is with its like.
+    known = [{"step": i, "seconds": i, "score": {"albedo_psnr": 12 + i}} for i in range(2)]
+    targets = time_to_quality(curves | {"c": score_curve(known)})
+    runs = {(target.quantity, target.run) for target in targets}
+    assert runs == {("albedo", "c"), ("aligned albedo", "a"), ("aligned albedo", "b")}
+    assert all(t.seconds["a"] is None for t in targets if t.quantity == "albedo")

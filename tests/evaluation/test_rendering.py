@@ -163,6 +163,17 @@ def test_scores_do_not_depend_on_the_exposure_of_the_png_files(folder, tmp_path)
     assert found[0] == found[1]
 
 
+def test_negative_pixels_of_the_truth_are_taken_as_zero_where_that_is_asked_for(folder, tmp_path):
+    light, settings = LightConfig(envmap=folder / "sky.exr"), RenderSettings(spp=1, max_depth=2)
+    truth = shutil.copytree(folder / "data", tmp_path / "truth", ignore=lambda *_: [".cache"])
+    for image in (truth / "images").iterdir():
+        write_exr(image, -1 - read_exr(image))
+    words = (folder / "run", tmp_path / "out", light, settings)
+    with pytest.raises(UserError, match="Pass --clip-negative"):
+        relight(*words, truth=truth, **SILENT)
+    assert relight(*words, truth=truth, clip_negative=True, **SILENT)["mean"]["views"]
+
+
 @pytest.mark.parametrize("scale", [0.2, 6.0])
 def test_pictures_are_aligned_where_the_fit_left_their_brightness_open(scale, folder, tmp_path):
     """Also where they are brighter than white, and the truth is not."""

@@ -99,6 +99,21 @@ def test_a_fit_that_was_killed_before_it_began_is_begun_again(fit, run):
     assert fit("--steps", 1).status == 0
 
 
+def test_files_of_other_programs_stay_in_the_folder_of_a_fit(fit, run):
+    """It may be the present one: `--out .`."""
+    theirs = [".config.toml.swp.tmp", ".notes.0123456789abcdef.tmp", "step-000001.partial"]
+    theirs += [".log.jsonl.tmp", ".origin.json.0123456789ABCDEF.tmp"]
+    ours = [".config.toml.0123456789abcdef.tmp", ".log.jsonl.4711.tmp"]
+    (run.path / ".work.tmp").mkdir(parents=True)
+    (run.path / ".work.tmp" / "a.txt").write_text("theirs")
+    for name in (*theirs, *ours):
+        (run.path / name).write_text("theirs")
+    assert fit("--steps", 1).status == 0
+    left = {path.name for path in run.path.iterdir()}
+    assert {*theirs, ".work.tmp"} <= left and not left & {*ours}
+    assert (run.path / ".work.tmp" / "a.txt").read_text() == "theirs"
+
+
 def test_checkpoints_of_another_run_are_not_evaluated(fit, run, unbake, tmp_path):
     assert fit("--steps", 4).status == 0
     shutil.copytree(run.checkpoints, tmp_path / "other")

@@ -1,12 +1,14 @@
 """`unbake bench`: the numbers it prints are those of its file, for one method and for several."""
 
 import json
+import shutil
 
 import pytest
 from support import TINY
 
 from unbake.comparison import bench_methods
 from unbake.errors import UserError
+from unbake.imaging.pictures import read_exr, write_exr
 from unbake.version import VERSION
 
 
@@ -49,15 +51,15 @@ def test_a_method_that_fails_does_not_keep_others_from_being_measured(
 ):
     measured = bench_methods._timed
 
-    def timed(dataset, config, steps):
+    def timed(dataset, config, *others):
         if config.method == "prb":
             raise UserError("no memory for a step")
-        return measured(dataset, config, steps)
+        return measured(dataset, config, *others)
 
     monkeypatch.setattr(bench_methods, "_timed", timed)
     out = tmp_path / "methods.json"
     done = bench(unbake, "methods", cornell, tiny, out, "direct", "prb")
-    assert done.status == 0 and "failed" in done.out
+    assert done.status == 1 and "failed" in done.out
     direct, prb = json.loads(out.read_text())["rows"]
     assert direct["milliseconds_per_step"] > 0 and prb["error"] == "no memory for a step"
     done = bench(unbake, "methods", cornell, tiny, out, "prb")
@@ -149,3 +151,37 @@ def test_what_cannot_be_measured_is_told_in_one_line(unbake, cornell, tiny, what
     done = bench(unbake, what, cornell, tiny, "unused.json", *methods)
     assert done.status == 2 and message in done.err
     assert done.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("what", ["step", "methods"])
+def test_options_that_an_error_advises_are_there(unbake, cornell, tiny, tmp_path, what):
+    data = shutil.copytree(cornell, tmp_path / "data", ignore=lambda *_: [".cache"])
+    image = data / "images" / "train_000.exr"
+    write_exr(tmp_path / "outside.exr", -1 - read_exr(image))
+    image.unlink()
+    image.symlink_to(tmp_path / "outside.exr")
+    out, flags = tmp_path / "out.json", []
+    for option in ("--allow-outside", "--clip-negative"):
+        done = bench(unbake, what, data, tiny, out, "direct", *flags)
+        assert done.status == 2 and option in done.err, done.err
+        flags.append(option)
+    assert bench(unbake, what, data, tiny, out, "direct", *flags).status == 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("step", "--data"),
+        ("methods", "--methods", "direct", "--data"),
+        ("ceiling",),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_told_before_the_work(
+    words, unbake, cornell, tiny, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("unbake.dataset.views.Dataset.load", None)
+    for out in (".", tmp_path):
+        done = unbake("bench", *words, cornell, "--settings", tiny, "--out", out)
+        assert done.status == 2 and done.err.count("\n") == 1
+        assert "cannot be written (there is a folder). Give the name of a file" in done.err

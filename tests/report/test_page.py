@@ -1083,3 +1083,51 @@ def test_matplotlib_is_imported_by_drawing_alone():
         [sys.executable, "-c", code], env=os.environ | source, capture_output=True, text=True
     )
     assert done.stdout.split() == ["False"]
+
+
+def _took(run: Path, *machines: dict[str, Any]) -> None:
+    """Write down that these machines took the steps of a run."""
+    origin = {"format": 2, "data": "room", "mean_radiance": 1.0, "clip_negative": False}
+    (run / "origin.json").write_text(json.dumps(origin | {"machines": machines}))
+
+
+def test_times_of_several_machines_are_not_ranked(made, tmp_path: Path):
+    _score(made[1][0], {0: 10.0, 40: 30.0, 80: 31.0})
+    _score(made[1][1], {0: 10.0, 40: 20.0})
+    one = {"processor": "A", "cores": 4, "threads": 4}
+    for others, apart in (
+        ((one,), False),
+        (({"processor": "A", "cores": 4},), False),  # of a version that did not count threads
+        ((one | {"threads": 2},), True),
+        ((one, one | {"processor": "B"}), True),
+    ):
+        _took(made[1][0], one)
+        _took(made[1][1], *others)
+        text = write_report(made[1], tmp_path / "report.html").read_text()
+        race = text.split("<h3>Time to quality</h3>")[1].split("<h3>")[0]
+        assert ('class="n best"' in race) != apart and ("Bold: the first" in race) != apart
+        assert ("several machines or numbers of threads" in race) == apart
+        assert ("on several machines" in _section(text, "numbers")) == apart
+
+
+def test_scores_of_other_renderings_are_not_ranked(made, tmp_path: Path):
+    """Those of materials are."""
+    _liken(made[1][0], 0.9514, 0.1)
+    _liken(made[1][1], 0.5, 0.2)
+    for spp, alike in ((64, True), (4, False)):
+        _edit(made[1][1], lambda m, n=spp: m["render"].update(spp=n))
+        text = write_report(made[1], tmp_path / "report.html").read_text()
+        numbers = _section(text, "numbers")
+        assert numbers.count("other samples or path depths") == (not alike)
+        assert ("cannot be compared: evaluate all alike" in numbers) != alike
+        scores, similar = (part.split("</table>")[0] for part in numbers.split("<table")[1:3])
+        assert scores.count(" best") == 2 * (2 + alike) and similar.count(" best") == 4 * alike
+        views = HELDOUT + 4
+        assert text.count('class="number best"') == views * (2 + alike)
+
+
+def test_commands_of_the_page_are_quoted(made, tmp_path: Path):
+    spaced = shutil.move(made[1][0], made[1][0].with_name("my run"))
+    _edit(Path(spaced), lambda metrics: metrics.update(data=str(tmp_path / "gone")))
+    with pytest.raises(UserError, match=r"--out '[^']*/my run' --resume; then .* '[^']*/my run'$"):
+        write_report([spaced], tmp_path / "report.html")

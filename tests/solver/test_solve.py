@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +30,7 @@ from unbake.scene.geometry import differing, probe
 from unbake.solver import learn
 from unbake.solver import solve as solving
 from unbake.solver.lit import matching_scale
-from unbake.solver.pictures import debiased_relative_mse, relative_mse
+from unbake.solver.pictures import broken_pixels, debiased_relative_mse, relative_mse
 from unbake.solver.points import SurfacePoints
 from unbake.solver.settings import SolveSettings
 from unbake.solver.solve import fine_tune, solve
@@ -109,6 +110,21 @@ def test_noise_of_the_reference_can_be_taken_out_of_an_error():
     assert abs(debiased_relative_mse([truth], halves)) < 0.1 * true
 
 
+def test_pixels_that_are_not_finite_are_left_out_of_an_error():
+    rng = np.random.default_rng(0)
+    reference = [rng.uniform(0.5, 2, (8, 8, 3)) for _ in range(2)]
+    pictures = [x + 0.1 * rng.standard_normal(x.shape) for x in reference]
+    halves = [[x + 0.1 * sign for x in reference] for sign in (1, -1)]
+    errors = relative_mse(pictures, reference), debiased_relative_mse(pictures, halves)
+    assert broken_pixels(pictures) == 0
+    pictures[0][3, 5, 1], pictures[1][0, 0] = np.nan, np.inf
+    reference[1][7, 2, 0] = halves[1][1][7, 2, 2] = -np.inf
+    assert broken_pixels(pictures) == 2 and broken_pixels(reference) == 1
+    found = relative_mse(pictures, reference), debiased_relative_mse(pictures, halves)
+    assert found == pytest.approx(errors, rel=0.2)
+    assert np.isnan(relative_mse([np.full((2, 2, 3), np.nan)], [np.ones((2, 2, 3))]))
+
+
 def test_what_is_written_is_told_and_can_be_read_again(solved):
     told = read_object(solved / "solve.json")
     assert told["finished"] and told["reference_noise"] > 0
@@ -138,6 +154,15 @@ def test_a_field_of_before_does_not_leak(solved, tmp_path):
     assert read_solved(tmp_path).settings.leak == 0
 
 
+def test_a_field_of_before_was_written_with_its_last_measurement(solved, tmp_path):
+    shutil.copy(solved / "radiance.safetensors", tmp_path)
+    told = read_object(solved / "solve.json")
+    assert told.pop("step") == SETTINGS.steps == read_solved(solved).steps
+    told["measurements"][-1]["step"] = 390
+    (tmp_path / "solve.json").write_text(json.dumps(told))
+    assert read_solved(tmp_path).steps == 390
+
+
 def test_a_damaged_folder_is_refused(solved, tmp_path):
     (tmp_path / "solve.json").write_text((solved / "solve.json").read_text())
     with pytest.raises(UserError, match="does not exist"):
@@ -163,6 +188,24 @@ def test_a_step_is_replayed_and_lowers_the_residual(built_in, attach):
     assert last < 0.5 * first
 
 
+@pytest.mark.parametrize("of_material", [False, True])
+def test_a_step_with_a_field_that_cannot_be_recorded_is_traced_each_time(built_in, of_material):
+    """Such as a PyTorch module: what is replayed would have the gradients of the first step."""
+    scene = mi.load_file(str(built_in("furnace")))
+    radiance = make_radiance("neural", TINY, Domain.of(scene.bbox()), scale=3.0, seed=1)
+    if not of_material:
+        radiance.function.recordable = False
+    problem = SimpleNamespace(
+        fields=lambda: [SimpleNamespace(recordable=not of_material)], assign=lambda arrays: None
+    )
+    adam = mi.ad.Adam(0.01, radiance.parameters(), mask_updates=True)
+    view, points = SceneView.of(scene, None, 8), SurfacePoints.of(scene)
+    step = SolverStep(view, radiance, points, replace(SETTINGS, batch=512), problem)
+    residuals = [float(step(adam, i, 0.01)["residual"][0]) for i in range(15)]
+    assert step.recordings() == 0
+    assert residuals[-1] < 0.7 * residuals[0]
+
+
 def test_gradients_of_the_right_hand_side_pass_only_where_it_is_attached(built_in):
     """Of a constant field in the furnace: L − ρ (E + L), by L, is 1, or 1 − ρ if attached."""
     scene = mi.load_file(str(built_in("furnace")))
@@ -173,6 +216,8 @@ def test_gradients_of_the_right_hand_side_pass_only_where_it_is_attached(built_i
             scale = 1.0
 
             value = mi.Float(3.0)
+
+            function = SimpleNamespace(recordable=True)
 
             def evaluate(self, p, w, n, albedo, valid, engine=None):
                 return dr.select(valid, mi.Color3f(self.value), 0)
@@ -269,13 +314,123 @@ def test_a_solve_that_is_stopped_keeps_all_that_was_learned(tmp_path, monkeypatc
 
     monkeypatch.setattr(SolverStep, "__call__", counted)
     monkeypatch.setattr(learn.dr, "sync_thread", interrupted)
-    settings = SolveSettings(steps=400, batch=64, views=1, resolution=8, spp=4, final_spp=4,
+    settings = SolveSettings(steps=400, batch=64, views=1, resolution=8, spp=4, final_spp=8,
                              reference_spp=0, radiance=SMALL)  # fmt: skip
     made = solve("furnace", tmp_path / "out", settings)
     *_, last = made["measurements"]
     assert sent and 30 < len(taken) < 60 and last["step"] == len(taken)
     assert made["finished"] is False
+    assert last["spp"] == 4 < settings.final_spp, "whoever stops it does not wait for the others"
     assert read_object(tmp_path / "out" / "solve.json")["measurements"][-1] == last
+
+
+SHORT = SolveSettings(
+    steps=64, batch=64, views=1, resolution=8, spp=4, final_spp=8, reference_spp=0, radiance=SMALL
+)
+
+
+class Killed(Exception):
+    """In the place of the end of the process."""
+
+
+def test_what_was_learned_is_written_before_the_last_pictures(tmp_path, monkeypatch):
+    """They may take hours; whoever ends them must not lose the training."""
+    rendered = learn.both_sides
+
+    def killed(scene_view, radiance, cameras, spp, seed, **more):
+        if spp == SHORT.final_spp:
+            raise Killed
+        return rendered(scene_view, radiance, cameras, spp, seed, **more)
+
+    monkeypatch.setattr(learn, "both_sides", killed)
+    with pytest.raises(Killed):
+        solve("furnace", tmp_path / "out", SHORT)
+    told = read_object(tmp_path / "out" / "solve.json")
+    assert told["step"] == SHORT.steps and not told["finished"]
+    assert told["measurements"][-1]["step"] < SHORT.steps
+    assert read_solved(tmp_path / "out").steps == SHORT.steps
+
+
+def test_whoever_stops_it_does_not_wait_for_the_last_pictures(tmp_path, monkeypatch):
+    asked = []
+
+    def rendered(scene_view, radiance, cameras, spp, seed, *, ended, **more):
+        if spp == SHORT.final_spp:
+            os.kill(os.getpid(), signal.SIGINT)
+        asked.append((spp, ended()))
+        return both_sides(scene_view, radiance, cameras, spp, seed, ended=ended, **more)
+
+    both_sides = learn.both_sides
+    monkeypatch.setattr(learn, "both_sides", rendered)
+    made = solve("furnace", tmp_path / "out", SHORT)
+    assert asked[-2:] == [(SHORT.final_spp, True), (SHORT.spp, False)]
+    *_, last = made["measurements"]
+    assert made["finished"] and (last["step"], last["spp"]) == (SHORT.steps, SHORT.spp)
+    assert (tmp_path / "out" / "train_000-lhs.exr").is_file()
+
+
+def test_what_was_learned_is_written_between_measurements(tmp_path, monkeypatch):
+    step = SolverStep.__call__
+
+    def killed(self, optimizer, number, *args):
+        if number == 28:
+            raise Killed
+        return step(self, optimizer, number, *args)
+
+    monkeypatch.setattr(SolverStep, "__call__", killed)
+    monkeypatch.setattr(learn, "MEASURED", (0.0, 1.0))
+    for seconds, kept in ((0.0, 24), (1e9, 0)):
+        monkeypatch.setattr(learn, "_KEPT", seconds)
+        out = tmp_path / f"out-{kept}"
+        with pytest.raises(Killed):
+            solve("furnace", out, SHORT)
+        assert read_solved(out).steps == kept
+        assert [entry["step"] for entry in read_object(out / "solve.json")["measurements"]] == [0]
+    values = [load_file(tmp_path / name / "radiance.safetensors") for name in ("out-24", "out-0")]
+    assert any((values[0][key] != values[1][key]).any() for key in values[0])
+
+
+def test_a_disk_that_is_full_for_a_while_ends_no_training(tmp_path, monkeypatch, capsys):
+    write, times = learn.write_solved, []
+
+    def full(*args):
+        times.append(1)
+        if len(times) < 4:
+            raise UserError("cannot be written (No space left on device)", tmp_path)
+        write(*args)
+
+    monkeypatch.setattr(learn, "write_solved", full)
+    made = solve("furnace", tmp_path / "out", SHORT, console=Console())
+    assert made["finished"] and read_solved(tmp_path / "out").steps == SHORT.steps
+    assert capsys.readouterr().out.count("the training goes on, and it is tried again") == 3
+
+
+def test_pixels_that_are_not_finite_end_no_training(tmp_path, monkeypatch, capsys):
+    sides, halves = learn.both_sides, learn.path_traced_halves
+
+    def broken_sides(*args, **more):
+        found = sides(*args, **more)
+        found["rhs"][0][3, 5] = np.nan
+        return found
+
+    def broken_halves(*args, **more):
+        found = halves(*args, **more)
+        found[1][0][2, :2, 1] = np.inf
+        return found
+
+    monkeypatch.setattr(learn, "both_sides", broken_sides)
+    monkeypatch.setattr(learn, "path_traced_halves", broken_halves)
+    lines = []
+    settings = replace(SHORT, reference_spp=8)
+    made = solve("furnace", tmp_path / "out", settings, console=Console(), tell=lines.append)
+    assert any("2 pixels of the reference are not finite" in line for line in lines)
+    assert "pixels (0 of LHS, 1 of RHS) are not finite" in capsys.readouterr().out
+    told = read_object(tmp_path / "out" / "solve.json")
+    assert told["reference_not_finite"] == 2 and told["finished"]
+    assert told["measurements"][-1]["not_finite"] == {"lhs": 0, "rhs": 1}
+    numbers = [told["reference_noise"], *told["measurements"][-1]["relmse"].values()]
+    assert np.isfinite(numbers).all() and made["measurements"] == told["measurements"]
+    assert (tmp_path / "out" / "train_000-rhs.png").is_file()
 
 
 @pytest.mark.parametrize(("problem", "option"), [(None, "--resolution"), (object(), "--cameras")])
@@ -350,6 +505,45 @@ def test_the_field_of_a_run_is_learned_on_under_another_light(tuned, run, cornel
     photograph = read_exr(Dataset.load(cornell).heldout[0].image)[..., :3]
     assert seen["rhs"].mean() == pytest.approx(seen["reference"].mean(), rel=0.2)
     assert seen["reference"].mean() > 3 * photograph.mean()
+
+
+def test_a_run_in_half_precision_is_learned_on_in_single(cornell, tiny, tmp_path):
+    """Without a scale of the loss, small gradients would be rounding alone."""
+    config = replace(read_toml(tiny), steps=2, precision="half")
+    fit(cornell, tmp_path / "run", config, console=Console(quiet=True))
+    started = load_run(tmp_path / "run").problem.learned_parameters()
+    with pytest.MonkeyPatch.context() as patch:
+        begun = []
+        patch.setattr(solving, "learn", lambda *words: begun.append(words) or {})
+        fine_tune(tmp_path / "run", tmp_path / "out", SETTINGS, tell=lambda line: None)
+    known, start = begun[0][:2]
+    assert load_run(tmp_path / "run").problem.half_precision
+    assert not known.problem.half_precision and start.radiance is known.problem.radiance
+    for key, value in start.radiance.parameters().items():
+        np.testing.assert_array_equal(np.array(value), np.array(started[key]))
+    made = fine_tune(tmp_path / "run", tmp_path / "tuned", SHORT, tell=lambda line: None)
+    assert made["measurements"][-1]["skipped"] == 0
+    assert read_solved(tmp_path / "tuned").steps == SHORT.steps
+
+
+@pytest.mark.parametrize(("size", "told"), [(16, False), (12, True)])
+def test_pictures_of_large_views_are_smaller(size, told, run, cornell, tmp_path, monkeypatch):
+    begun, lines = [], []
+    monkeypatch.setattr(solving, "learn", lambda known, *words: begun.append(known) or {})
+    monkeypatch.setattr(solving, "LARGEST", size)
+    fine_tune(run, tmp_path / "out", SETTINGS, tell=lines.append)
+    (camera,) = begun[0].cameras.values()
+    assert (camera.width, camera.height) == (size, size)
+    (own,) = Dataset.load(cornell).heldout
+    assert camera.fl_x / camera.width == pytest.approx(own.camera.fl_x / own.camera.width)
+    assert any("--cameras FILE says other sizes" in line for line in lines) == told
+
+
+def test_small_pictures_keep_their_shape():
+    camera = LookAt((0, 0, 3), (0, 0, 0), (0, 1, 0), 40).camera(3000, 2000)
+    small = solving._small(camera)
+    assert (small.width, small.height) == (512, 341)
+    assert solving._small(small) is small
 
 
 def test_a_sky_that_lies_on_its_side_is_told(run, sky, tmp_path, monkeypatch):

@@ -9,6 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from unbake.acquisition.capture import capture
+from unbake.acquisition.settings import CaptureSettings
 from unbake.config import read_toml
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
@@ -57,6 +59,40 @@ def test_a_score_is_what_an_evaluation_says(scored):
         same = score.measure(spp=FEW.material_spp, seed=2)
         assert same[key] == pytest.approx(said["heldout"][key], abs=1e-5)
         assert logged[key] == pytest.approx(said["heldout"][key], abs=0.5)
+
+
+def test_albedo_whose_scale_is_open_is_scored_after_alignment(scored, monkeypatch):
+    recovered = load_run(scored)
+    view = recovered.dataset.heldout[0]
+    plain = Score(recovered.problem, [view])
+    score = Score(recovered.problem, [view], shares_scale=True)
+    assert "albedo_psnr_aligned" not in plain.measure()
+    found = score.measure()
+    assert found["albedo_psnr_aligned"] > found["albedo_psnr"] == plain.measure()["albedo_psnr"]
+    real = MaterialBuffers.of
+
+    def dimmed(*words):
+        seen = real(*words)
+        factors = np.array([0.5, 0.25, 0.4], np.float32)
+        return [dataclasses.replace(s, values=s.values | {"albedo": s.values["albedo"] * factors})
+                for s in seen]  # fmt: skip
+
+    monkeypatch.setattr(MaterialBuffers, "of", dimmed)
+    dim = score.measure()
+    assert dim["albedo_psnr"] < found["albedo_psnr"] - 1
+    assert dim["albedo_psnr_aligned"] == pytest.approx(found["albedo_psnr_aligned"], abs=1e-3)
+    partly = dataclasses.replace(view, truth={"roughness": view.truth["roughness"]})
+    scores = Score(recovered.problem, [partly], shares_scale=True).measure()
+    assert scores["albedo_psnr_aligned"] is None and scores["roughness_psnr"] is not None
+
+
+def test_a_fit_of_materials_and_light_logs_aligned_albedo(tiny, tmp_path):
+    small = CaptureSettings(views=2, held_out=1, resolution=12, spp=4, max_depth=4)
+    data = capture("still", tmp_path / "data", small, tell=lambda line: None).folder
+    changes = {"unknown": "materials+lighting", "method": "direct", "score_seconds": 1e-9}
+    fit(data, tmp_path / "run", dataclasses.replace(read_toml(tiny), steps=2, **changes))
+    scores = [line["score"] for line in lines(tmp_path / "run") if "score" in line]
+    assert scores and all(s["albedo_psnr_aligned"] > s["albedo_psnr"] for s in scores)
 
 
 def test_every_view_gets_its_own_pixels(scored, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.console import Console
 from tyro.conf import Positional, arg
@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from .. import backend
 from ..config import FitConfig, PresetName
 from ..errors import UserError
+from ..io import require_writable_file
 from ..training.run_folder import RunFolder
 from .console import say
 from .flags import with_options
@@ -51,6 +52,7 @@ def _ready(
     steps: int,
     preset: PresetName | None,
     settings: Path | None,
+    out: Path | None,
 ) -> FitConfig:
     """The settings that steps are measured with, once the options are known to be good.
 
@@ -60,8 +62,15 @@ def _ready(
         exclude("data", {"scene": scene})
     chosen = chosen_settings(preset, settings)
     require("steps", steps, _FEWEST)
+    _require_out(out)
     backend.activate()
     return chosen
+
+
+def _require_out(out: Path | None) -> None:
+    """Refuse a file that cannot be written, before the work that takes minutes."""
+    if out is not None:
+        require_writable_file(out)
 
 
 def step(
@@ -71,6 +80,8 @@ def step(
     steps: int = 100,
     preset: Preset = None,
     settings: File = None,
+    clip_negative: Flag = False,
+    allow_outside: Flag = False,
     out: OutFile = None,
 ) -> None:
     """Take the step of one method apart: samples a second, and where the time goes.
@@ -84,9 +95,11 @@ def step(
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
+        clip_negative: Take negative pixels as zero instead of refusing them.
+        allow_outside: Read files that the data set or a scene names outside of its folder.
         out: JSON file to write the numbers to.
     """
-    chosen = _ready(data, scene, steps, preset, settings)
+    chosen = _ready(data, scene, steps, preset, settings, out)
     from ..comparison.method_variant import MethodVariant
     from ..profiling.bench_step import bench_step, small_data
 
@@ -94,8 +107,10 @@ def step(
         variant = MethodVariant.of(method)
     except UserError as error:
         raise UserError(error.what, "--method", error.remedy) from None
-    with small_data(data, scene or "demo") as small:
-        bench_step(small, variant.settings(chosen), steps, out, Console(highlight=False))
+    config, console = variant.settings(chosen), Console(highlight=False)
+    reading: Any = {"clip_negative": clip_negative, "allow_outside": allow_outside}
+    with small_data(data, scene or "demo", allow_outside=allow_outside) as small:
+        bench_step(small, config, steps, out, console, **reading)
 
 
 def methods(
@@ -105,9 +120,13 @@ def methods(
     steps: int = 100,
     preset: Preset = None,
     settings: File = None,
+    clip_negative: Flag = False,
+    allow_outside: Flag = False,
     out: OutFile = None,
-) -> None:
+) -> int:
     """Measure the steps of several methods side by side, in turn.
+
+    The exit status is 1 where a method failed.
 
     Args:
         methods: METHOD, METHOD:REPRESENTATION or METHOD:REPRESENTATION:ESTIMATOR, such as ours prb
@@ -118,16 +137,21 @@ def methods(
         preset: Settings to measure: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
+        clip_negative: Take negative pixels as zero instead of refusing them.
+        allow_outside: Read files that the data set or a scene names outside of its folder.
         out: JSON file to write the numbers to.
     """
-    chosen = _ready(data, scene, steps, preset, settings)
+    chosen = _ready(data, scene, steps, preset, settings, out)
     from ..comparison.bench_methods import bench_methods
     from ..comparison.method_variant import MethodVariant
     from ..profiling.bench_step import small_data
 
     variants = [MethodVariant.of(method) for method in methods]
-    with small_data(data, scene or "demo") as small:
-        bench_methods(small, variants, chosen, steps, out, Console(highlight=False))
+    console = Console(highlight=False)
+    reading: Any = {"clip_negative": clip_negative, "allow_outside": allow_outside}
+    with small_data(data, scene or "demo", allow_outside=allow_outside) as small:
+        found = bench_methods(small, variants, chosen, steps, out, console, **reading)
+    return 1 if any("error" in row for row in found["rows"]) else 0
 
 
 def rates(
@@ -140,6 +164,8 @@ def rates(
     schedule: Flag = False,
     preset: Preset = None,
     settings: File = None,
+    clip_negative: Flag = False,
+    allow_outside: Flag = False,
 ) -> None:
     """Search the learning rates of methods, by fits that are scored on held-out views.
 
@@ -159,6 +185,8 @@ def rates(
         preset: Settings to begin with: cpu (default), paper (Sec. 5), release (the authors' code),
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings; instead of --preset.
+        clip_negative: Take negative pixels as zero instead of refusing them.
+        allow_outside: Read files that data sets or their scenes name outside of their folders.
     """
     length = {"steps": steps, "seconds": seconds}
     chosen = chosen_settings(preset, settings)
@@ -174,7 +202,19 @@ def rates(
 
         variants = [MethodVariant.of(method) for method in methods]
         console = Console(highlight=False)
-        bench_rates(data, variants, chosen, out, console, seeds, schedule=schedule, ranks=ranks)
+        ranks.together(lambda: require_writable_file(out) if ranks.leads else None)
+        bench_rates(
+            data,
+            variants,
+            chosen,
+            out,
+            console,
+            seeds,
+            schedule=schedule,
+            clip_negative=clip_negative,
+            allow_outside=allow_outside,
+            ranks=ranks,
+        )
     if ranks.leads:
         say(f"wrote {out}")
 
@@ -206,6 +246,7 @@ def gradients(
     folder.require_fitted()
     changes = {name: x for name, x in {"batch": batch, "spp": spp}.items() if x is not None}
     config = with_options(folder.settings(), changes)
+    _require_out(out)
     backend.activate()
     from ..profiling.bench_gradients import FEWEST, bench_gradients
 
@@ -241,6 +282,7 @@ def ceiling(
     chosen = chosen_settings(preset, settings)
     if steps is not None:
         require("steps", steps, _FEWEST)
+    _require_out(out)
     backend.activate()
     from ..profiling.bench_ceiling import bench_ceiling
 
@@ -248,7 +290,7 @@ def ceiling(
 
 
 #: By the word after `bench`, in the order of the help.
-MEASUREMENTS: Mapping[str, Callable[..., None]] = {
+MEASUREMENTS: Mapping[str, Callable[..., int | None]] = {
     "step": step,
     "methods": methods,
     "rates": rates,

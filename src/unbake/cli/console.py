@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
-from pathlib import Path
 from typing import NoReturn
 
 from rich.console import Console
@@ -14,12 +12,6 @@ from ..errors import printable
 
 #: Characters of a line that is printed: more than a path can have.
 LONGEST = 1 << 14
-
-
-def quoted(path: Path) -> str:
-    """A path, quoted for a shell."""
-    text = str(path)
-    return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
 def say(line: str) -> None:

@@ -14,10 +14,11 @@ from tyro.conf import OmitArgPrefixes, Positional
 from .. import backend
 from ..acquisition.settings import CaptureSettings, DegradeSettings
 from ..config.light import LightConfig
-from ..errors import UserError, printable
+from ..errors import UserError, printable, quoted
 from ..importing.faults import ImportFaults
 from ..importing.settings import ImportSettings
-from .console import LONGEST, quoted, say
+from ..io import require_writable_file
+from .console import LONGEST, say
 from .flags import flags, given, with_options
 from .options import (
     Data,
@@ -172,6 +173,8 @@ def data(
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
     """
+    if out is not None:
+        require_writable_file(out, "page")
     backend.activate()
     from ..checks.check import check_data
     from ..checks.told import told_rows
@@ -226,7 +229,14 @@ def degrade(
     backend.activate()
     from ..acquisition.degrade import degrade as run_degrade
 
-    run_degrade(data, out, settings, allow_outside=allow_outside, tell=say)
+    try:
+        run_degrade(data, out, settings, allow_outside=allow_outside, tell=say)
+    except UserError as error:
+        if "--clip-negative" not in (error.remedy or ""):
+            raise
+        # No camera has such pixels, and a fit of the copy would not learn of the choice.
+        remedy = "Write the image again without them: a camera has none"
+        raise UserError(error.what, error.where, remedy) from None
     say(f"wrote {out}; next: unbake data check {quoted(out)}")
 
 

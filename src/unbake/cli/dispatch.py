@@ -21,6 +21,7 @@ from . import bench, data_sets, doctor, results, training
 from .console import fail, say
 from .help import NARROWEST, columns, wrapped_help
 from .processes import require_one_process
+from .words import plain_words
 
 _DESCRIPTION = (
     "Recovers the materials or the lighting of a scene with known geometry from posed "
@@ -101,7 +102,7 @@ def main() -> None:
         name = words[0] if family is None else " ".join(words[:2])
         if name in COMMANDS.keys() - SHARED and not {"-h", "--help"} & {*words}:
             require_one_process(name, SHARED)
-        with wrapped_help(words):
+        with wrapped_help(words), plain_words():
             status = _run(family, asked)
     except UserError as error:
         fail(str(error))
@@ -125,6 +126,9 @@ def _run(family: str | None, words: list[str]) -> int | None:
         family: its first word, if it has two.
         words: the others.
     """
+    name = words[0] if family is None else f"{family} {words[0]}"
+    if name in COMMANDS:  # alone, so that errors name the command, and its help
+        return tyro.cli(COMMANDS[name], prog=f"unbake {name}", args=words[1:])
     if family is not None:
         return tyro.extras.subcommand_cli_from_dict(
             _of_family(family), prog=f"unbake {family}", description=FAMILIES[family], args=words

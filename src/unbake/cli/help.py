@@ -56,7 +56,7 @@ def wrapped_help(words: Collection[str]) -> Iterator[None]:
 
 
 def _with_out(line: str, told: str) -> str:
-    """A line of usage with `-o PATH` or `-o FILE` where Tyro 1.0 hides that in `[... OPTIONS]`.
+    """A line of usage with `-o PATH` or `-o FILE` where Tyro 1.0 hides that in `[OPTIONS]`.
 
     Only where it is required.
 
@@ -65,14 +65,14 @@ def _with_out(line: str, told: str) -> str:
         told: all of the help.
     """
     plain = _CODES.sub("", line)
-    if not plain.startswith("usage: ") or " OPTIONS]" not in plain:
+    if not plain.startswith("usage: ") or "[OPTIONS]" not in plain:
         return line
     found = re.search(
         r"-o (PATH|FILE), --out \1(.*?)(?=[│|] -|[╰+])", _CODES.sub("", told), re.DOTALL
     )
     if found is None or "(required)" not in found[2]:
         return line
-    return line.replace(" OPTIONS]", f" OPTIONS] -o {found[1]}")
+    return line.replace("[OPTIONS]", f"[OPTIONS] -o {found[1]}")
 
 
 def wrapped(line: str, width: int) -> str:

@@ -11,10 +11,11 @@ from rich.console import Console
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from .. import backend, exports, signals
-from ..errors import UserError, collected, raise_together
+from ..errors import UserError, collected, quoted, raise_together
 from ..evaluation.settings import EvaluationSettings, RenderSettings
+from ..io import require_writable_file
 from ..training.run_folder import RunFolder
-from .console import quoted, say
+from .console import say
 from .flags import flags, given, with_options
 from .options import (
     Count,
@@ -104,6 +105,7 @@ def report(
     """
     if not runs:
         raise UserError("no run given", remedy="unbake report RUN [RUN ...] --out report.html")
+    require_writable_file(out, "page")
     backend.activate()
     from ..report.page import write_report
 
@@ -196,6 +198,7 @@ def relight(
     truth: OtherData = None,
     width: Count = None,
     height: Count = None,
+    clip_negative: Flag = False,
     allow_outside: Flag = False,
     *,
     light: OmitArgPrefixes[LightFlags],
@@ -219,6 +222,7 @@ def relight(
             --envmap or --lights: its views are rendered and compared.
         width: Width of the pictures in pixels (default: as the photographs, or as --height).
         height: Height of the pictures in pixels (default: as the photographs, or as --width).
+        clip_negative: Take negative pixels of --truth as zero instead of refusing them.
         allow_outside: Read files that data sets, scenes and --lights name outside of their folders.
         light: How the light is put into the scene.
         render: How pictures are rendered.
@@ -230,7 +234,8 @@ def relight(
     from ..evaluation.rendering import relight as run_relight
 
     places: dict[str, Any] = {"cameras": cameras, "turntable": turntable, "truth": truth}
-    made = run_relight(run, out, chosen, settings, **places, allow_outside=allow_outside, tell=say)
+    reading: Any = {"clip_negative": clip_negative, "allow_outside": allow_outside}
+    made = run_relight(run, out, chosen, settings, **places, **reading, tell=say)
     if made["mean"] is not None:
         scores = {k: v for k, v in made["mean"].items() if k != "views"}
         views, scored = made["mean"]["views"], made.get("scored", {})

@@ -11,11 +11,11 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from .. import backend, experiments, signals
 from ..config import FitConfig, with_quality
-from ..errors import UserError
+from ..errors import UserError, quoted
 from ..evaluation.settings import EvaluationSettings
 from ..solver.settings import SolveSettings
 from ..training.run_folder import RunFolder
-from .console import quoted, say
+from .console import say
 from .flags import flags, given, with_options
 from .options import (
     Count,
@@ -106,6 +106,7 @@ def fit(
         others = {name: value for name, value in changes.items() if name not in length}
         others |= {"preset": preset, "settings": settings, "quality": quality}
         others["radiance-from"] = radiance_from
+        others["clip-negative"] = clip_negative or None  # a run that goes on has its own
         exclude("resume", others)
         folder = RunFolder(out)
         folder.require_resumable()
@@ -168,15 +169,16 @@ def solve(
     left it, also under another light: `unbake relight` without paths.
 
     Writes L (radiance.safetensors), pictures of both sides and of the reference, and relMSE over
-    time (solve.json). Ctrl-C ends it early, with what was learned. `unbake fit --radiance-from`
-    starts with such an L.
+    time (solve.json). L is written once a minute, and before the last pictures. Ctrl-C ends it
+    early, with what was learned and pictures of --spp samples. `unbake fit --radiance-from` starts
+    with such an L.
 
     Args:
         scene: A Mitsuba 3 XML file, or a built-in scene: demo, annex, still, cornell, cube,
             furnace.
         out: Folder to write to, new or empty.
         from_: Folder that `unbake fit` wrote, instead of a scene: pictures are of its held-out
-            views.
+            views, at most 512 pixels wide and high.
         envmap: Environment map (OpenEXR, HDR) to light the scene by, instead of its own light.
         lights: Mitsuba XML file with lights to use instead of the scene's own.
         cameras: Camera file (or transforms.json) of the pictures, instead of --views.
@@ -226,9 +228,10 @@ def compare(
 ) -> int:
     """Fit several methods to the same photographs, and compare their quality over time.
 
-    Fields, batches, seed and length are the same for all. Learning rates, estimator, warm-up and
-    Adam's beta2 are each method's own, unless the settings give them. Methods with a radiance field
-    also search for roughness, where it is neural.
+    Fields, batches, seed and length are the same for all. Learning rates and their decay,
+    estimator, warm-up, Adam's beta2, bounces and the least slope of albedo are each method's own,
+    unless the settings give them. Methods with a radiance field also search for roughness, where it
+    is neural.
 
     Runs go to OUT/METHOD, tables to OUT/compare.json, a page to OUT/report.html. OUT/untrained has
     the fields before the first step: a method is worth what it adds to these. Where the data set
@@ -245,7 +248,7 @@ def compare(
             release-lighting (theirs for an unknown environment map).
         settings: TOML file with settings, such as the config.toml of a run; instead of --preset.
         score_seconds: Training time between scores on all held-out views (default: as the file
-            says, else 5; 0: no scores).
+            says if that is more than 0, else 5; with 0 there are no scores).
         evaluate_spp: Samples per pixel of the final renderings.
         evaluate_truth: Render captured scenes with their true materials too.
         clip_negative: Take negative pixels as zero instead of refusing them.
@@ -285,7 +288,8 @@ def compare(
     if not ranks.leads:
         return 0
     say(f"wrote {out / 'compare.json'} and {out / 'report.html'}")
-    return 1 if any("error" in row for row in result["methods"].values()) else 0
+    rows = (result["untrained"], *result["methods"].values())
+    return 1 if any("error" in row for row in rows) else 0
 
 
 def reproduce(

@@ -36,6 +36,9 @@ def bench_methods(
     steps: int,
     out: Path | None,
     console: Console,
+    *,
+    clip_negative: bool = False,
+    allow_outside: bool = False,
 ) -> dict:
     """Measure the step times of several methods, in turns.
 
@@ -46,6 +49,8 @@ def bench_methods(
         steps: number of measured steps of each method.
         out: JSON file to write.
         console: shows progress and a table.
+        clip_negative: set negative pixels to zero.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
 
     Returns:
         The content of the file. The row of a method that failed has its `error` instead of times.
@@ -55,7 +60,7 @@ def bench_methods(
 
     Paper: Sec. 6.2, Fig. 3.
     """
-    dataset = Dataset.load(data)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
     configs = [with_defaults(variant.settings(shared), dataset) for variant in variants]
     seconds: list[list[float]] = [[] for _ in configs]
     errors: dict[int, UserError] = {}
@@ -64,7 +69,8 @@ def bench_methods(
             if i in errors:
                 continue
             try:
-                seconds[i] += _timed(dataset, config, -(-steps // TURNS))
+                timed = _timed(dataset, config, -(-steps // TURNS), clip_negative)
+                seconds[i] += timed
                 text = f"{1e3 * statistics.median(seconds[i]):.1f} ms"
             except UserError as error:
                 errors[i], text = error, f"error: {error}"
@@ -91,9 +97,9 @@ def bench_methods(
     return result
 
 
-def _timed(dataset: Dataset, config: FitConfig, steps: int) -> list[float]:
+def _timed(dataset: Dataset, config: FitConfig, steps: int, clip_negative: bool) -> list[float]:
     """Seconds of each step of a new fit, after warm-up."""
-    fit, times = begin_fit(dataset, config), []
+    fit, times = begin_fit(dataset, config, clip_negative=clip_negative), []
     for i in range(WARM_UP + steps):
         start = time.perf_counter()
         fit.step(fit.state, i, learning_rates(config, i, 0.0))

@@ -36,7 +36,7 @@ from ..formats import check_format
 from ..io import read_object, write_json
 from ..machine import machine
 from ..memory import lack_told
-from ..quantities import QUANTITIES
+from ..quantities import ALIGNED, QUANTITIES
 from ..ranks import Agreed, Ranks
 from ..training.defaults import own_warm_up, with_defaults
 from ..training.fresh_fit import FreshFit, begin_fit, compile_kernels
@@ -63,7 +63,8 @@ TIME_EVERY = 4
 
 DEFINITIONS = {
     "factors": "multiples of the learning rates of the fields, by unknown",
-    "score": "mean of the numbers in dB of a trial: PSNRs of materials over all held-out views, "
+    "score": "mean of the numbers in dB of a trial: PSNRs of materials over all held-out views "
+    "(of albedo once aligned, where photographs leave its scale open), "
     f"PSNR of balls that are relit by the environment, -20 log10 of the relative error of lights; "
     f"{SPP} samples a pixel; mean over the seeds",
     "best": f"from the fields' own rates, one unknown after the other is moved by factors of "
@@ -116,6 +117,8 @@ def bench_rates(
     seeds: Sequence[int] = (0,),
     *,
     schedule: bool = False,
+    clip_negative: bool = False,
+    allow_outside: bool = False,
     ranks: Ranks | None = None,
 ) -> Row:
     """Search the learning rates of methods, and the estimator of those that follow paths.
@@ -133,6 +136,8 @@ def bench_rates(
         console: shows progress and a table.
         seeds: of the fits of a trial, whose scores are averaged. More of them may be given later.
         schedule: also search the decay of all rates and the warm-up of the unknowns.
+        clip_negative: set negative pixels to zero.
+        allow_outside: read files of data sets and scenes that lie outside of their folders.
         ranks: of MPI, which share the searches among them and all call this; None: this process is
             alone.
 
@@ -146,7 +151,9 @@ def bench_rates(
     out, ranks = Path(out), ranks or Ranks()
     if not ranks.leads:
         console = Console(quiet=True)
-    result, planned = ranks.together(lambda: _planned(data, variants, shared, out, seeds, schedule))
+    result, planned = ranks.together(
+        lambda: _planned(data, variants, shared, out, seeds, schedule, allow_outside)
+    )
     if ranks.size > 1:
         records = [record for _, _, record in planned]
         told = [{key: record[key] for key in ("method", "settings", "seeds")} for record in records]
@@ -167,7 +174,10 @@ def bench_rates(
             file = _part_of(out, ranks.rank)
             try:
                 with lack_told():
-                    _Search(dataset, config, record, part, file, console, schedule).run()
+                    search = _Search(
+                        dataset, config, record, part, file, console, schedule, clip_negative
+                    )
+                    search.run()
             except UserError as error:
                 errors.append([number, *error.parts])
         every = ranks.gather({"records": own, "errors": errors})
@@ -192,6 +202,7 @@ def _planned(
     out: Path,
     seeds: Sequence[int],
     schedule: bool,
+    allow_outside: bool,
 ) -> tuple[Row, list[tuple[Dataset, FitConfig, Row]]]:
     """The record so far, and data, settings and record of each search that is asked for.
 
@@ -199,7 +210,7 @@ def _planned(
         UserError: see `bench_rates`.
     """
     result = _read(out)
-    datasets = [Dataset.load(Path(folder)) for folder in data]
+    datasets = [Dataset.load(Path(folder), allow_outside=allow_outside) for folder in data]
     if not datasets:
         raise UserError("no data set given", "--data", "Give --data FOLDER [FOLDER ...]")
     if not seeds or len(set(seeds)) < len(seeds):
@@ -283,6 +294,7 @@ class _Search:
         out: Path,
         console: Console,
         schedule: bool,
+        clip_negative: bool,
     ) -> None:
         self._dataset = dataset
         self._name = f"{record['data']}, {record['method']}"
@@ -292,6 +304,7 @@ class _Search:
         self._out = out
         self._console = console
         self._schedule = SCHEDULE if schedule else ()
+        self._clip_negative = clip_negative
 
     def run(self) -> None:
         """Make the trials that are missing or failed before, and note the best one."""
@@ -305,7 +318,7 @@ class _Search:
         lights = [name for name in config.unknowns if name not in QUANTITIES]
         if config.seconds and (record["best"] is None or any(map(self._missing, record["trials"]))):
             variants = [replace(config, estimator=name) for name in _estimators(config)]
-            compile_kernels(self._dataset, variants)
+            compile_kernels(self._dataset, variants, clip_negative=self._clip_negative)
         searched = [*reversed(materials), *lights, *self._schedule]
         estimators = _estimators(config)
         best = best_trial(searched, estimators, self._score)
@@ -361,7 +374,7 @@ class _Search:
             tried = _tried(trial, config)
             config = replace(config, rate_factors=tried.pop("factors"), **tried)
         try:
-            fit = begin_fit(self._dataset, config)
+            fit = begin_fit(self._dataset, config, clip_negative=self._clip_negative)
             effort = learn(fit)
             return _scores(fit, self._dataset) | effort
         except UserError as error:
@@ -425,7 +438,7 @@ def _mean(fits: Sequence[Row]) -> Row:
 
 
 def _is_score(key: str) -> bool:
-    return key == "score" or key.endswith(("_psnr", "_db"))
+    return key in ("score", ALIGNED) or key.endswith(("_psnr", "_db"))
 
 
 def _read(out: Path) -> Row:
@@ -455,6 +468,12 @@ def _read_record(file: Path) -> Row:
 def _key(search: Row) -> tuple[Any, ...]:
     """What tells a search from the others of a record."""
     return tuple(search[key] for key in SEARCHED)
+
+
+def _has_plain_scores(search: Row) -> bool:
+    """Whether fits were judged by albedo as it is, as earlier versions did everywhere."""
+    fits = [fit for row in (search["untrained"], *search["trials"]) for fit in row["per_seed"]]
+    return any("albedo_psnr" in fit and ALIGNED not in fit for fit in fits)
 
 
 def _fits(search: Row) -> int:
@@ -516,6 +535,8 @@ def _search(
             if "settings" in other:
                 both = settings.keys() | search["settings"].keys()
                 other += sorted(k for k in both if search["settings"].get(k) != settings.get(k))
+            if config.shares_scale and _has_plain_scores(search):
+                other.append("scores, which are of albedo before alignment")
             if other:
                 what = f"the search of {name} in this file differs in {', '.join(other)}"
                 raise UserError(what, out, "Give another --out")
@@ -576,18 +597,21 @@ def _scores(fit: FreshFit, dataset: Dataset) -> Row:
     problem, values = fit.problem, {}
     fit.state.publish(problem)
     if problem.materials is not None:
-        score = Score(problem, dataset.heldout).measure(SPP)
+        shared = fit.config.shares_scale
+        score = Score(problem, dataset.heldout, shares_scale=shared).measure(SPP)
         values |= {key: value for key, value in score.items() if key != "views"}
     if problem.environment is not None:
         truth = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
         found = problem.environment.to_latlong(ROWS)
         values["relight_psnr"] = None if truth is None else relight_psnr(found, truth)
     if problem.emission is not None:
-        rows = recovered_emitters(problem, dataset.folder)
+        outside = dataset.allow_outside
+        rows = recovered_emitters(problem, dataset.folder, allow_outside=outside)
         errors = [row.emission_error for row in rows if row.emission_error is not None]
         error = max(float(np.mean(errors)), 1e-6) if errors else None
         values["emission_db"] = None if error is None else -20 * math.log10(error)
-    known = [value for value in values.values() if value is not None]
+    judged = [key for key in values if not (key == "albedo_psnr" and ALIGNED in values)]
+    known = [values[key] for key in judged if values[key] is not None]
     if not known:
         what = "has no held-out view with true materials, and no true light, to judge by"
         raise UserError(what, dataset.folder, "Capture it with `unbake capture`")

@@ -26,8 +26,8 @@ from ..evaluation.convergence import (
 from ..evaluation.evaluate import description, evaluate, require_true_materials
 from ..evaluation.settings import EvaluationSettings
 from ..evaluation.yardsticks import can_have_ceiling, find_ceiling, measure_ceiling
-from ..io import write_json
-from ..machine import machine
+from ..io import require_writable_folder, write_json
+from ..machine import distinct_machines, machine
 from ..memory import lack_told
 from ..ranks import Agreed, Ranks
 from ..report.page import write_report
@@ -61,14 +61,17 @@ DEFINITIONS = {
     "no true maps",
     "score": "mean PSNR over all held-out views during training, with few samples per pixel",
     "time_to_quality": "psnr: where the scores of a run end, and 1 and 2 dB below that, for each "
-    "unknown of the materials; seconds: training time after which a run first has it, interpolated "
-    "linearly between scores; null: never. Scores of all runs are smoothed by a running median of "
-    f"{WINDOW} (shorter at the ends). Targets below the end that a run has "
-    "before its first step are left out",
+    "unknown of the materials (aligned albedo, where photographs leave its scale open); seconds: "
+    "training time after which a run first has it, interpolated linearly between scores; null: "
+    f"never. Scores of all runs are smoothed by a running median of {WINDOW} (shorter at the "
+    "ends). Targets below the end that a run has before its first step are left out",
 }
 #: Of compare.json; 1 had the last albedo alone in `time_to_quality`, and no key `format`.
 COMPARISON_FORMAT = 2
 
+_OF_SEVERAL = (
+    "runs are of several machines or numbers of threads: their times and steps cannot be compared"
+)
 #: Name of the run whose fields are those that all methods start from.
 UNTRAINED = "untrained"
 #: The method of that run, which learns nothing: any has the same fields before its first step.
@@ -124,8 +127,8 @@ def compare(
         untrained fields in `untrained`. Other ranks than the first return nothing.
 
     Raises:
-        UserError: the data set cannot be used, a run in `out` has other settings or data, or every
-            method failed.
+        UserError: `out` cannot be written, the data set cannot be used, a run in `out` has other
+            settings or data, or every method failed.
         KeyboardInterrupt: a fit was stopped. The same call continues.
 
     Paper: Sec. 6.1, Fig. 3.
@@ -136,7 +139,7 @@ def compare(
     data, out, given = Path(data), Path(out), config
 
     dataset, config, fits = ranks.together(
-        lambda: _checked(data, variants, out, config, evaluation, allow_outside)
+        lambda: _checked(data, variants, out, config, evaluation, allow_outside, ranks.leads)
     )
     chosen = {name: settings for name, settings in fits.items() if name != UNTRAINED}
     if (recovered := told_unknown(given, dataset)) is not None:
@@ -203,15 +206,13 @@ def compare(
     write_report(good, out / "report.html", failed, allow_outside=allow_outside)
     print_comparison(result, console)
     if len(machines_of(rows.values())) > 1:
-        what = "runs are of several machines: their times and steps cannot be compared"
-        console.print(f"warning: {what}", style="yellow", soft_wrap=True)
+        console.print(f"warning: {_OF_SEVERAL}", style="yellow", soft_wrap=True)
     return result
 
 
 def machines_of(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """The different machines that rows of a comparison are of, as far as these tell."""
-    found = [machine for row in rows for machine in row.get("machines", ())]
-    return list({json.dumps(machine, sort_keys=True): machine for machine in found}.values())
+    return distinct_machines(machine for row in rows for machine in row.get("machines", ()))
 
 
 def _checked(
@@ -221,8 +222,12 @@ def _checked(
     config: FitConfig,
     evaluation: EvaluationSettings,
     allow_outside: bool,
+    writes: bool,
 ) -> tuple[Dataset, FitConfig, dict[str, FitConfig]]:
     """The data set, settings of all runs, and those of each by its name, the untrained one first.
+
+    Args:
+        writes: whether this process writes what is of all runs.
 
     Raises:
         UserError: see `compare`.
@@ -233,6 +238,8 @@ def _checked(
         raise UserError(what, "--methods", "Name each one once, such as: ours prb prb:bitmap")
     if UNTRAINED in names:
         raise UserError(f"a comparison has a run {UNTRAINED!r} already", "--methods", "Rename it")
+    if writes:  # fits and ceilings that take long come before anything is written
+        require_writable_folder(out)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     files = (
         fingerprint(dataset) if any(RunFolder(out / n).exists for n in (*names, UNTRAINED)) else {}

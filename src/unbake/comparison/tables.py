@@ -8,12 +8,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Column, Table
 
-from ..quantities import QUANTITIES
+from ..quantities import ALIGNED, QUANTITIES
 
 Row = dict[str, Any]
 
-#: The score of albedo after alignment, of runs whose lighting is unknown as well.
-_ALIGNED = "albedo_psnr_aligned"
+#: Characters that a column of names may be folded to where a table is too wide.
+_NARROWEST = 12
 
 
 def print_comparison(result: Row, console: Console) -> None:
@@ -36,7 +36,7 @@ def print_step_times(rows: list[Row], console: Console) -> None:
         time, rate = row["milliseconds_per_step"], row["samples_per_second"] / 1e3
         ratio = _number(row["times_the_first"], 2)
         table.add_row(*names, row["estimator"], f"{time:.1f}", f"{rate:.0f}", ratio)
-    console.print(table)
+    _show(table, console)
 
 
 def print_rates(searches: list[Row], console: Console) -> None:
@@ -52,15 +52,15 @@ def print_rates(searches: list[Row], console: Console) -> None:
         scores = search["untrained"].get("score"), trials[0]["score"], best["score"]
         numbers = (_number(score, 2) for score in scores)
         table.add_row(search["data"], search["method"], chosen, str(len(trials)), *numbers)
-    console.print(table)
+    _show(table, console)
 
 
 def _print_quality(rows: dict[str, Row], console: Console) -> None:
     evaluated = [row["heldout"] for row in rows.values() if "heldout" in row]
     materials = [q for q in QUANTITIES if any(f"{q}_psnr" in means for means in evaluated)]
     columns = {f"{name}_psnr": name for name in ("render", *materials)}
-    if any(_ALIGNED in means for means in evaluated):
-        columns[_ALIGNED] = "albedo, aligned"
+    if any(ALIGNED in means for means in evaluated):
+        columns[ALIGNED] = "albedo, aligned"
     table = _table("run", title="Held-out views, PSNR in dB")
     _add_numbers(table, *columns.values(), "steps", "time", "ms/step", "samples/s")
     for name, row in rows.items():
@@ -75,7 +75,7 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
     for label, scores in (pair for pairs in measured for pair in pairs):
         told = zip(columns, _scores(scores, columns), strict=True)
         table.add_row(label, *(x if key in own else "" for key, x in told))
-    console.print(table)
+    _show(table, console)
 
 
 def _scores(means: Row, keys: Iterable[str]) -> list[str]:
@@ -111,7 +111,7 @@ def _print_lighting(rows: dict[str, Row], console: Console) -> None:
             errors = [f"{100 * metrics[k]:.1f} %" for k in ("sh_error", "sh_error_aligned")]
             relit = [f"{metrics[k]:.1f} dB" for k in ("relight_psnr", "relight_psnr_aligned")]
             table.add_row(name, *errors, *relit)
-        console.print(table)
+        _show(table, console)
     for name, row in rows.items():
         known = [x for x in row.get("emission", ()) if x["emission_error"] is not None]
         for emitter in known:
@@ -134,13 +134,29 @@ def _print_time_to_quality(targets: list[Row], console: Console) -> None:
             label = f"  {below:g} dB below" if below else f"{numbers[run]} {run}"
             times = [_number(target["seconds"][name], 0) for name in numbers]
             table.add_row(label, _number(target["psnr"], 1), *times)
-        console.print(table)
+        _show(table, console)
 
 
 def _runs(targets: list[Row]) -> list[str]:
     """The runs that set targets, in the order of the comparison."""
     setting = {target["run"] for target in targets}
     return [run for run in targets[0]["seconds"] if run in setting] if targets else []
+
+
+def _show(table: Table, console: Console) -> None:
+    """Print a table; where its numbers do not fit the console, wider than that: none is cut."""
+    least = 1
+    for column in table.columns:
+        cells = [str(cell) for cell in column.cells]
+        words = str(column.header).split()  # titles may break between words
+        if column.justify == "right":
+            column.min_width = max(map(len, [*words, *cells]))
+        else:
+            column.min_width = min(max(map(len, [*words, *cells])), _NARROWEST)
+        least += column.min_width + 3  # with the line and the spaces beside it
+    if least > console.width:
+        table.width = least
+    console.print(table, crop=False)
 
 
 def _table(*names: str, title: str | None = None) -> Table:

@@ -90,6 +90,7 @@ def to_tables(text: str, where: str = "settings") -> dict[str, Any]:
     Raises:
         UserError: the text is not TOML, longer than settings are, or of a newer version.
     """
+    text = text.removeprefix("\ufeff")  # as programs of Windows may begin a file
     if len(text) > LONGEST:
         raise UserError(f"has {len(text)} characters, settings at most {LONGEST}", where)
     try:

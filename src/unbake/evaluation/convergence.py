@@ -10,12 +10,14 @@ from typing import Any, final
 
 import numpy as np
 
-from ..quantities import DEFAULT_QUANTITIES
+from ..quantities import ALIGNED, DEFAULT_QUANTITIES
 
 #: How far below the end of a run further targets are, in dB.
 BELOW = (0.0, 1.0, 2.0)
 #: Scores that a running median is taken over. A curve with fewer is left as it is.
 WINDOW = 5
+#: What the score of aligned albedo is of.
+ALIGNED_ALBEDO = "aligned albedo"
 #: The first steps trace and compile; intervals of the log that begin before are left out.
 WARM_UP = 4
 
@@ -28,7 +30,7 @@ class Target:
     """A score, and the time after which each run has it."""
 
     run: str  #: the run whose end sets it
-    quantity: str  #: what is scored: `albedo`
+    quantity: str  #: what is scored: `albedo`, `roughness`, or `aligned albedo`
     below: float  #: dB below that end
     psnr: float  #: dB, over all held-out views
     seconds: dict[str, float | None]  #: of training by run; None: never
@@ -48,9 +50,12 @@ def milliseconds_per_step(log: Log) -> float | None:
 
 
 def score_curve(log: Log) -> list[dict[str, float | None]]:
-    """The scores of a log in order: `seconds`, `step`, and PSNRs such as `albedo_psnr` in dB."""
+    """The scores of a log in order: `seconds`, `step`, and PSNRs such as `albedo_psnr` in dB.
+
+    Where photographs leave the scale of albedo open, `albedo_psnr_aligned` is one of them.
+    """
     found = {r["step"]: r for r in log if _timed(r) and isinstance(r.get("score"), Mapping)}
-    scored = [key for r in found.values() for key in r["score"] if key.endswith("_psnr")]
+    scored = [key for r in found.values() for key in r["score"] if _is_score(key)]
     keys = dict.fromkeys([*(f"{name}_psnr" for name in DEFAULT_QUANTITIES), *scored])
     return [
         {"seconds": r["seconds"], "step": step} | {key: r["score"].get(key) for key in keys}
@@ -106,7 +111,8 @@ def seconds_to(
 def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Target]:
     """Targets for every scored quantity: the end of each run's smoothed curve, and below it.
 
-    A run sets no target below its end that it has before its first step.
+    A run sets no target below its end that it has before its first step. A run that leaves the
+    scale of albedo open races with its aligned albedo alone: how far off the scale is, is chance.
 
     Args:
         curves: score curve of each run by name; a run without scores sets no target.
@@ -132,12 +138,24 @@ def time_to_quality(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[T
 def _scored(curves: Iterable[Sequence[Mapping[str, Any]]]) -> list[str]:
     """The quantities that score curves have, in the order of their appearance."""
     keys = dict.fromkeys(key for curve in curves for point in curve for key in point)
-    return [key.removesuffix("_psnr") for key in keys if key.endswith("_psnr")]
+    return [_quantity(key) for key in keys if _is_score(key)]
+
+
+def _is_score(key: str) -> bool:
+    return key.endswith("_psnr") or key == ALIGNED
+
+
+def _quantity(key: str) -> str:
+    """What a score is of."""
+    return ALIGNED_ALBEDO if key == ALIGNED else key.removesuffix("_psnr")
 
 
 def _points(curve: Sequence[Mapping[str, Any]], quantity: str) -> list[tuple[float, float]]:
-    """Seconds and smoothed scores."""
-    pairs = [(point["seconds"], point.get(f"{quantity}_psnr")) for point in curve]
+    """Seconds and smoothed scores; none of plain albedo where that has no scale of its own."""
+    if quantity == "albedo" and any(point.get(ALIGNED) is not None for point in curve):
+        return []
+    key = ALIGNED if quantity == ALIGNED_ALBEDO else f"{quantity}_psnr"
+    pairs = [(point["seconds"], point.get(key)) for point in curve]
     scored = [(t, v) for t, v in pairs if isinstance(v, int | float) and math.isfinite(v)]
     return list(zip([t for t, _ in scored], smoothed([v for _, v in scored]), strict=True))
 

@@ -15,9 +15,9 @@ from ..dataset.lighting import ROWS, true_environment
 from ..dataset.spread import evenly
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
-from ..imaging.metrics import HIGHEST, psnr
+from ..imaging.metrics import HIGHEST
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
-from ..quantities import QUANTITIES
+from ..quantities import ALIGNED, QUANTITIES
 from ..scene import edit
 from ..scene.parse import parse
 from ..training.cameras import Cameras
@@ -25,7 +25,13 @@ from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, EvaluationFolder, RunFolder
 from ..training.run_lock import RunLock
-from ..training.validation import GroundTruth, MaterialBuffers, psnr_keys
+from ..training.validation import (
+    GroundTruth,
+    MaterialBuffers,
+    albedos,
+    aligned,
+    psnr_keys,
+)
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from . import lighting, outliers, renderings, yardsticks
@@ -167,7 +173,6 @@ def _evaluate(
         "format": METRICS_FORMAT,
         **description(recovered.config),
         "steps": recovered.progress.step,
-        # Not what the checkpoint says: version 0.1 counts one of two passes.
         "samples": recovered.progress.samples,
         "seconds": round(recovered.progress.seconds, 2),
         "convergence": _convergence(recovered, folder),
@@ -369,28 +374,11 @@ def _evaluate_lighting(
 
 
 def _align_albedo(rows: list[dict], materials: Sequence[Seen]) -> list[float] | None:
-    """Add `albedo_psnr_aligned` to rows; returns the factor of each channel, one for all views.
-
-    Photographs may determine albedo and lighting only up to a common factor.
-    """
-    known = [
-        (s.values["albedo"], t.values["albedo"], s.mask(t))
-        if s and t and "albedo" in t.values
-        else None
-        for s, t in materials
-    ]
-    counted = [(s[m], t[m]) for s, t, m in filter(None, known)]
-    for row in rows:
-        row["albedo_psnr_aligned"] = None
-    if not any(len(found) for found, _ in counted):
-        return None
-    above = sum((found * true).sum(0) for found, true in counted)
-    scale = above / np.maximum(sum((found**2).sum(0) for found, _ in counted), 1e-12)
-    for row, view in zip(rows, known, strict=True):
-        if view is not None and view[2].any():
-            seen, truth, mask = view
-            row["albedo_psnr_aligned"] = psnr(seen * scale, truth, mask)
-    return [float(x) for x in scale]
+    """Add `albedo_psnr_aligned` to rows; returns the factor of each channel; see `aligned`."""
+    scale, scores = aligned([albedos(seen, truth) for seen, truth in materials])
+    for row, score in zip(rows, scores, strict=True):
+        row[ALIGNED] = score
+    return None if scale is None else [float(x) for x in scale]
 
 
 def _convergence(recovered: Recovered, folder: RunFolder) -> dict | None:

@@ -130,6 +130,7 @@ def relight(
     cameras: Path | str | None = None,
     turntable: int | None = None,
     truth: Path | str | None = None,
+    clip_negative: bool = False,
     allow_outside: bool = False,
     tell: Callable[[str], None] = print,
 ) -> dict[str, Any]:
@@ -144,6 +145,7 @@ def relight(
         turntable: number of cameras on a circle around the scene.
         truth: a data set of the same scene under that light, as `capture` makes it with the same
             `light`. Its views are rendered and compared, as in an evaluation.
+        clip_negative: take negative pixels of the truth as zero, also where the fit did not.
         allow_outside: read files of data sets, scenes and the light that lie outside of their
             folders.
         tell: called with lines of progress.
@@ -161,6 +163,7 @@ def relight(
     true = None if truth is None else Dataset.load(Path(truth), allow_outside=allow_outside)
     change = partial(change_light, light=light, allow_outside=allow_outside, tell=tell)
     recovered = load_run(Path(run), allow_outside=allow_outside, change=change)
+    recovered.clip_negative = recovered.clip_negative or clip_negative
     if true is not None:
         _require_truth_of(recovered.problem.scene_view.scene, true, light, tell)
     chosen = _Cameras(None if cameras is None else Path(cameras), turntable, true)

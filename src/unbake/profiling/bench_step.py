@@ -41,12 +41,13 @@ SPLIT = 7
 
 
 @contextmanager
-def small_data(data: Path | None, scene: str) -> Iterator[Path]:
+def small_data(data: Path | None, scene: str, *, allow_outside: bool = False) -> Iterator[Path]:
     """The folder of a data set, or of a temporary one that is rendered here.
 
     Args:
         data: folder of a data set; None renders a scene.
         scene: a built-in scene's name, or a Mitsuba XML file.
+        allow_outside: read files that the scene names outside of its folder.
     """
     if data is not None:
         yield data
@@ -55,12 +56,19 @@ def small_data(data: Path | None, scene: str) -> Iterator[Path]:
     with cleaned_up(lambda: shutil.rmtree(folder, ignore_errors=True)):
         small = CaptureSettings(views=4, held_out=0, resolution=64, spp=8)
         made = Path(folder) / Path(scene).stem
-        capture(scene, made, small, tell=lambda line: None)
+        capture(scene, made, small, allow_outside=allow_outside, tell=lambda line: None)
         yield made
 
 
 def bench_step(
-    data: Path, config: FitConfig, steps: int, out: Path | None, console: Console
+    data: Path,
+    config: FitConfig,
+    steps: int,
+    out: Path | None,
+    console: Console,
+    *,
+    clip_negative: bool = False,
+    allow_outside: bool = False,
 ) -> dict:
     """Measure the training step of a method on a data set, and its phases.
 
@@ -74,12 +82,14 @@ def bench_step(
         steps: number of measured steps.
         out: JSON file to write.
         console: shows the results.
+        clip_negative: set negative pixels to zero.
+        allow_outside: read files of the data set and its scene that lie outside of its folder.
 
     Returns:
         The content of the file.
     """
-    dataset = Dataset.load(data)
-    fit = begin_fit(dataset, config)
+    dataset = Dataset.load(data, allow_outside=allow_outside)
+    fit = begin_fit(dataset, config, clip_negative=clip_negative)
     config = fit.config
     result = {"unbake": VERSION, "machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
-from unbake.evaluation.convergence import score_curve, time_to_quality
-from unbake.quantities import QUANTITIES
+from unbake.evaluation.convergence import ALIGNED_ALBEDO, score_curve, time_to_quality
+from unbake.machine import distinct_machines
+from unbake.quantities import ALIGNED, QUANTITIES
 from unbake.report import charts, display
 from unbake.report.runs import EvaluatedRun
 from unbake.report.wording import NAMES
@@ -16,6 +17,7 @@ from unbake.transport.terms import TERMS
 
 #: Keys and titles of the scores of held-out views in a log.
 SCORES = {f"{n}_psnr": f"Held-out {row.title.lower()} PSNR" for n, row in QUANTITIES.items()}
+SCORES |= {ALIGNED: "Held-out albedo PSNR, aligned"}
 #: Keys and titles of a validation in a log.
 VALIDATION = {f"{name}_psnr": f"{row.title} PSNR" for name, row in QUANTITIES.items()}
 VALIDATION |= {"render_psnr": "Rendering PSNR"}
@@ -69,19 +71,27 @@ def race(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
     if len({target.run for target in targets}) < 2:
         return []
     index = {run.label: i for i, run in enumerate(runs)}
+    mixed = several_machines(raced)
     tables: dict[str, list[dict[str, Any]]] = {}
     for target in targets:
+        first = _first(target.seconds)
         row = {
             "run": index[target.run],
             "below": f"{target.below:g} dB below" if target.below else None,
             "target": display.decibels(target.psnr),
             "times": [
-                {"text": display.seconds(t), "best": t is not None and t == _first(target.seconds)}
+                {"text": display.seconds(t), "best": not mixed and t is not None and t == first}
                 for t in target.seconds.values()
             ],
         }
         tables.setdefault(target.quantity, []).append(row)
-    return [{"title": NAMES.get(name, name), "rows": rows} for name, rows in tables.items()]
+    titles = NAMES | {ALIGNED_ALBEDO: ALIGNED_ALBEDO.capitalize()}
+    return [{"title": titles.get(name, name), "rows": rows} for name, rows in tables.items()]
+
+
+def several_machines(runs: list[EvaluatedRun]) -> bool:
+    """Whether machines that differ took the steps of runs, as far as these tell."""
+    return len(distinct_machines(machine for run in runs for machine in run.machines)) > 1
 
 
 def _first(times: Mapping[str, float | None]) -> float | None:

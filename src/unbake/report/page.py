@@ -126,6 +126,8 @@ def _numbers(runs: list[EvaluatedRun]) -> dict[str, Any]:
         "measures": scores.YARDSTICKS,
         "similar": scores.similar_rows(runs),
         "uneven": scores.uneven_splits(runs),
+        "rendered_alike": scores.rendered_alike(runs),
+        "several_machines": curves.several_machines(runs),
         "definitions": definitions(runs),
     }
 

@@ -14,6 +14,7 @@ from unbake.imaging import pictures
 from unbake.quantities import QUANTITIES
 from unbake.report import display
 from unbake.report.runs import SHOWN_SPLITS, EvaluatedRun, ShownView
+from unbake.report.scores import rendered_alike
 from unbake.report.wording import NAMES, nothing_learned
 
 #: Captions of the scales beside pictures.
@@ -92,6 +93,7 @@ def _column(
         return display.tonemapped(linear, scales.exposure if quantity == "render" else 0.0)
 
     values = [display.number(run.view(view.name).get(f"{quantity}_psnr")) for run in runs]
+    alike = quantity != "render" or rendered_alike(runs)
     scale = scales.error[quantity]
     reference, mask = truth or (None, None)
     cells = []
@@ -107,7 +109,9 @@ def _column(
                 cell["error"] = display.painted(display.error(image, reference, path), scale, mask)
         unit = "" if psnr["text"] == display.DASH else " dB"
         more = display.similar(run.view(view.name)) if quantity == "render" else ""
-        cells.append(cell | {"number": psnr["text"] + unit, "best": psnr["best"], "more": more})
+        cells.append(
+            cell | {"number": psnr["text"] + unit, "best": psnr["best"] and alike, "more": more}
+        )
     shown = None if reference is None else paint(reference)
     return {"quantity": quantity, "truth": shown, "scale": scale, "cells": cells}
 

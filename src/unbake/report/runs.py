@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -10,7 +11,7 @@ from typing import Any, final
 from unbake.config.tables import flattened
 from unbake.dataset.spread import evenly
 from unbake.dataset.views import Dataset, View
-from unbake.errors import UserError, printable
+from unbake.errors import UserError, printable, quoted
 from unbake.quantities import DEFAULT_QUANTITIES
 from unbake.training.run_folder import RunFolder
 
@@ -34,6 +35,7 @@ class EvaluatedRun:
     config: dict[str, Any]
     log: list[dict[str, Any]]
     taken: int  #: steps that the log tells of; more than were evaluated where the fit went on
+    machines: tuple[Mapping[str, Any], ...] = ()  #: that took the steps; empty: nobody wrote it
 
     @property
     def untrained(self) -> bool:
@@ -109,7 +111,11 @@ def read_run(path: Path, label: str) -> EvaluatedRun:
     untrained = metrics.get("steps") == 0
     log = [] if untrained and not folder.log_file.is_file() else folder.log()
     taken = int(log[-1].get("step", 0)) if log else 0
-    return EvaluatedRun(folder, label, metrics, settings, [] if untrained else log, taken)
+    machines: tuple[Mapping[str, Any], ...] = ()
+    with suppress(UserError):  # a page may be of runs without it
+        machines = folder.origin().machines
+    log = [] if untrained else log
+    return EvaluatedRun(folder, label, metrics, settings, log, taken, machines)
 
 
 def made_of(manifest: dict[str, Any], where: Path, runs: list[EvaluatedRun]) -> int:
@@ -151,11 +157,11 @@ def data_folder(runs: list[EvaluatedRun]) -> Path:
             )
     if not folders[0].is_dir():
         first = runs[0].folder.path
+        again = f"unbake fit DATA --out {quoted(first)} --resume; then unbake evaluate"
         raise UserError(
             f"the data this run was evaluated on is gone ({folders[0]})",
             first,
-            f"Put it back, or tell where it is now: unbake fit DATA --out {first} --resume; then "
-            f"unbake evaluate {first}",
+            f"Put it back, or tell where it is now: {again} {quoted(first)}",
         )
     return folders[0]
 

@@ -64,6 +64,12 @@ def uneven_splits(runs: list[EvaluatedRun]) -> list[str]:
     return found
 
 
+def rendered_alike(runs: list[EvaluatedRun]) -> bool:
+    """Whether all renderings have as many samples and bounces; fewer cost them decibels."""
+    shown = [run.metrics.get("render") for run in runs if _has_number(run, "render_psnr")]
+    return all(render == shown[0] for render in shown)
+
+
 def _marked(
     values: list[float | None],
     write: Callable[[float | None], str],
@@ -71,7 +77,7 @@ def _marked(
     *,
     alike: bool,
 ) -> list[dict[str, Any]]:
-    """Means as text, the best of them marked where all are over the same views (`alike`)."""
+    """Means as text, the best of them marked where all are measured alike."""
     return [
         cell | {"best": cell["best"] and alike} for cell in display.marked(values, write, choose)
     ]
@@ -79,11 +85,12 @@ def _marked(
 
 def score_rows(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
     """One row a run: for each split and quantity its mean PSNR, the best of each column marked."""
-    columns, uneven = [], uneven_splits(runs)
+    columns, uneven, rendered = [], uneven_splits(runs), rendered_alike(runs)
     for split, key in ((split, key) for split in SHOWN_SPLITS for key in psnr_columns(runs)):
         values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
         tops = [_ceiling(run, key) if split == "heldout" else None for run in runs]
-        marked = _marked(values, display.decibels, alike=split not in uneven)
+        alike = split not in uneven and (rendered or key != "render_psnr")
+        marked = _marked(values, display.decibels, alike=alike)
         columns.append(
             [c | {"gap": _gap(*pair)} for c, *pair in zip(marked, values, tops, strict=True)]
         )
@@ -122,10 +129,11 @@ def similar_rows(runs: list[EvaluatedRun]) -> list[tuple[EvaluatedRun, list[dict
 
     Empty where no run has them, as after an evaluation by an earlier version.
     """
-    columns, uneven = [], uneven_splits(runs)
+    columns, uneven, rendered = [], uneven_splits(runs), rendered_alike(runs)
     for split, (key, _, choose) in product(SHOWN_SPLITS, SIMILAR):
         values = [display.number((run.metrics.get(split) or {}).get(key)) for run in runs]
-        columns.append(_marked(values, display.fraction, choose, alike=split not in uneven))
+        alike = rendered and split not in uneven
+        columns.append(_marked(values, display.fraction, choose, alike=alike))
     if all(cell["text"] == display.DASH for column in columns for cell in column):
         return []
     return [(run, list(row)) for run, row in zip(runs, zip(*columns, strict=True), strict=True)]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from unbake.errors import quoted
 from unbake.fields.registry import representation, representations
 from unbake.quantities import QUANTITIES
 from unbake.report import display
@@ -79,7 +79,7 @@ def _outdated(run: EvaluatedRun) -> list[str]:
     written = run.folder.written_checkpoints()
     if not written or written[0] == run.folder.checkpoint(int(steps)):
         return [told]
-    return [f"{told}; run `unbake evaluate {shlex.quote(str(run.folder.path))}` again"]
+    return [f"{told}; run `unbake evaluate {quoted(run.folder.path)}` again"]
 
 
 def _trend(run: EvaluatedRun) -> list[str]:

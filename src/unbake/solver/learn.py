@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,13 @@ from ..training.problem import Parameters, Problem
 from ..training.solved import FORMAT, description, write_solved
 from ..transport.vertex import SceneView
 from ..version import VERSION
-from .pictures import both_sides, debiased_relative_mse, path_traced_halves, relative_mse
+from .pictures import (
+    both_sides,
+    broken_pixels,
+    debiased_relative_mse,
+    path_traced_halves,
+    relative_mse,
+)
 from .points import SurfacePoints
 from .settings import SolveSettings
 from .step import SolverStep
@@ -37,13 +44,19 @@ LOG = "progress.jsonl"
 MEASURED = (0.0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
 #: Steps between looks at the clock, and between lines of the log.
 _TIMED, _READ = 8, 32
+#: Seconds of training, about, after which what was learned is written.
+_KEPT = 60.0
 #: Bytes a pixel of the pictures of both sides, of which two measurements are held at once; and of a
 #: reference, with all that they are compared by.
 _SIDES_BYTES, _REFERENCE_BYTES = 60, 180
+_LEFT_OUT = "are not finite, and left out of relMSE: check the values of scene and materials"
 _DEFINITIONS = {
+    "step": "of training, after which the field was written; measurements may be of earlier ones",
     "relmse": "mean of (a - b)^2 / (b^2 + 0.01) over all pixels and channels of all pictures; "
     "a: lhs or rhs, b: the path traced reference. Where the mean m of b is below 0.08 or above 1, "
-    "0.01 is multiplied by (m / 0.08)^2 or m^2",
+    "0.01 is multiplied by (m / 0.08)^2 or m^2. Pixels that are not finite are left out; it is "
+    "null where none is left",
+    "not_finite": "pixels of a, or in reference_not_finite of b, that are not finite",
     "relmse_debiased": "the same without the noise of the reference: (a - b) (a - c) in the place "
     "of the square, b and c independent halves of the reference; the noise of a is in it",
     "spp": "samples per pixel of a",
@@ -182,7 +195,8 @@ class _Learning:
 
     def make_reference(self) -> None:
         """Path trace the reference, if it is wanted."""
-        self.manifest |= {"reference_noise": None, "measurements": [], "finished": False}
+        self.manifest |= {"reference_noise": None, "reference_not_finite": 0}
+        self.manifest |= {"step": 0, "measurements": [], "finished": False}
         if not self.settings.reference_spp:
             return
         known, cameras = self.known, list(self.known.cameras.values())
@@ -192,28 +206,36 @@ class _Learning:
         )
         self.halves = [list(half) for half in halves]
         pairs = list(zip(*halves, strict=True))
-        reference = [(a + b) / 2 for a, b in pairs]
+        with np.errstate(invalid="ignore", over="ignore"):  # pixels that are not finite
+            reference = [(a + b) / 2 for a, b in pairs]
+            # The mean of two halves has the variance of half of their difference.
+            off = [(a - b) / 2 + r for (a, b), r in zip(pairs, reference, strict=True)]
         self.pictures["reference"] = reference
-        # The mean of two halves has the variance of half of their difference.
-        noise = relative_mse([(a - b) / 2 + r for (a, b), r in zip(pairs, reference, strict=True)],
-                             reference)  # fmt: skip
-        self.manifest["reference_noise"] = noise
+        self.manifest["reference_noise"] = _number(relative_mse(off, reference))
+        self.manifest["reference_not_finite"] = broken = broken_pixels(reference)
+        if broken:
+            self.tell(f"warning: {broken} pixels of the reference {_LEFT_OUT}")
 
     def train(self, console: Console) -> None:
-        """Take all steps, and measure at `MEASURED`; a signal ends it early."""
+        """Take all steps, and measure at `MEASURED`; a signal ends it early.
+
+        What was learned is written before the pictures of a measurement, which may take far longer
+        than the steps, and once a minute between them.
+        """
         settings, rate = self.settings, self.start.settings.learning_rate
         radiance, known = self.start.radiance, self.known
         optimizer = mi.ad.Adam(rate, radiance.parameters(), mask_updates=True)
         step = SolverStep(known.scene_view, radiance, known.points, settings, known.problem)
         total = settings.seconds or settings.steps
         number, seconds, cpu, skipped, due = 0, 0.0, 0.0, 0, list(MEASURED)
+        kept = 0.0  # when the field was written last
         recent: list[dict[str, mi.Float]] = []
 
         def done() -> float:
             return (seconds if settings.seconds else number) / total
 
         with deferred() as stop, Monitor(self.out / LOG, console, total) as monitor:
-            self._measure(optimizer, _entry(0, 0.0, 0.0, 0, settings.spp), monitor.say)
+            self._measure(optimizer, _entry(0, 0.0, 0.0, 0, settings.spp), monitor.say, stop)
             due.pop(0)
             clock, cpu_clock = time.perf_counter(), time.process_time()
             last = done() >= 1 or bool(stop)
@@ -221,29 +243,35 @@ class _Learning:
                 now = rate * settings.final_learning_rate ** min(done(), 1.0)
                 recent.append(step(optimizer, number, now, self.recovered))
                 number += 1
-                # A signal is looked for in one place, so that all that was learned is measured.
+                # Looked at once a step, so that all that was learned is measured.
                 last = done() >= 1 or bool(stop)
                 if not (last or number % _TIMED == 0):
                     continue
                 dr.sync_thread()
                 seconds, cpu = time.perf_counter() - clock, time.process_time() - cpu_clock
                 last = last or done() >= 1
-                reached = done() >= due[0]
-                if not (last or reached or len(recent) >= _READ):
+                reached, keep = done() >= due[0], seconds - kept >= _KEPT
+                if not (last or reached or keep or len(recent) >= _READ):
                     continue
                 skipped += _record(monitor, recent, done() * total, number, seconds, settings)
                 recent.clear()
+                if not (last or reached or keep):
+                    continue
                 if last or reached:
                     while len(due) > 1 and done() >= due[0]:
                         due.pop(0)
                     spp = settings.final_spp if last else settings.spp
                     entry = _entry(number, seconds, cpu, skipped, spp)
-                    self._measure(optimizer, entry, monitor.say)
-                    clock, cpu_clock = time.perf_counter() - seconds, time.process_time() - cpu
+                    self._measure(optimizer, entry, monitor.say, stop)
+                    last = last or bool(stop)  # all that was learned is measured
+                else:
+                    self._keep(optimizer, number, monitor.say)
+                kept = seconds
+                clock, cpu_clock = time.perf_counter() - seconds, time.process_time() - cpu
             for failure in monitor.failures:
                 raise failure
         self.manifest["finished"] = done() >= 1
-        self._write()
+        write_solved(self.out, self.start.radiance, self.manifest)
 
     def write_pictures(self) -> None:
         """Write both sides and the reference as OpenEXR and PNG."""
@@ -252,47 +280,76 @@ class _Learning:
                 write_exr(self.out / f"{name}-{kind}.exr", picture)
                 write_png(self.out / f"{name}-{kind}.png", tonemap(picture))
 
+    def _keep(self, optimizer: mi.ad.Adam, step: int, say: Callable[[str], None]) -> None:
+        """Write the field as it is after a step; where that fails, it is tried again later."""
+        self.start.radiance.assign(dict(optimizer.items()))
+        self.manifest["step"] = step
+        self._write(say)
+
     def _measure(
         self,
         optimizer: mi.ad.Adam,
         entry: dict[str, Any],
         say: Callable[[str], None],
+        stop: Sequence[int],
     ) -> None:
-        """Measure both sides now, tell it, and write it with the field.
+        """Write the field, measure both sides now, tell it, and write that with the field.
 
         Args:
             entry: when this is; it gets what is measured.
+            stop: fills at any moment: whoever stops it does not wait for the samples of the end.
         """
-        self.start.radiance.assign(dict(optimizer.items()))
+        self._keep(optimizer, entry["step"], say)
         if self.known.problem is not None:  # a step that was replayed leaves other arrays there
             self.known.problem.assign(self.recovered)
         cameras = list(self.known.cameras.values())
-        begun, begun_wall = time.process_time(), time.perf_counter()
-        sides = both_sides(
-            self.known.scene_view,
-            self.start.radiance,
-            cameras,
-            entry["spp"],
-            self.settings.seed,
-            hide_emitters=not self.known.room,
-        )
+        sides, few = {}, self.settings.spp
+        begun = begun_wall = 0.0
+        for spp in (entry["spp"], few):
+            begun, begun_wall = time.process_time(), time.perf_counter()
+            sides = both_sides(
+                self.known.scene_view,
+                self.start.radiance,
+                cameras,
+                spp,
+                self.settings.seed,
+                hide_emitters=not self.known.room,
+                ended=lambda spp=spp: bool(stop) and spp > few,
+            )
+            entry["spp"] = spp
+            if sides:
+                break
         entry["pictures_cpu_seconds"] = round(time.process_time() - begun, 3)
         entry["pictures_seconds"] = round(time.perf_counter() - begun_wall, 3)
+        entry["not_finite"] = {side: broken_pixels(images) for side, images in sides.items()}
+        if any(entry["not_finite"].values()):
+            counts = ", ".join(f"{n} of {side.upper()}" for side, n in entry["not_finite"].items())
+            say(f"warning: pixels ({counts}) {_LEFT_OUT}")
         reference = self.pictures.get("reference")
         if reference is not None:
             found = {side: relative_mse(images, reference) for side, images in sides.items()}
-            entry["relmse"] = found
+            entry["relmse"] = {side: _number(value) for side, value in found.items()}
             entry["relmse_debiased"] = {
-                side: debiased_relative_mse(images, self.halves) for side, images in sides.items()
+                side: _number(debiased_relative_mse(images, self.halves))
+                for side, images in sides.items()
             }
             told = ", ".join(f"{side.upper()} {value:.4f}" for side, value in found.items())
             say(f"step {entry['step']}, {entry['seconds']:.0f} s: relMSE of {told}")
         self.manifest["measurements"].append(entry)
         self.pictures |= sides
-        self._write()
+        self._write(say)
 
-    def _write(self) -> None:
-        write_solved(self.out, self.start.radiance, self.manifest)
+    def _write(self, say: Callable[[str], None]) -> None:
+        """Write what there is; a disk that is full now may have room in the end."""
+        try:
+            write_solved(self.out, self.start.radiance, self.manifest)
+        except UserError as error:
+            say(f"warning: {error}; the training goes on, and it is tried again later")
+
+
+def _number(value: float) -> float | None:
+    """A number for JSON, which has none for what is not finite."""
+    return value if math.isfinite(value) else None
 
 
 def _entry(number: int, seconds: float, cpu: float, skipped: int, spp: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import drjit as dr
@@ -36,14 +37,16 @@ def both_sides(
     seed: int,
     *,
     hide_emitters: bool,
+    ended: Callable[[], bool] = lambda: False,
 ) -> dict[str, list[np.ndarray]]:
     """What cameras see of both sides: `lhs`, E + L_θ at x₁, and `rhs`, one bounce and L_θ at x₂.
 
     Args:
         spp: samples a pixel.
+        ended: asked again and again whether nobody waits for the pictures any more.
 
     Returns:
-        Pictures of each camera, linear RGB, float32, (H, W, 3).
+        Pictures of each camera, linear RGB, float32, (H, W, 3); nothing where it was ended.
 
     Paper: Eq. 12, Eq. 13, Sec. 3.1.
     """
@@ -51,6 +54,8 @@ def both_sides(
     images = {side: np.zeros((rays.pixels, 3), np.float32) for side in ("lhs", "rhs")}
     sampler = mi.load_dict({"type": "independent"})
     for part, ray, number in parts_of(rays.through, rays.pixels, spp, seed ^ _PICTURES):
+        if ended():
+            return {}
         sampler.seed(dr.opaque(mi.UInt32, number), dr.width(ray))
         with dr.suspend_grad():
             sample = trace(
@@ -105,13 +110,16 @@ def path_traced_halves(
 def relative_mse(images: Sequence[np.ndarray], reference: Sequence[np.ndarray]) -> float:
     """relMSE: the mean of (a − b)² / (b² + ε) over all pixels and channels of all pictures.
 
-    ε is 0.01, or follows the mean of b as of `epsilon_at`.
+    ε is 0.01, or follows the mean of b as of `epsilon_at`. Pixels that are not finite are left out,
+    in all pictures; it is NaN where none is left.
 
     Args:
         images: a, linear RGB, (H, W, 3) each.
         reference: b, the same.
     """
-    a, b = _flat(images), _flat(reference)
+    a, b = _finite(images, reference)
+    if not a.size:
+        return math.nan
     return float(np.mean((a - b) ** 2 / (b**2 + epsilon_at(EPSILON, float(b.mean())))))
 
 
@@ -120,20 +128,32 @@ def debiased_relative_mse(
 ) -> float:
     """RelMSE that the noise of the reference adds nothing to; it may be negative.
 
-    The square is the product of the differences from two independent references.
+    The square is the product of the differences from two independent references. Pixels are left
+    out as of `relative_mse`.
 
     Args:
         images: linear RGB, (H, W, 3) each.
         halves: two references, the same; their mean is what errors are relative to.
     """
-    a, b, c = _flat(images), *(_flat(half) for half in halves)
+    a, b, c = _finite(images, *halves)
+    if not a.size:
+        return math.nan
     mean = (b + c) / 2
     below = mean**2 + epsilon_at(EPSILON, float(mean.mean()))
     return float(np.mean((a - b) * (a - c) / below))
 
 
-def _flat(images: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate([x.ravel() for x in images]).astype(np.float64)
+def broken_pixels(images: Sequence[np.ndarray]) -> int:
+    """How many pixels of pictures are not finite."""
+    return sum(int((~np.isfinite(image).all(-1)).sum()) for image in images)
+
+
+def _finite(*pictures: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The numbers of the pixels that are finite in all of several versions, one after another."""
+    rows = [np.concatenate([x.reshape(-1, 3) for x in images]) for images in pictures]
+    good = np.logical_and.reduce([np.isfinite(x).all(1) for x in rows])
+    chosen = rows if good.all() else [x[good] for x in rows]
+    return [x.ravel().astype(np.float64) for x in chosen]
 
 
 def _parted(pixels: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:

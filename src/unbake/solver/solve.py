@@ -39,6 +39,10 @@ from .lit import direct_light, matching_scale
 from .points import SurfacePoints
 from .settings import SolveSettings
 
+#: Width and height, at most, of pictures of a run's views: those of photographs would take hours,
+#: with the samples of `final_spp`, where the training takes minutes.
+LARGEST = 512
+
 
 def solve(
     scene: str | Path,
@@ -57,8 +61,8 @@ def solve(
 
     Args:
         scene: a Mitsuba XML file, or the name of a built-in scene.
-        out: folder to write; it must be new or empty. L_θ and measurements are written again with
-            each measurement, pictures in the end.
+        out: folder to write; it must be new or empty. L_θ is written once a minute of training, and
+            before and after the pictures of each measurement; pictures are written in the end.
         settings: how L_θ is learned and measured.
         cameras: a camera file; None: the built-in scene's own cameras, or automatic placement.
         light: takes the place of all light of the scene, unless it says otherwise; None: the
@@ -105,7 +109,8 @@ def fine_tune(
     """Learn the L_θ of a run further by the residual alone, with the materials it recovered.
 
     Under another light this is relighting without paths. The field is then scaled first so that
-    both sides of the rendering equation have the same mean.
+    both sides of the rendering equation have the same mean. Networks multiply in single precision,
+    whatever the run did: nothing scales the loss of small residuals here.
 
     Args:
         run: folder of a fit by a method with L_θ.
@@ -114,7 +119,8 @@ def fine_tune(
         tell: as of `solve`.
         settings: how L_θ is learned and measured; `views`, `resolution` and the field's settings do
             not count.
-        cameras: a camera file; None: the held-out views of the run's data set.
+        cameras: a camera file, whose pictures have the sizes that it says; None: the held-out views
+            of the run's data set, at most `LARGEST` pixels wide and high.
         light: takes the place of all light of the scene, unless it says otherwise; None: the run's
             own light.
         allow_outside: read files of the data set, its scene and the light that lie outside of their
@@ -135,7 +141,7 @@ def fine_tune(
     change = None
     if light is not None:
         change = partial(change_light, light=light, allow_outside=allow_outside, tell=tell)
-    recovered = load_run(run, allow_outside=allow_outside, change=change)
+    recovered = load_run(run, allow_outside=allow_outside, change=change, single=True)
     tell_tilt(light, [view.camera for view in recovered.dataset.train], tell)
     problem, config = recovered.problem, recovered.config
     radiance = problem.radiance
@@ -153,7 +159,7 @@ def fine_tune(
         "run": {"folder": os.fspath(run.resolve()), "steps": recovered.progress.step},
         "light": None if light is None else light.told(),
     }
-    known = Known(scene_view, _views(recovered, cameras), room, points, told, problem)
+    known = Known(scene_view, _views(recovered, cameras, tell), room, points, told, problem)
     if light is not None:
         factor = matching_scale(scene_view, radiance, points, settings.seed)
         radiance.scale *= factor
@@ -216,13 +222,32 @@ def _posed(
     return _named(posed), is_room(scene, [camera for *_, camera in posed])
 
 
-def _views(recovered: Recovered, cameras: Path | str | None) -> dict[str, Camera]:
-    """The cameras of a file, else the held-out views; all views where there are none."""
+def _views(
+    recovered: Recovered, cameras: Path | str | None, tell: Callable[[str], None]
+) -> dict[str, Camera]:
+    """The cameras of a file, else the held-out views; all views where there are none.
+
+    Those of views are made small, and so are cameras of the file that say no size.
+    """
     dataset = recovered.dataset
     if cameras is None:
-        return {v.name: recovered.camera(v) for v in dataset.heldout or dataset.views}
-    first = dataset.train[0].camera
+        own = {v.name: recovered.camera(v) for v in dataset.heldout or dataset.views}
+        small = {name: _small(camera) for name, camera in own.items()}
+        if any(small[name].width != camera.width for name, camera in own.items()):
+            told = f"pictures are at most {LARGEST} pixels wide and high, photographs are larger"
+            tell(f"{told}: --cameras FILE says other sizes")
+        return small
+    first = _small(dataset.train[0].camera)
     return _named(read_named_cameras(Path(cameras), first.width, first.height, keep_size=True))
+
+
+def _small(camera: Camera) -> Camera:
+    """The camera with a smaller picture, if that is larger than `LARGEST`."""
+    scale = LARGEST / max(camera.width, camera.height)
+    if scale >= 1:
+        return camera
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    return camera.rescaled(width, height)
 
 
 def _named(posed: list[tuple[str, str, Camera]]) -> dict[str, Camera]:

@@ -37,7 +37,8 @@ class Inputs:
 class SolverStep:
     """A step of Adam on the residual at random points and directions.
 
-    The right-hand side is a constant (semi-gradients) unless the settings attach it.
+    The right-hand side is a constant (semi-gradients) unless the settings attach it. The step is
+    traced each time where a field cannot be recorded.
 
     Args:
         problem: whose fields materials or lights are; None: they are the scene's own.
@@ -62,7 +63,9 @@ class SolverStep:
         self._problem = problem
         self._samplers = [mi.load_dict({"type": "independent"}) for _ in range(2)]
         self._epsilon = epsilon_at(settings.epsilon, radiance.scale)
-        self._frozen = dr.freeze(self._step)
+        fields = [radiance.function, *([] if problem is None else problem.fields())]
+        recordable = all(field.recordable for field in fields)
+        self._frozen = dr.freeze(self._step) if recordable else None
 
     def __call__(
         self,
@@ -84,8 +87,9 @@ class SolverStep:
         """
         # An array for each parameter: a changed Python number would be traced anew.
         optimizer.set_learning_rate({key: dr.opaque(mi.Float, rate) for key in optimizer})
+        step = self._step if self._frozen is None else self._frozen
         with without_garbage_collection():
-            return self._frozen(self.inputs(number, recovered), optimizer)
+            return step(self.inputs(number, recovered), optimizer)
 
     def inputs(self, number: int, recovered: Parameters | None = None) -> Inputs:
         """The arguments of a step."""
@@ -100,8 +104,8 @@ class SolverStep:
         )
 
     def recordings(self) -> int:
-        """How often the step was traced to be replayed."""
-        return self._frozen.n_recordings
+        """How often the step was traced to be replayed; 0 if it is traced each time."""
+        return 0 if self._frozen is None else self._frozen.n_recordings
 
     def _step(self, inputs: Inputs, optimizer: mi.ad.Adam) -> dict[str, mi.Float]:
         self._radiance.assign(dict(optimizer.items()))

@@ -126,7 +126,7 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
         origin = dataclasses.replace(origin, **{name: getattr(before, name) for name in kept})
         pixels = pixels.at_level(origin.photographs_level)
     problem = problem_of(dataset, config, origin.photographs_level)
-    untold = begin_cameras(problem, dataset, pixels)
+    untold = begin_cameras(problem, dataset, pixels, ranks)
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
     odd = [] if solved is None else start_radiance(problem, solved)
@@ -146,7 +146,8 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     state, restored = _state(problem, step, asked.folder if resume else None, origin, console)
     preview = Preview(problem, dataset, asked.folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds
-    score = Score(problem, dataset.heldout) if scored else None
+    shared = config.shares_scale
+    score = Score(problem, dataset.heldout, shares_scale=shared) if scored else None
     compared = () if preview is None or preview.has_truth else dataset.heldout
     aside, photographs = _probes(step, problem, dataset, compared, clip_negative)
     step.require_memory(state)

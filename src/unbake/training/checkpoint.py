@@ -125,6 +125,9 @@ def load_checkpoint(run: RunFolder, state: State) -> Progress | None:
     for path, arrays, progress in _whole(run, _most(expected)):
         _require_fit(arrays, expected, path)
         state.assign(arrays)
+        if run.exists:  # version 0.1 counted the samples of one of two passes
+            least = progress.step * run.settings().samples_per_step
+            progress.samples = max(progress.samples, least)
         return progress
     return None
 

@@ -14,12 +14,24 @@ def diagnose(step: TrainingStep, state: State, number: int, views: Sequence[str]
     """What is not finite in a step, in a few words.
 
     The step is taken again without being recorded, and without changing the state. The state may be
-    some steps older than the one in which the step was skipped.
+    some steps older than the one in which the step was skipped. Processes all call this together:
+    each knows its share of the pixels, and the first one that finds something is believed by all.
 
     Args:
         number: of the step.
         views: names of the training views.
+
+    Raises:
+        Agreed: it failed on some process.
     """
+    ranks = step.ranks
+    ranks.announce()  # some may compile for longer than a step takes
+    causes = ranks.gather(ranks.together(lambda: _cause(step, state, number, views)))
+    return next(filter(None, causes), "the loss was not finite, and is by now")
+
+
+def _cause(step: TrainingStep, state: State, number: int, views: Sequence[str]) -> str:
+    """What is not finite in the share of this process; empty if all is."""
     replay = step.replay(state, number)
     found = []
     terms = [term for term, value in replay.terms.items() if not np.isfinite(value)]
@@ -38,7 +50,7 @@ def diagnose(step: TrainingStep, state: State, number: int, views: Sequence[str]
         many = f" and {int(bad.sum()) - 1} more" if bad.sum() > 1 else ""
         where = f"view {views[view]}, pixel ({x}, {y}){many}"
         found.append(f"{where}: rendered {image}, photographed {photograph}")
-    return "; ".join(filter(None, found)) or "the loss was not finite, and is by now"
+    return "; ".join(filter(None, found))
 
 
 def _listed(terms: list[str]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import final
@@ -16,6 +17,8 @@ from ..dataset.pair_ratios import PairRatios, levels
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset, View
 from ..fields.arrays import from_numpy
+from ..fields.camera import CameraModel
+from ..ranks import Ranks
 from .cameras import Cameras, radius2
 from .first_response import SeenPoints, first_response, log_falloff
 from .problem import Problem
@@ -94,21 +97,62 @@ class SharedPoints:
 def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -> SharedPoints:
     """Random points that photographs see, with their light in all other ones that do.
 
-    Processes that share the photographs look for them together.
+    Processes that share the photographs all call this together: the first one looks where the
+    points are seen, and each tells the light of its own photographs.
 
     Args:
         scene: of known geometry.
         views: the training views.
         pixels: of these.
     """
-    rng = np.random.default_rng(0)
+    share, rng = pixels.photographs.share, np.random.default_rng(0)
+    ranks = Ranks() if share is None else share.ranks
     wanted = max(_PIXELS, _OF_EACH * len(views))
     places = rng.integers(0, pixels.photographs.count, wanted)
     numbers = np.unique(pixels.photographs.numbers(places)).astype(np.uint32)
+    numbers, source, target, place = _of_first(
+        ranks, lambda: _matches(scene, views, pixels, numbers, rng)
+    )
+    numbers = numbers.astype(np.uint32)
+    own = pixels.views_of(numbers)
+    firsts = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)])
+    # Masked pixels show something else, and those beside a hidden background nothing.
+    clear = pixels.photographs.counts(firsts[target] + place)
+    source, target, place = source[clear], target[clear], place[clear]
+
+    start, partner = own[source], firsts[target] + place
+    logs, bound = _logs(pixels, views, numbers, own)
+    there = _logs(pixels, views, partner, target)
+    known = np.ma.masked_array(logs, bound != 0)
+    whole = [np.ma.median(known[own == i], 0) for i in range(len(views))]
+    whole = np.ma.filled(np.ma.array(whole) - whole[0], 0.0)
+    logs, bound = (
+        np.stack([here[source], x]) for here, x in zip((logs, bound), there, strict=True)
+    )
+    pairs = (numbers[source], start), (partner, target)
+    away = np.stack([_radius2(views, firsts, *each) for each in pairs])
+    return SharedPoints(source, start, target, away, logs, bound, whole)
+
+
+def _matches(
+    scene: mi.Scene,
+    views: Sequence[View],
+    pixels: PixelSource,
+    numbers: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, ...]:
+    """Where points that pixels see are in other views, whatever photographs show there.
+
+    Args:
+        numbers: of the pixels.
+
+    Returns:
+        Numbers of the pixels that see a point. Then for each match the place of the pixel among
+        these, the other view, and the place of the pixel there, (n,) each.
+    """
     own = pixels.views_of(numbers)
     points, normals, valid = _points(scene, pixels, numbers)
     numbers, own, points, normals = (x[valid] for x in (numbers, own, points, normals))
-    firsts = np.cumsum([0, *(view.camera.width * view.camera.height for view in views)])
     origins = np.array([view.camera.origin for view in views])
 
     cameras = [view.camera for view in views]
@@ -127,22 +171,17 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
     side = [((origins[v] - points[source]) * normals[source]).sum(1) for v in (own[source], target)]
     clear = np.sign(side[0]) == np.sign(side[1])
     clear &= _visible(scene, points[source], normals[source], origins[target])
-    # Masked pixels show something else, and those beside a hidden background nothing.
-    clear &= pixels.photographs.counts(firsts[target] + place)
-    source, target, place = source[clear], target[clear], place[clear]
+    return numbers, source[clear], target[clear], place[clear]
 
-    start, partner = own[source], firsts[target] + place
-    logs, bound = _logs(pixels, views, numbers, own)
-    there = _logs(pixels, views, partner, target)
-    known = np.ma.masked_array(logs, bound != 0)
-    whole = [np.ma.median(known[own == i], 0) for i in range(len(views))]
-    whole = np.ma.filled(np.ma.array(whole) - whole[0], 0.0)
-    logs, bound = (
-        np.stack([here[source], x]) for here, x in zip((logs, bound), there, strict=True)
-    )
-    pairs = (numbers[source], start), (partner, target)
-    away = np.stack([_radius2(views, firsts, *each) for each in pairs])
-    return SharedPoints(source, start, target, away, logs, bound, whole)
+
+def _of_first(ranks: Ranks, look: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
+    """Whole numbers that the first process finds, on all: rays may differ between machines."""
+    if ranks.size == 1:
+        return look()
+    found = ranks.together(lambda: look() if ranks.leads else (), math.inf)
+    shapes = ranks.gather([array.shape for array in found])[0]
+    mine = found if ranks.leads else [np.empty(shape, np.int64) for shape in shapes]
+    return [ranks.as_first(array.astype(np.int64, copy=False)) for array in mine]
 
 
 def first_gains(shared: SharedPoints) -> np.ndarray:
@@ -167,10 +206,18 @@ def first_gains(shared: SharedPoints) -> np.ndarray:
     return np.exp(found - found[0])
 
 
-def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> str | None:
+def begin_cameras(
+    problem: Problem, dataset: Dataset, pixels: PixelSource, ranks: Ranks | None = None
+) -> str | None:
     """Let unknown exposures, white balances and responses begin where photographs say.
 
     Beside an unknown response, vignetting does so, too, if it is unknown.
+
+    Args:
+        problem: has the cameras, which are changed.
+        dataset: of the fit.
+        pixels: of its training views.
+        ranks: processes that all call this together; None: this one is alone.
 
     Returns:
         A line if a response is unknown that photographs do not tell. Each point of a surface has an
@@ -183,7 +230,23 @@ def begin_cameras(problem: Problem, dataset: Dataset, pixels: PixelSource) -> st
         return None
     if len(views) == 1:  # there is no other photograph of its points
         return _UNTOLD if camera.has_response else None
-    shared = shared_points(problem.scene_view.scene, views, pixels)
+    ranks = ranks or Ranks()
+    shared = ranks.together(lambda: shared_points(problem.scene_view.scene, views, pixels))
+    untold = ranks.together(lambda: _begin(camera, views, shared, solves))
+    if ranks.size > 1:  # sums may differ between machines in their last bits
+        begun = {key: ranks.as_first(x.numpy()) for key, x in camera.parameters().items()}
+        camera.assign({key: from_numpy(mi.Float, numbers) for key, numbers in begun.items()})
+    return untold
+
+
+def _begin(
+    camera: CameraModel, views: Sequence[View], shared: SharedPoints, solves: bool
+) -> str | None:
+    """Let cameras begin where shared points say; as of `begin_cameras`.
+
+    Args:
+        solves: whether there are exposures or white balances of single views to be found.
+    """
     gains = np.log(first_gains(shared)) if solves else np.zeros((len(views), 3))
     if not camera.has_response:
         camera.start(np.exp(gains))

@@ -479,7 +479,7 @@ def _log_entry(readings: list[dict[str, float]], progress: Progress, rate: float
     for term in readings[0] if readings else ():
         values = [reading[term] for reading in readings]
         if term == "skipped":
-            entry[term] = int(sum(values))
+            entry[term] = sum(value > 0 for value in values)  # of several processes it is a mean
             continue
         finite = [v for v in values if math.isfinite(v)]
         entry[term] = sum(finite) / len(finite) if finite else math.nan

@@ -14,6 +14,7 @@ from ..dataset.quick_check import quick_findings
 from ..dataset.views import Dataset
 from ..errors import UserError
 from ..fields.arrays import from_numpy
+from ..ranks import Ranks
 from ..scene.emitters import (
     ENVIRONMENTS,
     STRENGTHS,
@@ -38,6 +39,8 @@ def data_warnings(
 ) -> list[str]:
     """One line for each sign that something is wrong with the data of a fit.
 
+    Processes that share the photographs all call this together.
+
     Args:
         dataset: of the fit.
         pixels: to train on.
@@ -48,30 +51,41 @@ def data_warnings(
     Raises:
         UserError: no training view sees a surface of the scene, or what is not allowed.
     """
-    scene = problem.scene_view.scene
+    share = pixels.photographs.share
+    ranks = Ranks() if share is None else share.ranks
     with dr.suspend_grad():
-        inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
-        found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
-        hidden = dataset.background == "hidden"
-        words = (scene, dataset.train, pixels.photographs, dataset.folder)
-        found += pose_warnings(*words, hidden=hidden)
-        quick = quick_findings(scene, dataset.train, pixels.photographs)
-        # Of poses that see little of the scene, nothing else is told but what is surely wrong.
-        quick = [finding for finding in quick if finding.level == "error" or not found]
-        for finding in quick:
-            if finding.level == "error" and not allow_doubtful:
-                remedy = f"{finding.remedy}, or pass --allow-doubtful"
-                raise UserError(finding.what, finding.where or dataset.folder, remedy)
-        # Exposures that are fitted may differ.
-        fitted = problem.camera is not None and problem.camera.has_exposures
-        found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
-        units = None if found else _other_units(pixels, problem)
+        found = ranks.together(lambda: _doubts(dataset, pixels, problem, allow_doubtful))
+        # As the first one found it: rays may differ between machines, and all look or none does.
+        units = None if ranks.gather(bool(found))[0] else _other_units(pixels, problem)
     light, colour = _placeholder(dataset, problem), _open_colour(dataset, problem)
     hot_pixels = told_hot_pixels(pixels.photographs.hot_pixels)
     noise = noise_at_black(pixels.photographs.noise)
     told = (*found, units, light, colour, _pictures(dataset, problem), hot_pixels)
     told = (*told, noise and str(noise))
     return [line for line in told if line]
+
+
+def _doubts(
+    dataset: Dataset, pixels: PixelSource, problem: Problem, allow_doubtful: bool
+) -> list[str]:
+    """What rays and photographs tell of cameras, exposures and light; as of `data_warnings`."""
+    scene = problem.scene_view.scene
+    inside = check_cameras(scene, {v.name: v.camera for v in dataset.views})
+    found = [f"{name}: the camera seems to stand inside geometry" for name in inside]
+    hidden = dataset.background == "hidden"
+    words = (scene, dataset.train, pixels.photographs, dataset.folder)
+    found += pose_warnings(*words, hidden=hidden)
+    quick = quick_findings(scene, dataset.train, pixels.photographs)
+    # Of poses that see little of the scene, nothing else is told but what is surely wrong.
+    quick = [finding for finding in quick if finding.level == "error" or not found]
+    for finding in quick:
+        if finding.level == "error" and not allow_doubtful:
+            remedy = f"{finding.remedy}, or pass --allow-doubtful"
+            raise UserError(finding.what, finding.where or dataset.folder, remedy)
+    # Exposures that are fitted may differ.
+    fitted = problem.camera is not None and problem.camera.has_exposures
+    found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
+    return found
 
 
 def _placeholder(dataset: Dataset, problem: Problem) -> str | None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..config import FitConfig
 from ..dataset.camera import Camera
 from ..dataset.views import Dataset, View
-from ..errors import UserError
+from ..errors import UserError, quoted
 from ..scene.parse import ParsedScene
 from .checkpoint import Progress, load_checkpoint
 from .poses import refined_view
@@ -60,6 +60,7 @@ def open_run(
     *,
     allow_outside: bool = False,
     change: Callable[[ParsedScene], object] | None = None,
+    single: bool = False,
 ) -> OpenedRun:
     """Read settings and data set of a run, and make its fields.
 
@@ -67,6 +68,7 @@ def open_run(
         run: folder of a fit.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         change: called with the scene before it is made, such as to give it another light.
+        single: networks multiply in single precision, whatever the run did.
 
     Raises:
         UserError: the folder holds no run, or its data set is gone.
@@ -75,10 +77,13 @@ def open_run(
     folder = RunFolder(run)
     folder.require_fitted()
     config = folder.settings()
+    if single:
+        config = replace(config, precision="single")
     origin = folder.origin()
     data = folder.data(origin.data)
     if not data.is_dir():
-        moved = f"Put it back, or tell where it is now: unbake fit DATA --out {run} --resume"
+        resume = f"unbake fit DATA --out {quoted(run)} --resume"
+        moved = f"Put it back, or tell where it is now: {resume}"
         raise UserError(f"the data set of the run {run} is gone", data, moved)
     dataset = Dataset.load(data, allow_outside=allow_outside)
     problem = problem_of(dataset, config, origin.photographs_level, change=change)
@@ -92,6 +97,7 @@ def load_run(
     *,
     allow_outside: bool = False,
     change: Callable[[ParsedScene], object] | None = None,
+    single: bool = False,
 ) -> Recovered:
     """Read a run's newest checkpoint.
 
@@ -103,11 +109,12 @@ def load_run(
         run: folder of a fit.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         change: called with the scene before it is made, such as to give it another light.
+        single: networks multiply in single precision, whatever the run did.
 
     Raises:
         UserError: the folder holds no run, no checkpoint, or its data set is gone.
     """
-    opened = open_run(run, allow_outside=allow_outside, change=change)
+    opened = open_run(run, allow_outside=allow_outside, change=change, single=single)
     progress = load_checkpoint(opened.folder, opened.state)
     if progress is None:
         raise UserError("no readable checkpoint", where=run, remedy="Fit again, or wait for one")

@@ -29,9 +29,18 @@ from typing import Any, final
 
 from .. import json_checks
 from ..config import FitConfig, read_toml, to_tables, to_toml
-from ..errors import UserError
+from ..errors import UserError, quoted
 from ..formats import check_format
-from ..io import read_lines, read_object, read_text, require_utf8, write_json, write_text
+from ..io import (
+    read_lines,
+    read_object,
+    read_text,
+    require_utf8,
+    unfinished,
+    write_json,
+    write_text,
+)
+from ..machine import same_machine
 from ..signals import cleaned_up
 from . import run_numbers
 from .event_log import EventLog
@@ -105,7 +114,7 @@ class Origin:
 
     def on(self, machine: Mapping[str, Any]) -> Origin:
         """The same of a run whose next steps are taken on a machine."""
-        known = machine in self.machines
+        known = any(same_machine(machine, other) for other in self.machines)
         return self if known else replace(self, machines=(*self.machines, machine))
 
     @property
@@ -416,8 +425,13 @@ class RunFolder:
         _remove(*written[:at], *written[at + KEEP :])
 
     def sweep(self) -> None:
-        """Delete what a killed process left unfinished; only with the lock."""
-        for folder in (self.path, self.checkpoints, self.previews):
+        """Delete what a killed process left unfinished; only with the lock.
+
+        The folder itself may be one with files of other programs, such as the present one.
+        """
+        for file in (self.config_file, self.origin_file, self.log_file):
+            _remove(*(path for path in unfinished(file) if path.is_file() or path.is_symlink()))
+        for folder in (self.checkpoints, self.previews):
             # Version 0.1 wrote checkpoints under the name of `*.partial`.
             _remove(*folder.glob(".*.tmp"), *folder.glob("step-*.partial"))
 
@@ -477,7 +491,7 @@ class RunFolder:
     @property
     def evaluate_again(self) -> str:
         """The remedy where an evaluation is missing or damaged."""
-        return f"Run `unbake evaluate {self.path}`"
+        return f"Run `unbake evaluate {quoted(self.path)}`"
 
 
 def require_no_link(path: Path) -> None:

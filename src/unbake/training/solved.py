@@ -1,7 +1,8 @@
 """The folder of a radiance field that `unbake solve` wrote, which a fit can start with.
 
     DIR/
-      solve.json               settings and domain of L_θ, the scene's geometry, measurements
+      solve.json               settings and domain of L_θ, the scene's geometry, measurements, and
+                               after which step θ was written
       radiance.safetensors     θ
       NAME-SIDE.exr, .png      pictures
 
@@ -80,7 +81,7 @@ def description(
 
 
 def write_solved(folder: Path, radiance: RadianceField, manifest: Mapping[str, Any]) -> None:
-    """Write θ and the manifest, which has the `description` under "radiance"."""
+    """Write θ and the manifest, which has the `description` under "radiance" and θ's "step"."""
     arrays = {key: np.array(dr.detach(x)) for key, x in radiance.parameters().items()}
     write_atomically(folder / FIELD, lambda path: save_file(arrays, os.fspath(path)))
     write_json(folder / MANIFEST, manifest, allow_nan=False)
@@ -118,7 +119,10 @@ def read_solved(folder: Path | str) -> Solved:
         radiance = make_radiance(
             form, settings, Domain(cast(Any, centre), extent), scale=scale, seed=0
         )
-        steps = int(manifest["measurements"][-1]["step"])
+        steps = manifest.get("step")
+        if steps is None:  # of before: θ was written with each measurement alone
+            steps = manifest["measurements"][-1]["step"]
+        steps = int(steps)
         fresh = radiance.parameters()
     except (*_DAMAGED, SafetensorError) as error:
         raise UserError(f"is no field that can be read ({error})", folder, _AGAIN) from None

@@ -221,6 +221,11 @@ class TrainingStep:
         return told
 
     @property
+    def ranks(self) -> Ranks:
+        """The processes that take the steps together."""
+        return self._ranks
+
+    @property
     def processes(self) -> int:
         """How many take the steps together."""
         return self._ranks.size

@@ -10,12 +10,15 @@ import numpy as np
 from ..dataset.pixels import CameraRays
 from ..dataset.views import View, read_view
 from ..imaging.metrics import mean_psnr, psnr
-from ..quantities import QUANTITIES
+from ..quantities import ALIGNED, QUANTITIES
 from ..transport.render import render_materials
 from .problem import Problem
 
 #: Camera samples a pixel of a score in training.
 SAMPLES = 4
+
+#: Recovered and true albedo of a view, (H, W, 3), and the pixels that count, (H, W) bool.
+Albedos = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,36 @@ class MaterialBuffers:
         return scores
 
 
+def albedos(seen: MaterialBuffers | None, truth: GroundTruth | None) -> Albedos | None:
+    """Recovered and true albedo of a view, and where they count; None where one is not known."""
+    if seen is None or truth is None or "albedo" not in truth.values:
+        return None
+    return seen.values["albedo"], truth.values["albedo"], seen.mask(truth)
+
+
+def aligned(views: Sequence[Albedos | None]) -> tuple[np.ndarray | None, list[float | None]]:
+    """Albedo where photographs leave its scale open: after the best factor of each channel.
+
+    Photographs may determine albedo and lighting only up to a common factor.
+
+    Args:
+        views: as from `albedos`.
+
+    Returns:
+        The factors, one for all views (None where no pixel counts), and PSNRs of views in dB.
+    """
+    counted = [(found[mask], true[mask]) for found, true, mask in filter(None, views)]
+    if not any(len(found) for found, _ in counted):
+        return None, [None] * len(views)
+    above = sum((found * true).sum(0) for found, true in counted)
+    scale = above / np.maximum(sum((found**2).sum(0) for found, _ in counted), 1e-12)
+    scores: list[float | None] = []
+    for view in views:
+        counts = view is not None and view[2].any()
+        scores.append(psnr(view[0] * scale, view[1], view[2]) if view and counts else None)
+    return scale, scores
+
+
 def psnr_keys(quantities: Iterable[str]) -> list[str]:
     """Names of the PSNRs of quantities, in metrics and logs."""
     return [f"{name}_psnr" for name in quantities]
@@ -98,12 +131,21 @@ def psnr_keys(quantities: Iterable[str]) -> list[str]:
 class Score:
     """Scores the materials on views with ground truth, which is read once.
 
+    Args:
+        problem: with the materials.
+        views: to score them on.
+        shares_scale: photographs may tell albedo but for a factor (`FitConfig.shares_scale`): there
+            is a score of aligned albedo, too.
+
     Raises:
         UserError: a truth image cannot be read.
     """
 
-    def __init__(self, problem: Problem, views: Sequence[View]) -> None:
+    def __init__(
+        self, problem: Problem, views: Sequence[View], *, shares_scale: bool = False
+    ) -> None:
         self._problem = problem
+        self._shares_scale = shares_scale
         pairs = [(view, GroundTruth.of(view, problem.materials)) for view in views]
         self._views = [view for view, truth in pairs if truth is not None]
         self._truths = [truth for _, truth in pairs if truth is not None]
@@ -117,4 +159,7 @@ class Score:
         rows = [s.psnr(truth) for s, truth in zip(seen, self._truths, strict=True)]
         keys = psnr_keys(self._problem.materials or ())
         means = {key: mean_psnr(row[key] for row in rows) for key in keys}
+        if self._shares_scale:
+            pairs = [albedos(s, truth) for s, truth in zip(seen, self._truths, strict=True)]
+            means[ALIGNED] = mean_psnr(aligned(pairs)[1])
         return {"views": len(rows)} | means
