@@ -1,5 +1,6 @@
 """Light of emitters: what cut-outs and panes let pass is that of Mitsuba's `volpath`."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -110,6 +111,47 @@ def test_a_sun_behind_a_window_lights_what_is_before_it(pane):
     share = 1 - 2 * once / (1 + once) if pane == "thindielectric" else 1
     assert light[pane] == pytest.approx(share * light[None], rel=1e-3)
     assert light["turned"] == pytest.approx(light[pane], rel=1e-4)
+
+
+@pytest.mark.parametrize("leaf", [None, {"type": "thindielectric"}, {"type": "null"}], ids=str)
+@pytest.mark.parametrize("lights", [["lamp"], ["sky"], ["lamp", "sky", "spot"]], ids=" ".join)
+def test_light_of_lamps_and_skies_passes_holes_once(lights, leaf):
+    """Emitter sampling finds it, and rays that pass do: with weights that add up to one."""
+    scene, ray = scene_of(*lights, leaf=leaf)
+    theirs = stock_path(scene, ray, 3, max_depth=16, integrator="volpath")
+    view = SceneView.of(scene, None, 16)
+    ours = path_traced(view, ray, 2, max_depth=16, rr_depth=5, hide_emitters=False)
+    assert_same_expectation(ours, theirs, 1024)
+
+
+@pytest.mark.parametrize(
+    "pane",
+    [
+        {"type": "thindielectric"},
+        {"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse"}},
+    ],
+    ids=["pane", "leaf"],
+)
+def test_a_small_lamp_behind_a_hole_is_found_as_if_there_was_none(pane):
+    """Left to rays that happen to meet it, its light has ten thousand times the variance."""
+    shapes = {
+        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]).scale(0.2),
+            "emitter": {"type": "area", "radiance": 40.0},
+        },
+    }
+    up = mi.ScalarTransform4f().translate([0, 0, 1])
+    over = {"pane": {"type": "rectangle", "to_world": up, "bsdf": pane}}
+    lanes = 1 << 14
+    ray = mi.Ray3f(dr.full(mi.Point3f, 0.5, lanes), mi.Vector3f(0, 0, -1))
+    spread = []
+    for content in (shapes, shapes | over):
+        view = SceneView.of(mi.load_dict({"type": "scene", **content}), None, 8)
+        found = np.array(path_traced(view, ray, 2, max_depth=2, rr_depth=5, hide_emitters=False))[0]
+        spread.append(found.std() / found.mean())
+    assert spread[1] < 1.5 * spread[0] + 0.02
 
 
 def test_rays_meet_skies_and_lamps_behind_panes():

@@ -276,7 +276,7 @@ def _lights(
             found = mixture.pdf(found, x.si.to_world(wo))
         return found + bsdf.pdf(ctx, sharp, wo, active) * inv_opacity
 
-    ds, light = sample_emitter(scene, own, sampler.next_2d(), active, scene_view.pierced)
+    ds, light = sample_emitter(scene, own, sampler.next_2d(), active, holes=scene_view.has_holes)
     towards, lit = x.si.to_local(ds.d), active & (ds.pdf != 0)
     weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, density(towards)))
     found = [_Light(towards, lit, dr.select(lit, light * weight * inv_opacity, 0))]

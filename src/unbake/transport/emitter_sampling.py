@@ -38,29 +38,38 @@ def bsdf_flags(scene: mi.Scene) -> list[int]:
 
 
 def sample_emitter(
-    scene: mi.Scene, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool, pierced: bool
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    sample: mi.Point2f,
+    active: mi.Bool,
+    *,
+    holes: bool,
+    sized: bool = True,
 ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
     """An emitter in sight of a point, as `mi.Scene.sample_emitter_direction` samples it.
 
-    Mitsuba takes cut-outs and panes for opaque then. Light of areas and of the environment that
-    passes them is met by rays that do. No ray meets a light without size: its light is multiplied
-    by what surfaces on the way let pass, as in `volpath`.
+    Mitsuba takes cut-outs and panes for opaque then. Here light is multiplied by what surfaces on
+    the way let pass, as in `volpath`: no ray meets a light without size, and few meet a small one.
 
     Args:
         sample: uniform in [0, 1)².
-        pierced: of the scene, by `lights_pierce`.
+        holes: whether any surface lets rays pass (`lets_pass`).
+        sized: whether light of areas and of the environment passes, too; else it is left to rays
+            that pass.
 
     Returns:
         Direction and density, and radiance over the density, linear RGB; 0 where it is hidden.
     """
-    if not pierced:
+    if not holes:
         return scene.sample_emitter_direction(si, sample, True, active)
     ds, weight = scene.sample_emitter_direction(si, sample, False, active)
     lit = active & (ds.pdf != 0)
-    hidden = scene.ray_test(si.spawn_ray_to(ds.p), lit & ~ds.delta)
     with dr.suspend_grad():
-        passed = _passed(scene, si, ds.p, lit & ds.delta)
-    return ds, dr.select(ds.delta, passed, dr.select(hidden, 0.0, 1.0)) * weight
+        passed = _passed(scene, si, ds.p, lit if sized else lit & ds.delta)
+        if not sized:
+            hidden = scene.ray_test(si.spawn_ray_to(ds.p), lit & ~ds.delta)
+            passed = dr.select(ds.delta, passed, dr.select(hidden, 0.0, 1.0))
+    return ds, passed * weight
 
 
 @dr.syntax

@@ -116,7 +116,7 @@ def _follow(
 
         active &= si.is_valid() & (depth + 1 < max_depth)
         lit = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, weight = sample_emitter(scene, si, sampler.next_2d(), lit, pierced)
+        ds, weight = sample_emitter(scene, si, sampler.next_2d(), lit, holes=pierced, sized=False)
         lit &= ds.pdf != 0
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), lit)
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))

@@ -88,7 +88,7 @@ def bounce(
 
     # -------------------------------- Emitter sampling --------------------------------
 
-    ds, em_weight = sample_emitter(scene, si, sampler.next_2d(), active, scene_view.pierced)
+    ds, em_weight = sample_emitter(scene, si, sampler.next_2d(), active, holes=scene_view.has_holes)
     active_em = active & (ds.pdf != 0)
     bsdf_em, bsdf_pdf_em = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
     pdf_em = bsdf_pdf_em * inv_opacity

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..fields.materials import Materials, carrying
 from ..fields.shapes import met_shapes, registry_number
-from .emitter_sampling import bsdf_flags, has_lights_without_size, lets_pass
+from .emitter_sampling import bsdf_flags, lets_pass
 from .optimized import optimized_shapes
 
 
@@ -28,7 +28,6 @@ class SceneView:
         has_chains: whether any surface of the scene is specular or cut out (found by `of`).
         has_holes: whether any lets rays pass as they are: cut-outs, thin panes (found by `of`).
         has_area_emitters: whether any surface of the scene emits light (found by `of`).
-        pierced: whether lights without size shine through any surface (found by `of`).
         optimized: numbers of the shapes whose material is optimized (found by `of`).
     """
 
@@ -38,7 +37,6 @@ class SceneView:
     has_chains: bool
     has_holes: bool
     has_area_emitters: bool
-    pierced: bool
     optimized: frozenset[int]
 
     @staticmethod
@@ -47,8 +45,8 @@ class SceneView:
         holes, smooth = lets_pass(scene), int(mi.BSDFFlags.Smooth)
         chains = holes or any(not flags & smooth for flags in bsdf_flags(scene))
         area_emitters = any(shape.emitter() is not None for shape in met_shapes(scene))
-        found = chains, holes, area_emitters, holes and has_lights_without_size(scene)
-        return SceneView(scene, materials, max_specular, *found, optimized_shapes(scene))
+        found = chains, holes, area_emitters, optimized_shapes(scene)
+        return SceneView(scene, materials, max_specular, *found)
 
     def with_scene(self, scene: mi.Scene) -> SceneView:
         """The same around this handle of the scene (frozen functions bring their own)."""
@@ -137,21 +135,26 @@ def find_vertex(
         weight = _emission_weight(scene_view, si, origin, active)
         valid, β, opacity = active & si.is_valid(), mi.Color3f(1), mi.Float(1)
         direct_view = mi.Bool(valid)
-        chain = None
+        chain, end_weight = None, mi.Float(1)
         if scene_view.has_chains:
             hidden = hide_emitters and origin is None
-            chain = _follow_chain(scene_view, pi, ray, valid, sampler, hidden)
+            chain = _follow_chain(scene_view, pi, ray, valid, sampler, hidden, origin)
             pi, ray, β = chain.pi, chain.ray, chain.throughput
             direct_view &= ~chain.specular
             valid = valid & pi.is_valid()
             # Of a chain that ends nowhere it is that of the last hole, which may be 0.
             opacity = dr.select(valid, chain.opacity, 1)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, valid | chain.sees_end)
+            if scene_view.has_holes:
+                end_weight = _emission_weight(
+                    scene_view, si, origin, chain.sees_end & chain.straight
+                )
 
     # The light that is met passes gradients: lighting may be unknown.
     emitted = weight * first.emitter(scene).eval(first, seen)
     if chain is not None:
-        emitted += chain.emitted + β * si.emitter(scene, chain.sees_end).eval(si, chain.sees_end)
+        seen = chain.sees_end
+        emitted += chain.emitted + β * end_weight * si.emitter(scene, seen).eval(si, seen)
     unknown = dr.zeros(mi.Color3f)
     vertex = Vertex(si, si.bsdf(), valid, emitted, β, opacity, direct_view, unknown)
     evaluate(sampler, vertex)
@@ -175,7 +178,10 @@ def behind_area_emitters(
 def _emission_weight(
     scene_view: SceneView, si: mi.SurfaceInteraction3f, origin: Scattering | None, active: mi.Bool
 ) -> mi.Float:
-    """MIS weight of emission that a BSDF sample met; 1 for the camera and for delta lobes."""
+    """MIS weight of emission that a BSDF sample met, also through holes.
+
+    1 for the camera, for delta lobes, and in lanes that are not active.
+    """
     if origin is None:
         return mi.Float(1)
     emitter = si.emitter(scene_view.scene, active)
@@ -195,6 +201,8 @@ class _Chain:
     emitted: mi.Color3f  #: by surfaces on the way, times the throughput up to each
     opacity: mi.Float  #: the probability with which a cut-out stopped the ray at the end
     specular: mi.Bool  #: whether any surface was
+    #: Whether the ray went on as it was at all of them: emitter sampling finds what it meets, too.
+    straight: mi.Bool
     #: Whether light at the end counts in addition to that of the first surface: the ray has left
     #: that one, has not ended in black, and may see lights.
     sees_end: mi.Bool
@@ -208,11 +216,13 @@ def _follow_chain(
     active: mi.Bool,
     sampler: mi.Sampler,
     hide_emitters: bool,
+    origin: Scattering | None,
 ) -> _Chain:
     """Follow specular and cut-out surfaces, as long as there are any.
 
     Args:
         hide_emitters: whether no light is seen through holes alone, as in `find_vertex`.
+        origin: as there.
     """
     scene, limit, ctx = scene_view.scene, scene_view.max_specular, mi.BSDFContext()
     pi = mi.PreliminaryIntersection3f(pi)
@@ -221,10 +231,16 @@ def _follow_chain(
     emitted = mi.Color3f(0)
     opacity = mi.Float(1)
     any_specular = mi.Bool(False)
+    straight = mi.Bool(True)
     lost = mi.Bool(False)
     hidden = mi.Bool(hide_emitters)
+    holes = scene_view.has_holes
     looks_behind = scene_view.has_area_emitters and hide_emitters
     depth = mi.UInt32(0)
+
+    def share(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """What emitter sampling leaves of the light that is met; all where there are no holes."""
+        return _emission_weight(scene_view, si, origin, active) if holes else mi.Float(1)
 
     while dr.hint(active, label="specular chain"):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
@@ -240,10 +256,13 @@ def _follow_chain(
         specular = active & ~smooth
         any_specular |= specular
         passed = (passes | specular) & (depth > 0) & ~hidden
-        emitted += β * si.emitter(scene, passed).eval(si, passed)
+        found = si.emitter(scene, passed).eval(si, passed)
+        emitted += β * share(si, passed & straight) * found
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), specular)
         β = dr.select(specular, β * weight, β)
-        hidden &= ~specular | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        goes_straight = ~specular | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        hidden &= goes_straight
+        straight &= goes_straight
 
         # A chain that outgrows the limit, or is absorbed, ends in black.
         active = passes | specular
@@ -261,7 +280,7 @@ def _follow_chain(
         active &= pi.is_valid()
 
     sees_end = (depth > 0) & ~lost & ~hidden
-    return _Chain(pi, ray, β, emitted, opacity, any_specular, sees_end)
+    return _Chain(pi, ray, β, emitted, opacity, any_specular, straight, sees_end)
 
 
 def evaluate(sampler: mi.Sampler, *values: object) -> None:
