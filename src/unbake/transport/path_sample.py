@@ -154,6 +154,12 @@ def trace(
         if learned is not sample:
             with dr.suspend_grad(when=not requirements.image_attached):
                 _look_up(radiance, sample, last)
+            end = requirements.bounces
+            same = requirements.residuals <= end and not requirements.image_attached
+            if same and subset is not None and end + 1 in constant:
+                # Both paths end alike: of these lanes it is known.
+                learned.radiance[end] = _gather(sample.radiance[end], subset)
+                constant.remove(end + 1)
         if learned.pair is not None:
             with dr.suspend_grad(when=not requirements.pair_attached):
                 _look_up(radiance, learned.pair, {2})

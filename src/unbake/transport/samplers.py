@@ -22,7 +22,7 @@ from .loss import RelativeL2
 from .methods import BOUNCES, KEPT_PATHS, PATH_REPLAY, PHOTOMETRIC, Method
 from .objective import objective, requirements
 from .operator import transported
-from .path_sample import PathSample, SampleSubset, rhs, trace
+from .path_sample import PathSample, Requirements, SampleSubset, rhs, trace
 from .prb import light_through_holes, materials_along_paths, path_radiance, path_replay
 from .vertex import SceneView
 from .wavefront import PathLimits, Plan, path_light, plan_widths
@@ -125,6 +125,9 @@ class BounceSampler:
         self.keeps_paths = context.method.follows_paths
         self._bounces = context.max_depth - 1 if self.keeps_paths else context.bounces
         self._requirements = requirements(context.method.terms, self._bounces)
+        # What residuals read beside it is no part of the image.
+        end = frozenset({self._bounces + 1} if self._requirements.radiance else ())
+        self._of_image = Requirements(self._bounces, constant=end)
 
     def prepared(self) -> AbstractContextManager:
         """A context without effect."""
@@ -135,7 +138,7 @@ class BounceSampler:
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Radiance of camera samples."""
-        sample = self._trace(scene, ray, sampler, None)
+        sample = self._trace(scene, ray, sampler, None, self._of_image)
         return rhs(sample, sample.radiance[self._bounces], self._bounces)
 
     def terms(
@@ -150,7 +153,7 @@ class BounceSampler:
     ) -> dict[str, mi.Float]:
         """The terms of the objective."""
         guide, terms = self._context.guide, self._context.method.terms
-        sample = self._trace(scene, ray, sampler, subset)
+        sample = self._trace(scene, ray, sampler, subset, self._requirements)
         values = objective(terms, sample, target, loss, primal, self._bounces)
         if guide is not None:
             values[GUIDE] = self._guide_loss(guide, sample, loss.weight(target))
@@ -176,7 +179,12 @@ class BounceSampler:
         return guide.loss(first.choice, found)
 
     def _trace(
-        self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler, subset: SampleSubset | None
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        sampler: mi.Sampler,
+        subset: SampleSubset | None,
+        required: Requirements,
     ) -> PathSample:
         c = self._context
         return trace(
@@ -184,7 +192,7 @@ class BounceSampler:
             c.radiance,
             ray,
             sampler,
-            self._requirements,
+            required,
             hide_emitters=c.hide_emitters,
             subset=subset,
             guide=c.guide,
