@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import mitsuba as mi
+import numpy as np
 import pytest
 from support import TINY_FIT
 
@@ -11,9 +12,10 @@ from unbake.comparison.method_variant import MethodVariant
 from unbake.config import FitConfig, from_toml, preset, read_toml, to_toml, update
 from unbake.dataset.camera import Camera
 from unbake.dataset.views import Dataset
+from unbake.fields.domain import Domain
 from unbake.fields.grid_sizes import sized
 from unbake.training import grid_sizes
-from unbake.training.grid_sizes import surface_seen, with_grid_sizes
+from unbake.training.grid_sizes import domain_seen, surface_seen, with_grid_sizes
 
 #: Tiny fields whose sizes are left open, but for one.
 OPEN = {
@@ -59,6 +61,25 @@ def test_extent_footprint_and_area_of_a_wall():
 def test_many_photographs_from_one_place_show_no_more():
     alone, many = (surface_seen(wall(2.0), [camera(4.0, 30.0)] * count) for count in (1, 40))
     assert alone.area / 2 < many.area < 2 * alone.area
+
+
+def test_the_domain_of_what_is_seen_leaves_out_what_is_far_away():
+    """A lamp at the distance of a sun is most of a scene's box, and nothing that cameras see."""
+    turned = mi.ScalarTransform4f().scale(1.0)
+    far = {"type": "sphere", "center": [300.0, 0, 500.0], "radius": 2.0}
+    near = {"type": "rectangle", "to_world": turned}
+    scene = mi.load_dict({"type": "scene", "wall": near, "far": far})
+    whole = Domain.of(scene.bbox())
+    found = domain_seen(scene, [camera(4.0, straight_fov())], whole)
+    np.testing.assert_allclose(found.centre, 0, atol=0.05)
+    assert whole.extent > 400 and 2 < found.extent < 2.5
+    # What cameras see nearly all of is fields' domain as it is, and so is what they do not see.
+    alone = wall(2.0)
+    assert domain_seen(alone, [camera(4.0, straight_fov())], Domain.of(alone.bbox())) == Domain.of(
+        alone.bbox()
+    )
+    away = Camera.look_at((0, 0, 4), (0, 0, 9), (0, 1, 0), 40.0, 8, 8)
+    assert domain_seen(alone, [away], whole) == whole
 
 
 def straight_fov() -> float:

@@ -25,6 +25,9 @@ RAYS = 4096
 #: Hits to a box that tell how many boxes of that size the seen surface meets.
 _HITS = 4
 
+#: Share of the seen points that may lie beyond either side of what they are said to fill, how much
+#: larger the box around them is taken, and how much smaller than the domain it has to be.
+_BEYOND, _MARGIN, _MUCH_SMALLER = 0.01, 1.2, 0.5
 #: Of the boxes, in their edges: walls often lie in planes through the middle of the domain, where
 #: they would count in the boxes of either side.
 _SHIFT = (0.31, 0.53, 0.79)
@@ -84,21 +87,57 @@ def surface_seen(scene: mi.Scene, cameras: Sequence[Camera]) -> SurfaceSeen | No
         lamp or a known backdrop may be far larger. The area, which the radiance field has to cover,
         is of all: that of faces of boxes that have hits in them, exact to a factor of two.
     """
-    along = math.ceil(math.sqrt(RAYS / len(cameras)))
-    origins, directions = spread_rays(cameras, along)
+    hits, points, along = _first_hits(scene, cameras)
     focal = np.repeat([math.sqrt(camera.fl_x * camera.fl_y) for camera in cameras], along**2)
-    hits = free_space.trace(scene, origins, directions)
     distance = hits.distance
-    hit = np.isfinite(distance) & (distance > 0)
+    hit = np.isfinite(points).all(axis=1)
     if not hit.any():
         return None
-    points = origins[hit] + distance[hit, None] * directions[hit]
+    points = points[hit]
     domain = Domain.of(scene.bbox())
     unit = (points - np.array(domain.centre)) / domain.extent + 0.5
     wanted = hit & np.isin(hits.shape, list(optimized_shapes(scene)))
     wanted = wanted if wanted.any() else hit
     footprint = float(np.median(distance[wanted] / focal[wanted]))
     return SurfaceSeen(domain.extent, footprint, domain.extent**2 * _area(unit))
+
+
+def domain_seen(scene: mi.Scene, cameras: Sequence[Camera], domain: Domain) -> Domain:
+    """The part of a domain in which cameras see surfaces, where that is much smaller.
+
+    A lamp or a backdrop that is far away leaves a coarse grid a single cell for all that is seen.
+
+    Args:
+        scene: the scene.
+        cameras: those that are learned from, one at least.
+        domain: of the whole scene.
+    """
+    _, points, _ = _first_hits(scene, cameras)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return domain
+    low, high = np.quantile(points, (_BEYOND, 1 - _BEYOND), axis=0)
+    extent = _MARGIN * float((high - low).max())
+    if not 0 < extent < _MUCH_SMALLER * domain.extent:
+        return domain
+    x, y, z = (0.5 * (low + high)).tolist()
+    return Domain((x, y, z), extent)
+
+
+def _first_hits(
+    scene: mi.Scene, cameras: Sequence[Camera]
+) -> tuple[free_space.Hits, np.ndarray, int]:
+    """Hits of a sparse grid of rays of each camera, where they are, and rays along its edge.
+
+    Points (n, 3) are infinite where nothing was hit.
+    """
+    along = math.ceil(math.sqrt(RAYS / len(cameras)))
+    origins, directions = spread_rays(cameras, along)
+    hits = free_space.trace(scene, origins, directions)
+    hit = np.isfinite(hits.distance) & (hits.distance > 0)
+    distance = np.where(hit, hits.distance, np.inf)[:, None]
+    with np.errstate(invalid="ignore"):
+        return hits, np.where(hit[:, None], origins + distance * directions, np.inf), along
 
 
 def _area(points: np.ndarray) -> float:

@@ -31,8 +31,10 @@ from ..fields.texture import material_numbers, material_textures
 from ..ranks import Ranks
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
+from ..transport.emitter_weights import RAYS, chosen_alike, weigh_emitters
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
+from .grid_sizes import domain_seen
 from .limits import require_room
 from .outliers import OutlierModel
 from .poses import PoseModel
@@ -204,7 +206,10 @@ def make_problem(
         )
     guide = None
     if radiance is not None and config.guide.cells:
-        guide = LightGuide(config.guide, domain)
+        cameras = [view.camera for view in views]
+        # Of runs of before it is the whole domain: their guides learn anew.
+        seen = domain_seen(unchanged, cameras, domain) if cameras else domain
+        guide = LightGuide(config.guide, seen)
     scene_view = SceneView.of(loaded, materials, config.transport.max_specular)
     return Problem(
         scene_view=scene_view,
@@ -230,8 +235,11 @@ def problem_of(
     *,
     change: Callable[[ParsedScene], object] | None = None,
 ) -> Problem:
-    """The problem of a data set, with the cameras of its training views; see `make_problem`."""
-    return make_problem(
+    """The problem of a data set, with the cameras of its training views; see `make_problem`.
+
+    Lights that are known are sampled as often as suits these views.
+    """
+    problem = make_problem(
         dataset.scene,
         dataset.background,
         config,
@@ -239,6 +247,24 @@ def problem_of(
         dataset.root,
         views=dataset.train,
         change=change,
+    )
+    known = problem.environment is None and problem.emission is None
+    if known and dataset.train and chosen_alike(problem.scene_view.scene):
+        _weigh_emitters(problem, dataset.train)
+    return problem
+
+
+def _weigh_emitters(problem: Problem, views: Sequence[View]) -> None:
+    """Let emitters be sampled by how much light they bring to what some pixels see."""
+    rays = CameraRays.of([view.camera for view in views])
+    rng = np.random.default_rng(0)
+    chosen = mi.UInt32(rng.integers(0, rays.pixels, RAYS).astype(np.uint32))
+    offset = mi.Point2f(rng.random((2, RAYS)).astype(np.float32))
+    weigh_emitters(
+        problem.scene_view,
+        rays.through(chosen, offset),
+        hide_emitters=problem.hide_emitters,
+        seed=0,
     )
 
 
