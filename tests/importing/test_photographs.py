@@ -15,6 +15,7 @@ from unbake.imaging.coded import decode, read_codes
 from unbake.imaging.pictures import write_exr
 from unbake.imaging.profiles import linear_srgb, profile_name, read_profile
 from unbake.imaging.srgb import from_srgb, to_srgb
+from unbake.importing import import_data as importing
 from unbake.importing.faults import ImportFaults
 from unbake.importing.frames import _lens
 from unbake.importing.import_data import import_data
@@ -54,7 +55,7 @@ def imported(source, out, meshes, **more):
     return Dataset.load(out), told
 
 
-SETTINGS = ("leave_out_missing", "mesh_y_up", "keep_applied_transform")
+SETTINGS = ("leave_out_missing", "mesh_y_up", "keep_applied_transform", "longest")
 
 
 # -------------------------------------------------------------------------------------------- sizes
@@ -313,6 +314,62 @@ def test_masks_that_leave_no_pixel_are_told(project, meshes, tmp_path):
     with pytest.raises(UserError, match="masks leave no pixel of any photograph to train on"):
         imported(project, tmp_path / "none", meshes, masks=tmp_path / "masks")
     assert not (tmp_path / "none").exists()
+
+
+def test_photographs_are_made_smaller_by_the_mean_of_their_light(
+    captured, project, meshes, tmp_path
+):
+    """Squares of 3 x 3 pixels become one; of 16 pixels along an edge one is left over."""
+    names, masks = [], tmp_path / "masks"
+    for number, file in enumerate(sorted((project / "images").iterdir())):
+        codes = np.asarray(Image.open(file)).copy()
+        if number == 0:
+            codes[:3, :3] = 255  # a square that is clipped all over, and one in part
+            codes[3, 3] = 255
+            codes[3:6, 4:6] = codes[4:6, 3] = 40
+        save(codes, file)
+        mask = np.full((16, 16), 255, np.uint8)
+        mask[7, 7] = 0
+        save(mask, masks / file.name)
+        names.append(file.name)
+    whole, _ = imported(project, tmp_path / "whole", meshes, masks=masks)
+    small, told = imported(project, tmp_path / "small", meshes, masks=masks, longest=6)
+    count = len(names)
+    assert f"sizes: 3 x 3 pixels become one: {count} of {count} photographs" in told
+    for number, (large, view) in enumerate(zip(whole.views, small.views, strict=True)):
+        (full, mask), (found, small_mask) = (read_masked(v) for v in (large, view))
+        assert found.shape == (5, 5, 4) and (view.camera.width, view.camera.height) == (5, 5)
+        means = full[:15, :15].reshape(5, 3, 5, 3, 4).mean((1, 3))
+        np.testing.assert_allclose(found[..., :3], means[..., :3], atol=2e-4)
+        wanted = mask[:15, :15].reshape(5, 3, 5, 3).all((1, 3))
+        assert not wanted[2, 2]
+        clipped = (full[:15, :15, :3] >= large.clipped).reshape(5, 3, 5, 3, 3).mean((1, 3))
+        wanted &= np.isin(clipped, (0, 1)).all(2)
+        if number == 0:
+            assert not wanted[1, 1] and (found[0, 0, :3] >= view.clipped).all()
+        np.testing.assert_array_equal(small_mask, wanted)
+        # A pixel looks where the middle one of its square did.
+        ways = [
+            c.rays(*(np.array([x]) for x in at))[1]
+            for c, at in ((large.camera, (4.5, 7.5)), (view.camera, (1.5, 2.5)))
+        ]
+        np.testing.assert_allclose(*ways, atol=1e-9)
+    assert not any(
+        "sizes:" in line for line in imported(project, tmp_path / "same", meshes, longest=16)[1]
+    )
+
+
+def test_more_pixels_than_a_fit_can_have_are_told_before_anything_is_written(
+    project, meshes, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(importing, "MOST_PIXELS", 300)
+    with pytest.raises(UserError, match="have 768 pixels, more than 300"):
+        imported(project, tmp_path / "data", meshes)
+    assert not (tmp_path / "data").exists()
+    imported(project, tmp_path / "data", meshes, longest=8)
+    monkeypatch.setattr(importing, "_MANY", 100)
+    told = imported(project, tmp_path / "many", meshes, longest=8)[1]
+    assert any("a fit draws few" in line and "--longest 2048" in line for line in told)
 
 
 # -------------------------------------------------------------------------------- alpha and colours

@@ -30,7 +30,7 @@ from ..dataset.findings import (
 )
 from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
 from ..dataset.noise_at_black import found_noise
-from ..dataset.photographs import Photographs
+from ..dataset.photographs import MOST_PIXELS, Photographs
 from ..dataset.poses import check_cameras, pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, fitted, read_masked
@@ -192,6 +192,11 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         what = f"participating media, which are left out: {parsed.media}"
         remedy = "Fog and murky glass go into the materials behind them"
         result.add(Finding("hint", "media", what, where, remedy))
+    count = sum(view.camera.width * view.camera.height for view in dataset.train)
+    if count > MOST_PIXELS:
+        what = f"the training views have {count:,} pixels, and a fit has {MOST_PIXELS:,} at most"
+        remedy = "Use fewer views, or smaller images: `unbake import --longest` makes them"
+        result.add(Finding("error", "size", what, None, remedy))
     cameras = [small_camera(view.camera) for view in dataset.views]
     for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):
         with collected(faults):

@@ -95,7 +95,14 @@ def small_view(
 
 def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
     """The camera of the small view."""
-    block = block_of(camera, longest)
+    return in_blocks(camera, block_of(camera, longest))
+
+
+def in_blocks(camera: Camera, block: int) -> Camera:
+    """The camera of a picture whose pixels are means of squares of so many along an edge.
+
+    A remainder at the right and at the bottom is cut.
+    """
     return replace(
         camera,
         fl_x=camera.fl_x / block,

@@ -15,6 +15,8 @@ from ..acquisition.new_light import put_light, tell_tilt
 from ..config.light import LightConfig
 from ..dataset.camera import Camera, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
+from ..dataset.photographs import MOST_PIXELS
+from ..dataset.small_views import in_blocks
 from ..dataset.views import LONGEST_NAME
 from ..errors import UserError, named, printable
 from ..io import filled_folder, require_new_folder, require_utf8
@@ -39,6 +41,8 @@ _RAYS = 64
 _SAME = 1e-6
 #: A mesh that is this many times as wide as the space of the cameras may be in another unit.
 _LARGER = 20
+#: Pixels to train on from which on it is told that they are many: 4 GB when decoded.
+_MANY = 170_000_000
 #: A camera from which this share of all directions hits the mesh stands in a room.
 _ENCLOSED = 0.95
 _KNOWN = (
@@ -111,6 +115,7 @@ def import_data(
     splits = _splits(found.shots, settings.holdout)
     if splits and "train" not in splits.values() and not faults:
         faults.add("no photograph is left to train on: the source holds all of them out")
+    _check_sizes(_pixels(found.shots, splits, settings.longest), faults)
     faults.require_none(source)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
@@ -120,24 +125,27 @@ def import_data(
         background = pictures.background(settings.background, names)
         frames, blank = [], []
         for shot in found.shots:
-            cut = background == "hidden" and shot.name not in pictures.transparent
-            on_mesh = _on_mesh(scene, shot.lens.camera(shot.to_world)) if cut else None
-            changed = pictures.negative | pictures.profiles.keys()
-            same = shot.lens.straight and not shot.raw and shot.name not in changed
             name, split = names[shot.name], splits[shot.name]
-            frame, counts = write_view(data, shot, name, split, known, on_mesh, same=same)
+            cut = background == "hidden" and shot.name not in pictures.transparent
+            changed = shot.name in pictures.negative | pictures.profiles.keys()
+            block = _block(shot, settings.longest)
+            camera = in_blocks(shot.lens.camera(shot.to_world), block)
+            on_mesh = _on_mesh(scene, camera) if cut else None
+            frame, counts = write_view(
+                data, shot, name, split, known, on_mesh, block, changed=changed
+            )
             frames.append(frame)
             blank += [] if counts or shot.mask is None else [shot.name]
-        if all(shot.name in blank for shot in found.shots if splits[shot.name] == "train"):
-            what = "masks leave no pixel of any photograph to train on"
-            raise UserError(what, None, "Masks are black where pixels do not count: correct them")
+        _require_counted(blank, splits)
         complete_masks(data, frames)
         data.write_transforms(
             {"scene": data.relative(file), "background": background}
             | ({"light": "unknown"} if light is None else {})
             | {"frames": frames}
         )
-    found = replace(found, notes=(*found.notes, *_straightening(found.shots), *pictures.told()))
+    sizes = _sizes(found.shots, splits, settings.longest)
+    changes = (*_straightening(found.shots), *pictures.told(), *sizes)
+    found = replace(found, notes=(*found.notes, *changes))
     for line in _summary(found, splits, seen, parts, told):
         tell(line)
     for line in pictures.warnings(names, background, blank):
@@ -424,6 +432,56 @@ def _dark(parts: Sequence[Part], shots: Sequence[Shot]) -> str:
 def _enclosed(scene: mi.Scene, shots: Sequence[Shot]) -> bool:
     """Whether all cameras stand where the mesh is in nearly all directions."""
     return bool((free_space.enclosure(scene, _origins(shots)) >= _ENCLOSED).all())
+
+
+def _block(shot: Shot, longest: int) -> int:
+    """Pixels along an edge of the squares that become one pixel each; 1: it stays as it is."""
+    return -(-max(shot.size) // longest) if longest else 1
+
+
+def _check_sizes(count: int, faults: Faults) -> None:
+    """Refuse more pixels to train on than a fit can have."""
+    if count > MOST_PIXELS:
+        what = f"the photographs to train on have {count:,} pixels, more than {MOST_PIXELS:,}"
+        faults.add(what, remedy="Make them smaller with --longest 2048")
+
+
+def _require_counted(blank: Sequence[str], splits: Mapping[str, str]) -> None:
+    """Refuse photographs of which no pixel is left to train on.
+
+    Raises:
+        UserError: it tells what to correct.
+    """
+    if all(name in blank for name, split in splits.items() if split == "train"):
+        what = "masks leave no pixel of any photograph to train on"
+        raise UserError(what, None, "Masks are black where pixels do not count: correct them")
+
+
+def _pixels(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> int:
+    """How many pixels a fit would decode."""
+    return sum(
+        shot.lens.width * shot.lens.height // _block(shot, longest) ** 2
+        for shot in shots
+        if splits[shot.name] == "train"
+    )
+
+
+def _sizes(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> list[str]:
+    """What was made of the sizes of photographs, or could be, for people."""
+    blocks = Counter(_block(shot, longest) for shot in shots)
+    told = [
+        f"sizes: {block} x {block} pixels become one: {count} of {len(shots)} photographs"
+        for block, count in sorted(blocks.items())
+        if block > 1
+    ]
+    count = _pixels(shots, splits, longest)
+    if count <= _MANY:
+        return told
+    return [
+        *told,
+        f"the photographs to train on have {count / 1e6:,.0f} million pixels, of which a fit draws "
+        "few. With --longest 2048 they load faster, and take less room",
+    ]
 
 
 def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:

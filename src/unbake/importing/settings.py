@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from ..config.flag import Flag
+from ..dataset.camera import LONGEST_SIDE
 from ..errors import require_ranges
 
 
@@ -41,10 +42,17 @@ class ImportSettings:
             "files as Blender writes them, have y up"
         ),
     ] = False
+    longest: Annotated[
+        int,
+        Flag(
+            "Make photographs smaller, so that no edge has more pixels than this: squares of "
+            "pixels become one each, by the mean of their light; 0 leaves them as they are"
+        ),
+    ] = 0
     leave_out_missing: Annotated[
         bool,
         Flag("Go on without photographs that the source names and that do not exist"),
     ] = False
 
     def __post_init__(self) -> None:
-        require_ranges(self, {"holdout": (0, 10**6)})
+        require_ranges(self, {"holdout": (0, 10**6), "longest": (0, LONGEST_SIDE)})

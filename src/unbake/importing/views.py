@@ -12,8 +12,9 @@ import numpy as np
 
 from ..dataset.camera_files import frame_of
 from ..dataset.data_folder import DataFolder
+from ..dataset.small_views import in_blocks
 from ..imaging.coded import encode
-from ..imaging.pictures import write_exr
+from ..imaging.pictures import block_means, write_exr
 from ..io import write_atomically
 from .lens import Lens
 from .photographs import clipped_from, mask_of, pixels_of
@@ -27,8 +28,9 @@ def write_view(
     split: str,
     exposures: Mapping[str, float],
     on_mesh: np.ndarray | None,
+    block: int,
     *,
-    same: bool,
+    changed: bool,
 ) -> tuple[dict[str, Any], bool]:
     """Write the photograph and the mask of a view; returns its frame, and whether any pixel counts.
 
@@ -39,10 +41,13 @@ def write_view(
         split: its split.
         exposures: by names of photographs.
         on_mesh: pixels that alone count, (H, W) bool, also where the source has no mask.
-        same: copy the file as it is.
+        block: edge of the squares of pixels that become one each.
+        changed: its pixels are not those of the file, which is else copied if its lens is a pinhole
+            and it keeps its size.
     """
-    camera, limit, exact = shot.lens.camera(shot.to_world), clipped_from(shot), None
-    if same:
+    whole, limit, exact = shot.lens.camera(shot.to_world), clipped_from(shot), None
+    camera = in_blocks(whole, block)
+    if shot.lens.straight and not shot.raw and not changed and block == 1:
         image = data.image(name, shot.image.suffix.lower())
         image.parent.mkdir(exist_ok=True)
         shutil.copyfile(shot.image, image)
@@ -50,7 +55,9 @@ def write_view(
         image = data.image(name, ".png" if shot.coded else ".exr")
         pixels = np.maximum(pixels_of(shot), 0)
         if not shot.lens.straight:
-            pixels, exact = _straightened(shot.lens, pixels, camera.fl_x, limit)
+            pixels, exact = _straightened(shot.lens, pixels, whole.fl_x, limit)
+        if block > 1:
+            pixels, exact = _in_blocks(pixels, exact, block, limit)
         _write_picture(image, pixels)
     frame: dict[str, Any] = {
         "file_path": data.relative(image),
@@ -65,8 +72,9 @@ def write_view(
         frame["exposure"] = exposures[shot.name]
     mask = mask_of(shot)
     if mask is not None and not shot.lens.straight:
-        straight = shot.lens.straightened(mask[..., None].astype(np.float32), camera.fl_x)
+        straight = shot.lens.straightened(mask[..., None].astype(np.float32), whole.fl_x)
         mask = straight[..., 0] >= 1
+    mask = None if mask is None else _all_of(mask, block)
     masks = [one for one in (on_mesh, mask, exact) if one is not None]
     counted = np.all(masks, 0)
     if masks:
@@ -106,6 +114,33 @@ def _straightened(
     between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
     exact = np.logical_not(np.any(between, axis=2))
     return straight, exact if shown is None else exact & shown
+
+
+def _in_blocks(
+    pixels: np.ndarray, exact: np.ndarray | None, block: int, limit: float | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The means of squares of pixels, and which of them say what they say.
+
+    A mean of clipped pixels and others is like a pixel between them in `_straightened`.
+
+    Args:
+        exact: which pixels do; None: all.
+        limit: as there.
+    """
+    small = block_means(pixels, block)
+    told = None if exact is None else _all_of(exact, block)
+    if limit is None:
+        return small, told
+    clipped = block_means(np.asarray(pixels[..., :3] >= limit, np.float32), block)
+    exact_here = np.logical_or(clipped <= 0, clipped >= 1).all(axis=2)
+    # Rounding must not make a mean of clipped pixels one that is not.
+    small[..., :3] = np.where(clipped >= 1, np.maximum(small[..., :3], limit), small[..., :3])
+    return small, exact_here if told is None else np.logical_and(told, exact_here)
+
+
+def _all_of(mask: np.ndarray, block: int) -> np.ndarray:
+    """Which squares have a mask all over, (H, W) bool."""
+    return mask if block == 1 else np.asarray(block_means(mask.astype(np.float32), block) >= 1)
 
 
 def _write_picture(file: Path, pixels: np.ndarray) -> None:
