@@ -33,7 +33,7 @@ from ..scene.parse import ParsedScene, parse, write
 from ..signals import cleaned_up
 from ..transport.light_by_depth import light_by_depth
 from ..transport.render import parts_of, path_integrator, render_materials
-from ..transport.vertex import SceneView
+from ..transport.vertex import SceneView, has_area_emitters, rays_behind_area_emitters
 from .built_in import SCENES, default_cameras, write_scene
 from .coverage import BLACK, BLACK_BACKS, TURN_THEM, black_share, coverage, is_room
 from .new_light import change_light, tell_tilt
@@ -363,6 +363,7 @@ def photographs(
             "hide_emitters": not room,
         }
     )
+    hidden_lamps = not room and has_area_emitters(scene)
     spp = sampler.sample_count()
     sampler.set_samples_per_wavefront(spp)
     rgb = np.zeros((rays.pixels, 3), np.float32)
@@ -371,6 +372,8 @@ def photographs(
     told = 0.0
     for part, ray, seed in parts_of(rays.through, rays.pixels, spp, settings.seed):
         sampler.seed(dr.opaque(mi.UInt32, seed), dr.width(ray))
+        if hidden_lamps:
+            ray = rays_behind_area_emitters(scene, ray)
         radiance, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))
         light = mi.luminance(radiance)
         channels = [*radiance, dr.select(valid, mi.Float(1), 0), light, light**2]

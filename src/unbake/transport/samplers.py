@@ -24,7 +24,7 @@ from .objective import objective, requirements
 from .operator import transported
 from .path_sample import PathSample, Requirements, SampleSubset, rhs, trace
 from .prb import light_through_holes, materials_along_paths, path_radiance, path_replay
-from .vertex import SceneView
+from .vertex import SceneView, rays_behind_area_emitters
 from .wavefront import PathLimits, Plan, path_light, plan_widths
 
 #: Name of the guide's loss among the terms.
@@ -296,8 +296,10 @@ class PathReplaySampler(_WholePathSampler):
 
     def image(self, scene: mi.Scene, ray: mi.Ray3f, sampler: mi.Sampler) -> mi.Color3f:
         """Radiance of camera samples."""
-        c = self._context
-        light = path_radiance(self._integrator, scene, sampler, ray, c.read_by_scene())
+        c, seen = self._context, ray
+        if c.hide_emitters and c.scene_view.has_area_emitters:
+            seen = rays_behind_area_emitters(scene, ray)
+        light = path_radiance(self._integrator, scene, sampler, seen, c.read_by_scene())
         if c.hide_emitters and c.scene_view.has_holes:
             light -= light_through_holes(scene, ray, c.max_depth)
         return light

@@ -44,8 +44,7 @@ class SceneView:
         """The view of a scene; looks at every BSDF, also at those inside of instances."""
         holes, smooth = lets_pass(scene), int(mi.BSDFFlags.Smooth)
         chains = holes or any(not flags & smooth for flags in bsdf_flags(scene))
-        area_emitters = any(shape.emitter() is not None for shape in met_shapes(scene))
-        found = chains, holes, area_emitters, optimized_shapes(scene)
+        found = chains, holes, has_area_emitters(scene), optimized_shapes(scene)
         return SceneView(scene, materials, max_specular, *found)
 
     def with_scene(self, scene: mi.Scene) -> SceneView:
@@ -161,18 +160,40 @@ def find_vertex(
     return vertex
 
 
+@dr.syntax
 def behind_area_emitters(
     scene: mi.Scene, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
-    """The first hits behind area emitters, and the rays that start there."""
-    pi = mi.PreliminaryIntersection3f(pi)
+    """The first hits behind area emitters, and the rays that start there.
+
+    A hit says how far along its ray it is. (`skip_area_emitters` of Mitsuba's integrators moves the
+    ray and returns the hit alone; `path` and `prb` go on with a ray that was not moved. What is not
+    a mesh then lies elsewhere.)
+    """
+    pi, ray = mi.PreliminaryIntersection3f(pi), mi.Ray3f(ray)
     on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_emitter)
-    ray = dr.select(on_emitter, si.spawn_ray(ray.d), ray)
-    # Every integrator of Mitsuba has this helper.
-    integrator = mi.load_dict({"type": "path"})
-    pi[on_emitter] = integrator.skip_area_emitters(scene, ray, True, on_emitter)
+    while dr.hint(on_emitter, label="behind lamps"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_emitter)
+        ray = dr.select(on_emitter, si.spawn_ray(ray.d), ray)
+        pi_next = scene.ray_intersect_preliminary(ray, False, on_emitter)
+        pi = dr.select(on_emitter, pi_next, pi)
+        on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     return pi, ray
+
+
+def has_area_emitters(scene: mi.Scene) -> bool:
+    """Whether any surface emits light."""
+    return any(shape.emitter() is not None for shape in met_shapes(scene))
+
+
+def rays_behind_area_emitters(scene: mi.Scene, ray: mi.Ray3f) -> mi.Ray3f:
+    """Rays of cameras that see no lamps, starting behind those: for integrators of Mitsuba."""
+    with dr.suspend_grad():
+        everywhere = mi.Bool(True)
+        pi = scene.ray_intersect_preliminary(ray, True, everywhere)
+        _, moved = behind_area_emitters(scene, pi, ray, everywhere)
+        dr.eval(moved)
+    return moved
 
 
 def _emission_weight(
