@@ -12,9 +12,11 @@ from support import (
     built_in_cameras,
     enable_gradients,
     pixel_rays,
+    planned_sampler,
     seeded,
 )
 
+from unbake.transport import path_sample
 from unbake.transport.loss import RelativeL2
 from unbake.transport.methods import METHODS, PHOTOMETRIC
 from unbake.transport.objective import objective, requirements
@@ -128,3 +130,37 @@ def test_all_samples_are_learned_of_where_as_many_are_asked_for_as_there_are():
     for radiance_spp, learned in ((0, SPP), (2, 2), (SPP, SPP), (2 * SPP, SPP)):
         config = replace(TINY_FIT, spp=SPP, radiance_spp=radiance_spp)
         assert config.radiance_samples == learned
+
+
+@pytest.mark.parametrize(("method", "bounces"), [("ours", 1), ("ours", 2), ("no-prior", 1)])
+def test_an_image_asks_for_no_more_than_it_shows(problem, rays, method, bounces, monkeypatch):
+    """Residuals have bounces and look-ups of their own, which pictures and probes do without."""
+    sampler = planned_sampler(
+        method,
+        problem.scene_view,
+        rays,
+        SPP,
+        max_depth=4,
+        bounces=bounces,
+        radiance=problem.radiance,
+    )
+    looked_up, bounced = [], []
+    plain, plain_bounce = path_sample.reflected_radiance, path_sample.bounce
+
+    def counted(field, *vertices):
+        looked_up.append(sum(dr.width(vertex.valid) for vertex in vertices))
+        return plain(field, *vertices)
+
+    def counted_bounce(*arguments):
+        bounced.append(arguments)
+        return plain_bounce(*arguments)
+
+    monkeypatch.setattr(path_sample, "reflected_radiance", counted)
+    monkeypatch.setattr(path_sample, "bounce", counted_bounce)
+    image = sampler.image(problem.scene_view.scene, rays, seeded(2, dr.width(rays)))
+    assert sum(looked_up) == dr.width(rays) and len(bounced) == bounces
+    wanted = requirements(METHODS[method].terms, bounces)
+    whole = traced(problem, rays, wanted, subset=False)
+    np.testing.assert_allclose(
+        image, rhs(whole, whole.radiance[bounces], bounces), rtol=1e-4, atol=1e-6
+    )
