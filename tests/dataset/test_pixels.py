@@ -12,7 +12,14 @@ import pytest
 from unbake.dataset.camera import Camera
 from unbake.dataset.decoding import fill_rows, joined, stretch
 from unbake.dataset.photographs import Photographs
-from unbake.dataset.pixels import CameraRays, PixelSource, _Places, crop_edges, largest_crop
+from unbake.dataset.pixels import (
+    _AT_ONCE,
+    CameraRays,
+    PixelSource,
+    _Places,
+    crop_edges,
+    largest_crop,
+)
 from unbake.errors import UserError
 
 SIZES = [(5, 3), (4, 4), (1, 7), (6, 2)]
@@ -426,9 +433,12 @@ def test_stretches_of_numbers_may_be_empty_or_end_beyond_32_bits():
 
 
 def test_pixels_that_count_are_marked_part_by_part(many):
-    counted, peak = with_peak(lambda: many._counted)
-    assert np.array_equal(np.flatnonzero(counted), many.photographs.chosen)
-    assert peak < 1.5 * len(counted)
+    bits, peak = with_peak(lambda: many._counted)
+    assert np.array_equal(np.flatnonzero(np.unpackbits(bits)), many.photographs.chosen)
+    assert peak < 0.25 * len(many.photographs.table) + 1.5 * _AT_ONCE
+    numbers = np.random.default_rng(2).integers(0, len(many.photographs.table), 999)
+    wanted = np.isin(numbers, many.photographs.chosen)
+    np.testing.assert_array_equal(many._counts(numbers), wanted)
 
 
 def test_places_of_crops_are_kept_as_bits(many):

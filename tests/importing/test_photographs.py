@@ -359,6 +359,16 @@ def test_photographs_are_made_smaller_by_the_mean_of_their_light(
     )
 
 
+def test_photographs_may_have_more_pixels_than_pillow_takes(
+    project, meshes, tmp_path, monkeypatch, unbake
+):
+    """Cameras of telephones have 200 million, and Pillow calls 179 million an attack."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    words = ["--mesh", meshes[0], "--out", tmp_path / "data"]
+    assert unbake("import", project, *words).status == 0
+    assert len(Dataset.load(tmp_path / "data").views) == 3
+
+
 def test_more_pixels_than_a_fit_can_have_are_told_before_anything_is_written(
     project, meshes, tmp_path, monkeypatch
 ):

@@ -501,21 +501,30 @@ class PixelSource:
         inside &= (0 <= other + aside) & (other + aside < sizes)
         before, after = (numbers + np.where(inside, aside * stride + s * step, 0) for s in (-1, 1))
         if self._counted is not None:
-            start = self.photographs.pixels.start
-            inside &= self._counted[before - start] & self._counted[after - start]
+            inside &= self._counts(before) & self._counts(after)
         pair = (self.photographs.own_rows(side)[:, :3] for side in (after, before))
         return 0.5 * np.subtract(*pair), inside
 
     @cached_property
     def _counted(self) -> np.ndarray | None:
-        """Whether the pixels that this process holds count; None: all do."""
+        """Whether the pixels that this process holds count, eight a byte; None: all do."""
         found = self.photographs
         if found.chosen is None:
             return None
-        counted = np.zeros(len(found.pixels), bool)
-        for first in range(0, len(found.chosen), _AT_ONCE):
-            counted[found.chosen[first : first + _AT_ONCE] - found.pixels.start] = True
-        return counted
+        # A byte has pixels of one part only.
+        parts, start = [], found.pixels.start
+        for first in range(0, len(found.pixels), _AT_ONCE):
+            counted = np.zeros(min(_AT_ONCE, len(found.pixels) - first), bool)
+            here = stretch(found.chosen, start + first, start + first + len(counted))
+            counted[found.chosen[here] - np.uint32(start + first)] = True
+            parts.append(np.packbits(counted))
+        return np.concatenate(parts) if parts else np.zeros(0, np.uint8)
+
+    def _counts(self, numbers: np.ndarray) -> np.ndarray:
+        """Whether pixels that this process holds count, where not all do, (n,) bool."""
+        assert self._counted is not None
+        place = numbers - self.photographs.pixels.start
+        return (self._counted[place >> 3] >> (7 - (place & 7)).astype(np.uint8) & 1).astype(bool)
 
     def views_of(self, numbers: np.ndarray) -> np.ndarray:
         """The views of pixels, from 0."""
