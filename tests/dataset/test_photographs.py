@@ -2,10 +2,12 @@
 
 import errno
 import json
+import mmap
 import os
 import shutil
 import time
 import tracemalloc
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -433,6 +435,53 @@ def test_a_file_that_is_there_needs_no_memory(dataset, on_disk, monkeypatch):
     np.testing.assert_array_equal(found.table, wanted.table)
 
 
+def test_as_many_views_are_decoded_at_once_as_fit_beside_the_table(dataset, monkeypatch):
+    views = [replace(view, encoding="srgb") for view in dataset().train * 4]
+    pixels = WIDTH * HEIGHT
+    monkeypatch.setattr(decoding, "usable_cores", lambda: 8)
+    monkeypatch.setattr(decoding, "free_bytes", lambda: 10 * PIXEL_BYTES * pixels)
+    assert decoding._at_once(views, 1, 0) == 5
+    assert decoding._at_once(views, 1, 6 * PIXEL_BYTES * pixels) == 2
+    assert decoding._at_once(views, 2, 0) == 2
+    assert decoding._at_once(views, 1, 20 * PIXEL_BYTES * pixels) == 1
+    assert decoding._at_once(dataset().train, 1, 0) == 1, "OpenEXR reads in threads of its own"
+
+
+def test_of_a_file_that_memory_has_no_room_for_rows_alone_are_read(dataset, on_disk, monkeypatch):
+    made = dataset()
+    found, asked = Photographs.load(made, False), []
+
+    class Mapped:
+        def __len__(self):
+            return 1000
+
+        def madvise(self, advice):
+            asked.append(advice)
+
+    for free, wanted in ((10_000, []), (1500, [mmap.MADV_RANDOM])):
+        monkeypatch.setattr(decoded_file, "free_bytes", lambda free=free: free)
+        decoded_file.expect_random(SimpleNamespace(_mmap=Mapped()))
+        assert asked == wanted
+    found.expect_random()  # of a mapping that is one, and of arrays in memory
+    replace(found, table=np.array(found.table), chosen=None).expect_random()
+
+
+def test_another_writer_at_the_same_time_ends_no_fit(dataset, on_disk, monkeypatch):
+    """Some file systems have no locks: files of these names may be another's by now."""
+    made = dataset()
+    wanted = Photographs.load(made, False)
+    shutil.rmtree(made.folder / ".cache")
+    plain = decoded_file.write_json
+
+    def and_another(path, content, **more):
+        plain(path, content | {"table": [0, 0]}, **more)
+
+    monkeypatch.setattr(decoded_file, "write_json", and_another)
+    found = Photographs.load(made, False)
+    np.testing.assert_array_equal(found.table, wanted.table)
+    np.testing.assert_array_equal(found.chosen, wanted.chosen)
+
+
 def test_a_data_set_may_be_called_by_any_path(dataset, on_disk, monkeypatch):
     """What is decoded once serves fits in this folder and in others, and where it was moved."""
     made = dataset()
@@ -447,12 +496,19 @@ def test_a_data_set_may_be_called_by_any_path(dataset, on_disk, monkeypatch):
     Photographs.load(replace(made, folder=moved, views=views), False)
 
 
-def test_files_of_code_values_are_decoded_at_once(tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "JPEG"])
+def test_files_of_code_values_are_decoded_at_once(tmp_path, monkeypatch, kind):
     rng, views = np.random.default_rng(2), []
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, WIDTH, HEIGHT)
     for i in range(9):
-        image = tmp_path / f"{i}.png"
-        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)).save(image)
+        image = tmp_path / f"{i}.{'jpg' if kind == 'JPEG' else 'png'}"
+        if kind == "16 bits":
+            codes = rng.integers(0, 1 << 16, (HEIGHT, WIDTH, 4), dtype=np.uint16)
+            mi.Bitmap(codes).write(str(image))
+        else:
+            channels = 3 if kind == "JPEG" else 4
+            codes = rng.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
+            Image.fromarray(codes).save(image)
         views.append(View(f"{i}", "train", camera, image, {}, encoding="srgb"))
     made = Dataset(tmp_path, tmp_path / "s.xml", "hidden", views, {}, None)
     at_once = []
@@ -464,7 +520,10 @@ def test_files_of_code_values_are_decoded_at_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(decoding, "in_order", counted)
     monkeypatch.setattr(decoding, "usable_cores", lambda: 4)
+    filters = list(warnings.filters)
     several = Photographs.load(made, False)
+    # Filters and the limit are of the process, and threads come and go in any order.
+    assert warnings.filters == filters and Image.MAX_IMAGE_PIXELS
     monkeypatch.setattr(decoding, "usable_cores", lambda: 1)
     alone = Photographs.load(made, False)
     assert at_once == [4, 1]

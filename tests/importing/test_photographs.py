@@ -359,14 +359,12 @@ def test_photographs_are_made_smaller_by_the_mean_of_their_light(
     )
 
 
-def test_photographs_may_have_more_pixels_than_pillow_takes(
-    project, meshes, tmp_path, monkeypatch, unbake
-):
+def test_photographs_may_have_more_pixels_than_pillow_takes(project, meshes, tmp_path, monkeypatch):
     """Cameras of telephones have 200 million, and Pillow calls 179 million an attack."""
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
-    words = ["--mesh", meshes[0], "--out", tmp_path / "data"]
-    assert unbake("import", project, *words).status == 0
-    assert len(Dataset.load(tmp_path / "data").views) == 3
+    data, _ = imported(project, tmp_path / "data", meshes)
+    assert len(data.views) == 3 and read_photograph(data.views[0]).shape == (16, 16, 4)
+    assert Image.MAX_IMAGE_PIXELS == 100
 
 
 def test_more_pixels_than_a_fit_can_have_are_told_before_anything_is_written(
@@ -377,9 +375,17 @@ def test_more_pixels_than_a_fit_can_have_are_told_before_anything_is_written(
         imported(project, tmp_path / "data", meshes)
     assert not (tmp_path / "data").exists()
     imported(project, tmp_path / "data", meshes, longest=8)
+    monkeypatch.setattr(importing, "MOST_PIXELS", 1 << 32)
     monkeypatch.setattr(importing, "_MANY", 100)
-    told = imported(project, tmp_path / "many", meshes, longest=8)[1]
+    told = imported(project, tmp_path / "many", meshes)[1]
     assert any("a fit draws few" in line and "--longest 2048" in line for line in told)
+    # Whoever followed that advice is not given it again.
+    told = imported(project, tmp_path / "few", meshes, longest=8)[1]
+    assert not any("a fit draws few" in line for line in told)
+    monkeypatch.setattr(importing, "MOST_PIXELS", 30)
+    with pytest.raises(UserError) as caught:
+        imported(project, tmp_path / "more", meshes, longest=8)
+    assert "Make them smaller with --longest 4" in str(caught.value)
 
 
 # -------------------------------------------------------------------------------- alpha and colours

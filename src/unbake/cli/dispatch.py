@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 import tyro
-from PIL import Image
 
 from .. import signals
 from ..errors import UserError, of_system
@@ -127,9 +126,6 @@ def _run(family: str | None, words: list[str]) -> int | None:
         family: its first word, if it has two.
         words: the others.
     """
-    # There are cameras with 200 million pixels, and Pillow refuses more than 179. Sizes are known
-    # from headers, and compared with the free memory, before pixels are read.
-    Image.MAX_IMAGE_PIXELS = None
     name = words[0] if family is None else f"{family} {words[0]}"
     if name in COMMANDS:  # alone, so that errors name the command, and its help
         return tyro.cli(COMMANDS[name], prog=f"unbake {name}", args=words[1:])

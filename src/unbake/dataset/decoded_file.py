@@ -68,6 +68,17 @@ def in_file(plan: Plan, decode: Callable[..., tuple[np.ndarray | None, Totals]])
         raise Unwritable(why) from None
 
 
+def expect_random(array: np.ndarray) -> None:
+    """Tell the system that rows of a mapped file will be read at random from now on.
+
+    Where memory has no room for it, what is asked for is then read alone, and not what stands
+    around it, some hundred thousand bytes a row. Until then whole views are looked at.
+    """
+    free, mapped = free_bytes(), getattr(array, "_mmap", None)
+    if free is not None and mapped is not None and len(mapped) > _FITTING * free:
+        mapped.madvise(mmap.MADV_RANDOM)
+
+
 def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
     """What the file is made of."""
     views, folder = plan.dataset.train, data.path
@@ -151,24 +162,10 @@ def _mapped(path: Path, stamp: list[int], kind: type, shape: tuple[int, ...]) ->
     """An array in a file, if it is the one that has this stamp; a `ValueError` otherwise."""
     if _stamp(path) != stamp:
         raise ValueError(path)
-    array = _read_only(path)
+    array = np.load(path, mmap_mode="r")
     # Another fit may have replaced the file in between
     if _stamp(path) != stamp or array.dtype != kind or array.shape != shape:
         raise ValueError(path)
-    return array
-
-
-def _read_only(path: Path) -> np.ndarray:
-    """The array of a file, mapped.
-
-    Of a file that memory has no room for, the system reads what is asked for alone, and not what
-    stands around it: pixels are drawn at random, and each would bring some hundred thousand bytes.
-    """
-    array = np.load(path, mmap_mode="r")
-    free = free_bytes()
-    mapped = getattr(array, "_mmap", None)
-    if free is not None and array.nbytes > _FITTING * free and mapped is not None:
-        mapped.madvise(mmap.MADV_RANDOM)
     return array
 
 
@@ -217,6 +214,9 @@ def _write_cache(
             _, totals = decode(table, plan.dataset.train)
         table.flush()
         del table  # a mapping that was written to stays in memory as a whole
+        # Others may write files of these names next: what was written is looked at from here on.
+        chosen = np.load(foreground_file, mmap_mode="r") if _chooses(key) else None
+        made = Decoded(np.load(table_file, mmap_mode="r"), chosen, totals)
         stored |= {**asdict(totals), "table": _stamp(table_file)}
         if _chooses(key):
             foreground_file.rename(data.cached_foreground)
@@ -228,10 +228,6 @@ def _write_cache(
             file.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             data.cache.rmdir()  # if nothing was made
-    made = _find_cache(data, key)
-    if made is None:
-        what = "the decoded photographs are not as they were written"
-        raise UserError(what, data.cache, "Delete the folder, and look at the disk")
     return made
 
 

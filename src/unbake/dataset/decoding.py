@@ -121,6 +121,7 @@ class Plan:
         first: int = 0,
         *,
         processes: int = 1,
+        held: int = 0,
         keep: Callable[[np.ndarray], None] | None = None,
     ) -> tuple[np.ndarray | None, Totals]:
         """Put the images of views into a table, but for what is too bright in them.
@@ -130,6 +131,7 @@ class Plan:
         Args:
             first: number of the first pixel of the table.
             processes: that decode on this machine.
+            held: bytes of each that are to stay, such as of the table.
             keep: takes the numbers of the pixels to train on, view after view; None: they are
                 returned, if there are any.
 
@@ -155,12 +157,12 @@ class Plan:
 
         sizes = [view.camera.width * view.camera.height for view in views]
         starts = np.cumsum([0, *sizes])[:-1].tolist()
-        at_once = _at_once(views, processes)
+        at_once = _at_once(views, processes, held)
         made = in_order(put, list(zip(views, starts, strict=True)), at_once)
         return joined(made, self.chooses, keep)
 
 
-def _at_once(views: Sequence[View], processes: int) -> int:
+def _at_once(views: Sequence[View], processes: int, held: int) -> int:
     """How many views are decoded at once.
 
     Files of radiance are read one after the other: Mitsuba reads each in threads of its own, and
@@ -168,12 +170,14 @@ def _at_once(views: Sequence[View], processes: int) -> int:
 
     Args:
         processes: that decode on this machine.
+        held: bytes of each that are to stay.
     """
     if any(view.encoding != "srgb" for view in views):
         return 1
     largest = max((view.camera.width * view.camera.height for view in views), default=1)
     free, cores = free_bytes(), usable_cores() // processes
-    fitting = cores if free is None else int(_OF_FREE * free / (processes * PIXEL_BYTES * largest))
+    each = processes * PIXEL_BYTES * largest
+    fitting = cores if free is None else int(_OF_FREE * (free - processes * held) / each)
     return max(1, min(len(views), cores, fitting))
 
 

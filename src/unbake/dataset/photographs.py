@@ -19,7 +19,7 @@ from ..errors import UserError
 from ..memory import require_memory
 from ..ranks import Ranks
 from .camera import Camera
-from .decoded_file import Unwritable, in_file
+from .decoded_file import Unwritable, expect_random, in_file
 from .decoding import COLUMNS, WITH_BLURRED, Decoded, Plan, Totals, fill_rows, joined
 from .hot_pixels import HotPixels
 from .image_files import PIXEL_BYTES
@@ -144,6 +144,12 @@ class Photographs:
         """What each process tells of the pixels that it holds, in their order; see `Ranks`."""
         return work() if self.share is None else self.share.ranks.joined(work)
 
+    def expect_random(self) -> None:
+        """Tell the system, of pixels in a file, that they will be drawn at random from now on."""
+        for array in (self.table, self.chosen):
+            if array is not None:
+                expect_random(array)
+
     @property
     def bytes(self) -> int:
         """Memory that the pixels take, unless they lie in a file."""
@@ -263,7 +269,7 @@ def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
     except UserError as error:
         raise unwritable or error from None
     table = np.empty((pixels.stop - pixels.start, plan.columns), np.float32)
-    found = plan.decode_into(table, views[own], pixels.start, processes=here)
+    found = plan.decode_into(table, views[own], pixels.start, processes=here, held=held)
     return Decoded(table, *found)
 
 

@@ -59,7 +59,7 @@ class LightGuide:
     """Distributions of directions, by which bounces find the light that surfaces reflect.
 
     Directions drawn by the BSDF alone seldom meet small bright places, and nearly all noise of one
-    bounce is that of the radiance that it meets. Here the cells of a grid over the scene's cube,
+    bounce is that of the radiance that it meets. Here the cells of a grid over a cube of the scene,
     each divided by the six directions that normals are nearest to, have a distribution over world
     space directions, constant in bins of equal solid angle: bands of height z times sectors around
     the z axis. It is learned by the cross-entropy with what samples contribute, and so is the share
@@ -67,7 +67,8 @@ class LightGuide:
 
     Args:
         settings: sizes.
-        domain: the scene's cube.
+        domain: the cube, of the scene or of what cameras see of it; what lies outside has the cells
+            at its faces.
 
     See Müller et al. 2017, Practical Path Guiding, and Müller 2019, whose shares are learned alike.
     """

@@ -163,7 +163,7 @@ def require_no_pieces(settings: object, key: str) -> None:
 class GuideConfig:
     """Where bounces look for light, beside where the BSDF scatters (ours); see `guide.py`."""
 
-    cells: int = 8  #: along an edge of the scene's cube; 0: directions come from the BSDF alone
+    cells: int = 8  #: along an edge of the grid's cube; 0: directions come from the BSDF alone
     bands: int = 8  #: of a distribution of directions, from below to above
     sectors: int = 16  #: of each band, around the z axis
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from ..errors import UserError
 from ..io import require_file
 from .chroma import with_sharp_colour
 from .headers import HeaderError, read_header
+from .pillow import opened
 from .srgb import from_srgb, to_srgb
 from .windows import bands
 
@@ -142,20 +142,18 @@ def _read_png(path: Path) -> np.ndarray:
 
 
 def _read_by_pillow(path: Path) -> np.ndarray:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of odd tags, and of sizes that were checked
-        with Image.open(path, formats=_FORMATS) as image:
-            # Pillow turns TIFF files while it reads them.
-            image.getexif().pop(_ORIENTATION, None)
-            if image.mode not in _MODES:
-                raise _OtherColours(image.mode)
-            blocks = _colour_blocks(image)
-            if blocks is not None:
-                image.draft("YCbCr", image.size)
-            if image.mode == "YCbCr" and blocks is not None:
-                return with_sharp_colour(np.array(image), *blocks)
-            alpha = "A" in image.mode or "transparency" in image.info
-            return np.array(image.convert("RGBA" if alpha else "RGB"))
+    with opened(path, _FORMATS) as image:
+        # Pillow turns TIFF files while it reads them.
+        image.getexif().pop(_ORIENTATION, None)
+        if image.mode not in _MODES:
+            raise _OtherColours(image.mode)
+        blocks = _colour_blocks(image)
+        if blocks is not None:
+            image.draft("YCbCr", image.size)
+        if image.mode == "YCbCr" and blocks is not None:
+            return with_sharp_colour(np.array(image), *blocks)
+        alpha = "A" in image.mode or "transparency" in image.info
+        return np.array(image.convert("RGBA" if alpha else "RGB"))
 
 
 def _colour_blocks(image: Image.Image) -> tuple[int, int] | None:

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, TiffImagePlugin
 
 from ..errors import UserError
+from .pillow import opened
 from .srgb import from_srgb
 
 #: The largest difference of linear values, up to which a profile is that of sRGB.
@@ -95,7 +96,7 @@ def _embedded(path: Path) -> bytes | None:
     if path.suffix.lower() in _TIFF:
         return _of_tiff(path)
     try:
-        with Image.open(path, formats=_FORMATS) as image:
+        with opened(path, _FORMATS) as image:
             found = image.info.get("icc_profile")
             return found or (_adobe_rgb() if _says_adobe_rgb(image.getexif()) else None)
     except Exception:  # decoders of damaged files raise whatever they meet; pixels tell why

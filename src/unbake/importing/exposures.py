@@ -9,10 +9,9 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from ..dataset.views import MEASURABLE
 from ..errors import UserError, named, printable
+from ..imaging.pillow import opened
 from ..io import read_text
 from .faults import Faults
 from .raw import raw_exposure
@@ -135,8 +134,8 @@ def _spread(exposures: Mapping[str, float]) -> str:
 def _exif(image: Path) -> tuple[float, float | None] | None:
     """Seconds x ISO / 100, and the f-number; None where it is not told."""
     try:
-        with Image.open(image, formats=("PNG", "JPEG", "TIFF")) as opened:
-            tags = opened.getexif().get_ifd(_DIRECTORY)
+        with opened(image, ("PNG", "JPEG", "TIFF")) as file:
+            tags = file.getexif().get_ifd(_DIRECTORY)
         seconds, iso = _value(tags.get(_SECONDS)), _value(tags.get(_ISO))
         aperture = _value(tags.get(_APERTURE))
     except UserError:

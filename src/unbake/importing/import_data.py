@@ -41,6 +41,8 @@ _RAYS = 64
 _SAME = 1e-6
 #: A mesh that is this many times as wide as the space of the cameras may be in another unit.
 _LARGER = 20
+#: Pixels along an edge that suit most photographs.
+_SMALL = 2048
 #: Pixels to train on from which on it is told that they are many: 4 GB when decoded.
 _MANY = 170_000_000
 #: A camera from which this share of all directions hits the mesh stands in a room.
@@ -115,7 +117,7 @@ def import_data(
     splits = _splits(found.shots, settings.holdout)
     if splits and "train" not in splits.values() and not faults:
         faults.add("no photograph is left to train on: the source holds all of them out")
-    _check_sizes(_pixels(found.shots, splits, settings.longest), faults)
+    _check_sizes(_pixels(found.shots, splits, settings.longest), settings.longest, faults)
     faults.require_none(source)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
@@ -439,11 +441,22 @@ def _block(shot: Shot, longest: int) -> int:
     return -(-max(shot.size) // longest) if longest else 1
 
 
-def _check_sizes(count: int, faults: Faults) -> None:
-    """Refuse more pixels to train on than a fit can have."""
+def _check_sizes(count: int, longest: int, faults: Faults) -> None:
+    """Refuse more pixels to train on than a fit can have.
+
+    Args:
+        count: of them.
+        longest: as the settings have it.
+        faults: to add to.
+    """
     if count > MOST_PIXELS:
         what = f"the photographs to train on have {count:,} pixels, more than {MOST_PIXELS:,}"
-        faults.add(what, remedy="Make them smaller with --longest 2048")
+        faults.add(what, remedy=f"Make them smaller with --longest {_shorter(longest)}")
+
+
+def _shorter(longest: int) -> int:
+    """What to make photographs smaller by, where so many pixels along an edge are too many."""
+    return _SMALL if not longest or longest > _SMALL else max(1, longest // 2)
 
 
 def _require_counted(blank: Sequence[str], splits: Mapping[str, str]) -> None:
@@ -475,12 +488,12 @@ def _sizes(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> li
         if block > 1
     ]
     count = _pixels(shots, splits, longest)
-    if count <= _MANY:
+    if count <= _MANY or 0 < longest <= _SMALL:
         return told
     return [
         *told,
         f"the photographs to train on have {count / 1e6:,.0f} million pixels, of which a fit draws "
-        "few. With --longest 2048 they load faster, and take less room",
+        f"few. With --longest {_SMALL} they load faster, and take less room",
     ]
 
 

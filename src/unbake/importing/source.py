@@ -9,10 +9,10 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import final
 
 import numpy as np
-from PIL import Image
 
 from ..errors import UserError, named
 from ..imaging.headers import CODED_SUFFIXES, SUFFIXES, HeaderError, ImageHeader, read_header
+from ..imaging.pillow import opened
 from ..io import inside, require_file
 from .faults import Faults
 from .lens import Lens
@@ -313,8 +313,8 @@ def orientation(image: Path) -> int:
     if image.suffix.lower() not in CODED_SUFFIXES:
         return 1
     try:
-        with Image.open(image, formats=("PNG", "JPEG", "TIFF")) as opened:
-            told = opened.getexif().get(_ORIENTATION)
+        with opened(image, ("PNG", "JPEG", "TIFF")) as file:
+            told = file.getexif().get(_ORIENTATION)
     except Exception:  # EXIF that is damaged raises whatever Pillow meets
         return 1
     return told if isinstance(told, int) and 1 <= told <= 8 else 1

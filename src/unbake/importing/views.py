@@ -135,7 +135,7 @@ def _in_blocks(
     exact_here = np.logical_or(clipped <= 0, clipped >= 1).all(axis=2)
     # Rounding must not make a mean of clipped pixels one that is not.
     small[..., :3] = np.where(clipped >= 1, np.maximum(small[..., :3], limit), small[..., :3])
-    return small, exact_here if told is None else np.logical_and(told, exact_here)
+    return small, np.asarray(exact_here if told is None else told & exact_here)
 
 
 def _all_of(mask: np.ndarray, block: int) -> np.ndarray:

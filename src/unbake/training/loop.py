@@ -202,6 +202,7 @@ class _Training:
         self._watchdog = Watchdog(begun.state, begun.step, progress, begun.views)
         self._search = _searches(begun, ranks)
         self._shown_at = self._scored_at = progress.seconds
+        begun.step.pixels.photographs.expect_random()
         self._clock = 0.0  # when training began, but for the times at which it stood still
 
     def run(self, stop: list[int]) -> bool:

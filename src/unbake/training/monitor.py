@@ -73,7 +73,10 @@ class Monitor:
         self._bar.stop()
         if self._events is not None:
             self._events.close()
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:  # disks over a network may tell only now that they are full
+            self.failures.append(self._unwritable(error))
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
@@ -137,6 +140,10 @@ class Monitor:
             text = f"{v['split']} view, {told}"
         self.say(f"step {entry['step']}, {entry['seconds']:.0f} s: {text}")
 
+    def _unwritable(self, error: OSError) -> UserError:
+        what = f"the log cannot be written ({error.strerror})"
+        return UserError(what, self._path, "Make room")
+
     def _write(self, entry: dict) -> None:
         if self._events is not None:
             self._events.add(entry)
@@ -149,8 +156,7 @@ class Monitor:
             while self._unwritten:  # a disk may have room for a part of it
                 self._unwritten = self._unwritten[self._file.write(self._unwritten) :]
         except OSError as error:
-            what = f"the log cannot be written ({error.strerror})"
-            self.failures = [UserError(what, self._path, "Make room")]
+            self.failures = [self._unwritable(error)]
             if not told:
                 self.say(f"warning: {self.failures[0]}; the fit goes on")
 
