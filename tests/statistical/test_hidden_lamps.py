@@ -1,14 +1,19 @@
 """What lies behind lamps that cameras do not see is where it is, whatever shape both have."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import pixel_rays, seeded
+from support import TINY_FIT, assert_only_replayed, grey_photographs, pixel_rays, seeded
 
 from unbake.acquisition.capture import photographs
 from unbake.acquisition.settings import CaptureSettings
 from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import CameraRays
+from unbake.training.problem import make_problem
+from unbake.training.state import initial_state
+from unbake.training.step import TrainingStep
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.prb import path_radiance, path_replay
 from unbake.transport.vertex import SceneView, find_vertex, rays_behind_area_emitters
@@ -23,6 +28,13 @@ LAMPS = {
     "none": None,
 }
 MATERIAL = {"type": "principled", "base_color": {"type": "rgb", "value": [0.6, 0.5, 0.4]}}
+
+SCENE = """<scene version="3.0.0">
+  <shape type="sphere"><bsdf type="principled"/></shape>
+  <shape type="sphere"><point name="center" x="0" y="0" z="3"/><float name="radius" value="0.4"/>
+    <emitter type="area"><rgb name="radiance" value="3"/></emitter></shape>
+  <emitter type="constant"><rgb name="radiance" value="0.1"/></emitter>
+</scene>"""
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +109,16 @@ def test_vertices_behind_closed_lamps_lie_on_their_surface():
     radius = np.linalg.norm(np.array(vertex.si.p), axis=0)[np.array(vertex.valid)]
     assert len(radius) > 100
     np.testing.assert_allclose(radius, 1, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_steps_with_hidden_lamps_are_replayed(method, tmp_path):
+    """Rays that start behind lamps are a part of the recording."""
+    file = tmp_path / "scene.xml"
+    file.write_text(SCENE)
+    config = replace(TINY_FIT, method=method)
+    problem = make_problem(file, "hidden", config, 0.2)
+    assert problem.hide_emitters and problem.scene_view.has_area_emitters
+    step = TrainingStep(problem, grey_photographs([CAMERA, CAMERA]), config)
+    rates = dict.fromkeys(("albedo", "roughness", "radiance"), 1e-3)
+    assert_only_replayed(step, initial_state(problem), lambda number: rates)

@@ -6,10 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, assert_same_expectation, pixel_rays
+from support import TINY_FIT, assert_same_expectation, pixel_rays, whole_and_in_parts
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
+from unbake.config import read_toml
 from unbake.dataset.camera import Camera
 from unbake.dataset.views import Dataset
 from unbake.training.problem import problem_of
@@ -110,14 +111,32 @@ def test_where_no_light_arrives_all_stay_alike():
     assert weights(dark) == [1.0, 1.0]
 
 
-def test_a_fit_weighs_lights_that_are_known(tmp_path):
-    file = tmp_path / "scene.xml"
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory):
+    """A captured data set with a lamp and a dim sky, to be read alone."""
+    folder = tmp_path_factory.mktemp("lit")
+    file = folder / "scene.xml"
     file.write_text(SCENE)
     small = CaptureSettings(views=2, held_out=1, resolution=8, spp=4, max_depth=4)
-    capture(file, tmp_path / "data", small, tell=lambda line: None)
-    dataset = Dataset.load(tmp_path / "data")
+    capture(file, folder / "data", small, tell=lambda line: None)
+    return folder / "data"
+
+
+def test_a_fit_weighs_lights_that_are_known(lit):
+    dataset = Dataset.load(lit)
     found = weights(problem_of(dataset, TINY_FIT, 0.2).scene_view.scene)
     again = weights(problem_of(dataset, TINY_FIT, 0.2).scene_view.scene)
     assert sorted(found)[1] > 1.2 and found == again
     config = dataclasses.replace(TINY_FIT, unknown="emission")
     assert weights(problem_of(dataset, config, 0.2).scene_view.scene) == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_a_fit_with_weighed_lights_is_replayed_and_goes_on_bit_for_bit(
+    lit, tiny, tmp_path, monkeypatch, method
+):
+    settings = dataclasses.replace(read_toml(tiny), method=method, steps=8)
+    whole, parts, step = whole_and_in_parts(lit, tmp_path, settings, monkeypatch)
+    assert 1 <= step.recordings() <= 3
+    for key, value in whole.items():
+        assert np.array_equal(value, parts[key]), key
