@@ -54,8 +54,8 @@ def sample_emitter(
     Args:
         sample: uniform in [0, 1)².
         holes: whether any surface lets rays pass (`lets_pass`).
-        sized: whether light of areas and of the environment passes, too; else it is left to rays
-            that pass.
+        sized: whether light of areas and of the environment passes, too, and what passes is
+            evaluated, so not in a loop; else it is left to rays that pass.
 
     Returns:
         Direction and density, and radiance over the density, linear RGB; 0 where it is hidden.
@@ -66,7 +66,9 @@ def sample_emitter(
     lit = active & (ds.pdf != 0)
     with dr.suspend_grad():
         passed = _passed(scene, si, ds.p, lit if sized else lit & ds.delta)
-        if not sized:
+        if sized:
+            dr.eval(passed)  # gradients would follow the rays once more
+        else:
             hidden = scene.ray_test(si.spawn_ray_to(ds.p), lit & ~ds.delta)
             passed = dr.select(ds.delta, passed, dr.select(hidden, 0.0, 1.0))
     return ds, passed * weight
