@@ -62,7 +62,7 @@ class Cameras:
         limit = np.inf if view.clipped is None else view.clipped
         light = model.light(photograph.astype(np.float64)).reshape(-1, 3) / view.exposure
         expected = radiance.astype(np.float64).reshape(-1, 3) * common
-        finite = np.isfinite(light).all(-1) & np.isfinite(expected).all(-1)
+        finite = np.isfinite(light + expected).min(axis=-1)
         if not finite.any():
             return common
         bright = [x > _DARK * x[finite].mean() for x in (light, expected)]
