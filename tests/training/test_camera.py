@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
@@ -26,7 +27,7 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.fingerprint import changed, fingerprint
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays
-from unbake.dataset.views import Dataset, SensorNoise
+from unbake.dataset.views import Dataset, SensorNoise, View
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import evaluate
 from unbake.evaluation.settings import EvaluationSettings
@@ -437,7 +438,7 @@ def test_a_gain_that_is_right_is_as_good_as_a_divided_photograph(pairs):
 def start(built_in, camera, **more):
     config = replace(TINY_FIT, camera=camera, **more)
     cameras = built_in_cameras("cornell", 8, views=2)
-    views = [None] * len(cameras)
+    views = [View(str(i), "train", c, Path(), {}) for i, c in enumerate(cameras)]
     problem = make_problem(built_in("cornell"), "visible", config, 0.2, views=views)
     return TrainingStep(problem, grey_photographs(cameras), config), initial_state(problem)
 

@@ -283,11 +283,11 @@ def _put_reference(
     shape = (camera.height, camera.width, -1)
     image, weight = rgb.reshape(shape), counts.astype(np.float32).reshape(shape)
     for band, needed, made in bands(camera.height, _REACH):
+        rows = slice(band.start * camera.width, band.stop * camera.width)
         # Squares of radiance beyond 1e19 are infinite: such pixels weigh nothing.
         with np.errstate(over="ignore", invalid="ignore"):
             found = _reference(image[needed], weight[needed], sensor)[made]
-        rows = slice(band.start * camera.width, band.stop * camera.width)
-        out[rows] = found.reshape(-1, 3)
+            out[rows] = found.reshape(-1, 3)
 
 
 def _reference(image: np.ndarray, weight: np.ndarray, sensor: SensorNoise | None) -> np.ndarray:

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from ..config.flag import Flag
-from ..dataset.camera import LONGEST_SIDE
 from ..errors import require_ranges
+
+#: As of cameras (`LONGEST_SIDE`).
+_MOST = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -55,4 +57,4 @@ class ImportSettings:
     ] = False
 
     def __post_init__(self) -> None:
-        require_ranges(self, {"holdout": (0, 10**6), "longest": (0, LONGEST_SIDE)})
+        require_ranges(self, {"holdout": (0, 10**6), "longest": (0, _MOST)})
