@@ -26,7 +26,7 @@ from unbake.io import write_json
 from unbake.machine import machine
 from unbake.scene.edit import to_principled
 from unbake.scene.parse import parse
-from unbake.transport.emitter_weights import RAYS, chosen_alike, weigh_emitters
+from unbake.transport.emitter_weights import RAYS, chosen_alike
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.render import parts_of
 from unbake.transport.vertex import SceneView
@@ -59,18 +59,17 @@ def main() -> None:
 
 def measured(dataset: Dataset, spp: int) -> dict | None:
     """Variances with lights chosen alike and by weights; None where there is nothing to choose."""
+    from unbake.training.problem import weigh_lights  # it needs a variant
+
     parsed = parse(dataset.scene, dataset.root)
     to_principled(parsed)
     scene = parsed.instantiate()
     if not chosen_alike(scene):
         return None
     view, hidden = SceneView.of(scene, None, 8), dataset.background == "hidden"
-    rays = CameraRays.of([camera.camera for camera in dataset.train])
-    rng = np.random.default_rng(0)
-    chosen = mi.UInt32(rng.integers(0, rays.pixels, RAYS).astype(np.uint32))
-    offset = mi.Point2f(rng.random((2, RAYS)).astype(np.float32))
+    rays = CameraRays.of([shot.camera for shot in dataset.train])
     found = {"lights": len(scene.emitters()), "alike": variances(view, rays, spp, hidden)}
-    weigh_emitters(view, rays.through(chosen, offset), hide_emitters=hidden, seed=0)
+    weigh_lights(view, dataset.train, hide_emitters=hidden)
     weights = sorted(
         (float(mi.traverse(e)["sampling_weight"]) for e in scene.emitters()), reverse=True
     )

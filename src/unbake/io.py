@@ -75,15 +75,17 @@ def write_atomically(
             raise UserError(f"the {what} cannot be written ({reason})", path) from error
 
 
-def require_writable_file(path: Path, what: str = "file") -> None:
+def require_writable_file(path: Path | None, what: str = "file") -> None:
     """Raise the error that `write_atomically` would end in, before the work for it is done.
 
-    Nothing is left behind; arguments as of `write_atomically`.
+    Nothing is left behind; arguments as of `write_atomically`. Of None nothing is asked.
 
     Raises:
         UserError: there is a folder, a pipe or a device, or the folder of the file cannot be made
             or written.
     """
+    if path is None:
+        return
     path = Path(path)
     _require_name_of_file(path, what)
     _require_room(temporary_beside(path), path, what)

@@ -22,7 +22,7 @@ from unbake.importing.import_data import import_data
 from unbake.importing.lens import Lens
 from unbake.importing.photographs import CLIPPED_CODE
 from unbake.importing.settings import ImportSettings
-from unbake.importing.source import same_shape
+from unbake.importing.source import Shot, same_shape
 
 imagecodecs = pytest.importorskip("imagecodecs", reason="colour profiles need imagecodecs")
 
@@ -357,6 +357,13 @@ def test_photographs_are_made_smaller_by_the_mean_of_their_light(
     assert not any(
         "sizes:" in line for line in imported(project, tmp_path / "same", meshes, longest=16)[1]
     )
+
+
+def test_a_picture_of_one_line_stays_one(captured):
+    """As those that are made small for checks and previews."""
+    lens = Lens(5000, 1, 100.0, 100.0, 2500.0, 0.5)
+    shot = Shot("line", None, captured.views[0].image, lens, np.eye(4))
+    assert importing._block(shot, 2048) == 1 and importing._block(shot, 0) == 1
 
 
 def test_photographs_may_have_more_pixels_than_pillow_takes(project, meshes, tmp_path, monkeypatch):

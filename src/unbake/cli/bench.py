@@ -62,15 +62,9 @@ def _ready(
         exclude("data", {"scene": scene})
     chosen = chosen_settings(preset, settings)
     require("steps", steps, _FEWEST)
-    _require_out(out)
+    require_writable_file(out)
     backend.activate()
     return chosen
-
-
-def _require_out(out: Path | None) -> None:
-    """Refuse a file that cannot be written, before the work that takes minutes."""
-    if out is not None:
-        require_writable_file(out)
 
 
 def step(
@@ -246,7 +240,7 @@ def gradients(
     folder.require_fitted()
     changes = {name: x for name, x in {"batch": batch, "spp": spp}.items() if x is not None}
     config = with_options(folder.settings(), changes)
-    _require_out(out)
+    require_writable_file(out)
     backend.activate()
     from ..profiling.bench_gradients import FEWEST, bench_gradients
 
@@ -282,7 +276,7 @@ def ceiling(
     chosen = chosen_settings(preset, settings)
     if steps is not None:
         require("steps", steps, _FEWEST)
-    _require_out(out)
+    require_writable_file(out)
     backend.activate()
     from ..profiling.bench_ceiling import bench_ceiling
 

@@ -173,8 +173,7 @@ def data(
         clip_negative: Take negative pixels as zero instead of refusing them.
         allow_outside: Read files that the data set or its scene names outside of its folder.
     """
-    if out is not None:
-        require_writable_file(out, "page")
+    require_writable_file(out, "page")
     backend.activate()
     from ..checks.check import check_data
     from ..checks.told import told_rows

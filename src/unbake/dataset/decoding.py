@@ -14,7 +14,7 @@ from ..memory import free_bytes
 from ..threads import in_order, usable_cores
 from .camera import Camera
 from .clipped_noise import without_clipped_noise
-from .hot_pixels import HotPixels, without_hot_pixels
+from .hot_pixels import without_hot_pixels
 from .image_files import PIXEL_BYTES
 from .shares import dealt
 from .views import Dataset, SensorNoise, View, fitted, read_masked
@@ -139,7 +139,7 @@ class Plan:
             `Decoded.chosen` and `Decoded.totals`.
         """
 
-        def image(view: View) -> tuple[Image, HotPixels | None]:
+        def put(view: View, start: int) -> Filled:
             pixels, mask = read_masked(view, self.clip_negative)
             counted = fitted(pixels, mask, self.dataset.background).ravel()
             pixels, camera = pixels.reshape(-1, 4), view.camera
@@ -147,12 +147,8 @@ class Plan:
             noise = None if view.noise is None else view.noise.divided(view.exposure)
             radiance = _in_radiance(pixels, view)
             rgb = without_clipped_noise(radiance[:, :3], counted, camera, noise, view.limit)
-            return (camera, rgb, counted, noise), found
-
-        def put(view: View, start: int) -> Filled:
-            shown, found = image(view)
-            stop = start + len(shown[1])
-            filled = fill_rows(table[start:stop], shown, self.chooses, first + start)
+            rows, image = table[start : start + len(rgb)], (camera, rgb, counted, noise)
+            filled = fill_rows(rows, image, self.chooses, first + start)
             return filled if found is None else replace(filled, hot_pixels=asdict(found))
 
         sizes = [view.camera.width * view.camera.height for view in views]

@@ -13,6 +13,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..scene.parse import parse
+from ..threads import usable_cores
 from .views import Dataset
 
 _CHUNK = 1 << 20  # bytes
@@ -88,7 +89,7 @@ def _of_values(values: Any) -> str:
 
 
 def _of_files(files: Iterable[Path]) -> list[str]:
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(usable_cores()) as threads:
         return list(threads.map(_of_file, files))
 
 

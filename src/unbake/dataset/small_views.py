@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -66,6 +67,20 @@ class Seen:
         return Seen(*(values[part] for values in fields))
 
 
+class Sized(Protocol):
+    """What tells the pixels of a picture, such as a camera."""
+
+    @property
+    def width(self) -> int:
+        """Pixels along a row."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Pixels along a column."""
+        ...
+
+
 def small_view(
     name: str,
     camera: Camera,
@@ -114,10 +129,10 @@ def in_blocks(camera: Camera, block: int) -> Camera:
     )
 
 
-def block_of(camera: Camera, longest: int = LONGEST_SIDE) -> int:
+def block_of(picture: Sized, longest: int = LONGEST_SIDE) -> int:
     """Pixels along an edge of the blocks that become pixels of a small view."""
-    block = -(-max(camera.height, camera.width) // longest)
-    return min(block, camera.height, camera.width)  # a picture of one line keeps it
+    block = -(-max(picture.height, picture.width) // longest)
+    return min(block, picture.height, picture.width)  # a picture of one line keeps it
 
 
 def pixel_rays(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:

@@ -18,8 +18,6 @@ from .pillow import opened
 from .srgb import from_srgb, to_srgb
 from .windows import bands
 
-#: Formats that Pillow may try, by its names: it knows some that start other programs.
-_FORMATS = ("PNG", "JPEG", "TIFF")
 #: What Pillow calls JPEG files; the second where small pictures, or those of another eye, follow.
 _JPEG = ("JPEG", "MPO")
 #: The tag of EXIF and of TIFF.
@@ -142,7 +140,7 @@ def _read_png(path: Path) -> np.ndarray:
 
 
 def _read_by_pillow(path: Path) -> np.ndarray:
-    with opened(path, _FORMATS) as image:
+    with opened(path) as image:
         # Pillow turns TIFF files while it reads them.
         image.getexif().pop(_ORIENTATION, None)
         if image.mode not in _MODES:

@@ -11,6 +11,9 @@ from typing import Any
 
 from PIL import Image
 
+#: Formats that may be tried, by Pillow's names: it knows some that start other programs.
+FORMATS = ("PNG", "JPEG", "TIFF")
+
 _lock = threading.Lock()
 #: How many images are open, and what is to be restored after the last one: filters of warnings and
 #: the limit belong to the process, and several threads may have images open.
@@ -19,7 +22,7 @@ _before: tuple[Any, int | None]
 
 
 @contextmanager
-def opened(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Image.Image]:
     """An image file, of any size: that is known from headers, and compared with the free memory.
 
     Pillow refuses more than 179 million pixels, and there are cameras with 200 million. It warns of
@@ -27,7 +30,7 @@ def opened(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
 
     Args:
         path: the file.
-        formats: that may be tried, by Pillow's names: it knows some that start other programs.
+        formats: that may be tried, of `FORMATS`.
     """
     _enter()
     try:

@@ -134,7 +134,7 @@ def _spread(exposures: Mapping[str, float]) -> str:
 def _exif(image: Path) -> tuple[float, float | None] | None:
     """Seconds x ISO / 100, and the f-number; None where it is not told."""
     try:
-        with opened(image, ("PNG", "JPEG", "TIFF")) as file:
+        with opened(image) as file:
             tags = file.getexif().get_ifd(_DIRECTORY)
         seconds, iso = _value(tags.get(_SECONDS)), _value(tags.get(_ISO))
         aperture = _value(tags.get(_APERTURE))

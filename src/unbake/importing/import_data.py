@@ -16,7 +16,7 @@ from ..config.light import LightConfig
 from ..dataset.camera import Camera, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.photographs import MOST_PIXELS
-from ..dataset.small_views import in_blocks
+from ..dataset.small_views import block_of, in_blocks
 from ..dataset.views import LONGEST_NAME
 from ..errors import UserError, named, printable
 from ..io import filled_folder, require_new_folder, require_utf8
@@ -438,7 +438,7 @@ def _enclosed(scene: mi.Scene, shots: Sequence[Shot]) -> bool:
 
 def _block(shot: Shot, longest: int) -> int:
     """Pixels along an edge of the squares that become one pixel each; 1: it stays as it is."""
-    return -(-max(shot.size) // longest) if longest else 1
+    return block_of(shot.lens, longest) if longest else 1
 
 
 def _check_sizes(count: int, longest: int, faults: Faults) -> None:

@@ -313,7 +313,7 @@ def orientation(image: Path) -> int:
     if image.suffix.lower() not in CODED_SUFFIXES:
         return 1
     try:
-        with opened(image, ("PNG", "JPEG", "TIFF")) as file:
+        with opened(image) as file:
             told = file.getexif().get(_ORIENTATION)
     except Exception:  # EXIF that is damaged raises whatever Pillow meets
         return 1

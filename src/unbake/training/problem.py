@@ -250,22 +250,23 @@ def problem_of(
     )
     known = problem.environment is None and problem.emission is None
     if known and dataset.train and chosen_alike(problem.scene_view.scene):
-        _weigh_emitters(problem, dataset.train)
+        weigh_lights(problem.scene_view, dataset.train, hide_emitters=problem.hide_emitters)
     return problem
 
 
-def _weigh_emitters(problem: Problem, views: Sequence[View]) -> None:
-    """Let emitters be sampled by how much light they bring to what some pixels see."""
+def weigh_lights(scene_view: SceneView, views: Sequence[View], *, hide_emitters: bool) -> None:
+    """Let lights be sampled by how much they bring to what some pixels of views see.
+
+    Args:
+        scene_view: whose scene is changed; see `chosen_alike`.
+        views: one at least.
+        hide_emitters: as of `Problem`.
+    """
     rays = CameraRays.of([view.camera for view in views])
     rng = np.random.default_rng(0)
     chosen = mi.UInt32(rng.integers(0, rays.pixels, RAYS).astype(np.uint32))
     offset = mi.Point2f(rng.random((2, RAYS)).astype(np.float32))
-    weigh_emitters(
-        problem.scene_view,
-        rays.through(chosen, offset),
-        hide_emitters=problem.hide_emitters,
-        seed=0,
-    )
+    weigh_emitters(scene_view, rays.through(chosen, offset), hide_emitters=hide_emitters, seed=0)
 
 
 def pixels_of(

@@ -142,9 +142,7 @@ class Watchdog:
         """
         if self.trusts:
             return []
-        number, snapshot = self._good[0]
-        self._state.restore(snapshot)
-        self._suspicious = 0
+        number = self._restore()
         what = "the loss had risen far above what it was lately"
         return [f"step {self._progress.step}: {what}; saved is the state of step {number}"]
 
@@ -263,12 +261,7 @@ class Watchdog:
 
     def _go_back(self, what: str, last: bool) -> str:
         """Go back to the last good state, or give up where that was done before."""
-        number, snapshot = self._good[0]
-        self._state.restore(snapshot)
-        self._good.clear()
-        self._good.append((number, snapshot))
-        self._last_losses.clear()
-        self._suspicious = 0
+        number = self._restore()
         again = " again" if self._progress.rate < 1 else ""
         if again or last:
             raise UserError(
@@ -280,6 +273,16 @@ class Watchdog:
             f"step {self._progress.step}: {what}; back to the state of step {number}, with "
             f"{SLOWER:g} times the learning rates"
         )
+
+    def _restore(self) -> int:
+        """Restore the last good state; returns after which step it was."""
+        number, snapshot = self._good[0]
+        self._state.restore(snapshot)
+        self._good.clear()
+        self._good.append((number, snapshot))
+        self._last_losses.clear()
+        self._suspicious = 0
+        return number
 
     def _looked_at_again(self, count: int) -> list[Reading]:
         """The loss terms of the first batches, now."""
