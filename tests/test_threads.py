@@ -32,6 +32,20 @@ def test_no_more_results_wait_than_calls_may_run():
         assert len(begun) <= taken + 3
 
 
+def test_arguments_are_made_by_the_caller_as_they_are_needed():
+    made, caller = [], threading.get_ident()
+
+    def arguments():
+        for number in range(8):
+            assert threading.get_ident() == caller
+            made.append(number)
+            yield (number,)
+
+    for taken, _ in enumerate(in_order(lambda number: number, arguments(), 2), 1):
+        assert len(made) <= taken + 2
+    assert made == list(range(8))
+
+
 def test_an_error_comes_in_its_turn_and_ends_the_rest():
     begun = []
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
@@ -18,13 +19,13 @@ def usable_cores() -> int:
 
 
 def in_order(
-    work: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], at_once: int
+    work: Callable[..., Result], arguments: Iterable[tuple[Any, ...]], at_once: int
 ) -> Iterator[Result]:
     """Results of a function for each of some arguments, in their order.
 
     Args:
         work: must not use Dr.Jit, which is not to be called from several threads.
-        arguments: of each call.
+        arguments: of each call; they are taken by the caller's thread, as late as possible.
         at_once: calls that run at the same time, at most. No more results wait to be taken, either.
 
     Raises:
@@ -33,13 +34,12 @@ def in_order(
     if at_once == 1:
         yield from (work(*each) for each in arguments)
         return
-    pool = ThreadPoolExecutor(at_once)
+    pool, waiting = ThreadPoolExecutor(at_once), iter(arguments)
     try:
-        running = [pool.submit(work, *each) for each in arguments[:at_once]]
-        for following in range(at_once, len(arguments) + at_once):
+        running = [pool.submit(work, *each) for each in islice(waiting, at_once)]
+        while running:
             result = running.pop(0).result()
-            if following < len(arguments):
-                running.append(pool.submit(work, *arguments[following]))
+            running += [pool.submit(work, *each) for each in islice(waiting, 1)]
             yield result
     finally:
         pool.shutdown(cancel_futures=True)

@@ -1,6 +1,7 @@
 """What is wrong with a data set is told at once, with the remedy; good data raise no alarm."""
 
 import re
+import typing
 from xml.etree import ElementTree
 
 import numpy as np
@@ -9,10 +10,11 @@ from PIL import Image
 
 from unbake.checks.check import check_data
 from unbake.checks.pictures import PictureFacts, blurred, percentage, picture_facts
-from unbake.checks.told import told_rows
+from unbake.checks.told import ROWS, told_rows
 from unbake.dataset import alignment as aligning
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
+from unbake.dataset.findings import Check
 from unbake.dataset.mistakes import OPENCV, Mistake, all_mistakes
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.quick_check import quick_findings
@@ -628,3 +630,17 @@ def test_of_many_views_those_are_compared_that_show_the_same(captured):
     assert min(found.pairs, alone.pairs) > len(inside)
     np.testing.assert_allclose(found.stops[:4], alone.stops, atol=1e-6)
     assert np.isnan(found.stops[4:]).all()
+
+
+def test_every_check_has_a_row():
+    """`Finding` takes no others, which the type checker holds."""
+    rows = [check for checks in ROWS.values() for check in checks]
+    assert sorted(rows) == sorted(typing.get_args(Check))
+
+
+def test_more_pixels_than_a_fit_can_have_are_an_error_of_the_files(spoilt, monkeypatch):
+    data = spoilt("cornell")
+    data.save()
+    monkeypatch.setattr("unbake.checks.check.MOST_PIXELS", 100)
+    rows = {row: verdict for row, verdict, _ in told_rows(check_data(data.folder))}
+    assert rows["files"] == "error"

@@ -10,6 +10,7 @@ import tracemalloc
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -436,15 +437,15 @@ def test_a_file_that_is_there_needs_no_memory(dataset, on_disk, monkeypatch):
 
 
 def test_as_many_views_are_decoded_at_once_as_fit_beside_the_table(dataset, monkeypatch):
-    views = [replace(view, encoding="srgb") for view in dataset().train * 4]
-    pixels = WIDTH * HEIGHT
+    count, pixels = 4 * len(dataset().train), WIDTH * HEIGHT
+    most = partial(decoding.decoded_at_once, count, pixels, coded=True)
     monkeypatch.setattr(decoding, "usable_cores", lambda: 8)
     monkeypatch.setattr(decoding, "free_bytes", lambda: 10 * PIXEL_BYTES * pixels)
-    assert decoding._at_once(views, 1, 0) == 5
-    assert decoding._at_once(views, 1, 6 * PIXEL_BYTES * pixels) == 2
-    assert decoding._at_once(views, 2, 0) == 2
-    assert decoding._at_once(views, 1, 20 * PIXEL_BYTES * pixels) == 1
-    assert decoding._at_once(dataset().train, 1, 0) == 1, "OpenEXR reads in threads of its own"
+    assert most() == 5
+    assert most(held=6 * PIXEL_BYTES * pixels) == 2
+    assert most(processes=2) == 2
+    assert most(held=20 * PIXEL_BYTES * pixels) == 1
+    assert most(coded=False) == 1, "OpenEXR reads in threads of its own"
 
 
 def test_of_a_file_that_memory_has_no_room_for_rows_alone_are_read(dataset, on_disk, monkeypatch):

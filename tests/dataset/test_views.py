@@ -8,11 +8,12 @@ from unittest.mock import patch
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 from unbake import memory
 from unbake.dataset.camera import Camera
 from unbake.dataset.fingerprint import fingerprint
-from unbake.dataset.image_files import counted_by, read_image
+from unbake.dataset.image_files import counted_by, counted_in, read_image
 from unbake.dataset.poses import check_cameras
 from unbake.dataset.views import Dataset, View, fitted_pixels, read_photograph
 from unbake.errors import UserError
@@ -420,6 +421,22 @@ def test_black_and_transparent_pixels_of_a_mask_do_not_count(colours, alpha, cou
     if alpha is not None:
         codes = np.dstack([codes, np.array([alpha], np.uint8)])
     assert counted_by(codes).tolist() == [counted]
+
+
+def test_noise_of_jpeg_counts_no_pixel_of_a_mask(tmp_path):
+    """Beside edges of a disk, JPEG leaves small codes in black and lowers white."""
+    y, x = np.mgrid[:64, :64]
+    disk = np.hypot(x - 30, y - 33) < 20
+    codes = np.where(disk, 255, 0).astype(np.uint8)
+    for name in ("mask.png", "mask.jpg"):
+        Image.fromarray(codes).save(tmp_path / name)
+    stored = np.asarray(Image.open(tmp_path / "mask.jpg"))
+    assert (stored[~disk] > 0).any()
+    assert np.array_equal(counted_in(tmp_path / "mask.png"), disk)
+    assert np.array_equal(counted_in(tmp_path / "mask.jpg"), disk)
+    dark = np.where(disk, 3, 0).astype(np.uint8)
+    Image.fromarray(dark).save(tmp_path / "dark.png")
+    assert np.array_equal(counted_in(tmp_path / "dark.png"), disk), "of PNG, all but black counts"
 
 
 def test_the_fingerprint_knows_masks(folder):

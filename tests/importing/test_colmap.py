@@ -284,7 +284,7 @@ def test_real_photographs_become_a_data_set(tmp_path):
     assert (len(found.train), len(found.heldout)) == (8, 2)
     assert told[0].endswith("of 1024 x 769 pixels")
     assert "(1.3 stops apart), by EXIF" in told[1]
-    assert "one part, 14,709 triangles; 59 % of the pixels see it (54 to 70 %" in told[2]
+    assert "one part, 14,709 triangles; 59 % of the pixels see it (54 to 70 %" in told[3]
     view = found.views[0]
     assert view.camera.cx == pytest.approx(525.25, abs=0.01)
     assert (tmp_path / "data" / "images" / "00000.jpg").read_bytes() == (

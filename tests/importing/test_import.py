@@ -36,12 +36,10 @@ from unbake.dataset.views import Dataset, read_masked, read_photograph
 from unbake.errors import UserError
 from unbake.imaging.coded import encode
 from unbake.imaging.pictures import write_exr
-from unbake.importing.faults import Faults, ImportFaults
-from unbake.importing.frames import read_one_file
+from unbake.importing.faults import ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.meshes import TO_Z_UP
 from unbake.importing.settings import ImportSettings
-from unbake.importing.source import Reading
 from unbake.scene.edit import material_names
 from unbake.scene.free_space import trace
 from unbake.scene.parse import parse
@@ -65,6 +63,7 @@ def test_nerfstudio_comes_back(captured, nerfstudio, meshes, tmp_path):
     import_data(nerfstudio, out, meshes, tell=told.append)
     found = same_as_captured(captured, out)
     assert found.background == "visible"
+    assert "background: visible, pixels beside the mesh show the environment" in told
     assert told[0].endswith("2 training and 1 held-out views of 16 x 16 pixels")
     assert "before 'applied_transform'" in told[1]
     assert "100 % of the pixels see it" in told[-1]
@@ -912,16 +911,6 @@ def test_test_frames_are_held_out(captured, nerfstudio, meshes, tmp_path):
     splits = {view.name: view.split for view in Dataset.load(tmp_path / "data").views}
     names = [view.name for view in captured.views]
     assert splits == {names[0]: "train", names[1]: "heldout", names[2]: "train"}
-
-
-def test_cameras_that_older_nerfstudio_turned_are_told(nerfstudio, tmp_path):
-    (nerfstudio / "colmap" / "sparse" / "0").mkdir(parents=True)
-    for keys, count in ((("applied_transform",), 1), ((), 0)):
-        folder = tmp_path / f"source{count}"
-        shutil.copytree(nerfstudio, folder)
-        change(folder, lambda c, keys=keys: [c.pop(key) for key in keys])
-        found = read_one_file(folder / "transforms.json", Reading(), Faults())
-        assert sum("older nerfstudio" in note for note in found.notes) == count
 
 
 def test_an_angle_that_contradicts_a_focal_length_is_told(nerfstudio, meshes, tmp_path):

@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from layouts import quiet, write_blender, write_nerfstudio
+from layouts import APPLIED, quiet, write_blender, write_nerfstudio
 
 from unbake.errors import UserError
+from unbake.importing import meshes as meshes_module
 from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.meshes import TO_Z_UP, Part, read_parts, write_scene
@@ -274,8 +275,11 @@ def test_meshes_of_ns_export_are_taken_back(captured, tmp_path):
     assert np.allclose(part.positions, box.vertices, atol=1e-5)
     assert np.allclose(part.normals, box.vertex_normals, atol=1e-5)
     both = ImportSettings(keep_applied_transform=True)
-    with pytest.raises(ImportFaults, match="--keep-applied-transform leaves cameras in another"):
-        import_data(tmp_path / "nerf", tmp_path / "none", given, both, **more)
+    import_data(tmp_path / "nerf", tmp_path / "kept", given, both, **more)
+    (part,) = parts_of(*(tmp_path / "kept" / "scene" / "meshes").iterdir())
+    moved = box.copy()
+    moved.apply_transform(APPLIED)
+    assert np.allclose(part.positions, moved.vertices, atol=1e-5), "where cameras stay"
     for wrong, told in (({"scale": 0.0}, "'scale' is not positive"), ({"transform": 1}, "3 x 4")):
         file.write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1} | wrong))
         with pytest.raises(ImportFaults, match=told):
@@ -326,3 +330,112 @@ def test_texture_coordinates_follow_vertices_that_get_several_normals(tmp_path):
     np.testing.assert_array_equal(places, box.faces.ravel())
     # To Mitsuba, v = 0 is the first row of an image.
     np.testing.assert_allclose(found.uv[corners] * (1, -1) + (0, 1), uv[places], atol=1e-6)
+
+
+#: An L, whose area is 3, and a wall of 4 x 3 with a window of 2 x 1, to which its edge goes.
+LETTER = ((0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2))
+WALL = ((0, 0), (4, 0), (4, 3), (0, 3), (0, 0), (1, 1), (1, 2), (3, 2), (3, 1), (1, 1))
+POLYGONS = {"letter": (LETTER, 3), "wall": (WALL, 10)}
+
+
+def area_of(part):
+    a, b, c = part.positions[part.faces].transpose(1, 0, 2)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
+def polygon_files(points, folder):
+    """A polygon on a slope as one face, beside a triangle: OBJ and PLY, each with uv = (x, y) / 4.
+
+    OBJ has it with and without normals; PLY with and without a texture of each vertex.
+    """
+    places = [(x, y, x + 2 * y) for x, y in (*points, (0, -1))]
+    numbers = [range(1, len(points) + 1), (1, 2, len(points) + 1)]
+    lines = [f"v {x} {y} {z}" for x, y, z in places]
+    lines += [f"vt {x / 4} {y / 4}" for x, y, _ in places] + ["vn 0.6 0 0.8"]
+    for kind, word in (("normals", "{0}/{0}/1"), ("textured", "{0}/{0}"), ("bare", "{0}")):
+        faces = ["f " + " ".join(word.format(k) for k in face) for face in numbers]
+        (folder / f"{kind}.obj").write_text("\n".join([*lines, "usemtl clay", *faces]) + "\n")
+    for kind in ("textured", "bare"):
+        columns = ("x", "y", "z", "s", "t")[: 5 if kind == "textured" else 3]
+        head = ["ply", "format ascii 1.0", f"element vertex {len(places)}"]
+        head += [f"property float {name}" for name in columns]
+        head += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+        rows = [(x, y, z, x / 4, y / 4)[: len(columns)] for x, y, z in places]
+        rows += [(len(face), *(k - 1 for k in face)) for face in numbers]
+        body = [" ".join(map(str, row)) for row in rows]
+        (folder / f"{kind}.ply").write_text("\n".join([*head, *body]) + "\n")
+    return sorted(file for file in folder.iterdir() if file.suffix in (".obj", ".ply"))
+
+
+@pytest.mark.parametrize("shape", POLYGONS)
+def test_polygons_that_are_not_convex_are_filled_and_nothing_else(shape, tmp_path):
+    """Whatever their first corner is, with texture coordinates and normals of their corners."""
+    points, area = POLYGONS[shape]
+    for first in range(len(points)):
+        turned = points[first:] + points[:first]
+        beside = 0.5 * abs(np.linalg.det([np.subtract(p, (0, -1)) for p in turned[:2]]))
+        for file in polygon_files(turned, tmp_path):
+            (part,) = parts_of(file)
+            assert np.isclose(area_of(part), (area + beside) * np.sqrt(6)), file
+            assert len(part.faces) == len(points) - 1
+            if file.stem != "bare":
+                assert np.allclose(part.uv, part.positions[:, :2] / 4)
+            if file.stem == "normals":
+                assert np.allclose(part.normals, (0.6, 0, 0.8))
+
+
+def test_corners_of_a_ply_files_quads_keep_their_textures(tmp_path):
+    """A quad with a corner that points inwards, with texture coordinates of its corners."""
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\n"
+    head += b"property float y\nproperty float z\nelement face 1\nproperty list uchar int "
+    head += b"vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+    body = np.array([(0, 0, 0), (4, 0, 0), (1, 1, 0), (0, 4, 0)], "<f4").tobytes()
+    body += struct.pack("<B4iB8f", 4, 1, 2, 3, 0, 8, 1, 0, 0.25, 0.25, 0, 1, 0, 0)
+    (tmp_path / "dart.ply").write_bytes(head + body)
+    (part,) = parts_of(tmp_path / "dart.ply")
+    assert np.isclose(area_of(part), 4) and np.allclose(part.uv, part.positions[:, :2] / 4)
+
+
+def test_a_face_that_crosses_itself_is_a_fault(tmp_path):
+    star = [(np.cos(a), np.sin(a)) for a in np.arange(5) * 0.8 * np.pi]
+    lines = [f"v {x} {y} 0" for x, y in [*star[:2], (-2, 0.5), *star[2:]]]
+    (tmp_path / "star.obj").write_text("\n".join([*lines, "f 1 2 3 4 5 6"]) + "\n")
+    with pytest.raises(ImportFaults, match=r"cross themselves \(1\).*with triangulated faces"):
+        parts_of(tmp_path / "star.obj")
+
+
+def test_a_ply_file_that_is_not_read_names_what_to_export(tmp_path):
+    """The reader takes no binary files of triangles and quads."""
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\n"
+    head += b"property float y\nproperty float z\nelement face 2\n"
+    head += b"property list uchar int vertex_indices\nend_header\n"
+    body = np.array(CORNERS[:4], "<f4").tobytes()
+    body += struct.pack("<B4iB3i", 4, 0, 1, 3, 2, 3, 0, 1, 3)
+    (tmp_path / "mixed.ply").write_bytes(head + body)
+    with pytest.raises(ImportFaults, match=r"cannot be read .*with triangulated faces, or as GLB"):
+        parts_of(tmp_path / "mixed.ply")
+
+
+def test_many_parts_are_named_in_no_time_and_told(captured, tmp_path, monkeypatch):
+    """A name asks a set, and not every part before it."""
+    asked = []
+
+    def ids(name):
+        asked.append(name)
+        return name, f"{name}_sides", f"{name}_shape"
+
+    monkeypatch.setattr(meshes_module, "_ids", ids)
+    lines = [f"v {x} {y} 0" for x, y in ((0, 0), (1, 0), (0, 1))]
+    for number in range(300):
+        lines += [f"o {'part' if number % 2 else 'PART'}", f"g {number % 3}"]
+        lines += ["f 1 2 3", f"o rest {number}", "f 1 2 3"]
+    (tmp_path / "many.obj").write_text("\n".join(lines) + "\n")
+    files = [tmp_path / "many.obj"] * 3
+    parts = parts_of(*files)
+    assert len({part.name.lower() for part in parts}) == len(parts) > 900
+    assert len(asked) < 4 * len(parts)
+    monkeypatch.undo()
+    write_blender(captured, tmp_path / "blender")
+    told = []
+    import_data(tmp_path / "blender", tmp_path / "data", files[:1], tell=told.append)
+    assert any("parts has a BSDF of its own" in line for line in told)

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import tifffile
+import trimesh
 from layouts import codes, quiet, save, write_blender, write_colmap, write_nerfstudio
 from PIL import Image
 
@@ -16,13 +18,15 @@ from unbake.imaging.pictures import write_exr
 from unbake.imaging.profiles import linear_srgb, profile_name, read_profile
 from unbake.imaging.srgb import from_srgb, to_srgb
 from unbake.importing import import_data as importing
+from unbake.importing import views
 from unbake.importing.faults import ImportFaults
 from unbake.importing.frames import _lens
 from unbake.importing.import_data import import_data
-from unbake.importing.lens import Lens
+from unbake.importing.lens import Lens, opencv
 from unbake.importing.photographs import CLIPPED_CODE
 from unbake.importing.settings import ImportSettings
 from unbake.importing.source import Shot, same_shape
+from unbake.importing.views import _straightened, block_for
 
 imagecodecs = pytest.importorskip("imagecodecs", reason="colour profiles need imagecodecs")
 
@@ -55,7 +59,7 @@ def imported(source, out, meshes, **more):
     return Dataset.load(out), told
 
 
-SETTINGS = ("leave_out_missing", "mesh_y_up", "keep_applied_transform", "longest")
+SETTINGS = ("leave_out_missing", "mesh_y_up", "keep_applied_transform", "longest", "background")
 
 
 # -------------------------------------------------------------------------------------------- sizes
@@ -363,7 +367,61 @@ def test_a_picture_of_one_line_stays_one(captured):
     """As those that are made small for checks and previews."""
     lens = Lens(5000, 1, 100.0, 100.0, 2500.0, 0.5)
     shot = Shot("line", None, captured.views[0].image, lens, np.eye(4))
-    assert importing._block(shot, 2048) == 1 and importing._block(shot, 0) == 1
+    assert block_for(shot, 2048) == 1 and block_for(shot, 0) == 1
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+@pytest.mark.parametrize("limit", [None, 0.9, 2.0])
+def test_photographs_are_straightened_as_if_all_was_resampled(opaque, limit):
+    """Bit for bit: what is known beforehand is left out."""
+    radial, rng = np.array([0.05, 0.01, 0]), np.random.default_rng(3)
+    project = opencv((40.0, 40.0), (25.0, 16.0), radial, 0.001, 0.0)
+    lens = Lens(48, 32, 40.0, 40.0, 25.0, 16.0, project)
+    pixels = rng.random((32, 48, 4)).astype(np.float32)
+    pixels[..., 2] *= 0.5  # is clipped nowhere
+    if opaque:
+        pixels[..., 3] = 1
+    focal = lens.camera(np.eye(4)).fl_x
+    found, exact = _straightened(lens, pixels, focal, limit)
+    wanted = lens.straightened(pixels, focal)
+    assert np.array_equal(found, wanted)
+    if limit is None:
+        assert exact is None
+        return
+    clipped = lens.straightened((pixels[..., :3] >= limit).astype(np.float32), focal)
+    between = (clipped > 0) & (wanted[..., :3] < np.float32(limit))
+    assert np.array_equal(exact, ~between.any(2)) and exact.all() == (limit == 2)
+
+
+def test_photographs_are_the_same_whether_read_alone_or_together(captured, meshes, tmp_path):
+    write_nerfstudio(captured, tmp_path / "nerf")
+    content = json.loads((tmp_path / "nerf" / "transforms.json").read_text())
+    (tmp_path / "nerf" / "transforms.json").write_text(json.dumps(content | {"k1": 0.02}))
+    told, files = [], []
+    for at_once in (1, 3):
+        with (
+            patch("unbake.importing.progress.decoded_at_once", return_value=at_once),
+            patch("unbake.importing.progress.EVERY", 0.0),
+        ):
+            out = tmp_path / f"data{at_once}"
+            told.append(imported(tmp_path / "nerf", out, meshes)[1])
+            found = (file for file in sorted(out.rglob("*")) if file.is_file())
+            files.append({str(f.relative_to(out)): f.read_bytes() for f in found})
+    assert files[0] == files[1] and told[0] == told[1]
+    for what in ("read", "wrote"):
+        assert [f"{what} {n} of 3 photographs" in told[0] for n in (1, 2, 3)] == [True, True, False]
+
+
+def test_photographs_that_the_disk_has_no_room_for_are_refused_first(
+    project, meshes, tmp_path, monkeypatch
+):
+    need = sum(file.stat().st_size for file in (project / "images").iterdir())
+    monkeypatch.setattr(views, "free_disk", lambda folder: need)
+    imported(project, tmp_path / "data", meshes)
+    monkeypatch.setattr(views, "free_disk", lambda folder: need - 1)
+    with pytest.raises(UserError, match=r"take about .* are free.*--longest 2048"):
+        imported(project, tmp_path / "none", meshes)
+    assert not (tmp_path / "none").exists()
 
 
 def test_photographs_may_have_more_pixels_than_pillow_takes(project, meshes, tmp_path, monkeypatch):
@@ -413,6 +471,37 @@ def test_transparent_pixels_that_are_fitted_as_black_are_told(
     names = ", ".join(file.name for file in others)
     wanted = f"black background: {names}, beside opaque ones ({first.name}). Give --background hid"
     assert any(wanted in line for line in told) == (background != "hidden")
+
+
+def test_a_background_that_alpha_leaves_in_is_masked_by_the_mesh(captured, tmp_path):
+    """Alpha cuts out a corner of one photograph alone, and the mesh is a small ball."""
+    write_nerfstudio(captured, tmp_path / "nerf")
+    first, second, third = sorted((tmp_path / "nerf" / "images").iterdir())
+    clear = np.full((16, 16, 1), 255, np.uint8)
+    clear[0, 0] = 0
+    save(np.concatenate([np.asarray(Image.open(first)), clear], 2), first)
+    ball = trimesh.creation.icosphere(2, 0.4)
+    ball.export(tmp_path / "ball.ply")
+    background = {"background": "hidden"}
+    found, told = imported(
+        tmp_path / "nerf", tmp_path / "data", [tmp_path / "ball.ply"], **background
+    )
+    assert all(view.mask_from_mesh for view in found.views)
+    views = {view.name: read_masked(view)[1] for view in found.views}
+    assert 0 < views[first.stem].mean() < 0.6
+    line = "hidden, by the alpha of photographs (1 with transparent pixels) and where the mesh is "
+    assert any(f"{line}not seen (2 photographs)" in each for each in told)
+    assert any(f"which is masked as well: images/{first.name}" in line for line in told)
+    # Cut out as the mesh is, alpha alone tells
+    for file in (first, second, third):
+        counted = views[file.stem].astype(np.uint8)[..., None] * 255
+        save(np.concatenate([np.asarray(Image.open(file))[..., :3], counted], 2), file)
+    found, told = imported(
+        tmp_path / "nerf", tmp_path / "cut", [tmp_path / "ball.ply"], **background
+    )
+    assert not any(view.mask_from_mesh for view in found.views)
+    wanted = "background: hidden, by the alpha of photographs (3 with transparent pixels)"
+    assert wanted in told and not any("masked as well" in line for line in told)
 
 
 def test_grey_photographs_among_others_are_told(project, meshes, tmp_path):

@@ -22,6 +22,7 @@ from ..dataset.agreement import (
 from ..dataset.alignment import Alignment, alignment
 from ..dataset.camera import Camera
 from ..dataset.findings import (
+    Check,
     Finding,
     light_that_turns,
     misaligned,
@@ -123,7 +124,7 @@ class DataCheck:
         self.findings += [finding for finding in findings if finding is not None]
 
     def warn(
-        self, check: str, what: str, where: str | None = None, remedy: str | None = None
+        self, check: Check, what: str, where: str | None = None, remedy: str | None = None
     ) -> None:
         """Add a warning."""
         self.add(Finding("warning", check, what, where, remedy))
@@ -420,7 +421,7 @@ def _untold(view: CheckedView) -> float:
 
 def _share(
     result: DataCheck,
-    check: str,
+    check: Check,
     shares: list[float],
     limits: tuple[float, float],
     what: str,

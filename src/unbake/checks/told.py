@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..dataset.findings import Check
 from ..errors import printable
 from .check import CheckedView, DataCheck
 from .pictures import percentage
 
 #: The checks in the order in which they are told, and those that each row stands for.
-_ROWS = {
-    "files": ("files", "scene", "masks", "hot pixels"),
+ROWS: dict[str, tuple[Check, ...]] = {
+    "files": ("files", "size", "scene", "media", "masks", "hot pixels"),
     "geometry": ("geometry", "units", "normals"),
     "alignment": ("alignment",),
     "exposure": ("exposure",),
@@ -39,7 +40,7 @@ def told_rows(result: DataCheck) -> list[tuple[str, str, str]]:
         "duplicates": _duplicates(result),
     }
     rows = []
-    for row, checks in _ROWS.items():
+    for row, checks in ROWS.items():
         told = numbers[row]
         levels = {finding.level for finding in result.findings if finding.check in checks}
         verdict = next((level for level in ("error", "warning", "hint") if level in levels), None)

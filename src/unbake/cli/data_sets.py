@@ -26,6 +26,7 @@ from .options import (
     Flag,
     Folder,
     LightFlags,
+    Matrix,
     Meshes,
     Out,
     OutFile,
@@ -93,6 +94,7 @@ def import_(
     masks: Folder = None,
     exposures: File = None,
     mesh_transform: File = None,
+    mesh_matrix: Matrix = (),
     envmap: File = None,
     lights: File = None,
     allow_outside: Flag = False,
@@ -120,7 +122,10 @@ def import_(
             NAME.jpg. By default the one that the source names.
         exposures: Table (CSV) with the columns name and exposure, instead of EXIF.
         mesh_transform: The dataparser_transforms.json of a nerfstudio run, whose ns-export wrote
-            the mesh: takes the mesh back to the frame of COLMAP.
+            the mesh: takes the mesh back to the frame of the cameras.
+        mesh_matrix: What takes the mesh to the frame of the cameras, row by row: a file (text or
+            JSON) or 16 numbers; a rotation with a scale and a translation. It comes after the other
+            options that move the mesh.
         envmap: Environment map (OpenEXR, HDR) that is the known light.
         lights: Mitsuba XML file with the known lights: emitters, and shapes that emit light.
         allow_outside: Read files that the source and --lights name outside of their folders.
@@ -138,6 +143,7 @@ def import_(
         "masks": masks,
         "exposures": exposures,
         "mesh_transform": mesh_transform,
+        "mesh_matrix": mesh_matrix or None,
         "light": known,
     }
     try:

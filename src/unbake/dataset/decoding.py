@@ -153,28 +153,35 @@ class Plan:
 
         sizes = [view.camera.width * view.camera.height for view in views]
         starts = np.cumsum([0, *sizes])[:-1].tolist()
-        at_once = _at_once(views, processes, held)
+        coded = all(view.encoding == "srgb" for view in views)
+        at_once = decoded_at_once(
+            len(views), max(sizes, default=1), coded=coded, processes=processes, held=held
+        )
         made = in_order(put, list(zip(views, starts, strict=True)), at_once)
         return joined(made, self.chooses, keep)
 
 
-def _at_once(views: Sequence[View], processes: int, held: int) -> int:
-    """How many views are decoded at once.
+def decoded_at_once(
+    count: int, largest: int, *, coded: bool, processes: int = 1, held: int = 0
+) -> int:
+    """How many images are decoded at once.
 
     Files of radiance are read one after the other: Mitsuba reads each in threads of its own, and
     two of them may wait for each other.
 
     Args:
+        count: of the images.
+        largest: pixels of the largest one.
+        coded: whether all of them have code values.
         processes: that decode on this machine.
         held: bytes of each that are to stay.
     """
-    if any(view.encoding != "srgb" for view in views):
+    if not coded:
         return 1
-    largest = max((view.camera.width * view.camera.height for view in views), default=1)
     free, cores = free_bytes(), usable_cores() // processes
     each = processes * PIXEL_BYTES * largest
     fitting = cores if free is None else int(_OF_FREE * (free - processes * held) / each)
-    return max(1, min(len(views), cores, fitting))
+    return max(1, min(count, cores, fitting))
 
 
 def _in_radiance(pixels: np.ndarray, view: View) -> np.ndarray:

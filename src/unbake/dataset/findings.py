@@ -21,6 +21,27 @@ from .views import SensorNoise
 #: An error: a fit makes no sense. A warning: it will be worse than it could be. A hint: something
 #: to know.
 Level = Literal["error", "warning", "hint"]
+#: What was looked at.
+Check = Literal[
+    "files",
+    "size",
+    "scene",
+    "media",
+    "masks",
+    "hot pixels",
+    "geometry",
+    "units",
+    "normals",
+    "alignment",
+    "exposure",
+    "light",
+    "clipped",
+    "black",
+    "noise",
+    "blur",
+    "coverage",
+    "duplicates",
+]
 #: Stops between the darkest and the brightest exposure from which on it matters.
 SPREAD = 0.5
 #: Light turns with the cameras if it explains such a share of what differs between views, and so
@@ -34,14 +55,14 @@ class Finding:
 
     Args:
         level: how bad it is.
-        check: the check that found it, a word.
+        check: the check that found it.
         what: what is wrong, as a sentence without full stop.
         where: views or files; None: the data set as a whole.
         remedy: what to do about it, without full stop.
     """
 
     level: Level
-    check: str
+    check: Check
     what: str
     where: str | None = None
     remedy: str | None = None

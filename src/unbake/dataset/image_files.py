@@ -19,6 +19,8 @@ ENCODINGS = ("linear", "srgb")
 
 _LDR_SUFFIXES = (*CODED_SUFFIXES, ".bmp", ".tga", ".webp", ".gif", ".ppm")
 _MOST_CHANNELS = 4
+#: Suffixes of formats that change pixels.
+_LOSSY = (".jpg", ".jpeg")
 _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 #: Memory in bytes that takes part in decoding a pixel, blurring it included.
 PIXEL_BYTES = 100
@@ -81,6 +83,23 @@ def read_radiance(path: Path, width: int, height: int) -> np.ndarray:
         remedy = "No measurement is like that: render or convert the image again"
         raise UserError(what, path, remedy)
     return pixels
+
+
+def counted_in(path: Path, remedy: str = REPLACE) -> np.ndarray:
+    """Whether pixels count by a mask, (H, W) bool.
+
+    Args:
+        path: a PNG, JPEG or TIFF file. Of JPEG, codes count from half the largest one on: it leaves
+            noise beside edges, black and white.
+        remedy: of the error message.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    codes = read_codes(path, remedy)
+    if path.suffix.lower() in _LOSSY:
+        codes = np.where(codes > np.iinfo(codes.dtype).max // 2, codes, 0)
+    return counted_by(codes)
 
 
 def counted_by(codes: np.ndarray) -> np.ndarray:

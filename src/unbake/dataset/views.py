@@ -13,10 +13,9 @@ import numpy as np
 from unbake.dataset.camera import Camera
 from unbake.dataset.camera_files import camera_from_frame, frame_of, read_split
 from unbake.dataset.data_folder import DataFolder
-from unbake.dataset.image_files import ENCODINGS, REPLACE, check_header, counted_by, read_image
+from unbake.dataset.image_files import ENCODINGS, check_header, counted_in, read_image
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError, collected, raise_together
-from unbake.imaging.coded import read_codes
 from unbake.imaging.headers import CODED_SUFFIXES, HeaderError, read_header
 from unbake.io import number, require_file, text
 from unbake.quantities import QUANTITIES
@@ -298,7 +297,19 @@ def read_masked(view: View, clip_negative: bool = False) -> tuple[np.ndarray, np
     width, height = view.camera.width, view.camera.height
     pixels = read_image(view.image, width, height, clip_negative, view.encoding)
     pixels = pixels.reshape(height, width, 4)
-    return pixels, _read_mask(view)
+    return pixels, read_mask(view)
+
+
+def read_mask(view: View) -> np.ndarray | None:
+    """Whether pixels count by the mask of a view, (H, W) bool; None where it has none.
+
+    Raises:
+        UserError: the mask cannot be read, or has another size.
+    """
+    if view.mask is None:
+        return None
+    check_header(view.mask, view.camera.width, view.camera.height, "srgb")
+    return counted_in(view.mask)
 
 
 def fitted_pixels(view: View, background: str) -> np.ndarray | None:
@@ -313,7 +324,7 @@ def fitted_pixels(view: View, background: str) -> np.ndarray | None:
     if background == "hidden" and _may_be_transparent(view.image):
         counted = fitted(*read_masked(view, clip_negative=True), background)
     else:
-        counted = _read_mask(view)
+        counted = read_mask(view)
     return None if counted is None or counted.all() else counted
 
 
@@ -324,14 +335,6 @@ def fitted(pixels: np.ndarray, mask: np.ndarray | None, background: str) -> np.n
     """
     counted = np.ones(pixels.shape[:2], bool) if mask is None else mask
     return counted & (pixels[..., 3] > 0) if background == "hidden" else counted
-
-
-def _read_mask(view: View) -> np.ndarray | None:
-    """Whether pixels count by the mask of a view, (H, W) bool; None where it has none."""
-    if view.mask is None:
-        return None
-    check_header(view.mask, view.camera.width, view.camera.height, "srgb")
-    return counted_by(read_codes(view.mask, REPLACE))
 
 
 def _may_be_transparent(image: Path) -> bool:

@@ -27,10 +27,11 @@ _SPHERICAL = ("EQUIRECTANGULAR",)
 
 def find_model(folder: Path) -> Path | None:
     """The folder of a project that has a COLMAP model in it; None where there is none."""
-    return next((m for m in (folder / name for name in _MODELS) if _is_model(m)), None)
+    return next((m for m in (folder / name for name in _MODELS) if is_model(m)), None)
 
 
-def _is_model(folder: Path) -> bool:
+def is_model(folder: Path) -> bool:
+    """Whether a folder has a COLMAP model in it."""
     names = ("cameras", "images")
     return any(all((folder / f"{n}{end}").is_file() for n in names) for end in _ENDINGS)
 
@@ -88,7 +89,7 @@ def _other_models(model: Path) -> list[str]:
     """A note of models beside this one, into which COLMAP divides what it cannot join."""
     if not model.name.isdecimal():
         return []
-    beside = [f for f in sorted(model.parent.iterdir()) if f.name.isdecimal() and _is_model(f)]
+    beside = [f for f in sorted(model.parent.iterdir()) if f.name.isdecimal() and is_model(f)]
     others = [folder.name for folder in beside if folder.name != model.name]
     return [f"{model.parent} has other models, left out: {named(others)}"] if others else []
 
@@ -129,11 +130,25 @@ def _is_binary(model: Path) -> bool:
     return (model / "cameras.bin").is_file()
 
 
+def poses_of(model: Path) -> dict[str, np.ndarray]:
+    """Camera to world (4, 4), OpenGL axes, by the names of a model's images.
+
+    Raises:
+        UserError: pycolmap is missing, or cannot read the model.
+    """
+    images = _reconstruction(model).images.values()
+    return {image.name: _pose(image) for image in images if image.has_pose}
+
+
 def _shot(image: Any, lens: Lens, file: Path) -> Shot:
+    return Shot(image.name, None, file, suited(lens, file), _pose(image))
+
+
+def _pose(image: Any) -> np.ndarray:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
     # COLMAP's cameras look along z with y down.
-    return Shot(image.name, None, file, suited(lens, file), pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def _lens(camera: Any) -> Lens:

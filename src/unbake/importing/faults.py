@@ -48,6 +48,11 @@ class Faults:
         places = self._places.setdefault((what, remedy), [])
         places.extend([] if place is None else [printable(place)])
 
+    def extend(self, others: Faults) -> None:
+        """Add all of these."""
+        for fault, places in others._places.items():
+            self._places.setdefault(fault, []).extend(places)
+
     @contextlib.contextmanager
     def collected(self, place: object = None) -> Iterator[None]:
         """Turn a `UserError` of the block into a fault; the block ends there.

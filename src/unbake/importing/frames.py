@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,12 +12,12 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.camera_files import camera_from_frame, with_top
-from ..dataset.data_folder import TRANSFORMS
 from ..errors import UserError, named, printable
 from ..imaging.headers import CODED_SUFFIXES
 from ..io import array, number, read_object, require_file, text
 from .faults import Faults
 from .lens import Lens, fisheye, opencv
+from .nerfstudio import world_of
 from .source import Reading, Shot, Source, ends_of, find_image, image_header, suited
 
 #: What the layout with one file is called, for people.
@@ -42,15 +42,6 @@ _SPLITS = {
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _LENSES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
-_INSTANT_NGP = (
-    f"{TRANSFORMS} may be of instant-ngp, whose colmap2nerf.py turns and scales cameras unless it "
-    "is run with --keep_colmap_coords: a mesh of COLMAP does not fit then"
-)
-_TURNED_ONCE = (
-    f"{TRANSFORMS} has no 'applied_transform': older nerfstudio turned the cameras of COLMAP and "
-    "did not say so. For a mesh of COLMAP, add to the file: "
-    '"applied_transform": [[0,1,0,0],[1,0,0,0],[0,0,-1,0]]'
-)
 #: The difference of two focal lengths of one camera, relative, that is more than rounding.
 _CONTRADICTS = 0.01
 #: A pose whose axes are so much longer or shorter than 1 has a scale; shorter ones are no pose.
@@ -77,25 +68,26 @@ def read_one_file(file: Path, reading: Reading, faults: Faults) -> Source:
     if "scene" in top:
         faults.add(f"the folder is a data set already: {file.name} names a 'scene'")
         return Source("data set", ())
-    back, notes = _taken_back(top, file, reading.keep_applied_transform, faults)
     splits = _listed_splits(top, file, faults)
     shots = _read_frames(file, top, reading, None, faults)
     if top.get(_TEST_FRAMES):
         shots += _read_frames(file, top, reading, "heldout", faults, _TEST_FRAMES)
+    poses = {shot.name: shot.to_world for shot in shots}
+    world = world_of(top, file, poses, reading.keep_applied_transform, faults)
     placed = [
         Shot(
             shot.name,
             _listed(shot.name, splits) or shot.split,
             shot.image,
             shot.lens,
-            shot.to_world if back is None else back(shot.to_world),
+            world.camera(shot.to_world),
             shot.mask,
         )
         for shot in shots
     ]
     kept, left_out = _of_lists(placed, splits)
-    told = (*notes, *_unknown_names(top, splits), *left_out)
-    return Source(NERFSTUDIO, kept, told, put_back=back is not None)
+    told = (*_unknown_names(top, splits), *left_out)
+    return Source(NERFSTUDIO, kept, told, world=world)
 
 
 def _of_lists(
@@ -382,45 +374,6 @@ def _contradicts(top: Mapping[str, Any], frame: Mapping[str, Any], lens: Lens) -
             if abs(focal / given - 1) > _CONTRADICTS:
                 return True
     return False
-
-
-def _taken_back(
-    top: dict[str, Any], file: Path, keep: bool, faults: Faults
-) -> tuple[Callable[[np.ndarray], np.ndarray] | None, tuple[str, ...]]:
-    """What puts poses back into the frame before `applied_transform`, and a note of it.
-
-    None: they stay.
-    """
-    if "applied_transform" not in top and "applied_scale" not in top:
-        # instant-ngp writes the key; its script turns and scales what COLMAP found by default.
-        if "aabb_scale" in top:
-            return None, (_INSTANT_NGP,)
-        return None, (_TURNED_ONCE,) if (file.parent / "colmap").is_dir() else ()
-    if keep:
-        return None, ()
-    applied, scale = np.eye(4), 1.0
-    with faults.collected(file.name):
-        if "applied_transform" in top:
-            rows = top["applied_transform"]
-            shape = (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 4)
-            applied[:3] = array(top, "applied_transform", shape, str(file))[:3]
-        rotation = applied[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
-            raise UserError("'applied_transform' is no rotation with a translation")
-    with faults.collected(file.name):
-        scale = number(top, "applied_scale", file.name) if "applied_scale" in top else 1.0
-        if scale <= 0:
-            raise UserError("'applied_scale' is not positive")
-    if faults or (np.allclose(applied, np.eye(4)) and scale == 1):
-        return None, ()
-    undo = np.linalg.inv(applied)
-
-    def back(pose: np.ndarray) -> np.ndarray:
-        pose = pose.copy()
-        pose[:3, 3] /= scale
-        return undo @ pose
-
-    return back, (f"cameras are in the frame before 'applied_transform' of {TRANSFORMS}",)
 
 
 def _listed_splits(top: dict[str, Any], file: Path, faults: Faults) -> dict[PurePosixPath, str]:

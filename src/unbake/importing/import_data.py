@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from ..acquisition.new_light import put_light, tell_tilt
 from ..config.light import LightConfig
-from ..dataset.camera import Camera, spread_rays
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.photographs import MOST_PIXELS
-from ..dataset.small_views import block_of, in_blocks
 from ..dataset.views import LONGEST_NAME
 from ..errors import UserError, named, printable
 from ..io import filled_folder, require_new_folder, require_utf8
@@ -27,16 +26,17 @@ from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import WIDEST
-from .meshes import TO_Z_UP, Part, read_parts, read_transform, write_scene
-from .photographs import check_pictures
+from .meshes import TO_Z_UP, Part, read_parts, write_scene
+from .photographs import Pictures, check_cameras, check_pictures
+from .progress import each_photograph
 from .raw import for_sensor, is_raw, raw_balances
 from .rooms import is_room, read_room
+from .seen import on_mesh, on_mesh_if_stray, shares_seen
 from .settings import ImportSettings
 from .source import Reading, Shot, Source, masks_in, orientation
-from .views import complete_masks, write_view
+from .views import block_for, complete_masks, require_disk, write_view
+from .world import World, read_matrix
 
-#: Rays a view, along each edge, that tell how much of a photograph sees the mesh.
-_RAYS = 64
 #: Poses are the same but for this in their axes, and this part of the largest coordinate.
 _SAME = 1e-6
 #: A mesh that is this many times as wide as the space of the cameras may be in another unit.
@@ -45,6 +45,8 @@ _LARGER = 20
 _SMALL = 2048
 #: Pixels to train on from which on it is told that they are many: 4 GB when decoded.
 _MANY = 170_000_000
+#: Parts of a mesh from which on it is told that they are many.
+_MANY_PARTS = 200
 #: A camera from which this share of all directions hits the mesh stands in a room.
 _ENCLOSED = 0.95
 _KNOWN = (
@@ -63,6 +65,7 @@ def import_data(
     masks: str | Path | None = None,
     exposures: str | Path | None = None,
     mesh_transform: str | Path | None = None,
+    mesh_matrix: str | Path | Sequence[float | str] | None = None,
     light: LightConfig | None = None,
     allow_outside: bool = False,
     tell: Callable[[str], None] = print,
@@ -82,6 +85,8 @@ def import_data(
         masks: folder of masks, where it is not the source's own: zero where pixels do not count.
         exposures: table of `name,exposure`; None: EXIF tells.
         mesh_transform: nerfstudio's `dataparser_transforms.json`, which is taken back of the mesh.
+        mesh_matrix: 16 numbers, row by row, or a file of them, that take the mesh to the frame of
+            the cameras, after all else that moves it.
         light: the known light; None: the light is unknown, and a constant environment stands for
             it.
         allow_outside: read files that lie outside of the source.
@@ -106,38 +111,35 @@ def import_data(
     if not given:
         faults.add("no mesh was given (--mesh FILE)")
     found = _balanced(found)
-    parts = _placed(read_parts(given, faults), settings, mesh_transform, faults)
+    parts = read_parts(given, faults)
+    parts = _placed(parts, found.world, settings, mesh_transform, mesh_matrix, faults)
     known, told = exposures_of(found.shots)
     if exposures is not None:
         with faults.collected():
             known, told = read_table(Path(exposures), found.shots, faults)
     _check_light(light, allow_outside, faults)
     names = _names(found.shots, faults)
-    pictures = check_pictures(found.shots, faults)
+    check_cameras(found.shots, faults)
     splits = _splits(found.shots, settings.holdout)
     if splits and "train" not in splits.values() and not faults:
         faults.add("no photograph is left to train on: the source holds all of them out")
     _check_sizes(_pixels(found.shots, splits, settings.longest), settings.longest, faults)
-    faults.require_none(source)
+    if faults:  # what is wrong with photographs is told with the rest
+        check_pictures(found.shots, faults, tell)
+        faults.require_none(source)
     with filled_folder(out) as folder:
         data = DataFolder(folder)
         file, scene = _write_scene(data, parts, found.shots, light, allow_outside, tell)
-        seen = _shares_seen(scene, found, parts)
+        # Before photographs are decoded, which may take long
+        seen = _shares_seen(scene, found, parts, settings, turnable=mesh_matrix is None)
         dark = light is None and _enclosed(scene, found.shots)
+        require_disk(folder.parent, found.shots, settings.longest)
+        pictures = check_pictures(found.shots, faults, tell)
+        faults.require_none(source)
+        frames, blank, stray = _write_views(
+            data, scene, found.shots, pictures, settings, names, splits, known, tell
+        )
         background = pictures.background(settings.background, names)
-        frames, blank = [], []
-        for shot in found.shots:
-            name, split = names[shot.name], splits[shot.name]
-            cut = background == "hidden" and shot.name not in pictures.transparent
-            changed = shot.name in pictures.negative | pictures.profiles.keys()
-            block = _block(shot, settings.longest)
-            camera = in_blocks(shot.lens.camera(shot.to_world), block)
-            on_mesh = _on_mesh(scene, camera) if cut else None
-            frame, counts = write_view(
-                data, shot, name, split, known, on_mesh, block, changed=changed
-            )
-            frames.append(frame)
-            blank += [] if counts or shot.mask is None else [shot.name]
         _require_counted(blank, splits)
         complete_masks(data, frames)
         data.write_transforms(
@@ -148,7 +150,8 @@ def import_data(
     sizes = _sizes(found.shots, splits, settings.longest)
     changes = (*_straightening(found.shots), *pictures.told(), *sizes)
     found = replace(found, notes=(*found.notes, *changes))
-    for line in _summary(found, splits, seen, parts, told):
+    told_of = [told, *_background(background, pictures, names, stray)]
+    for line in _summary(found, splits, seen, parts, told_of):
         tell(line)
     for line in pictures.warnings(names, background, blank):
         tell(line)
@@ -189,19 +192,28 @@ def _read_source(source: Path, reading: Reading, faults: Faults) -> Source:
 
 
 def _placed(
-    parts: list[Part], settings: ImportSettings, transform: str | Path | None, faults: Faults
+    parts: list[Part],
+    world: World,
+    settings: ImportSettings,
+    transform: str | Path | None,
+    matrix: str | Path | Sequence[float | str] | None,
+    faults: Faults,
 ) -> list[Part]:
     """The parts in the frame of the cameras."""
+    moves = []
     if transform is not None:
-        if settings.keep_applied_transform:
-            what = (
-                "a mesh is taken back to the frame of COLMAP, and --keep-applied-transform leaves "
-            )
-            faults.add(f"{what}cameras in another", remedy="Leave one of them out")
         with faults.collected(transform):
-            back = read_transform(Path(transform))
-            parts = [part.moved(back) for part in parts]
-    return [part.moved(TO_Z_UP) for part in parts] if settings.mesh_y_up else parts
+            moves.append(world.exported(Path(transform)))
+    if settings.mesh_y_up:
+        moves.append(TO_Z_UP)
+    if settings.mesh_scale != 1:
+        moves.append(np.diag([settings.mesh_scale] * 3 + [1.0]))
+    if matrix is not None:
+        with faults.collected():
+            moves.append(read_matrix(matrix))
+    for move in moves:
+        parts = [part.moved(move) for part in parts]
+    return parts
 
 
 def _balanced(source: Source) -> Source:
@@ -385,20 +397,91 @@ def _write_scene(
     return file, parse(file).instantiate()
 
 
-def _shares_seen(scene: mi.Scene, source: Source, parts: Sequence[Part]) -> np.ndarray:
-    """The share of each photograph's pixels that see the mesh."""
+def _write_views(
+    data: DataFolder,
+    scene: mi.Scene,
+    shots: Sequence[Shot],
+    pictures: Pictures,
+    settings: ImportSettings,
+    names: Mapping[str, str],
+    splits: Mapping[str, str],
+    exposures: Mapping[str, float],
+    tell: Callable[[str], None],
+) -> tuple[list[dict[str, Any]], list[str], list[str]]:
+    """Write photographs and masks.
+
+    Returns:
+        Their frames, names of those of which masks leave no pixel, and names of those of which
+        alpha leaves in much that is no mesh.
+    """
+    hidden = pictures.background(settings.background, names) == "hidden"
+    stray: list[str] = []
+
+    def arguments() -> Iterator[tuple[Shot, np.ndarray | None]]:
+        for shot in shots:  # what is traced is traced in this thread
+            block, seen = block_for(shot, settings.longest), None
+            if hidden and shot.name not in pictures.transparent:
+                seen = on_mesh(scene, shot, block)
+            elif settings.background == "hidden":
+                seen = on_mesh_if_stray(scene, shot, block)
+                stray.extend([] if seen is None else [shot.name])
+            yield shot, seen
+
+    def written(shot: Shot, seen: np.ndarray | None) -> tuple[dict[str, Any], bool]:
+        name, split = names[shot.name], splits[shot.name]
+        changed = shot.name in pictures.negative | pictures.profiles.keys()
+        block = block_for(shot, settings.longest)
+        return write_view(data, shot, name, split, exposures, seen, block, changed=changed)
+
+    made = list(each_photograph(written, arguments(), shots, "wrote", tell))
+    blank = [
+        shot.name
+        for shot, (_, counts) in zip(shots, made, strict=True)
+        if not counts and shot.mask is not None
+    ]
+    return [frame for frame, _ in made], blank, stray
+
+
+def _shares_seen(
+    scene: mi.Scene,
+    source: Source,
+    parts: Sequence[Part],
+    settings: ImportSettings,
+    *,
+    turnable: bool,
+) -> np.ndarray:
+    """The share of each photograph's pixels that see the mesh.
+
+    Args:
+        scene: with the mesh.
+        source: of the photographs.
+        parts: of the mesh.
+        settings: whether it was turned.
+        turnable: nothing has moved it after that, but for its scale.
+
+    Raises:
+        UserError: none does; it tells what is known of the frame of cameras, and what may help.
+    """
     cameras = [shot.lens.camera(shot.to_world) for shot in source.shots]
-    seen = np.array([_hits(scene, *spread_rays([c], _RAYS)).mean() for c in cameras])
-    if not seen.any():
-        mesh, stand = _box(_corners(parts)), _box(_origins(source.shots))
-        remedy = "Mesh and cameras must be in one frame and unit"
-        if source.put_back:
-            remedy += (
-                "; --keep-applied-transform leaves nerfstudio's cameras in the frame of their file"
-            )
-        what = f"no photograph sees the mesh, which is {mesh}; the cameras stand {stand}"
-        raise UserError(what, None, remedy)
-    return seen
+    seen = shares_seen(scene, cameras)
+    if seen.any():
+        return seen
+    mesh, stand = _box(_corners(parts)), _box(_origins(source.shots))
+    remedy = (
+        "Mesh and cameras must be in one frame and unit (--mesh-scale, --mesh-matrix move the mesh)"
+    )
+    if source.world.put_back:
+        remedy += (
+            "; --keep-applied-transform leaves nerfstudio's cameras in the frame of their file"
+        )
+    turn = TO_Z_UP if settings.mesh_y_up else TO_Z_UP.T
+    turned = shares_seen(scene, [replace(c, to_world=turn @ c.to_world) for c in cameras])
+    if turnable and turned.any():
+        which = "without --mesh-y-up" if settings.mesh_y_up else "with --mesh-y-up"
+        remedy += f"; {which}, {(turned > 0).sum()} of {len(cameras)} photographs would see it"
+    notes = "".join(f". {note}" for note in source.world.notes)
+    what = f"no photograph sees the mesh, which is {mesh}; the cameras stand {stand}"
+    raise UserError(what, None, remedy + notes)
 
 
 def _corners(parts: Sequence[Part]) -> np.ndarray:
@@ -436,11 +519,6 @@ def _enclosed(scene: mi.Scene, shots: Sequence[Shot]) -> bool:
     return bool((free_space.enclosure(scene, _origins(shots)) >= _ENCLOSED).all())
 
 
-def _block(shot: Shot, longest: int) -> int:
-    """Pixels along an edge of the squares that become one pixel each; 1: it stays as it is."""
-    return block_of(shot.lens, longest) if longest else 1
-
-
 def _check_sizes(count: int, longest: int, faults: Faults) -> None:
     """Refuse more pixels to train on than a fit can have.
 
@@ -473,7 +551,7 @@ def _require_counted(blank: Sequence[str], splits: Mapping[str, str]) -> None:
 def _pixels(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> int:
     """How many pixels a fit would decode."""
     return sum(
-        shot.lens.width * shot.lens.height // _block(shot, longest) ** 2
+        shot.lens.width * shot.lens.height // block_for(shot, longest) ** 2
         for shot in shots
         if splits[shot.name] == "train"
     )
@@ -481,7 +559,7 @@ def _pixels(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> i
 
 def _sizes(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> list[str]:
     """What was made of the sizes of photographs, or could be, for people."""
-    blocks = Counter(_block(shot, longest) for shot in shots)
+    blocks = Counter(block_for(shot, longest) for shot in shots)
     told = [
         f"sizes: {block} x {block} pixels become one: {count} of {len(shots)} photographs"
         for block, count in sorted(blocks.items())
@@ -497,18 +575,6 @@ def _sizes(shots: Sequence[Shot], splits: Mapping[str, str], longest: int) -> li
     ]
 
 
-def _on_mesh(scene: mi.Scene, camera: Camera) -> np.ndarray:
-    """Which pixels see nothing but the mesh, by their four corners: (H, W) bool."""
-    x, y = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
-    hit = _hits(scene, *camera.rays(x.ravel(), y.ravel())).reshape(x.shape)
-    return hit[:-1, :-1] & hit[:-1, 1:] & hit[1:, :-1] & hit[1:, 1:]
-
-
-def _hits(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Whether rays (n, 3) hit something, (n,) bool."""
-    return np.isfinite(free_space.trace(scene, origins, directions).distance)
-
-
 # ------------------------------------------------------------------------------------------ telling
 
 
@@ -517,9 +583,9 @@ def _summary(
     splits: Mapping[str, str],
     seen: np.ndarray,
     parts: Sequence[Part],
-    exposures: str,
+    more_told: Sequence[str],
 ) -> list[str]:
-    """What was found, in a few lines."""
+    """What was found, in a few lines; `more_told` of exposures and the background."""
     shots = source.shots
     sizes = sorted({(shot.lens.width, shot.lens.height) for shot in shots})
     size = " to ".join(f"{w} x {h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
@@ -534,9 +600,39 @@ def _summary(
     low, high = (f"{100 * value:.0f}" for value in (seen.min(), seen.max()))
     share = f"{100 * seen.mean():.0f} % of the pixels see it"
     share += "" if low == high else f" ({low} to {high} % by view)"
-    lines = [f"{source.kind}: {', '.join([views, *more])}", *source.notes, exposures]
+    lines = [f"{source.kind}: {', '.join([views, *more])}", *source.world.notes, *source.notes]
+    lines += more_told
     lines += [f"mesh: {count}, {triangles:,} triangles; {share}"]
+    if len(parts) >= _MANY_PARTS:
+        lines += [
+            f"each of the {len(parts)} parts has a BSDF of its own, which makes loading and steps "
+            "slower: join those that are no materials of their own"
+        ]
     blind = [shot.name for shot, value in zip(shots, seen, strict=True) if value == 0]
     if blind:
         lines += [f"{len(blind)} photographs do not see the mesh: {', '.join(blind[:3])}"]
     return lines
+
+
+def _background(
+    background: str, pictures: Pictures, names: Collection[str], stray: Sequence[str]
+) -> list[str]:
+    """What becomes of pixels beside the mesh, for people.
+
+    Args:
+        background: of the data set.
+        pictures: what photographs hold.
+        names: of all photographs.
+        stray: photographs of which alpha leaves much in that is no mesh.
+    """
+    if background == "visible":
+        return ["background: visible, pixels beside the mesh show the environment"]
+    clear = len(pictures.transparent)
+    ways = [f"by the alpha of photographs ({clear} with transparent pixels)"] if clear else []
+    if clear < len(names):
+        ways.append(f"where the mesh is not seen ({len(names) - clear} photographs)")
+    told = [f"background: hidden, {' and '.join(ways)}"]
+    if stray:
+        what = "alpha leaves in much that is no mesh, which is masked as well"
+        told.append(f"background: {what}: {named(stray)}")
+    return told

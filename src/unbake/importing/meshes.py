@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import mmap
@@ -17,11 +18,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError, named, printable
-from ..io import array, number, read_object, require_file
+from ..io import require_file
 from ..scene.meshes import HEADER, check_mesh
 from ..scene.normals import repaired
 from ..scene.triangles import creased, write_mesh
 from .faults import Faults
+from .polygons import beyond_fans, fan, obj_in_triangles
 
 #: Suffixes of the meshes that are read.
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf")
@@ -95,21 +97,23 @@ def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
     """The parts of meshes: objects and groups of an OBJ file, nodes of a glTF file, all of a PLY.
 
     Positions stay as they are, with the transforms of a glTF file's nodes. Faces with more than
-    three corners become triangles. Materials are not read.
+    three corners become triangles that fill them, also where they are not convex. Materials are
+    not read.
 
     Args:
         files: PLY, OBJ, GLB or glTF.
         faults: all that is wrong is added to it.
     """
     parts: list[Part] = []
+    names = _Names()
     for file in files:
         with faults.collected(file):
             own = _read_ply(file)
             if own is not None:
-                parts.append(replace(own, name=_unique(file.stem, parts)))
+                parts.append(replace(own, name=names.unique(file.stem)))
                 continue
             for name, mesh, to_file in _loaded(file):
-                parts.append(_part(_unique(name or file.stem, parts), mesh, to_file, file))
+                parts.append(_part(names.unique(name or file.stem), mesh, to_file, file))
     if parts:
         _check_place(parts, faults)
     return parts
@@ -227,6 +231,7 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     """The triangle meshes of a file: names, meshes, and what takes these to its frame, (4, 4)."""
     try:
         import trimesh
+        from trimesh.resolvers import FilePathResolver
     except ImportError:
         remedy = "pip install 'unbake[import]'"
         raise UserError("meshes need trimesh", file, remedy) from None
@@ -239,31 +244,85 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     if of_nodes:
         _require_plain(file)
     options: dict[str, Any] = {"process": False}
+    opened: Any = file
     if suffix == ".obj":
         # Not maintain_order: with it, trimesh 5.2 gives vertices the normals and texture
         # coordinates of others.
         options |= {"split_objects": True, "split_groups": True}
         _require_absolute(file)
+        in_triangles = obj_in_triangles(file)
+        if in_triangles is not None:
+            opened = io.BytesIO(in_triangles)
+            options |= {"file_type": "obj", "resolver": FilePathResolver(str(file))}
     if suffix == ".ply" and _has_normals(file):
         options["fix_texture"] = False  # it would forget normals
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of textures that are not there
-            scene = trimesh.load_scene(file, **options)
+            scene = trimesh.load_scene(opened, **options)
         found = []
         for node in sorted(scene.graph.nodes_geometry):
             transform, name = scene.graph[node]
             mesh = scene.geometry[name]
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                mesh = _refilled(mesh, file, options) if suffix == ".ply" else mesh
                 found.append((str(node if of_nodes else name), mesh, np.array(transform)))
+    except UserError:
+        raise
     except Exception as error:  # readers of damaged files raise whatever they meet
         told = " ".join(str(error).split())[:160] or type(error).__name__
-        raise UserError(f"the mesh cannot be read ({told})", file) from None
+        remedy = "Export it with triangulated faces, or as GLB" if suffix == ".ply" else None
+        raise UserError(f"the mesh cannot be read ({told})", file, remedy) from None
     if not found:
         raise UserError("the mesh has no triangles", file)
     if len(found) == 1 and not of_nodes:
         return [("", *found[0][1:])]
     return found
+
+
+def _refilled(mesh: Any, file: Path, options: dict[str, Any]) -> Any:
+    """The mesh of a PLY file, with triangles that fill its faces where fans do not.
+
+    Args:
+        mesh: as trimesh reads it, which keeps what the file holds.
+        file: for the error message.
+        options: that it was read with.
+    """
+    import trimesh
+    from trimesh.exchange.ply import _elements_to_kwargs
+
+    raw = mesh.metadata.get("_ply_raw", {})
+    faces = _lists(raw, ("vertex_index", "vertex_indices"))
+    if faces is None:
+        return mesh
+    vertices = np.column_stack([raw["vertex"]["data"][axis] for axis in "xyz"]).astype(np.float64)
+    lengths, vertices_of = np.array([len(face) for face in faces]), np.concatenate(faces)
+    own = beyond_fans(vertices, vertices_of, lengths, file)
+    if not own:
+        return mesh
+    triangles = [own.get(number, fan(length)) for number, length in enumerate(lengths)]
+    firsts = np.repeat(np.cumsum(lengths) - lengths, [len(each) for each in triangles])
+    corners = np.concatenate(triangles) + firsts[:, None]
+    data = {"vertex_indices": vertices_of[corners]}
+    textures = _lists(raw, ("texcoord",))
+    if textures is not None:
+        uv = np.concatenate(textures).reshape(-1, 2)
+        data["texcoord"] = uv[corners].reshape(-1, 6)
+    raw["face"]["data"] = data
+    fix_texture = options.get("fix_texture", True)
+    kwargs = _elements_to_kwargs(raw, fix_texture, None)
+    return trimesh.Trimesh(**kwargs, process=False)
+
+
+def _lists(raw: dict[str, Any], names: Sequence[str]) -> list[np.ndarray] | None:
+    """A list of each face of a PLY file by the first of these names; None: it has none."""
+    data = raw.get("face", {}).get("data")
+    known = data.keys() if isinstance(data, dict) else getattr(data, "dtype", data).names or ()
+    for name in names:
+        if name in known:
+            rows = data[name] if isinstance(data, dict) else data[name]["f1"]
+            return [np.asarray(row) for row in rows]
+    return None
 
 
 def _require_plain(file: Path) -> None:
@@ -284,34 +343,14 @@ def _require_plain(file: Path) -> None:
         raise UserError(what, file, "Export it without compression")
 
 
-def read_transform(file: Path) -> np.ndarray:
-    """What takes a mesh of `ns-export` back to the frame of COLMAP, (4, 4) float64.
-
-    Args:
-        file: the `dataparser_transforms.json` of the run: `transform` (3, 4) and `scale`, which
-            have taken the cameras to the frame that it trained in.
-
-    Raises:
-        UserError: the file is of another kind.
-    """
-    top = read_object(file)
-    forwards = np.eye(4)
-    forwards[:3] = array(top, "transform", (3, 4), str(file))
-    scale = number(top, "scale", str(file))
-    rotation = forwards[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
-        raise UserError("'transform' is no rotation with a translation", file)
-    if not scale > 0:
-        raise UserError("'scale' is not positive", file)
-    forwards[:3] *= scale
-    return np.linalg.inv(forwards)
-
-
 def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     linear = to_file[:3, :3]
     if not np.isfinite(to_file).all() or np.linalg.cond(linear) > 1e12:
         raise UserError(f"the transform of {printable(name)!r} flattens it", file)
-    positions = np.array(mesh.vertices, np.float64) @ linear.T + to_file[:3, 3]
+    if np.ndim(mesh.vertices) != 2 or np.shape(mesh.vertices)[1] != 3:
+        raise UserError("the mesh has vertices without three coordinates", file)
+    with np.errstate(all="ignore"):  # that they are finite is looked at next
+        positions = np.array(mesh.vertices, np.float64) @ linear.T + to_file[:3, 3]
     faces = np.array(mesh.faces, np.int64)
     if np.linalg.det(linear) < 0:
         faces = faces[:, ::-1]
@@ -324,7 +363,8 @@ def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     faces, normals = places.reshape(faces.shape), None
     # Where the file has none, trimesh 5.2 makes them up at this very access, and keeps them there.
     if "vertex_normals" in mesh._cache and np.shape(mesh.vertex_normals) == positions.shape:
-        found = np.array(mesh.vertex_normals, np.float64)[used] @ np.linalg.inv(linear)
+        with np.errstate(all="ignore"):  # those that are none are repaired
+            found = np.array(mesh.vertex_normals, np.float64)[used] @ np.linalg.inv(linear)
         normals = _of_length_one(found, positions[used], faces)
     uv = getattr(mesh.visual, "uv", None)
     known = uv is not None and np.shape(uv) == (len(positions), 2) and np.isfinite(uv).all()
@@ -352,12 +392,21 @@ def _ids(name: str) -> tuple[str, str, str]:
     return name, f"{name}_sides", f"{name}_shape"
 
 
-def _unique(name: str, parts: Sequence[Part]) -> str:
-    """A name for files and for Mitsuba that no part has, also where case is not told apart."""
-    taken = {_ENVIRONMENT, *(key.lower() for part in parts for key in _ids(part.name))}
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "part"
-    found, number = plain, 1
-    while not taken.isdisjoint(key.lower() for key in _ids(found)):
-        number += 1
-        found = f"{plain}_{number}"
-    return found
+class _Names:
+    """Names for files and for Mitsuba, unique also where case is not told apart."""
+
+    def __init__(self) -> None:
+        self._taken = {_ENVIRONMENT}
+        self._next: dict[str, int] = {}
+
+    def unique(self, name: str) -> str:
+        """A name that no part has, nor any of its `_ids`, by a number if need be."""
+        plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "part"
+        count = self._next.get(plain.lower(), 1)
+        found = plain if count == 1 else f"{plain}_{count}"
+        while not self._taken.isdisjoint(key.lower() for key in _ids(found)):
+            count += 1
+            found = f"{plain}_{count}"
+        self._next[plain.lower()] = count + 1
+        self._taken.update(key.lower() for key in _ids(found))
+        return found

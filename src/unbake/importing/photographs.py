@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from PIL import Image
 
 from ..dataset.camera import LONGEST_SIDE
-from ..dataset.image_files import PIXEL_BYTES, counted_by, read_radiance
+from ..dataset.image_files import PIXEL_BYTES, counted_in, read_radiance
 from ..errors import UserError, named
 from ..imaging.coded import decode, read_codes
 from ..imaging.profiles import linear_srgb, profile_name, read_profile
 from ..memory import require_memory
 from .faults import Faults
+from .progress import each_photograph
 from .raw import CLIPPED as CLIPPED_RAW
 from .raw import raw_told, read_raw
 from .source import Shot, image_header, same_shape
 
+_AGAIN = "Write it again, or copy it again"
 #: Codes at and above this share of the largest one are taken for clipped: 250 of 255.
 CLIPPED_CODE = 250 / 255
 #: A linear value below zero by more than this is a colour that sRGB lacks, and the share of pixels
@@ -79,6 +81,11 @@ class Pictures:
         if channels <= 2:
             self.grey.add(shot.name)
 
+    def extend(self, others: Pictures) -> None:
+        """Take what is known of other photographs into account."""
+        for each in fields(self):
+            getattr(self, each.name).update(getattr(others, each.name))
+
     def background(self, wanted: str, names: Collection[str]) -> str:
         """The background of the data set, "visible" or "hidden".
 
@@ -125,26 +132,46 @@ class Pictures:
             yield f"{len(self.negative)} photographs have negative pixels, taken as zero: {few}"
 
 
-def check_pictures(shots: Sequence[Shot], faults: Faults) -> Pictures:
-    """Decode all photographs and masks once, and add those that cannot be read to the faults."""
-    found = Pictures()
+def check_cameras(shots: Sequence[Shot], faults: Faults) -> None:
+    """Add cameras that are none, and images that are too long, to the faults."""
     for shot in shots:
-        size = shot.lens.width, shot.lens.height
-        if max(size) > LONGEST_SIDE:
+        if max(shot.size) > LONGEST_SIDE:
             faults.add(f"the image has over {LONGEST_SIDE} pixels along an edge", shot.name)
             continue
         with faults.collected(shot.name):
-            found.add(shot, pixels_of(shot))
-        with faults.collected(shot.name):
             shot.lens.camera(shot.to_world)
-        if shot.mask is None:
-            continue
+
+
+def check_pictures(shots: Sequence[Shot], faults: Faults, tell: Callable[[str], None]) -> Pictures:
+    """Decode all photographs and masks once, and add those that cannot be read to the faults.
+
+    Those that are too long, as `check_cameras` tells, are left out.
+
+    Args:
+        shots: the photographs.
+        faults: to add to.
+        tell: called where it takes long.
+    """
+    found = Pictures()
+    shots = [shot for shot in shots if max(shot.size) <= LONGEST_SIDE]
+    for own, wrong in each_photograph(_looked_at, ((s,) for s in shots), shots, "read", tell):
+        found.extend(own)
+        faults.extend(wrong)
+    return found
+
+
+def _looked_at(shot: Shot) -> tuple[Pictures, Faults]:
+    """What the pixels of one photograph say, and what is wrong with it and its mask."""
+    found, faults = Pictures(), Faults()
+    with faults.collected(shot.name):
+        found.add(shot, pixels_of(shot))
+    if shot.mask is not None:
         with faults.collected(shot.mask):
             header = image_header(shot.mask)
-            if not same_shape((header.width, header.height), size):
+            if not same_shape((header.width, header.height), shot.size):
                 raise UserError("the mask has another size than its image")
             mask_of(shot)
-    return found
+    return found, faults
 
 
 def pixels_of(shot: Shot) -> np.ndarray:
@@ -166,7 +193,7 @@ def pixels_of(shot: Shot) -> np.ndarray:
 
 def mask_of(shot: Shot) -> np.ndarray | None:
     """Which pixels count, (H, W) bool; None: all do."""
-    mask = None if shot.mask is None else _of_size(counted_by(read_codes(shot.mask)), shot.size)
+    mask = None if shot.mask is None else _of_size(counted_in(shot.mask, _AGAIN), shot.size)
     told = raw_told(shot.image, shot.balance, shot.size) if shot.raw else _told(shot)
     if told is None or told.all():
         return mask

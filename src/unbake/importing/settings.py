@@ -44,6 +44,10 @@ class ImportSettings:
             "files as Blender writes them, have y up"
         ),
     ] = False
+    mesh_scale: Annotated[
+        float,
+        Flag("Multiply the mesh by this number, where it is in another unit than the cameras"),
+    ] = 1.0
     longest: Annotated[
         int,
         Flag(
@@ -57,4 +61,5 @@ class ImportSettings:
     ] = False
 
     def __post_init__(self) -> None:
-        require_ranges(self, {"holdout": (0, 10**6), "longest": (0, _MOST)})
+        ranges = {"holdout": (0, 10**6), "mesh_scale": (1e-9, 1e9), "longest": (0, _MOST)}
+        require_ranges(self, ranges)

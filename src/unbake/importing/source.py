@@ -18,6 +18,7 @@ from .faults import Faults
 from .lens import Lens
 from .raw import SUFFIXES as RAW_SUFFIXES
 from .raw import Balance, is_cut, is_raw, raw_header
+from .world import World
 
 #: Suffixes that are tried where the name of an image has none: radiance before code values.
 _TRIED = tuple(s for suffix in (".exr", *CODED_SUFFIXES) for s in (suffix, suffix.upper()))
@@ -140,7 +141,7 @@ class Source:
         notes: what the user should know of how it was read.
         mesh: the file of the geometry, where it belongs to the layout.
         masks: the folder of masks, where it belongs to the layout.
-        put_back: cameras were put back into the frame before nerfstudio's `applied_transform`.
+        world: the frame that cameras are in.
     """
 
     kind: str
@@ -148,7 +149,7 @@ class Source:
     notes: tuple[str, ...] = ()
     mesh: Path | None = None
     masks: Path | None = None
-    put_back: bool = False
+    world: World = field(default_factory=World)
 
 
 def image_header(path: Path) -> ImageHeader:

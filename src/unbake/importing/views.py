@@ -12,13 +12,18 @@ import numpy as np
 
 from ..dataset.camera_files import frame_of
 from ..dataset.data_folder import DataFolder
-from ..dataset.small_views import in_blocks
+from ..dataset.small_views import block_of, in_blocks
+from ..errors import UserError
 from ..imaging.coded import encode
 from ..imaging.pictures import block_means, write_exr
 from ..io import write_atomically
+from ..memory import size
 from .lens import Lens
 from .photographs import clipped_from, mask_of, pixels_of
 from .source import Shot
+
+#: Bytes of a pixel that is written anew: three channels of 16 bits, compressed.
+_WRITTEN = 3
 
 
 def write_view(
@@ -74,7 +79,7 @@ def write_view(
     if mask is not None and not shot.lens.straight:
         straight = shot.lens.straightened(mask[..., None].astype(np.float32), whole.fl_x)
         mask = straight[..., 0] >= 1
-    mask = None if mask is None else _all_of(mask, block)
+    mask = None if mask is None else all_of(mask, block)
     masks = [one for one in (on_mesh, mask, exact) if one is not None]
     counted = np.all(masks, 0)
     if masks:
@@ -84,6 +89,46 @@ def write_view(
     if on_mesh is not None:
         frame["mask_from"] = "mesh"
     return frame, bool(counted.any())
+
+
+def block_for(shot: Shot, longest: int) -> int:
+    """Pixels along an edge of the squares that become one pixel each; 1: it stays as it is.
+
+    Args:
+        shot: the photograph.
+        longest: pixels that an edge may have; 0: as many as it has.
+    """
+    return block_of(shot.lens, longest) if longest else 1
+
+
+def require_disk(folder: Path, shots: Sequence[Shot], longest: int) -> None:
+    """Refuse photographs that there is no room for.
+
+    Args:
+        folder: to write to.
+        shots: the photographs.
+        longest: as in `block_for`.
+
+    Raises:
+        UserError: there is too little.
+    """
+    need, free = sum(_size(shot, block_for(shot, longest)) for shot in shots), free_disk(folder)
+    if need > free:
+        what = f"the photographs take about {size(need)}, {size(free)} are free"
+        remedy = "Make room, give another --out, or make them smaller: --longest 2048"
+        raise UserError(what, folder, remedy)
+
+
+def free_disk(folder: Path) -> int:
+    """Bytes that are free where a folder is."""
+    return shutil.disk_usage(folder).free
+
+
+def _size(shot: Shot, block: int) -> int:
+    """Bytes of a photograph in the data set, rather too few: those that are copied are exact."""
+    if shot.lens.straight and not shot.raw and block == 1:
+        return shot.image.stat().st_size
+    return _WRITTEN * shot.lens.width * shot.lens.height // block**2
 
 
 def complete_masks(data: DataFolder, frames: Sequence[dict[str, Any]]) -> None:
@@ -107,11 +152,19 @@ def _straightened(
     Args:
         limit: from which on channels are clipped; None: they never are.
     """
-    straight, shown = lens.straightened(pixels, focal), lens.shown(focal)
+    # Alpha stays 1 where it is 1 all over, and nothing lies between clipped pixels that are none:
+    # these are not resampled, and the others all at once.
+    opaque = bool((pixels[..., 3] >= 1).all())
+    clipped = pixels[..., :3] >= np.float32(np.inf if limit is None else limit)
+    some = clipped.any(axis=(0, 1))
+    values = [pixels[..., :3] if opaque else pixels, clipped[..., some].astype(np.float32)]
+    found = lens.straightened(np.concatenate(values, 2), focal)
+    straight, shown = np.ones((*found.shape[:2], 4), np.float32), lens.shown(focal)
+    count = 3 if opaque else 4
+    straight[..., :count] = found[..., :count]
     if limit is None:
         return straight, shown
-    clipped = (pixels[..., :3] >= np.float32(limit)).astype(np.float32)
-    between = (lens.straightened(clipped, focal) > 0) & (straight[..., :3] < np.float32(limit))
+    between = (found[..., count:] > 0) & (straight[..., :3][..., some] < np.float32(limit))
     exact = np.logical_not(np.any(between, axis=2))
     return straight, exact if shown is None else exact & shown
 
@@ -128,7 +181,7 @@ def _in_blocks(
         limit: as there.
     """
     small = block_means(pixels, block)
-    told = None if exact is None else _all_of(exact, block)
+    told = None if exact is None else all_of(exact, block)
     if limit is None:
         return small, told
     clipped = block_means(np.asarray(pixels[..., :3] >= limit, np.float32), block)
@@ -138,8 +191,8 @@ def _in_blocks(
     return small, np.asarray(exact_here if told is None else told & exact_here)
 
 
-def _all_of(mask: np.ndarray, block: int) -> np.ndarray:
-    """Which squares have a mask all over, (H, W) bool."""
+def all_of(mask: np.ndarray, block: int) -> np.ndarray:
+    """Which squares of so many pixels along an edge have a mask all over, (H, W) bool."""
     return mask if block == 1 else np.asarray(block_means(mask.astype(np.float32), block) >= 1)
 
 
