@@ -26,7 +26,7 @@ from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
 from unbake.exports import export as exporting
 from unbake.exports import gltf
-from unbake.exports.bake import WANTED, Baker, own_textures
+from unbake.exports.bake import WANTED, Baker, bake_texture, own_opacities, own_textures
 from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
 from unbake.exports.lights import environment_picture
@@ -36,6 +36,8 @@ from unbake.exports.parts import parsed_principled, read_parts
 from unbake.exports.tessellate import Triangles
 from unbake.exports.textures import file_names
 from unbake.exports.unwrap import make_atlases, unique_share
+from unbake.exports.upright import Up
+from unbake.exports.usd import write_usd
 from unbake.imaging.metrics import psnr
 from unbake.imaging.pictures import read_exr, tonemap, write_exr, write_png
 from unbake.scene.triangles import write_mesh
@@ -538,30 +540,84 @@ def test_panes_have_two_sides_and_mere_boundaries_are_left_out(tmp_path):
     assert {name: mesh.GetDoubleSidedAttr().Get() for name, mesh in meshes.items()} == sides
 
 
-@pytest.mark.parametrize(
-    ("up", "told"), [((0, 0, 1), None), ((0, 1, 0), None), ((0, -1, 0), "−y"), ((-1, 0, 0), "−x")]
-)
-def test_gltf_stands_upright_and_usd_tells_what_it_cannot_say(up, told):
+def cameras_of(up):
+    """Cameras that look at the origin from three places."""
     eyes = [(2.0, 1.9, 1.8), (-2.1, 1.7, 2.2), (1.8, -2.2, 1.9)]
-    cameras = [LookAt(eye, (0, 0, 0), up, 40.0).camera(8, 8) for eye in eyes]
-    views = tuple(View(str(i), "train", c, Path("a.exr"), {}) for i, c in enumerate(cameras))
-    dataset = Dataset(Path(), Path("scene.xml"), "visible", views, {}, None)
-    note = exporting._turned(dataset)
-    assert note is None if told is None else f"up is {told} by the cameras" in note
+    return [LookAt(eye, (0, 0, 0), up, 40.0).camera(8, 8) for eye in eyes]
+
+
+def leaning(degrees):
+    """An up that leans from +z towards +x and +y."""
+    sin, cos = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    return (0.8 * sin, 0.6 * sin, cos)
+
+
+@pytest.mark.parametrize(
+    ("up", "taken", "usd", "told"),
+    [
+        ((0, 0, 1), (0, 0, 1), "Z", None),
+        ((0, 1, 0), (0, 1, 0), "Y", None),
+        ((0, -1, 0), (0, -1, 0), "Y", "−y"),
+        ((-1, 0, 0), (-1, 0, 0), "Y", "−x"),
+        (leaning(5), (0, 0, 1), "Z", None),
+        (leaning(25), leaning(25), "Z", "25° from +z"),
+    ],
+)
+def test_files_stand_upright(up, taken, usd, told, tmp_path):
+    from pxr import Usd, UsdGeom
+
+    cameras = cameras_of(up)
+    found = Up.of(cameras)
+    np.testing.assert_allclose(found.direction, taken, atol=1e-6)
+    notes = exporting._of_axes(cameras, ["gltf", "usd"])
+    assert (not notes) if told is None else f"up is {told} by the cameras" in notes[0]
+    assert not exporting._of_axes(cameras, ["mitsuba", "textures"])
     document = Document()
     names = [document.add("nodes", {"name": "part"}) for _ in range(2)]
     document.json["scenes"][0]["nodes"] += names
-    document.turn(exporting._up_axis(dataset))
+    document.turn(found)
     nodes, (*tops,) = document.json["nodes"], document.json["scenes"][0]["nodes"]
     if up == (0, 1, 0):
         assert tops == names and len(nodes) == 2
-        return
-    (top,) = (nodes[number] for number in tops)
-    x, y, z, w = top["rotation"]
-    about = np.array([x, y, z])
-    turned = up + 2 * np.cross(about, np.cross(about, up) + w * np.array(up))
-    np.testing.assert_allclose(turned, (0, 1, 0), atol=1e-12)
-    assert top["children"] == names and x * x + y * y + z * z + w * w == pytest.approx(1)
+    else:
+        (top,) = (nodes[number] for number in tops)
+        x, y, z, w = top["rotation"]
+        about, start = np.array([x, y, z]), np.array(taken)
+        turned = start + 2 * np.cross(about, np.cross(about, start) + w * start)
+        np.testing.assert_allclose(turned, (0, 1, 0), atol=1e-6)
+        np.testing.assert_allclose(found.rotation("Y") @ start, (0, 1, 0), atol=1e-6)
+        assert top["children"] == names and x * x + y * y + z * z + w * w == pytest.approx(1)
+    write_usd(tmp_path, None, [], [], [], None, found)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    assert UsdGeom.GetStageUpAxis(stage) == usd
+    turn = UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)
+    np.testing.assert_allclose(
+        turn.TransformDir(tuple(map(float, taken))), np.eye(3)["XYZ".index(usd)], atol=1e-6
+    )
+
+
+def test_the_environment_of_gltf_stands_upright(tmp_path):
+    """What shines from a direction of the scene shines from where the node `upright` turns it."""
+    picture = np.zeros((32, 64, 3), np.float32)
+    picture[12:14, 20:22] = 50
+    up = Up.of(cameras_of(leaning(40)))
+    notes = exporting._environment_of_gltf(tmp_path, picture, up)
+    assert notes[0].endswith("for scene.glb it is environment_upright.exr") and len(notes) == 2
+    write_exr(tmp_path / "environment.exr", picture)
+    d = np.random.default_rng(0).normal(size=(3, 4000))
+    d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
+    means = []
+    for name, ahead in (("environment", d), ("environment_upright", up.rotation("Y") @ d)):
+        light = mi.load_dict({"type": "envmap", "filename": str(tmp_path / f"{name}.exr")})
+        si = dr.zeros(mi.SurfaceInteraction3f, 4000)
+        si.wi = mi.Vector3f(-ahead.astype(np.float32))
+        seen = np.array(light.eval(si))[0]
+        means.append((ahead * seen).sum(1) / seen.sum())
+    assert np.linalg.norm(means[0]) > 0.9
+    np.testing.assert_allclose(up.rotation("Y") @ means[0], means[1], atol=0.03)
+    level = Up.of(cameras_of((0, 1, 0)))
+    (note,) = exporting._environment_of_gltf(tmp_path / "none", picture, level)
+    assert note.endswith("for scene.glb it is environment.exr") and not (tmp_path / "none").exists()
 
 
 def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
@@ -575,7 +631,8 @@ def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
     fit(data, tmp_path / "run", replace(config, quantities=("roughness",)))
     options = {"texels": 2.0, "tell": lambda line: None}
     manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["gltf", "usd"], **options)
-    assert "glTF and usd have no sheen: left out of velvet" in manifest["notes"]
+    told = "unbake does not write sheen to glTF and usd: left out of velvet"
+    assert told in manifest["notes"]
     made = document_of(tmp_path / "out" / "scene.glb")["materials"]
     shiny = next(m for m in made if m["name"] == "shiny")["extensions"]
     assert shiny["KHR_materials_ior"]["ior"] == pytest.approx(1.789, abs=1e-3)
@@ -586,6 +643,53 @@ def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):
     assert surface.GetInput("ior").Get() == pytest.approx(1.789, abs=1e-3)
     assert surface.GetInput("clearcoat").Get() == pytest.approx(0.2)
     assert {row["name"] for row in manifest["materials"]} == {"shiny", "velvet", "spectral"}
+
+
+def test_whole_numbers_are_numbers(tmp_path):
+    given = """<integer name="eta" value="2"/><integer name="clearcoat" value="1"/>
+      <integer name="clearcoat_gloss" value="1"/>"""
+    text = f'<scene version="3.0.0"><bsdf type="principled">{given}</bsdf></scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    found = material_constants(parsed_principled(tmp_path / "scene.xml", tmp_path), [0])
+    assert (found.ior, found.clearcoat, found.left_out) == (2.0, 0.25, ())
+    assert found.clearcoat_roughness == pytest.approx(0.001**0.5)
+    material = plain("roughconductor", '<integer name="alpha" value="1"/>', tmp_path)
+    assert material["pbrMetallicRoughness"]["roughnessFactor"] == 1
+
+
+def test_ids_that_nobody_chose_are_no_names(tmp_path):
+    """Those that Mitsuba gives where it writes a scene."""
+    sheet = triangle((0, 0, 0), (1, 0, 0), (0, 1, 0))
+    write_mesh(tmp_path / "door.ply", *sheet.arrays)
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0"><bsdf type="principled" id="elm__1"/>
+          <shape type="ply" id="elm__2"><string name="filename" value="door.ply"/>
+            <ref id="elm__1"/></shape>
+          <shape type="rectangle" id="floor"><bsdf type="diffuse"/></shape></scene>"""
+    )
+    found = read_parts(tmp_path / "scene.xml", tmp_path)
+    assert [part.name for part in found.parts] == ["door", "floor"]
+    assert [atlas.name for atlas in make_atlases(found.scene, found.parts, 2.0)] == [
+        "door",
+        "floor",
+    ]
+
+
+def test_textures_whose_coordinates_no_file_has_are_told(exported, tmp_path, monkeypatch):
+    exported.use(monkeypatch)
+    options = {"texels": 2.0, "tell": lambda line: None}
+    for formats, told in ((["textures"], True), (["textures", "gltf"], False)):
+        out = tmp_path / "-".join(formats)
+        notes = exporting.export(exported.run, out, formats, **options)["notes"]
+        assert [n.endswith("for meshes that have them") for n in notes if "unwrapped" in n] == (
+            [True] * told
+        )
+        assert not told or any("has: stone, cloth; add gltf" in note for note in notes)
+
+
+def test_what_blender_makes_of_lights_is_told(exported):
+    (note,) = (note for note in exported.manifest["notes"] if "Unitless" in note)
+    assert note.endswith("for torch") and "Blender" in note
 
 
 @pytest.mark.parametrize(
@@ -829,7 +933,8 @@ def test_an_environment_that_was_known_is_taken_along(with_metallic, tmp_path, m
     formats = ["gltf", "mitsuba", "usd"]
     manifest = exporting.export(with_metallic.run, out, formats, **words)
     (file,) = out.glob("environment.*")
-    np.testing.assert_allclose(read_exr(file), 0.5, rtol=1e-3)
+    for made in (file, out / "environment_upright.exr"):  # z is up
+        np.testing.assert_allclose(read_exr(made), 0.5, rtol=1e-3)
     assert manifest["environment"] == file.name
     stage = Usd.Stage.Open(str(out / "usd" / "scene.usdc"))
     (dome,) = (p for p in stage.Traverse() if p.IsA(UsdLux.DomeLight))
@@ -837,8 +942,7 @@ def test_an_environment_that_was_known_is_taken_along(with_metallic, tmp_path, m
     assert Path(found).resolve() == file.resolve()
     text = (out / "mitsuba" / "scene.xml").read_text()
     assert 'type="constant"' in text and 'type="envmap"' not in text
-    (note,) = [note for note in manifest["notes"] if file.name in note]
-    assert note.startswith("scene.glb has no environment, as glTF has none")
+    assert any(note.startswith("glTF has no environment") for note in manifest["notes"])
 
 
 def test_what_no_view_saw_is_filled_and_marked(exported, tmp_path, monkeypatch):
@@ -924,7 +1028,7 @@ class SeenFrom:
         return active & (p.x > self._x)
 
 
-def rewritten(file, out, texels=100.0):
+def rewritten(file, out, texels=100.0, *, refine=False):
     """Have Mitsuba's scene written with its own values, all in the coordinates of atlases."""
     found = read_parts(file, file.parent)
     scene, scratch, own = (parsed_principled(file, file.parent) for _ in range(3))
@@ -934,7 +1038,8 @@ def rewritten(file, out, texels=100.0):
     assert {one.atlas.method for one in baked} == {"uvunwrap"}
     out.mkdir()
     camera = LookAt((0, 0, 3), (0, 0, 0), (0, 1, 0), 40).camera(16, 16)
-    return write_scene(out, scene, scratch, found.parts, baked, [], None, camera)
+    parts = found.parts
+    return write_scene(out, scene, scratch, parts, baked, [], None, camera, refine=refine)
 
 
 def two_sheets(name, x=0.0):
@@ -978,6 +1083,83 @@ def test_a_metal_in_several_materials_keeps_its_texture_in_all(tmp_path):
         )
         assert np.ptp(truth) > 0.1, x
         assert (np.abs(found - truth).max(0) < 0.01).mean() > 0.9, x
+
+
+def striped(name, slot, folder):
+    """A texture of 16 stripes with sharp edges."""
+    stripes = np.broadcast_to(np.arange(64) // 4 % 2, (64, 64)).astype(np.float32)
+    write_exr(folder / f"{name}.exr", stripes)
+    return f'''<texture type="bitmap" name="{slot}"><string name="filename" value="{name}.exr"/>
+      <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/></texture>'''
+
+
+@pytest.mark.parametrize("slot", ["metallic", "opacity"])
+def test_known_textures_are_as_fine_as_in_the_scene(slot, tmp_path):
+    """Smooth fields ask for less; a texture that stays coarse is told."""
+    texture = striped("stripes", slot, tmp_path)
+    inner = f'<bsdf type="principled" id="sheet">{texture if slot == "metallic" else ""}</bsdf>'
+    bsdf = f'<bsdf type="mask">{texture}{inner}</bsdf>' if slot == "opacity" else inner
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><shape type="rectangle">{bsdf}</shape></scene>'
+    )
+    asked = {"refine": True, "known": True}
+    baked = {
+        words: baked_of(
+            tmp_path / "scene.xml", SeenFrom(-np.inf), 2.0, **{k: asked[k] for k in words}
+        )["sheet"]
+        for words in [("refine", "known"), ("known",), ("refine",), ()]
+    }
+    sizes = {words: one.atlas.resolution for words, one in baked.items()}
+    assert sizes == {("refine", "known"): 512, ("known",): 64, ("refine",): 64, (): 64}
+    coarse = {words: one.coarse for words, one in baked.items()}
+    assert coarse == {("refine", "known"): [], ("known",): [slot], ("refine",): [], (): []}
+    (note,) = (n for n in exporting._notes(PARTS, [baked["known",]], [], "more") if slot in n)
+    assert note == f"{slot} is coarser than in the scene in sheet; more"
+
+
+PARTS = SimpleNamespace(left_out=[])
+
+
+def test_what_is_finer_than_texels_is_averaged(cut):
+    one = baked_of(cut, SeenFrom(-np.inf), 2.0)["leaf paint"]
+    columns = np.broadcast_to(np.arange(128) % 2, (128, 128)).astype(np.float32)
+    picture = {"bitmap": mi.Bitmap(columns), "raw": True, "filter_type": "nearest"}
+    texture = mi.load_dict({"type": "bitmap", **picture})
+    pixels, is_near = bake_texture(one, texture, colour=False)
+    assert one.atlas.resolution == 64 and not is_near
+    np.testing.assert_allclose(pixels, 0.5, atol=1e-6)
+
+
+def test_a_moved_bump_map_is_as_fine_as_in_the_scene(tmp_path):
+    texture = striped("bumps", "arbitrary", tmp_path)
+    bsdf = f'<bsdf type="bumpmap" id="sheet">{texture}<bsdf type="principled"/></bsdf>'
+    text = f'<scene version="3.0.0">{bsdf}{two_sheets("sheet")}<emitter type="constant"/></scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    sizes = {}
+    for refine in (False, True):
+        out = tmp_path / f"out-{refine}"
+        notes = rewritten(tmp_path / "scene.xml", out, 2.0, refine=refine).notes
+        told = "sheet: its bump map is coarser than in the scene; a larger --texels keeps more"
+        assert (told in notes) == (not refine)
+        (file,) = out.rglob("*_texture-0.exr")
+        sizes[refine] = len(read_exr(file))
+    assert sizes == {False: 64, True: 512}
+
+
+def test_textures_rise_within_one_budget(exported, tmp_path, monkeypatch):
+    """All are counted before the first one rises, and not only those before it."""
+    exported.use(monkeypatch)
+    as_if_seen(monkeypatch)
+    monkeypatch.setattr("unbake.exports.unwrap.SMALLEST", 16)
+    # As if the fields had detail without end.
+    monkeypatch.setattr("unbake.exports.bake.WANTED", 1.1)
+    total = {}
+    for most in (0, 6000):
+        monkeypatch.setattr("unbake.exports.bake._MOST", most)
+        out, words = tmp_path / f"{most}", {"tell": lambda line: None}
+        told = exporting.export(exported.run, out, ["textures"], **words)
+        total[most] = sum(row["resolution"] ** 2 for row in told["materials"])
+    assert total[0] < total[6000] <= 6000
 
 
 BRUSHED = """<bsdf type="blendbsdf" id="sheet"><float name="weight" value="0.5"/>
@@ -1058,6 +1240,58 @@ def test_other_textures_of_unwrapped_materials_move_along(mixed, tmp_path, monke
     assert '"metallic" value="0.25"' in (tmp_path / "out/mitsuba/scene.xml").read_text()
 
 
+FLAT = """<bsdf type="bumpmap" id="{}"><texture type="bitmap" name="arbitrary">
+  <string name="filename" value="flat.exr"/><boolean name="raw" value="true"/></texture>{}</bsdf>"""
+WALL = """<shape type="ply"><string name="filename" value="wall.ply"/><ref id="{}"/>
+  <transform name="to_world"><translate x="{}" y="{}"/></transform></shape>"""
+#: Walls whose texture runs upwards, with a flat bump map: one in coordinates of its own, two that
+#: are unwrapped, and two of known metal.
+WALLS = f"""<scene version="3.0.0">
+  {FLAT.format("plaster", '<bsdf type="principled"/>')}
+  {FLAT.format("paper", '<bsdf type="principled"/>')}
+  {FLAT.format("steel", '<bsdf type="roughconductor"/>')}
+  {WALL.format("plaster", 0, 0)}{WALL.format("paper", 3, 0)}{WALL.format("paper", 3, 1)}
+  {WALL.format("steel", 6, 0)}
+  <shape type="rectangle"><ref id="steel"/><transform name="to_world">
+    <matrix value="0 -1 0 9  0 0 -1 0  1 0 0 0  0 0 0 1"/></transform></shape>
+  <emitter type="constant"/></scene>"""
+
+
+def test_flat_bump_maps_are_numbers_in_mitsuba_alone(tmp_path):
+    scene = tmp_path / "scene" / "scene.xml"
+    write_exr(scene.parent / "flat.exr", np.full((4, 4), 0.5))
+    corners = np.array([(1, 0, -1), (1, 0, 1), (-1, 0, 1), (-1, 0, -1)])
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    write_mesh(scene.parent / "wall.ply", corners, np.array([(0, 1, 2), (0, 2, 3)]), uv=uv)
+    scene.write_text(WALLS)
+    data = grey_data(scene, tmp_path / "data")
+    fit(data, tmp_path / "run", replace(tiny_fields("grid"), method="direct", steps=0))
+    options = {"texels": 20.0, "tell": lambda line: None}
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba"], **options)
+    rows = {row["name"]: row["coordinates"] for row in manifest["materials"]}
+    assert sorted(rows.values()) == ["own", "uvunwrap"]
+    places = np.random.default_rng(0).uniform(-0.95, 0.95, (2, 2000)).astype(np.float32)
+
+    def share_lit(file, x):
+        walls = mi.load_file(str(file), optimize=False)
+        ray = mi.Ray3f(mi.Point3f(places[0] + x, -4, places[1]), mi.Vector3f(0, 1, 0))
+        si = walls.ray_intersect(ray)
+        assert np.array(si.is_valid()).all()
+        value = si.bsdf().eval(mi.BSDFContext(), si, dr.normalize(mi.Vector3f(0.2, 0.1, 1)))
+        return (np.array(value) > 0).all(0).mean()  # of a metal they are black
+
+    for x in (0, 3, 6, 9):
+        assert share_lit(data / "scene.xml", x) < 0.9, "Mitsuba has mended it"
+        assert share_lit(tmp_path / "out" / "mitsuba" / "scene.xml", x) == 1, x
+    # Charts are turned by more than rounding hides in small ones.
+    found = read_parts(scene, scene.parent)
+    (paper,) = (a for a in make_atlases(found.scene, found.parts, 2.0) if a.method == "uvunwrap")
+    for placed in paper.placed:
+        a, b, c = placed.triangles.uv[placed.triangles.faces[0]]
+        sides = np.abs([b - a, c - a, c - b])
+        assert (sides.min(1) / sides.max(1)).min() > 5e-4
+
+
 #: BSDFs around others, glass among them.
 AROUND = """<scene version="3.0.0">
   <shape type="rectangle" id="fence"><bsdf type="mask"><float name="opacity" value="0.5"/>
@@ -1068,9 +1302,220 @@ AROUND = """<scene version="3.0.0">
     <rgb name="normalmap" value="0.5 0.5 1"/><bsdf type="diffuse"/></bsdf></shape>
   <shape type="rectangle" id="pane"><bsdf type="mask"><float name="opacity" value="0.5"/>
     <bsdf type="conductor"/></bsdf></shape>
+  <shape type="rectangle" id="grille"><bsdf type="mask">
+    <texture type="checkerboard" name="opacity"/><bsdf type="conductor"/></bsdf></shape>
   <shape type="rectangle" id="rust"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>
     <bsdf type="diffuse"/><bsdf type="conductor"/></bsdf></shape>
   <shape type="rectangle" id="floor"><bsdf type="diffuse"/></shape></scene>"""
+
+
+def masked(name, opacity):
+    return f'''<bsdf type="mask" id="{name}">{opacity}<bsdf type="twosided">
+      <bsdf type="principled" id="{name} paint"><texture type="bitmap" name="base_color">
+        <string name="filename" value="leaf.exr"/><string name="filter_type" value="nearest"/>
+      </texture></bsdf></bsdf></bsdf>'''
+
+
+def opacity_of(file):
+    return f'''<texture type="bitmap" name="opacity"><string name="filename" value="{file}"/>
+      <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/></texture>'''
+
+
+#: A leaf of which there is a half, on one square and on two; a veil; and glass that is painted.
+CUT = f"""<scene version="3.0.0">
+  {masked("leaf", opacity_of("half.exr"))}{masked("leaves", opacity_of("half.exr"))}
+  {masked("veil", '<float name="opacity" value="0.3"/>')}{masked("fog", opacity_of("fog.exr"))}
+  <shape type="rectangle" id="one"><ref id="leaf"/></shape>{two_sheets("leaves", 3)}
+  <shape type="rectangle" id="hung"><ref id="veil"/>
+    <transform name="to_world"><translate y="3"/></transform></shape>
+  <shape type="rectangle" id="misty"><ref id="fog"/>
+    <transform name="to_world"><translate y="6"/></transform></shape>
+  <shape type="rectangle" id="pane"><bsdf type="mask"><float name="opacity" value="0.25"/>
+    <bsdf type="conductor"/></bsdf></shape>
+  <emitter type="constant"/></scene>"""
+GREEN = (0.1, 0.6, 0.2)
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory) -> Path:
+    """The file of a scene with cut-outs, black in their holes."""
+    folder = tmp_path_factory.mktemp("cut")
+    half = np.zeros((8, 8))
+    half[:, 4:] = 1
+    write_exr(folder / "half.exr", half)
+    write_exr(folder / "leaf.exr", half[..., None] * np.array(GREEN))
+    write_exr(folder / "fog.exr", 0.3 + 0.4 * half)
+    (folder / "scene.xml").write_text(CUT)
+    return folder / "scene.xml"
+
+
+def baked_of(file, views, texels=20.0, **words):
+    """All materials of a scene as they are there, by name."""
+    found = read_parts(file, file.parent)
+    atlases = make_atlases(found.scene, [p for p in found.parts if p.is_optimized], texels)
+    own = own_textures(parsed_principled(file, file.parent), (), stored=True)
+    masks = {mask for part in found.parts for mask in part.masks}
+    opacities = own_opacities(parsed_principled(file, file.parent), masks)
+    baker = Baker(None, own, views, opacities)
+    return {atlas.name: baker.bake(atlas, **words) for atlas in atlases}
+
+
+def test_holes_are_no_surface(cut):
+    """Nobody sees them, they count in no share, and their colours are those of the rim."""
+    baked = baked_of(cut, SeenFrom(-np.inf))
+    assert baked["leaf paint"].atlas.method == "own"
+    assert baked["leaves paint"].atlas.method == "uvunwrap"
+    for name in ("leaf paint", "leaves paint"):
+        one = baked[name]
+        solid = one.opacity > 0.5
+        assert not one.observed[one.opacity == 0].any() and one.observed[one.opacity == 1].any()
+        assert one.unobserved_share == 0 and not one.blends
+        off = np.abs(one.values["albedo"] - GREEN).max(-1)
+        assert off.max() < 1e-4, "of the leaf alone, also in its holes"
+        share = solid.mean() if name == "leaf paint" else solid[one.covered].mean()
+        assert share > 0.4
+    for name in ("veil paint", "fog paint"):  # transparent to a part, and seen
+        assert baked[name].blends and baked[name].observed[baked[name].covered].all()
+    assert baked["veil paint"].constant_opacity == pytest.approx(0.3, abs=1e-5)
+    assert baked["fog paint"].constant_opacity is None
+    assert baked_of(cut, SeenFrom(np.inf))["leaf paint"].unobserved_share == 1
+
+
+@pytest.fixture(scope="module")
+def cut_out(cut, tmp_path_factory) -> tuple[Path, dict]:
+    """The scene with cut-outs, exported to all formats; and what is told of it."""
+    folder = tmp_path_factory.mktemp("cut-out")
+    data = grey_data(cut, folder / "data")
+    fit(data, folder / "run", replace(tiny_fields("grid"), method="direct", steps=0))
+    options = {"texels": 20.0, "tell": lambda line: None}
+    formats = ["gltf", "usd", "textures"]
+    return folder / "out", exporting.export(folder / "run", folder / "out", formats, **options)
+
+
+def test_gltf_has_cut_outs(cut_out):
+    folder, manifest = cut_out
+    made = {m["name"]: m for m in document_of(folder / "scene.glb")["materials"]}
+    assert {name: m.get("alphaMode") for name, m in made.items()} == {
+        "leaf paint": "MASK", "leaves paint": "MASK", "veil paint": "BLEND", "fog paint": "BLEND",
+        "pane": "BLEND",
+    }  # fmt: skip
+    assert {m.get("alphaCutoff") for m in made.values()} == {0.5, None}
+    for name, opacity in (("veil paint", 0.3), ("pane", 0.25)):
+        factor = made[name]["pbrMetallicRoughness"]["baseColorFactor"]
+        assert factor[3] == pytest.approx(opacity, abs=1e-5)
+    assert not any("cut-outs" in note for note in manifest["notes"])
+    loaded = trimesh.load(folder / "scene.glb")
+    rng = np.random.default_rng(0)
+    for name, least, most in (("one", 0, 255), ("misty", 0.3 * 255, 0.7 * 255)):
+        picture = loaded.geometry[name].visual.material.baseColorTexture
+        assert picture.mode == "RGBA"
+        uv = rng.uniform(0.05, 0.95, (500, 2))
+        uv = uv[np.abs(uv[:, 0] - 0.5) > 0.05]
+        wanted = np.where(uv[:, 0] < 0.5, least, most)
+        assert np.abs(looked_up(picture, uv)[:, 3] - wanted).max() <= 1
+        assert np.array(picture)[..., :3].min() > 50, "colours are not multiplied by it"
+    rows = {row["name"]: row for row in manifest["materials"]}
+    file = next(f for f in rows["leaf paint"]["textures"] if f.endswith("_opacity.exr"))
+    assert set(np.unique(read_exr(folder / "textures" / file))) == {0, 1}
+
+
+def test_khronos_finds_nothing_wrong_with_cut_outs(cut_out, judges):
+    lacks = judges["validator_lacks"]()
+    if lacks is not None:
+        pytest.skip(lacks)
+    report = judges["validated"](cut_out[0] / "scene.glb")
+    assert report["numErrors"] == report["numWarnings"] == 0, report["messages"]
+
+
+def test_usd_has_cut_outs(cut_out):
+    from pxr import Usd, UsdShade
+
+    stage = Usd.Stage.Open(str(cut_out[0] / "usd" / "scene.usdc"))
+    surfaces = {
+        prim.GetDisplayName(): UsdShade.Material(prim).ComputeSurfaceSource()[0]
+        for prim in stage.Traverse()
+        if prim.IsA(UsdShade.Material)
+    }
+    for name in ("leaf paint", "leaves paint", "fog paint"):
+        surface = surfaces[name]
+        threshold = surface.GetInput("opacityThreshold")
+        assert (threshold.Get() if threshold else None) == (None if "fog" in name else 0.5)
+        (source,) = surface.GetInput("opacity").GetConnectedSources()[0]
+        assert source.sourceName == "a"
+        file = UsdShade.Shader(source.source.GetPrim()).GetInput("file").Get().resolvedPath
+        assert np.ptp(as_pixels(file)[..., 3]) > 100
+    assert surfaces["veil paint"].GetInput("opacity").Get() == pytest.approx(0.3)
+    assert surfaces["pane"].GetInput("opacity").Get() == pytest.approx(0.25)
+
+
+#: A sheet whose corners have colours, and one below whose triangles have.
+COLOURED = """<scene version="3.0.0">
+  <bsdf type="principled" id="dyed"><texture type="mesh_attribute" name="base_color">
+    <string name="name" value="vertex_color"/></texture></bsdf>
+  <bsdf type="principled" id="tiled"><texture type="mesh_attribute" name="base_color">
+    <string name="name" value="face_color"/></texture></bsdf>
+  <shape type="ply" id="sheet"><string name="filename" value="vertex.ply"/><ref id="dyed"/></shape>
+  <shape type="ply" id="tiles"><string name="filename" value="face.ply"/><ref id="tiled"/>
+    <transform name="to_world"><translate x="3"/></transform></shape>
+  <emitter type="constant"/></scene>"""
+COLOURS = ("0.9 0.1 0.1", "0.1 0.9 0.1", "0.1 0.1 0.9", "0.9 0.9 0.1")
+
+
+def write_coloured(folder, kind, *, own):
+    """A square of two triangles as PLY; with texture coordinates, or without."""
+    of_vertex, of_face = (
+        [f" {c}" if kind == each else "" for c in COLOURS] for each in ("vertex", "face")
+    )
+    channels = [f"property float {name}" for name in ("red", "green", "blue")]
+    corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    uv = [f" {(x + 1) / 2} {(y + 1) / 2}" if own else "" for x, y in corners]
+    lines = [
+        "ply", "format ascii 1.0", "element vertex 4",
+        *(f"property float {name}" for name in ("x", "y", "z", *("uv" if own else ""))),
+        *(channels if kind == "vertex" else []), "element face 2",
+        "property list uchar int vertex_indices", *(channels if kind == "face" else []),
+        "end_header",
+        *(f"{x} {y} 0{at}{c}" for (x, y), at, c in zip(corners, uv, of_vertex, strict=True)),
+        *(f"3 {face}{c}" for face, c in zip(("0 1 2", "0 2 3"), of_face, strict=False)),
+    ]  # fmt: skip
+    (folder / f"{kind}.ply").write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("unknown", ["lighting", "materials"])
+def test_colours_stored_in_meshes_become_textures(unknown, own, tmp_path):
+    """Where they were known: the albedo of a fit that finds light, or roughness alone."""
+    scene = tmp_path / "scene" / "scene.xml"
+    scene.parent.mkdir()
+    for kind in ("vertex", "face"):
+        write_coloured(scene.parent, kind, own=own)
+    scene.write_text(COLOURED)
+    data = grey_data(scene, tmp_path / "data")
+    config = replace(tiny_fields("grid"), method="direct", unknown=unknown, steps=0)
+    fit(data, tmp_path / "run", replace(config, quantities=("roughness",)))
+    options = {"texels": 60.0, "tell": lambda line: None}
+    formats = ["gltf", "mitsuba", "textures"]
+    manifest = exporting.export(tmp_path / "run", tmp_path / "out", formats, **options)
+    assert {row["coordinates"] for row in manifest["materials"]} == {"own" if own else "uvunwrap"}
+    original = parsed_principled(data / "scene.xml", data).instantiate(merge=False)
+    written = mi.load_file(str(tmp_path / "out" / "mitsuba" / "scene.xml"), optimize=False)
+    geometry = trimesh.load(tmp_path / "out" / "scene.glb").geometry
+    places = np.random.default_rng(0).uniform(-0.95, 0.95, (2, 400)).astype(np.float32)
+    places = places[:, np.abs(places[0] - places[1]) > 0.1]
+    for name, at in (("sheet", 0), ("tiles", 3)):
+        ray = mi.Ray3f(mi.Point3f(places[0] + at, places[1], 1), mi.Vector3f(0, 0, -1))
+        truth, found = (
+            np.array(si.bsdf().eval_diffuse_reflectance(si)).T
+            for si in (original.ray_intersect(ray), written.ray_intersect(ray))
+        )
+        assert np.ptp(truth) > 0.5 and np.abs(found - truth).max() < 0.01, name
+        points = np.stack([places[0] + at, places[1], 0 * places[0]], -1)
+        faces = (places[0] < places[1]).astype(int)
+        mesh = geometry[name]
+        weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
+        uv = np.einsum("nk,nkd->nd", weights, mesh.visual.uv[mesh.faces[faces]]) * [1, -1] + [0, 1]
+        colour = looked_up(mesh.visual.material.baseColorTexture.convert("RGB"), uv)
+        assert np.abs(colour - 255 * srgb(truth)).max() <= 3, name
 
 
 @pytest.mark.parametrize("kind", ["gltf", "usd", "mitsuba"])
@@ -1080,12 +1525,15 @@ def test_layers_of_materials_that_are_left_out_are_told(kind, tmp_path):
     found = read_parts(tmp_path / "scene.xml", tmp_path)
     notes = exporting._without_place(found, [], [kind], [])
     told = {
-        "cut-outs": "fence, pane",
+        "cut-outs of materials without textures": "grille",
         "bump maps": "fence",
         "normal maps": "tiles",
         "blends of materials": "rust",
     }
-    lost = [f"glTF and usd have no {name}: left out of {of}" for name, of in told.items()]
+    lost = [
+        f"unbake does not write {name} to glTF and usd: left out of {of}"
+        for name, of in told.items()
+    ]
     assert sorted(notes) == ([] if kind == "mitsuba" else sorted(lost))
 
 
@@ -1097,7 +1545,7 @@ def test_lights_that_other_formats_do_not_have_are_told(kind, tmp_path):
           </emitter><emitter type="point"/><emitter type="constant"/></scene>"""
     )
     found = read_parts(tmp_path / "scene.xml", tmp_path)
-    told = ["glTF and usd have no such lights, left out: beamer"] if kind == "gltf" else []
+    told = ["unbake does not write such lights to glTF and usd: beamer"] if kind == "gltf" else []
     assert exporting._without_place(found, [], [kind], []) == told
 
 
@@ -1236,7 +1684,18 @@ def test_own_coordinates_count_where_they_are_unique(mixed):
 
 
 def test_xatlas_takes_over_where_uvunwrap_fails(mixed, monkeypatch):
+    """Its page grows beyond what it is asked for, and the texels with it."""
     import uvunwrap
+    import xatlas
+
+    pages = []
+
+    class Noted(xatlas.Atlas):
+        def generate(self, *words):
+            super().generate(*words)
+            pages.append(max(self.width, self.height))
+
+    monkeypatch.setattr(xatlas, "Atlas", Noted)
 
     def fails(*words, **named):
         raise uvunwrap.UnwrapError("it fails")
@@ -1247,20 +1706,29 @@ def test_xatlas_takes_over_where_uvunwrap_fails(mixed, monkeypatch):
     (atlas,) = make_atlases(found.scene, cloth, 40.0)
     assert atlas.method == "xatlas" and atlas.unique >= 0.999
     assert unique_share(atlas.placed, seed=7) >= 0.999
+    (crowded,) = make_atlases(found.scene, many_boxes(found), 0.5)
+    assert crowded.method == "xatlas" and crowded.wanted <= 64 < pages[1] <= crowded.resolution
+    assert pages[0] <= atlas.resolution and crowded.resolution < 2 * pages[1]
+    uv = np.concatenate([placed.triangles.uv for placed in crowded.placed])
+    assert uv.min() < 0.02 and uv.max(0) == pytest.approx([1, 1], abs=0.02)
 
 
-def test_many_charts_get_a_page_that_holds_them(mixed):
-    found = read_parts(mixed, mixed.parent)
+def many_boxes(found):
+    """300 parts of the material of the block, each of six charts."""
     block = next(part for part in found.parts if part.name == "block")
     rng = np.random.default_rng(0)
-    boxes = [
+    return [
         replace(block, name=f"box-{i}", triangles=replace(
             block.triangles, uv=None,
             positions=block.triangles.positions + rng.uniform(-3, 3, 3).astype(np.float32),
         ))
         for i in range(300)
     ]  # fmt: skip
-    (atlas,) = make_atlases(found.scene, boxes, 0.5)
+
+
+def test_many_charts_get_a_page_that_holds_them(mixed):
+    found = read_parts(mixed, mixed.parent)
+    (atlas,) = make_atlases(found.scene, many_boxes(found), 0.5)
     assert atlas.wanted <= 64 < atlas.resolution <= 512
     assert atlas.method == "uvunwrap" and atlas.unique >= 0.999
 
@@ -1433,7 +1901,10 @@ def test_the_command_tells_what_it_wrote(exported, tmp_path, unbake, monkeypatch
     assert "floor/paint: 64 x 64 texels, its own coordinates" in outcome.out
     assert lines[-1] == f"wrote {out}: scene.glb, export.json" and max(map(len, lines[:-1])) < 80
     assert sorted(p.name for p in out.iterdir()) == sorted(
-        ["environment" + ".exr", "export.json", "scene.glb", "unobserved"]
+        [
+            *("environment.exr", "environment_upright.exr"),
+            *("export.json", "scene.glb", "unobserved"),
+        ]
     )
     # A file of glTF has no place for the masks of what no view saw.
     told = json.loads((out / "export.json").read_text())

@@ -124,9 +124,9 @@ def export(
     """Write what a run recovered for other programs: textures, glTF, OpenUSD, or for Mitsuba.
 
     The scene keeps its parts and their names. Each material gets textures of albedo, roughness and
-    metallic, in the texture coordinates of its parts if these are unique, else unwrapped. What no
-    training view saw is filled in from what was seen, and marked in a mask. PATH/export.json has
-    all of it.
+    metallic, and of opacity where it is cut out, in the texture coordinates of its parts if these
+    are unique, else unwrapped. What no training view saw is filled in from what was seen, and
+    marked in a mask. PATH/export.json has all of it.
 
     Args:
         run: Folder that `unbake fit` wrote.
@@ -135,8 +135,8 @@ def export(
             (OpenEXR and PNG), mitsuba (a scene that Mitsuba renders without unbake) and usd
             (OpenUSD; it needs pip install 'unbake[usd]').
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
-            surfaces, or more where what was recovered is finer). A texture has from 64 to 8192
-            along an edge.
+            surfaces, or more where what was recovered, or a known texture, is finer). A texture has
+            from 64 to 8192 along an edge.
         allow_outside: Read files that the data set or its scene names outside of its folder.
     """
     backend.activate()

@@ -8,6 +8,7 @@ DIR/
   mitsuba/scene.xml       the scene for Mitsuba, with its own meshes and textures
   usd/scene.usdc          the scene as OpenUSD, with its own textures
   environment.exr         the environment, recovered or that of the scene
+  environment_upright.exr the same in the axes of scene.glb, where these are others
 """
 
 from __future__ import annotations
@@ -22,8 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ..dataset.camera import up_of
-from ..dataset.views import Dataset
+from ..dataset.camera import Camera
 from ..errors import UserError, collected, named, raise_together
 from ..imaging.pictures import write_exr
 from ..io import filled_folder, require_new_folder, write_json
@@ -35,26 +35,28 @@ from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
 from ..version import VERSION
 from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
-from .bake import WANTED, Baked, Baker, own_textures
-from .constants import TEXTURED, material_constants
-from .gltf import write_glb
-from .lights import Light, environment_picture, read_lights
+from .bake import WANTED, Baked, Baker, own_opacities, own_textures
+from .constants import TEXTURED, constant_opacity, material_constants
+from .gltf import PUNCTUAL, write_glb
+from .lights import Light, environment_picture, read_lights, turned_latlong
 from .mitsuba import write_scene
 from .observed import training_views
 from .parts import Part, Parts, parsed_principled, read_parts
 from .textures import COLOUR_SPACES, file_names, write_mask, write_textures
-from .unwrap import LARGEST, UNIQUE, make_atlases
+from .unwrap import LARGEST, UNIQUE, Atlas, make_atlases
+from .upright import Up
 from .usd import require_usd, write_usd
 
 #: The environment, recovered or of the scene, beside `export.json`.
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
+#: The same in the axes of `scene.glb`.
+_UPRIGHT = Path("environment_upright").with_suffix(".exr").name
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
 #: Materials that are told one by one.
 _TOLD = 12
-#: BSDFs around others that glTF and OpenUSD have no place for, and what they give.
+#: BSDFs around others that are not written to glTF and OpenUSD, and what they give.
 _LAYERS = {
-    "mask": "cut-outs",
     "bumpmap": "bump maps",
     "normalmap": "normal maps",
     "blendbsdf": "blends of materials",
@@ -67,17 +69,20 @@ _CONVENTIONS = {
     "texture coordinates": "(0, 0) is the corner of the first texel of the first row of an image, "
     "in Mitsuba and in glTF",
     "roughness": "perceptual: GGX alpha = roughness squared",
-    "axes of usd": "those of the scene; the stage calls up what is nearest to the cameras' up, y "
-    "or z",
+    "axes of usd": "those of the scene where y or z is up by the cameras, as the stage says; "
+    "else /scene turns what is up to one of them",
     "texture coordinates of usd": "(u, 1 - v): (0, 0) is the corner of the first texel of the last "
     "row",
     "light of usd": "a point or spot light of radiant intensity I has intensity 4 I and is "
     "normalized: its radiance does not depend on the radius",
+    "opacity": "the alpha of the base colour, in glTF and in usd: cut-outs are solid from 0.5 on, "
+    "and what is transparent to a part is blended",
     "metallic and roughness of glTF": "blue and green of one texture",
     "light": "radiance and intensity in the scene's own units; glTF takes them as candela",
     "environment": "latitude and longitude as Mitsuba's envmap reads them without to_world: +y is "
     "the first row, -y the last one, +z the middle column, -z the left and right border, +x at a "
-    "quarter of the width; linear RGB",
+    "quarter of the width; linear RGB; in axes of the scene, and environment_upright in those of "
+    "scene.glb",
     "texels_per_unit": "at least, but for textures of the smallest and the largest size; where "
     "nobody chose it, textures have more that need it",
     "near": "by quantity, the share of the surface seen by training views where the texture "
@@ -108,8 +113,8 @@ def export(
         out: folder to write; it must be new or empty, and is filled only when all is complete.
         formats: of `FORMATS`.
         texels: along a scene unit; None: one for each pixel of the training views on the surfaces,
-            or more where the recovered fields hold finer detail, until 95 % of each surface differs
-            from them by 2/255 at most.
+            or more where the recovered fields or known textures hold finer detail, until 95 % of
+            each surface differs from them by 2/255 at most.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         console: where a progress bar is shown, if it is a terminal; None: nowhere.
         tell: called with lines of progress.
@@ -173,21 +178,23 @@ def _export(
     found = found.without(known_materials(found.scene, recovered.config))
     lights = read_lights(found.scene, problem)
     learned = () if problem.materials is None else tuple(problem.materials)
-    own = own_textures(parsed_principled(dataset.scene, dataset.root), learned)
     of_lamps = "mitsuba" in formats and bool(learned)
     wanted = [p for p in found.parts if p.is_optimized or of_lamps]
     with _Bar(console) as bar:
         atlases = make_atlases(found.scene, wanted, density, bar.unwraps)
         bar.total(sum(atlas.resolution**2 for atlas in atlases))
-        baker = Baker(problem.materials, own, training_views(recovered))
+        baker, known = _baker(recovered, atlases, learned), set(formats) != {"mitsuba"}
         baked = []
         for atlas in atlases:
             bar.bakes(atlas.name)
             refine = texels is None and atlas.is_optimized
-            baked.append(baker.bake(atlas, bar.advance, refine=refine))
+            shown = known and atlas.is_optimized
+            baked.append(baker.bake(atlas, bar.advance, refine=refine, known=shown))
         bar.says("writing …")
         environment = environment_picture(problem)
-        written = _write(recovered, out, formats, found, baked, lights, environment, learned)
+        written = _write(
+            recovered, out, formats, found, baked, lights, environment, learned, texels is None
+        )
     names = {id(placed.part): atlas.name for atlas in atlases for placed in atlas.placed}
     manifest = {
         "format": EXPORT_FORMAT,
@@ -222,11 +229,25 @@ def _export(
             *_notes(found, baked, lights, _COARSE[texels is None]),
             *_without_place(found, baked, formats, learned),
             *_of_lamps(found, formats, learned),
+            *_of_coordinates(baked, formats),
+            *_of_strengths(lights, formats),
+            *_of_axes([view.camera for view in dataset.train], formats),
             *written.notes,
         ],
     }
     _report(manifest, tell)
     return manifest
+
+
+def _baker(recovered: Recovered, atlases: Sequence[Atlas], learned: Sequence[str]) -> Baker:
+    """What looks up the materials of atlases."""
+    parsed = parsed_principled(recovered.dataset.scene, recovered.dataset.root)
+    numbers = {number for atlas in atlases for number in atlas.materials}
+    own = own_textures(parsed, learned, numbers, stored=True)
+    masks = {mask for atlas in atlases for around in atlas.masks for mask in around}
+    opacities = own_opacities(parsed, masks)
+    texels = sum(atlas.resolution**2 for atlas in atlases)
+    return Baker(recovered.problem.materials, own, training_views(recovered), opacities, texels)
 
 
 @dataclass(frozen=True)
@@ -247,6 +268,7 @@ def _write(
     lights: Sequence[Light],
     environment: Any,
     learned: Sequence[str],
+    refine: bool,
 ) -> _Written:
     """Write all formats."""
     dataset = recovered.dataset
@@ -268,17 +290,14 @@ def _write(
     if others and len(visible) < len(found.parts):
         hidden = named([part.name for part in found.parts if not part.is_shown])
         notes.append(f"glTF and usd have no surfaces that nobody sees (null): without {hidden}")
-    if "usd" in formats and (turned := _turned(dataset)) is not None:
-        notes.append(turned)
+    up = Up.of([view.camera for view in dataset.train])
     if "gltf" in formats:
-        write_glb(out / "scene.glb", found.scene, visible, shown, lights, _up_axis(dataset))
-        if environment is not None:
-            what = "scene.glb has no environment, as glTF has none"
-            notes.append(f"{what}: it is {_ENVIRONMENT}")
+        write_glb(out / "scene.glb", found.scene, visible, shown, lights, up)
+        notes += _environment_of_gltf(out, environment, up)
     if "usd" in formats:
         (out / "usd").mkdir()
         beside = None if environment is None else f"../{_ENVIRONMENT}"
-        write_usd(out / "usd", found.scene, visible, shown, lights, beside, _up(dataset))
+        write_usd(out / "usd", found.scene, visible, shown, lights, beside, up)
     if "mitsuba" in formats:
         (out / "mitsuba").mkdir()
         # The scene's own stays as it is.
@@ -292,32 +311,54 @@ def _write(
             lights,
             recovered_environment,
             recovered.camera(dataset.train[0]),
+            refine=refine,
         )
         notes += scene.notes
     return _Written(files, masks, notes)
 
 
-def _up_axis(dataset: Dataset) -> np.ndarray:
-    """The axis of the scene that is up by the cameras, or next to it: a unit vector (3,)."""
-    up = up_of([view.camera for view in dataset.train])
-    axis = int(np.abs(up).argmax())
-    return np.sign(up[axis]) * np.eye(3)[axis]
+def _environment_of_gltf(out: Path, environment: Any, up: Up) -> list[str]:
+    """Write the environment in the axes of `scene.glb`, where these are others; what to tell."""
+    if environment is None:
+        return []
+    what = "glTF has no environment: for scene.glb it is"
+    if not up.is_turned("Y"):
+        return [f"{what} {_ENVIRONMENT}"]
+    write_exr(out / _UPRIGHT, turned_latlong(environment, up.rotation("Y")))
+    kept = f"{_ENVIRONMENT} has the axes of the scene, as mitsuba and usd take it"
+    return [f"{what} {_UPRIGHT}", kept]
 
 
-def _up(dataset: Dataset) -> str:
-    """Which axis is up by the cameras, as OpenUSD calls it."""
-    up = up_of([view.camera for view in dataset.train])
-    return "Z" if abs(up[2]) > abs(up[1]) else "Y"
+def _of_coordinates(baked: Sequence[Baked], formats: Sequence[Format]) -> list[str]:
+    """Which textures are in coordinates that no file has."""
+    unwrapped = [
+        one.atlas.name for one in baked if one.atlas.is_optimized and one.atlas.method != "own"
+    ]
+    if set(formats) != {"textures"} or not unwrapped:
+        return []
+    what = f"unwrapped, in texture coordinates that no file here has: {named(unwrapped)}"
+    return [f"{what}; add gltf, usd or mitsuba to --format for meshes that have them"]
 
 
-def _turned(dataset: Dataset) -> str | None:
-    """A note where up is an axis that OpenUSD cannot say; None where it can."""
-    up = _up_axis(dataset)
-    axis = int(np.abs(up).argmax())
-    if axis > 0 and up[axis] > 0:
-        return None
-    told = f"{'−' if up[axis] < 0 else '+'}{'xyz'[axis]}"
-    return f"up is {told} by the cameras, which usd cannot say: turn what it shows"
+def _of_strengths(lights: Sequence[Light], formats: Sequence[Format]) -> list[str]:
+    """Which lights Blender divides by 683, unless it is told not to; it does not divide lamps."""
+    names = [light.name for light in lights if light.plugin in PUNCTUAL and light.strength]
+    if "gltf" not in formats or not names:
+        return []
+    what = "in Blender, import scene.glb with Lighting Mode: Unitless"
+    return [f"{what}, for {named(names)}"]
+
+
+def _of_axes(cameras: Sequence[Camera], formats: Sequence[Format]) -> list[str]:
+    """What is turned because the scene is not upright."""
+    up = Up.of(cameras)
+    axes = {"gltf": "Y", "usd": up.of_usd}
+    turned = [name for name, to in axes.items() if name in formats and up.is_turned(to)]
+    usual = up.axis in ("+y", "+z") and not up.tilt
+    if not turned or usual:  # between +y and +z every program turns
+        return []
+    names = " and ".join("glTF" if name == "gltf" else name for name in turned)
+    return [f"up is {up.told()} by the cameras, and turned upright in {names}"]
 
 
 # ------------------------------------------------------------------------------------- the manifest
@@ -391,19 +432,25 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
             f"less than {100 * WANTED:.0f} % of the surface is within 2/255 of the fields in "
             f"{len(far)} of {len(shown)} materials ({named(far)}); {remedy}"
         )
+    coarse: dict[str, list[str]] = {}
+    for one in shown:
+        for name in one.coarse:
+            coarse.setdefault(name, []).append(one.atlas.name)
+    for name, of in coarse.items():
+        notes.append(f"{name} is coarser than in the scene in {named(of)}; {remedy}")
     varying = [light.name for light in lights if light.strength is None]
     if varying:
         notes.append(f"lights of varying strength are dark in glTF and usd: {', '.join(varying)}")
     if not any(one.learned for one in baked):
         what = "the run learned no materials: all textures are the scene's own"
-        notes.append(f"{what}, sampled anew; a larger --texels keeps more of them")
+        notes.append(f"{what}, sampled anew")
     return notes
 
 
 def _without_place(
     found: Parts, baked: Sequence[Baked], formats: Sequence[Format], learned: Sequence[str]
 ) -> list[str]:
-    """What materials have and glTF and OpenUSD have not."""
+    """What materials and lights have that is not written to glTF and OpenUSD."""
     if not {"gltf", "usd"} & set(formats):
         return []
     lost = {name: ["all materials"] for name in learned if name not in TEXTURED}
@@ -416,9 +463,14 @@ def _without_place(
         plugins = {nodes[i].props.plugin_name() for i in inside}
         for plugin in filter(plugins.__contains__, _LAYERS):
             lost.setdefault(_LAYERS[plugin], []).append(part.name)
-    told = [f"glTF and usd have no {name}: left out of {named(of)}" for name, of in lost.items()]
+        if not part.is_optimized and constant_opacity(found.scene, part.masks) is None:
+            lost.setdefault("cut-outs of materials without textures", []).append(part.name)
+    told = [
+        f"unbake does not write {name} to glTF and usd: left out of {named(of)}"
+        for name, of in lost.items()
+    ]
     if others := names_besides(found.scene, (*STRENGTHS, *ENVIRONMENTS)):
-        told.append(f"glTF and usd have no such lights, left out: {named(others)}")
+        told.append(f"unbake does not write such lights to glTF and usd: {named(others)}")
     return told
 
 

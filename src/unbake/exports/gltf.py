@@ -2,7 +2,7 @@
 
 Texture coordinates are the same in Mitsuba and in glTF: (0, 0) is the corner of the first texel of
 the first row. Positions and units are those of the scene. glTF takes +y as up, and metres: a node
-around all others turns the axis that is up in the scene to +y.
+around all others turns what is up in the scene to +y.
 
 Source: Khronos, glTF 2.0 specification; KHR_lights_punctual, KHR_materials_emissive_strength,
 KHR_materials_transmission, KHR_materials_ior, KHR_materials_clearcoat.
@@ -29,11 +29,12 @@ from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from ..version import VERSION
 from .bake import Baked
-from .constants import Constants, material_constants
+from .constants import Constants, constant_opacity, is_number, material_constants
 from .lights import Light
 from .parts import Part
 from .tessellate import Triangles
-from .textures import picture
+from .textures import base_colour, picture
+from .upright import Up
 
 _FLOAT, _UINT, _ARRAY, _INDEX = 5126, 5125, 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
@@ -43,10 +44,13 @@ _CONDUCTORS = ("conductor", "roughconductor")
 _PLASTIC = "plastic"
 #: Width of microfacets in Mitsuba where nothing is said.
 _ALPHA = 0.1
-_SPOTS = {"point": "point", "spot": "spot", "directional": "directional"}
+#: Lights without extent, as glTF calls them.
+PUNCTUAL = {"point": "point", "spot": "spot", "directional": "directional"}
 
 #: The node that turns the scene, where its up is not +y.
 UPRIGHT = "upright"
+#: The opacity from which a cut-out is solid.
+CUTOFF = 0.5
 #: Bytes that the header of a file can tell.
 LARGEST = 2**32 - 1
 
@@ -70,16 +74,11 @@ class Document:
         entries.append(entry)
         return len(entries) - 1
 
-    def turn(self, up: np.ndarray) -> None:
-        """Put a node around all that there is, which turns an axis (3,) of the scene to +y."""
-        y = np.array([0.0, 1.0, 0.0])
-        half = np.array([*np.cross(up, y), 1 + up @ y])
-        if not half.any():  # the opposite of +y: half a turn about x
-            half = np.array([1.0, 0.0, 0.0, 0.0])
-        if half[3] == 2:  # +y already
+    def turn(self, up: Up) -> None:
+        """Put a node around all that there is, which turns up to +y, where it is not."""
+        if not up.is_turned("Y"):
             return
-        rotation = (half / np.linalg.norm(half)).tolist()
-        top = self.json["scenes"][0]
+        rotation, top = up.quaternion("Y").tolist(), self.json["scenes"][0]
         node = {"name": UPRIGHT, "rotation": rotation, "children": top["nodes"]}
         top["nodes"] = [self.add("nodes", node)]
 
@@ -167,7 +166,7 @@ def write_glb(
     parts: Sequence[Part],
     baked: Sequence[Baked],
     lights: Sequence[Light],
-    up: np.ndarray,
+    up: Up,
 ) -> None:
     """Write parts, their materials and the lights.
 
@@ -178,7 +177,7 @@ def write_glb(
         baked: textures of the others.
         lights: point, spot and directional lights are written as such, area lights as emission of
             their parts; environments are left out, as glTF knows none.
-        up: the axis of the scene that is up, a unit vector (3,).
+        up: what is up in the scene.
     """
     document = Document()
     placed = {id(p.part): (p.triangles, b) for b in baked for p in b.atlas.placed}
@@ -203,7 +202,7 @@ def write_glb(
         triangles = triangles if part.is_optimized else replace(triangles, uv=None)
         _add_part(document, part.name, triangles, materials[key])
     for light in lights:
-        if light.plugin in _SPOTS and light.strength is not None:
+        if light.plugin in PUNCTUAL and light.strength is not None:
             _add_light(document, light)
     document.turn(up)
     document.write(path)
@@ -233,14 +232,19 @@ def _textured(document: Document, baked: Baked, constants: Constants) -> dict[st
     name, values = baked.atlas.name, baked.values
     roughness, metallic = (picture(k, values[k]) for k in ("roughness", "metallic"))
     both = np.stack([np.full_like(roughness, 255), roughness, metallic], -1)
-    colour = document.image(f"{name} base colour", picture("albedo", values["albedo"]))
-    return {
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": colour},
-            "metallicRoughnessTexture": {"index": document.image(f"{name} roughness", both)},
-        },
-        "extensions": extensions,
+    colour = document.image(f"{name} base colour", base_colour(baked))
+    factors: dict[str, Any] = {
+        "baseColorTexture": {"index": colour},
+        "metallicRoughnessTexture": {"index": document.image(f"{name} roughness", both)},
     }
+    material: dict[str, Any] = {"pbrMetallicRoughness": factors, "extensions": extensions}
+    if baked.opacity is not None:
+        material["alphaMode"] = "BLEND" if baked.blends else "MASK"
+        if not baked.blends:
+            material["alphaCutoff"] = CUTOFF
+        if baked.constant_opacity is not None:
+            factors["baseColorFactor"] = [1.0, 1.0, 1.0, baked.constant_opacity]
+    return material
 
 
 def plain_material(
@@ -283,6 +287,10 @@ def plain_material(
         material["extensions"] = _refraction(document, plastic, 1.49)
     else:
         factors["baseColorFactor"] = [0.5, 0.5, 0.5, 1.0]
+    opacity = constant_opacity(scene, part.masks)
+    if opacity is not None and opacity < 1:
+        factors["baseColorFactor"][3] = opacity
+        material["alphaMode"] = "BLEND"
     material["pbrMetallicRoughness"] = factors
     return material
 
@@ -321,7 +329,7 @@ def _roughness(props: Any, rough: str) -> float:
         return 0.0
     keys = ("alpha_u", "alpha_v") if {"alpha_u", "alpha_v"} & set(props) else ("alpha",)
     given = [props.get(key, _ALPHA) for key in keys]
-    widths = [alpha if isinstance(alpha, float) else _ALPHA for alpha in given]
+    widths = [alpha if is_number(alpha) else _ALPHA for alpha in given]
     return math.sqrt(min(max(sum(widths) / len(widths), 0.0), 1.0))
 
 
@@ -353,7 +361,7 @@ def _add_light(document: Document, light: Light) -> None:
     largest = max(*light.strength, 1e-12)
     entry: dict[str, Any] = {
         "name": light.name,
-        "type": _SPOTS[light.plugin],
+        "type": PUNCTUAL[light.plugin],
         "color": [max(x, 0.0) / largest for x in light.strength],
         "intensity": largest,
     }

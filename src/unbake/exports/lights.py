@@ -89,6 +89,24 @@ def environment_picture(problem: Problem) -> np.ndarray | None:
     return environment_latlong(scene, max(ROWS, rows))
 
 
+def turned_latlong(picture: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """An environment in turned axes: a direction d has the radiance of R⁻¹ d.
+
+    Args:
+        picture: (rows, 2 rows, 3) float32, as `envmap` reads it.
+        rotation: R, (3, 3).
+    """
+    to_world = np.eye(4)
+    to_world[:3, :3] = rotation
+    environment = {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(picture),
+        "to_world": mi.ScalarTransform4f(to_world),
+    }
+    scene = mi.load_dict({"type": "scene", "environment": environment})
+    return environment_latlong(scene, len(picture))
+
+
 def _cone(props: mi.Properties) -> tuple[float, float]:
     outer = float(props.get("cutoff_angle", 20.0))
     inner = float(props.get("beam_width", outer * 3 / 4))

@@ -21,6 +21,7 @@ from .lights import Light
 from .parts import Part
 from .tessellate import Triangles
 from .textures import as_image, file_names
+from .unwrap import Placed
 
 _TEXTURES, _MESHES, _ENVIRONMENT = "textures", "meshes", "environment"
 
@@ -53,11 +54,14 @@ def write_scene(
     lights: Sequence[Light],
     environment: np.ndarray | None,
     camera: Camera,
+    *,
+    refine: bool = False,
 ) -> Written:
     """Write `scene.xml`, meshes and textures.
 
     Shapes whose materials are written as textures become PLY meshes with the coordinates of these
-    textures; so do shapes that instances place. All others stay as they are.
+    textures; so do shapes that instances place, and those with bump maps, whose texture is turned a
+    little here (see `scene.bumps`). All others stay as they are.
 
     Args:
         folder: to write to; it must be new.
@@ -68,6 +72,7 @@ def write_scene(
         lights: with recovered strengths.
         environment: the recovered one, as `envmap` reads it.
         camera: of the sensor that is added where the scene has none.
+        refine: textures that move to other coordinates may become finer than their material's.
 
     Raises:
         UserError: a texture cannot be made, or a file cannot be written.
@@ -82,9 +87,9 @@ def write_scene(
     copies = _own_bsdfs(scene, baked)
     for stem, one, copied in zip(stems, baked, copies, strict=True):
         _replace_textures(folder, stem, one, scene, copied)
-        if one.atlas.method != "own":
-            notes += _move_others(folder, stem, one, scene, scratch, copied)
-    placed = {id(p.part): p.triangles for one in baked for p in one.atlas.placed}
+        notes += _move_others(folder, stem, one, scene, scratch, copied, refine=refine)
+    placed = {id(p.part): _triangles(p, one) for one in baked for p in one.atlas.placed}
+    placed |= {id(part): part.triangles for part in parts if _is_to_turn(part, placed)}
     names = {part.node: part.name for part in parts if not part.instanced}
     names |= _replace_shapes(folder, scene, parts, placed)
     if environment is not None:
@@ -178,11 +183,16 @@ def _move_others(
     scene: ParsedScene,
     scratch: ParsedScene,
     copies: Mapping[int, int],
+    *,
+    refine: bool,
 ) -> list[str]:
     """Bring the other textures of a material's BSDFs and lamps into the coordinates of its atlas.
 
+    Those stay that are looked up in coordinates that the parts keep.
+
     Args:
         copies: as of `_replace_textures`.
+        refine: as of `write_scene`.
 
     Returns:
         What is not as it was.
@@ -194,8 +204,8 @@ def _move_others(
     outer = {copies.get(part.bsdf, part.bsdf) for part in parts if part.bsdf is not None}
     inside = {i for bsdf in outer for i in scene.reachable(bsdf)}
     inside |= {part.emitter for part in parts if part.emitter is not None}
-    notes = []
-    if any(_is_anisotropic(scene.state.nodes[i].props) for i in inside):
+    notes, is_kept = [], baked.atlas.method == "own"
+    if not is_kept and any(_is_anisotropic(scene.state.nodes[i].props) for i in inside):
         # They are along the coordinates.
         notes.append(f"{baked.atlas.name}: anisotropic highlights follow the new coordinates")
     moved: dict[tuple[int, bool], int] = {}
@@ -210,6 +220,8 @@ def _move_others(
             baked_here = i in fitted and key in learned
             if inner is None or inner.type != mi.ObjectType.Texture or baked_here:
                 continue
+            if is_kept and not _is_stored(scene, node.props[key].index()):
+                continue
             if plugin == "normalmap":
                 # Its vectors are in the frame of the old coordinates.
                 node.props[key] = mi.ScalarColor3d([0.5, 0.5, 1.0])
@@ -217,7 +229,12 @@ def _move_others(
                 continue
             old, colour = node.props[key].index(), key in _COLOURS
             if (old, colour) not in moved:
-                pixels = bake_texture(baked, make_texture(scratch, old), colour=colour)
+                texture = make_texture(scratch, old, stored=True)
+                pixels, is_near = bake_texture(baked, texture, colour=colour, refine=refine)
+                if not is_near:
+                    what = "bump map" if plugin == "bumpmap" else key
+                    told = f"{baked.atlas.name}: its {what} is coarser than in the scene"
+                    notes.append(f"{told}; a larger --texels keeps more")
                 if (pixels == pixels[..., :1]).all():
                     pixels = pixels[..., 0]
                 file = folder / _TEXTURES / f"{stem}_texture-{len(moved)}.exr"
@@ -225,6 +242,12 @@ def _move_others(
             props = scene.state.nodes[i].props
             props[key] = mi.Properties.ResolvedReference(moved[old, colour])
     return notes
+
+
+def _is_stored(scene: ParsedScene, texture: int) -> bool:
+    """Whether a texture reads values stored in meshes, which the meshes here have not."""
+    nodes = scene.state.nodes
+    return any(nodes[i].props.plugin_name() == "mesh_attribute" for i in scene.reachable(texture))
 
 
 def _is_anisotropic(props: mi.Properties) -> bool:
@@ -251,6 +274,19 @@ def _bitmap(scene: ParsedScene, file: Path, values: np.ndarray, *, colour: bool)
 
 
 # ------------------------------------------------------------------------------------------- shapes
+
+
+def _triangles(placed: Placed, baked: Baked) -> Triangles:
+    """A part as it is written: with a bump map its own coordinates stay turned, and are not cut."""
+    turned = baked.atlas.method == "own" and placed.part.is_bumped
+    return replace(placed.triangles, uv=placed.own_uv) if turned else placed.triangles
+
+
+def _is_to_turn(part: Part, placed: Mapping[int, Triangles]) -> bool:
+    """Whether a part has a bump map, and nothing is written for it that is turned already."""
+    triangles = part.triangles
+    bumped = part.is_bumped and part.exact and triangles.uv is not None
+    return bumped and not triangles.stored and id(part) not in placed
 
 
 def _replace_shapes(

@@ -15,9 +15,12 @@ from ..fields.pieces import Pieces
 from ..fields.shapes import PlacedShape, placed_shapes
 from ..scene import edit
 from ..scene.parse import ParsedScene, parse
+from ..scene.transforms import chosen_id
 from ..scene.triangles import doubled_normals, unit
 from .tessellate import TESSELLATED, Triangles, tessellated
 
+#: What meshes have besides the values stored in them.
+_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 #: By which a shape that was made is found among the nodes.
 _ID = "shape node {}"
 
@@ -39,6 +42,8 @@ class Part:
     pieces: np.ndarray | None = None  #: (m, 3) of each triangle, as `Pieces.of` tells them
     is_pane: bool = False  #: thin glass, which both sides show
     is_shown: bool = True  #: it is no mere boundary, which pictures do not show
+    masks: tuple[int, ...] = ()  #: the nodes of the masks around its BSDF, the outermost first
+    is_bumped: bool = False  #: it has a bump map
 
     @property
     def is_optimized(self) -> bool:
@@ -150,8 +155,20 @@ def _described(scene: ParsedScene, node: int, materials: Mapping[int, int]) -> P
         instanced=False,
         dropped=0,
         is_pane="thindielectric" in plugins,
+        masks=_masks(scene, bsdf),
+        is_bumped="bumpmap" in plugins,
         is_shown=emitter is not None or bsdf is None or nodes[bsdf].props.plugin_name() != "null",
     )
+
+
+def _masks(scene: ParsedScene, bsdf: int | None) -> tuple[int, ...]:
+    """The nodes of the masks around a BSDF, the outermost first: no other BSDF may hold one."""
+    nodes, found = scene.state.nodes, []
+    while bsdf is not None and nodes[bsdf].props.plugin_name() == "mask":
+        found.append(bsdf)
+        inside = scene.references(bsdf)
+        bsdf = next((i for i in inside if nodes[i].type == mi.ObjectType.BSDF), None)
+    return tuple(found)
 
 
 _NOTHING = Triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), None, None)
@@ -164,7 +181,7 @@ def _names(scene: ParsedScene) -> dict[int, str]:
         if node.type == mi.ObjectType.Shape:
             # Shapes need no id, and data sets of earlier versions have lost theirs.
             stem = Path(str(node.props.get("filename", ""))).stem
-            names[i] = node.props.id() or stem or f"{node.props.plugin_name()}-{len(names)}"
+            names[i] = chosen_id(node) or stem or f"{node.props.plugin_name()}-{len(names)}"
     return names
 
 
@@ -216,7 +233,23 @@ def _of_mesh(mesh: mi.Mesh) -> Triangles:
         normals = unit(np.array(mesh.vertex_normals_buffer(), np.float32).reshape(-1, 3))
     if mesh.has_vertex_texcoords():
         uv = np.array(mesh.vertex_texcoords_buffer(), np.float32).reshape(-1, 2)
-    return _as_shaded(_as_seen(mesh, Triangles(positions, faces, normals, uv)))
+    made = Triangles(positions, faces, normals, uv, _stored(mesh))
+    return _as_shaded(_as_seen(mesh, made))
+
+
+def _stored(mesh: mi.Mesh) -> dict[str, np.ndarray]:
+    """The values stored in a mesh."""
+    if not mesh.has_mesh_attributes():
+        return {}
+    rows = {"vertex": mesh.vertex_count(), "face": mesh.face_count()}
+    params = mi.traverse(mesh)
+    return {
+        name: np.array(params[name], np.float32).reshape(rows[name.split("_")[0]], -1)
+        for name in params.keys()  # noqa: SIM118 - it is no dictionary
+        if name.startswith(("vertex_", "face_"))
+        and mesh.has_attribute(name)
+        and name not in _BUFFERS
+    }
 
 
 def _as_shaded(triangles: Triangles) -> Triangles:
@@ -255,10 +288,4 @@ def _sound(triangles: Triangles) -> tuple[Triangles, np.ndarray]:
     """The triangles without those of no area, with the vertices that they use; which are kept."""
     kept = triangles.areas() > 0
     used, faces = np.unique(triangles.faces[kept], return_inverse=True)
-    sound = Triangles(
-        triangles.positions[used],
-        faces.reshape(-1, 3).astype(np.uint32),
-        None if triangles.normals is None else triangles.normals[used],
-        None if triangles.uv is None else triangles.uv[used],
-    )
-    return sound, kept
+    return triangles.of_vertices(used, faces.reshape(-1, 3).astype(np.uint32), kept), kept

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,6 +24,8 @@ class Triangles:
     faces: np.ndarray  #: (m, 3) uint32, counterclockwise seen from the side of the normal
     normals: np.ndarray | None  #: (n, 3), unit; None: faces are flat
     uv: np.ndarray | None  #: (n, 2), Mitsuba's texture coordinates; None: there are none
+    #: Values stored in the mesh by their names: `vertex_…` (n, k), `face_…` (m, k).
+    stored: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
@@ -36,7 +39,7 @@ class Triangles:
         normals = None
         if self.normals is not None:
             normals = unit(self.normals @ np.linalg.pinv(linear))
-        moved = Triangles(positions.astype(np.float32), self.faces, normals, self.uv)
+        moved = replace(self, positions=positions.astype(np.float32), normals=normals)
         return moved.reversed_faces() if np.linalg.det(linear) < 0 else moved
 
     def reversed_faces(self) -> Triangles:
@@ -47,6 +50,28 @@ class Triangles:
         """The same seen from the other side: triangles and normals are turned around."""
         normals = None if self.normals is None else -self.normals
         return replace(self.reversed_faces(), normals=normals)
+
+    def of_vertices(
+        self, used: np.ndarray, faces: np.ndarray, kept: np.ndarray | None = None
+    ) -> Triangles:
+        """Triangles of some vertices of these.
+
+        Args:
+            used: (k,) numbers of vertices.
+            faces: (j, 3) uint32, indices of `used`.
+            kept: which triangles they are, (m,) bool; None: all.
+        """
+        stored = {}
+        for name, values in self.stored.items():
+            chosen = used if name.startswith("vertex_") else kept
+            stored[name] = values if chosen is None else values[chosen]
+        return Triangles(
+            self.positions[used],
+            faces,
+            None if self.normals is None else self.normals[used],
+            None if self.uv is None else self.uv[used],
+            stored,
+        )
 
     def areas(self) -> np.ndarray:
         """The areas of the triangles, (m,) float64."""

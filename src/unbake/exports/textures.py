@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..imaging.pictures import shown, write_exr, write_png
+from ..imaging.pictures import shown, to_bytes, write_exr, write_png
 from ..quantities import QUANTITIES
 from .bake import Baked
 
@@ -16,7 +16,7 @@ from .bake import Baked
 COLOUR_SPACES = {
     name: {"exr": "linear", "png": "sRGB" if q.display == "colour" else "linear"}
     for name, q in QUANTITIES.items()
-}
+} | {"opacity": {"exr": "linear", "png": "linear"}}
 
 
 def file_names(names: Sequence[str]) -> list[str]:
@@ -41,6 +41,10 @@ def write_textures(folder: Path, stem: str, baked: Baked) -> list[str]:
         write_exr(folder / f"{stem}_{name}.exr", as_image(values))
         write_png(folder / f"{stem}_{name}.png", picture(name, values))
         names += [f"{stem}_{name}.exr", f"{stem}_{name}.png"]
+    if baked.opacity is not None:
+        write_exr(folder / f"{stem}_opacity.exr", baked.opacity)
+        write_png(folder / f"{stem}_opacity.png", to_bytes(baked.opacity))
+        names += [f"{stem}_opacity.exr", f"{stem}_opacity.png"]
     return [*names, write_mask(folder, stem, baked)]
 
 
@@ -54,6 +58,17 @@ def write_mask(folder: Path, stem: str, baked: Baked) -> str:
 def as_image(values: np.ndarray) -> np.ndarray:
     """The same without the axis of channels where there is one channel."""
     return values[..., 0] if values.shape[-1] == 1 else values
+
+
+def base_colour(baked: Baked) -> np.ndarray:
+    """The albedo in 8 bits, (n, n, 3), or (n, n, 4) with an opacity that varies as its alpha.
+
+    Colours are not multiplied by it.
+    """
+    colour = picture("albedo", baked.values["albedo"])
+    if baked.opacity is None or baked.constant_opacity is not None:
+        return colour
+    return np.concatenate([colour, to_bytes(baked.opacity)[..., None]], -1)
 
 
 def picture(name: str, values: np.ndarray) -> np.ndarray:

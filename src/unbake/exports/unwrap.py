@@ -10,7 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..scene.bumps import turned
 from ..scene.parse import ParsedScene
+from ..scene.transforms import chosen_id
 from ..scene.triangles import doubled_normals, mesh_of, numbered
 from .parts import Part, unique_names
 from .tessellate import Triangles
@@ -25,6 +27,8 @@ _LARGER = 8
 _PADDING = 2
 #: Of the extent of a material's parts: how near a point must come back.
 _NEAR = 1e-3
+#: Radians by which charts of bump maps are turned.
+_TURN = 1e-3
 #: The share of a square that charts are expected to fill.
 _FILLED = 0.6
 
@@ -54,6 +58,11 @@ class Atlas:
     def is_optimized(self) -> bool:
         """Whether any part shows what the fit recovered."""
         return any(placed.part.is_optimized for placed in self.placed)
+
+    @property
+    def masks(self) -> list[tuple[int, ...]]:
+        """The masks that its parts have, each once, as of `Part.masks`."""
+        return sorted({placed.part.masks for placed in self.placed if placed.part.masks})
 
     def area(self) -> float:
         """Of the surface, in square world units."""
@@ -123,9 +132,9 @@ def _material_names(scene: ParsedScene, groups: list[list[Part]]) -> list[str]:
     names = []
     for group in groups:
         part = group[0]
-        known = [scene.state.nodes[nodes[part.materials[0]]].props.id()]
+        known = [chosen_id(scene.state.nodes[nodes[part.materials[0]]])]
         if part.bsdf is not None:
-            known.append(scene.state.nodes[part.bsdf].props.id())
+            known.append(chosen_id(scene.state.nodes[part.bsdf]))
         names.append(next(filter(None, known), part.name))
     return unique_names(names)
 
@@ -147,6 +156,8 @@ def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
         except (RuntimeError, ValueError, ImportError) as error:
             failures.append(f"{method}: {error}")
             continue
+        if any(part.is_bumped for part in parts):
+            corners = [_askew(uv) for uv in corners]
         placed = [_split(part, uv) for part, uv in zip(parts, corners, strict=True)]
         share = unique_share(placed)
         found.append(Atlas(name, materials, placed, method, share, size, wanted))
@@ -291,7 +302,10 @@ def _by_xatlas(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndarra
     for number in range(len(meshes)):
         _, indices, uv = atlas.get_mesh(number)
         corners.append(uv[indices].astype(np.float32))
-    return _checked(corners, meshes), resolution
+    # The resolution is only a wish: a page grows until it holds the padding of all charts, too.
+    # Coordinates are relative to each side of it; a square of the longer one is only denser.
+    edge = 1 << math.ceil(math.log2(max(atlas.width, atlas.height, resolution)))
+    return _checked(corners, meshes), min(edge, LARGEST)
 
 
 def _welded(mesh: Triangles) -> tuple[np.ndarray, np.ndarray]:
@@ -308,6 +322,15 @@ def _checked(corners: list[np.ndarray], meshes: list[Triangles]) -> list[np.ndar
     return corners
 
 
+def _askew(corners: np.ndarray) -> np.ndarray:
+    """Corners in the unit square, turned a little within it; see `scene.bumps`.
+
+    Charts are small: rounding would hide the turn that is enough for whole walls.
+    """
+    shrunk = (corners.reshape(-1, 2).astype(np.float64) - 0.5) / (math.cos(_TURN) + math.sin(_TURN))
+    return (turned(shrunk, _TURN) + 0.5).astype(np.float32).reshape(corners.shape)
+
+
 def _split(part: Part, corners: np.ndarray) -> Placed:
     """A part whose vertices are split where charts meet."""
     mesh = part.triangles
@@ -316,10 +339,8 @@ def _split(part: Part, corners: np.ndarray) -> Placed:
     keys[:, 1:] = np.ascontiguousarray(corners.reshape(-1, 2), np.float32).view(np.uint32)
     first, number = numbered(*keys.T)
     old = keys[first, 0]
-    split = Triangles(
-        mesh.positions[old],
-        number.astype(np.uint32).reshape(-1, 3),
-        None if mesh.normals is None else mesh.normals[old],
-        corners.reshape(-1, 2)[first].astype(np.float32).clip(0, 1),
+    split = replace(
+        mesh.of_vertices(old, number.astype(np.uint32).reshape(-1, 3)),
+        uv=corners.reshape(-1, 2)[first].astype(np.float32).clip(0, 1),
     )
     return Placed(part, split, None if mesh.uv is None else mesh.uv[old])

@@ -3,8 +3,9 @@
     usd/scene.usdc        binary; names of parts and materials are display names
     usd/textures/         PNG, sRGB for albedo
 
-A texture coordinate (u, v) of Mitsuba and glTF is (u, 1 − v) in USD: (0, 0) is below. Axes and
-units stay those of the scene; the stage says which axis is up.
+A texture coordinate (u, v) of Mitsuba and glTF is (u, 1 − v) in USD: (0, 0) is below. Units
+stay those of the scene, and so do axes where y or z is up: the stage says which. Where neither is,
+`/scene` turns what is up to the nearer of the two.
 
 Source: Pixar, OpenUSD: UsdGeom, UsdShade, UsdPreviewSurface 2.6, UsdLux.
 """
@@ -27,11 +28,12 @@ from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from .bake import Baked
 from .constants import Constants, material_constants
-from .gltf import Document, plain_material
+from .gltf import CUTOFF, Document, plain_material
 from .lights import Light
 from .parts import Part
 from .tessellate import Triangles
-from .textures import COLOUR_SPACES, file_names, picture
+from .textures import COLOUR_SPACES, base_colour, file_names, picture
+from .upright import Up
 
 #: Of the shader: the quantity, and its type and the channels of the texture that it takes.
 _INPUTS = {
@@ -61,7 +63,7 @@ def write_usd(
     baked: Sequence[Baked],
     lights: Sequence[Light],
     environment: str | None,
-    up: str,
+    up: Up,
 ) -> None:
     """Write parts, their materials and the lights.
 
@@ -72,14 +74,14 @@ def write_usd(
         baked: textures of the others.
         lights: those without extent are written as such, area lights as emission of their parts.
         environment: path of the environment's file from the folder; None: there is none.
-        up: "Y" or "Z".
+        up: what is up in the scene.
     """
     from pxr import Usd, UsdGeom, UsdLux
 
     stage = Usd.Stage.CreateNew(os.fspath(folder / "scene.usdc"))
-    UsdGeom.SetStageUpAxis(stage, up)
+    UsdGeom.SetStageUpAxis(stage, up.of_usd)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    writer = _Writer(stage)
+    writer = _Writer(stage, up)
     stems = file_names([one.atlas.name for one in baked])
     placed, textured = {}, {}
     for stem, one in zip(stems, baked, strict=True):
@@ -108,14 +110,18 @@ def write_usd(
 class _Writer:
     """Adds prims to a stage; names that USD does not take are changed, and kept for display."""
 
-    def __init__(self, stage: Any) -> None:
-        from pxr import UsdGeom
+    def __init__(self, stage: Any, up: Up) -> None:
+        from pxr import Gf, UsdGeom
 
         self._stage = stage
         self._taken: set[str] = set()
         self._plain: dict[str, Any] = {}
         root = UsdGeom.Xform.Define(stage, "/scene")
         stage.SetDefaultPrim(root.GetPrim())
+        if up.is_turned(up.of_usd):
+            turn = np.eye(4)
+            turn[:3, :3] = up.rotation(up.of_usd).T  # rows are the images of the axes
+            root.AddTransformOp().Set(Gf.Matrix4d(turn.tolist()))
         for name in ("materials", "lights"):
             UsdGeom.Scope.Define(stage, f"/scene/{name}")
 
@@ -176,7 +182,9 @@ class _Writer:
         coordinates = reader.CreateOutput("result", kinds.Float2)
         for name, (target, kind, channels) in _INPUTS.items():
             file = f"textures/{stem}_{name}.png"
-            write_png(folder / file, picture(name, baked.values[name]))
+            values = baked.values[name]
+            pixels = base_colour(baked) if name == "albedo" else picture(name, values)
+            write_png(folder / file, pixels)
             texture = UsdShade.Shader.Define(self._stage, root.AppendChild(name))
             texture.CreateIdAttr("UsdUVTexture")
             texture.CreateInput("file", kinds.Asset).Set(f"./{file}")
@@ -188,6 +196,14 @@ class _Writer:
             colour = kinds.Float3 if channels == "rgb" else kinds.Float
             found = texture.CreateOutput(channels, colour)
             surface.CreateInput(target, getattr(kinds, kind)).ConnectToSource(found)
+            if name == "albedo" and baked.opacity is not None:
+                opacity = surface.CreateInput("opacity", kinds.Float)
+                if baked.constant_opacity is None:
+                    opacity.ConnectToSource(texture.CreateOutput("a", kinds.Float))
+                else:
+                    opacity.Set(baked.constant_opacity)
+        if baked.opacity is not None and not baked.blends:
+            surface.CreateInput("opacityThreshold", kinds.Float).Set(CUTOFF)
         return material
 
     def plain(self, told: Mapping[str, Any]) -> Any:
@@ -200,7 +216,7 @@ class _Writer:
         kinds = Sdf.ValueTypeNames
         material, surface = self._material(told["name"])
         factors, extra = told["pbrMetallicRoughness"], told.get("extensions", {})
-        colour = factors.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])[:3]
+        *colour, opacity = factors.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
         surface.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(*colour))
         surface.CreateInput("roughness", kinds.Float).Set(factors["roughnessFactor"])
         surface.CreateInput("metallic", kinds.Float).Set(factors["metallicFactor"])
@@ -208,8 +224,9 @@ class _Writer:
             strength = extra["KHR_materials_emissive_strength"]["emissiveStrength"]
             glow = Gf.Vec3f(*(strength * x for x in told["emissiveFactor"]))
             surface.CreateInput("emissiveColor", kinds.Color3f).Set(glow)
-        if "KHR_materials_transmission" in extra:
-            surface.CreateInput("opacity", kinds.Float).Set(0.0)
+        opacity = 0.0 if "KHR_materials_transmission" in extra else opacity
+        if opacity < 1:
+            surface.CreateInput("opacity", kinds.Float).Set(opacity)
         if "KHR_materials_ior" in extra:
             surface.CreateInput("ior", kinds.Float).Set(extra["KHR_materials_ior"]["ior"])
         self._plain[key] = material

@@ -53,8 +53,13 @@ def turn_textures(scene: mi.Scene) -> None:
         params = mi.traverse(shape)
         if "vertex_texcoords" not in params:
             continue  # it has none, or is a rectangle
-        u, v = np.array(params["vertex_texcoords"], np.float64).reshape(-1, 2).T
-        cos, sin = math.cos(_TURN), math.sin(_TURN)
-        turned = np.stack([cos * u - sin * v, sin * u + cos * v], 1)
-        params["vertex_texcoords"] = turned.astype(np.float32).ravel()
+        uv = np.array(params["vertex_texcoords"], np.float64).reshape(-1, 2)
+        params["vertex_texcoords"] = turned(uv).astype(np.float32).ravel()
         params.update()
+
+
+def turned(uv: np.ndarray, angle: float = _TURN) -> np.ndarray:
+    """Texture coordinates (n, 2) float64, turned about (0, 0) by an angle in radians."""
+    u, v = uv.T
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.stack([cos * u - sin * v, sin * u + cos * v], 1)

@@ -98,14 +98,19 @@ def _with_own_dollars(text: str) -> str:
 
 
 def _is_named(node: Any) -> bool:
-    """Whether a node is a shape, a material or a light with an id by which people know it.
+    """Whether a node is a shape, a material or a light with an id by which people know it."""
+    if node.type not in (mi.ObjectType.Shape, mi.ObjectType.BSDF, mi.ObjectType.Emitter):
+        return False
+    return bool(chosen_id(node))
+
+
+def chosen_id(node: Any) -> str:
+    """The id of a node that somebody chose for it; empty where nobody did.
 
     The built-in scenes call the shape of `lamp.ply` `lamp_shape`, and all know it as `lamp`.
     """
-    if node.type not in (mi.ObjectType.Shape, mi.ObjectType.BSDF, mi.ObjectType.Emitter):
-        return False
     name, file = node.props.id(), Path(str(node.props.get("filename", "")))
-    return bool(name) and not _UNNAMED.match(name) and name != f"{file.stem}_shape"
+    return "" if _UNNAMED.match(name) or name == f"{file.stem}_shape" else name
 
 
 def _with_ids(text: str, ids: list[str]) -> str:
