@@ -24,6 +24,7 @@ from unbake.imaging.pictures import read_exr, write_exr
 from unbake.machine import machine
 from unbake.ranks import Ranks
 from unbake.training import loop
+from unbake.training.checkpoint import newest_progress
 from unbake.training.run_folder import RunFolder
 
 
@@ -117,6 +118,15 @@ def test_kernels_are_compiled_before_the_clock_of_a_fit_starts(
     calls.clear()
     assert unbake(*words).status == 0
     assert not [call for call in calls if call.startswith("compile")], "nothing is left to do"
+    # A fit that was interrupted has kernels to compile in this process, as others have.
+    progress = newest_progress(RunFolder(tmp_path / "out" / "direct"))
+    part = dataclasses.replace(progress, seconds=0.05)
+    monkeypatch.setattr(
+        module, "newest_progress", lambda run: part if run.path.name == "direct" else progress
+    )
+    calls.clear()
+    assert unbake(*words).status == 0
+    assert [call for call in calls if call.startswith("compile")] == ["compile direct"]
 
 
 def test_only_the_method_differs_and_what_belongs_to_it(compare, tmp_path):

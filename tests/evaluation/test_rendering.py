@@ -195,6 +195,35 @@ def test_pictures_are_aligned_where_the_fit_left_their_brightness_open(scale, fo
     assert not any("aligned" in key for key in (*made["frames"][0], *made["mean"], *made))
 
 
+def test_pixels_that_are_not_finite_are_left_out_and_told(folder, tmp_path, monkeypatch):
+    """Also where they are the brightest ones, which says nothing of a black picture."""
+
+    def broken(*words):
+        picture = render_camera(*words)
+        picture[SIZE // 2, SIZE // 2] = np.nan
+        return picture
+
+    monkeypatch.setattr("unbake.evaluation.rendering.render_camera", broken)
+    light, settings = LightConfig(envmap=folder / "sky.exr"), RenderSettings(spp=4, max_depth=3)
+    lines: list[str] = []
+    words = (folder / "run", tmp_path / "out", light, settings)
+    made = relight(*words, truth=folder / "data", tell=lines.append)
+    (frame,) = made["frames"]
+    assert frame["not_finite"] == 1 and frame["render_psnr"] > 0
+    assert np.isfinite(made["render_scale"]).all() and frame["render_psnr_aligned"] > 0
+    assert any(line.endswith("1 pixel is not finite and left out") for line in lines)
+    assert not any("all pictures are black" in line for line in lines)
+
+
+def test_scores_need_more_memory_than_pictures(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("unbake.evaluation.rendering._SCORED_BYTES", 1e15)
+    light, settings = LightConfig(envmap=folder / "sky.exr"), RenderSettings(spp=1, max_depth=2)
+    words = (folder / "run", tmp_path / "out", light, settings)
+    with pytest.raises(UserError, match=r"a picture and its scores need about .* of memory"):
+        relight(*words, truth=folder / "data", **SILENT)
+    relight(*words, **SILENT)
+
+
 def test_another_light_than_that_of_the_truth_scores_less(folder, tmp_path):
     settings = RenderSettings(spp=64, max_depth=8)
     light = LightConfig(envmap=folder / "sky.exr")
@@ -571,7 +600,7 @@ def test_relit_pictures_that_are_far_from_white_are_told(folder, tmp_path):
 
 
 def mask_all(data, name):
-    """Mask all of a view, so that no pixel of its rendering is scored."""
+    """Mask all of a view, so that no pixel of it is scored."""
     write_png(data / "black.png", np.zeros((SIZE, SIZE, 3), np.uint8))
     file = data / "transforms.json"
     transforms = json.loads(file.read_text())
@@ -593,11 +622,11 @@ def test_evaluate_tells_of_how_many_views_means_are(unbake, folder, tmp_path):
     outcome = unbake("evaluate", run, *words)
     assert outcome.status == 0, outcome.err
     (line,) = [line for line in outcome.out.splitlines() if line.startswith("train (2 views): ")]
-    assert re.search(r" render_psnr \S+ dB \(1 of 2 views\), .* albedo_psnr \S+ dB, ", line)
+    assert re.search(r" render_psnr \S+ dB \(1 of 2 views\), .* albedo_psnr \S+ dB \(1 of", line)
     metrics = RunFolder(run).metrics()
     assert metrics["train"]["views"] == 2 and "scored" in metrics["definitions"]
-    # Truth pictures know nothing of the mask.
-    assert metrics["scored"] == {"train": dict.fromkeys(METRICS, 1)}
+    keys = (*METRICS, "albedo_psnr", "roughness_psnr")
+    assert metrics["scored"] == {"train": dict.fromkeys(keys, 1)}
 
 
 def test_relight_tells_of_how_many_views_means_are(unbake, folder, tmp_path):

@@ -162,12 +162,20 @@ def _read_picture(folder: Path) -> None:
     read_exr(folder / "picture.exr")
 
 
+def _read_degraded(folder: Path) -> None:
+    from unbake.dataset.views import Dataset
+    from unbake.evaluation.evaluate import require_true_materials
+
+    require_true_materials(Dataset.load(folder))
+
+
 def _read_emission(folder: Path) -> None:
     from unbake.dataset.lighting import true_emission
 
     true_emission(folder)
 
 
+DEGRADED = json.dumps({"gain": 0.5, "displaced": {"meshes": [], "world_units": 0.0}})
 CAMERAS = json.dumps(
     {
         "cameras": [
@@ -495,6 +503,9 @@ FORMATS: dict[str, Format] = {
     "emission.json": Format(
         "truth/emission.json", _files("data/truth/emission.json"), mutations.JSON, _read_emission,
         _data_set, 2,
+    ),
+    "degraded.json": Format(
+        "degraded.json", _texts(DEGRADED), mutations.JSON, _read_degraded, _data_set
     ),
     "settings": Format(
         "settings.toml", _files("run/config.toml"), mutations.TOML, _read_settings, weight=3

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from unbake.errors import UserError
-from unbake.imaging import pictures
+from unbake.imaging import perceptual, pictures
 from unbake.imaging.perceptual import PIXELS_PER_DEGREE, flip, ssim
 
 
@@ -44,6 +46,22 @@ def test_ssim_is_its_formula_within_a_window(pair):
     expected = (2 * mean_a * mean_b + 1e-4) * (2 * both + 9e-4)
     expected /= (mean_a**2 + mean_b**2 + 1e-4) * (sum(variance) + 9e-4)
     assert ssim(*pair)[7, 15] == pytest.approx(expected.mean(), abs=1e-9)
+
+
+@pytest.mark.parametrize("compare", [ssim, flip])
+def test_bands_of_rows_are_the_whole_picture_and_need_less_memory(compare, monkeypatch):
+    rng = np.random.default_rng(0)
+    a, b = (rng.random((300, 40, 3)) for _ in range(2))
+    tracemalloc.start()
+    found = compare(a, b)
+    _, in_bands = tracemalloc.get_traced_memory()
+    monkeypatch.setattr(perceptual, "bands", lambda height, _: [(slice(0, height),) * 3])
+    tracemalloc.reset_peak()
+    whole = compare(a, b)
+    _, at_once = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_allclose(found, whole, rtol=0, atol=1e-12)
+    assert in_bands < 0.5 * at_once
 
 
 def test_equal_pictures_look_equal(pair):

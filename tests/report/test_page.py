@@ -19,10 +19,12 @@ import numpy as np
 import pytest
 from support import BROWSERS, found_browser
 
+from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.imaging import pictures
 from unbake.report import charts, display
 from unbake.report.page import write_report
+from unbake.report.runs import read_run, read_views
 
 SIZE = (24, 32)
 TRAINING, HELDOUT = 6, 2
@@ -164,6 +166,23 @@ def test_of_many_held_out_views_some_are_shown(tmp_path: Path, monkeypatch):
     assert "24 of 30 views, evenly spaced" in _section(text, "heldout")
 
 
+@pytest.mark.parametrize(("runs", "shown"), [(3, 16), (20, 4)])
+def test_of_many_runs_fewer_views_are_shown(runs, shown, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "HELDOUT", 30)
+    data = _make_data(tmp_path / "room", known=False)
+    made = [_make_run(tmp_path / f"run-{i}", data, "ours", 0.01, known=False) for i in range(2)]
+    views = read_views(Dataset.load(data), [read_run(made[i % 2], str(i)) for i in range(runs)])
+    assert sum(view.split == "heldout" for view in views) == shown
+
+
+def test_each_evaluated_picture_is_read_once(made, tmp_path: Path, monkeypatch):
+    read, read_exr = [], pictures.read_exr
+    monkeypatch.setattr(pictures, "read_exr", lambda path: read.append(path) or read_exr(path))
+    write_report(made[1], tmp_path / "report.html")
+    evaluated = [path for path in read if "evaluation" in path.parts]
+    assert len(evaluated) == len(set(evaluated)) == 2 * 3 * (HELDOUT + 4)
+
+
 def test_logged_terms_without_a_title_have_charts_too(made, tmp_path: Path):
     """Regularizers, and terms of methods that are not registered here."""
     log = made[1][0] / "log.jsonl"
@@ -290,6 +309,24 @@ def test_errors_of_renderings_are_of_pixels_that_count(known, tmp_path: Path, mo
     if known:
         expected &= _truth(0)["mask"] > 0
     assert (painted[0][1] == expected).all() and 0 < expected.sum() < expected.size
+    for _, counted in painted[1:3] if known else ():  # albedo and roughness of the view
+        assert (counted == expected).all()
+
+
+def test_errors_are_not_of_pixels_that_see_other_things_in_part(made, tmp_path, monkeypatch):
+    """As scores are: what the truth or the run covers in part does not count."""
+    data, (run, _) = made
+    partly = np.ones(SIZE)
+    partly[:, :10] = 0.75
+    albedo = data / "truth" / "albedo" / "heldout_000.exr"
+    _save(albedo, pictures.read_exr(albedo)[..., :3], partly)
+    own = run / "evaluation" / "heldout" / "heldout_000_albedo.exr"
+    _save(own, pictures.read_exr(own), partly[:, ::-1])
+    painted = _painted(monkeypatch)
+    write_report([run], tmp_path / "page.html")
+    inside = _truth(TRAINING)["mask"] > 0
+    expected = inside & (partly == 1) & (partly[:, ::-1] == 1)
+    assert (painted[1][1] == expected).all() and expected.sum() < inside.sum()
 
 
 def test_clipped_photographs_are_compared_as_renderings_are(made, tmp_path: Path, monkeypatch):
@@ -1000,18 +1037,18 @@ def test_a_resumed_log_draws_each_step_once_and_in_order():
 
 def test_many_points_are_summarised_with_a_band_inside_the_chart():
     rng = np.random.default_rng(0)
-    log = [{"step": s, "v": float(v)} for s, v in enumerate(rng.lognormal(0, 2, 5000))]
+    log = [{"step": s, "v": float(v)} for s, v in enumerate(rng.lognormal(0, 1, 5000))]
     figure = charts.chart([log, []], "step", "step", lambda r: r["v"], True)
     assert figure is not None
     (curve,), (band,) = _drawn(figure)
     x, y = curve.get_xydata().T
     assert len(x) == charts.BINS
-    # Of a log-normal distribution with σ = 2: the median, the 10th and the 90th percentile.
-    np.testing.assert_allclose(np.log(y), 0, atol=1.2)
-    np.testing.assert_allclose(np.log(y).mean(), 0, atol=0.1)
+    # Of a log-normal distribution with σ = 1: the mean, the 10th and the 90th percentile.
+    np.testing.assert_allclose(np.log(y), 0.5, atol=0.8)
+    np.testing.assert_allclose(np.log(y.mean()), 0.5, atol=0.1)
     edges = np.log(band.get_paths()[0].vertices[:, 1])
-    assert np.mean(edges[edges < 0]) == pytest.approx(-2.56, abs=0.2)
-    assert np.mean(edges[edges > 0]) == pytest.approx(2.56, abs=0.2)
+    assert np.mean(edges[edges < 0]) == pytest.approx(-1.28, abs=0.1)
+    assert np.mean(edges[edges > 0]) == pytest.approx(1.28, abs=0.1)
     (axes,) = figure.axes
     (left, right), (low, high) = axes.get_xlim(), np.log(axes.get_ylim())
     assert left <= x.min() and x.max() <= right
@@ -1037,6 +1074,31 @@ def test_axes_have_ticks_for_any_range(values: list[float], logarithmic: bool):
     for ticks in (_ticks(axes.xaxis), _ticks(axes.yaxis)):
         assert 2 <= len(ticks) <= 14
         assert len(set(ticks)) == len(ticks) and all(ticks)
+
+
+def test_noise_below_zero_does_not_raise_the_curve_of_a_loss():
+    """Products of independent errors have no bias, and are below zero at times."""
+    rng = np.random.default_rng(0)
+    values = 0.1 + 0.5 * rng.standard_normal(12_000)
+    values[:100] -= 10.0  # a whole interval
+    log = [{"step": s, "v": float(v)} for s, v in enumerate(values)]
+    figure = charts.chart([log], "step", "step", lambda r: r["v"], True)
+    assert figure is not None
+    (curve,), (band,) = _drawn(figure)
+    _, y = curve.get_xydata().T
+    lost, count = charts.not_positive([log], "step", lambda r: r["v"])[0]
+    assert count == charts.BINS and len(y) == count - lost and 1 <= lost < 20
+    assert y.mean() == pytest.approx(0.1, abs=0.02)
+    figure.draw_without_rendering()
+    assert band.get_paths()[0].vertices[:, 1].min() > 0
+
+
+def test_what_is_not_positive_is_counted_below_the_chart(made, tmp_path: Path):
+    log = made[1][0] / "log.jsonl"
+    lines = [{"step": s, "seconds": s, "photometric": 0.5 - (s == 2)} for s in range(4)]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert text.count("Not positive, left out: ours 1 of 4") == 2  # over steps, over seconds
 
 
 def test_a_term_that_no_run_has_draws_no_chart():

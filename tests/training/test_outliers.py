@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,8 +16,9 @@ from unbake.dataset.pixels import CameraRays
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import evaluate
+from unbake.evaluation.outliers import evaluate_outliers
 from unbake.evaluation.settings import EvaluationSettings
-from unbake.imaging.pictures import read_exr, read_png, write_exr
+from unbake.imaging.pictures import read_exr, read_png, tonemap, write_exr, write_png
 from unbake.report.page import write_report
 from unbake.training.loop import fit
 from unbake.training.outliers import OutlierModel
@@ -41,6 +43,55 @@ def test_pixels_have_the_weight_of_their_block():
     masks = np.concatenate([mask.ravel() for mask in model.masks()])
     np.testing.assert_array_equal(masks, expected**2 < 0.5)
     assert masks.any() and not masks.all()
+
+
+def test_shares_are_of_pixels_that_count():
+    """Blocks at edges are smaller, and what is masked was drawn by no step."""
+    cameras = built_in_cameras("cornell", 10, views=2)
+    model = OutlierModel(cameras, 4, 10.0)
+    counted = np.random.default_rng(0).random((10, 10)) < 0.5
+    for mask in (None, counted):
+        found = model.pixels_in(1, mask)
+        each = np.ones((10, 10), bool) if mask is None else mask
+        rows = [
+            [each[4 * i : 4 * i + 4, 4 * j : 4 * j + 4].sum() for j in range(3)] for i in range(3)
+        ]
+        np.testing.assert_array_equal(found, rows)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_masked_pixels_are_no_part_of_the_share_of_outliers(masked, painted, tmp_path, monkeypatch):
+    """Of many views no more masks are made than there are pictures."""
+    data = shutil.copytree(painted, tmp_path / "data", ignore=lambda *_: [".cache"])
+    transforms = json.loads((data / "transforms.json").read_text())
+    if masked:
+        mask = np.full((16, 16), 255, np.uint8)
+        mask[:4], mask[8:] = 0, 0
+        write_png(data / "mask.png", mask)
+        transforms["frames"][0]["mask_path"] = "mask.png"
+    (data / "transforms.json").write_text(json.dumps(transforms))
+    dataset = Dataset.load(data)
+    model = OutlierModel([view.camera for view in dataset.train], 8, 10.0)
+    odds = np.zeros(8, np.float32)
+    odds[0] = -9  # the first of four blocks of the first view
+    model.assign({"outliers.odds": mi.Float(odds)})
+    problem = SimpleNamespace(outliers=model)
+    recovered = SimpleNamespace(problem=problem, dataset=dataset, clip_negative=False)
+    made, whole = [], OutlierModel.mask
+    monkeypatch.setattr(OutlierModel, "mask", lambda *x: made.append(x[1]) or whole(*x))
+    lines: list[str] = []
+    with RunFolder(tmp_path).new_evaluation() as out:
+        found = evaluate_outliers(recovered, out, lines.append)["outliers"]
+        picture = read_png(out.picture("train", "train_000", "outliers", ".png"))
+    first = 32 / 64 if masked else 64 / 256
+    assert [row["share"] for row in found["images"]] == [first, 0.0]
+    assert found["share"] == (32 / (64 + 256) if masked else 64 / 512)
+    assert found["shown"] == ["train_000"] and made == [0]
+    plain = tonemap(read_exr(dataset.train[0].image)[..., :3])
+    tinted = (picture != plain).any(-1)
+    expected = np.zeros((16, 16), bool)
+    expected[4 * masked : 8, :8] = True
+    np.testing.assert_array_equal(tinted, expected)
 
 
 def test_weights_settle_where_errors_and_their_cost_balance():

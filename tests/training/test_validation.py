@@ -12,15 +12,17 @@ import pytest
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config import read_toml
+from unbake.dataset.fingerprint import truth_fingerprint
+from unbake.dataset.ground_truth import GroundTruth
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.evaluate import _true_scene, evaluate
 from unbake.evaluation.settings import EvaluationSettings
 from unbake.imaging.metrics import HIGHEST
-from unbake.imaging.pictures import read_exr, write_exr
+from unbake.imaging.pictures import read_exr, write_exr, write_png
 from unbake.training.loop import TIME_EVERY, fit
 from unbake.training.recovered import load_run
-from unbake.training.validation import GroundTruth, MaterialBuffers, Score
+from unbake.training.validation import MaterialBuffers, Score
 
 FEW = EvaluationSettings(spp=2, max_depth=3, train_views=0)
 
@@ -129,6 +131,27 @@ def test_pixels_that_see_other_things_do_not_count():
     assert seen.mask(truth).tolist() == [[True, True, False, False]]
     expected = 10 * np.log10(2 / 0.1**2)
     assert seen.psnr(truth) == pytest.approx({"albedo_psnr": expected, "roughness_psnr": expected})
+
+
+def test_masked_pixels_do_not_count_in_scores_of_materials(scored, cornell, tmp_path):
+    data = shutil.copytree(cornell, tmp_path / "data", ignore=lambda *_: [".cache"])
+    half = np.full((16, 16), 255, np.uint8)
+    half[:, :8] = 0
+    write_png(data / "mask.png", half)
+    transforms = json.loads((data / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["mask_path"] = "mask.png"
+    (data / "transforms.json").write_text(json.dumps(transforms))
+    view, masked = (Dataset.load(folder).heldout[0] for folder in (cornell, data))
+    whole, part = GroundTruth.of(view), GroundTruth.of(masked)
+    np.testing.assert_array_equal(part.known, whole.known & (half > 0))
+    assert 0 < part.known.sum() < whole.known.sum()
+    recovered = load_run(scored)
+    scores = [Score(recovered.problem, [v]).measure()["albedo_psnr"] for v in (view, masked)]
+    assert scores[0] != scores[1]
+    # What fields can learn of such maps is less, and has another key.
+    prints = [truth_fingerprint(Dataset.load(d), ["albedo"])["truth"] for d in (cornell, data)]
+    assert prints[0] != prints[1]
 
 
 def test_what_cannot_be_compared_has_no_number(scored):

@@ -23,7 +23,7 @@ from unbake import cli
 from unbake.config import to_toml
 from unbake.errors import UserError
 from unbake.exports.parts import read_parts
-from unbake.imaging.pictures import MAGMA
+from unbake.imaging.pictures import MAGMA, OUTSIDE_MASK, write_png
 from unbake.io import write_text
 from unbake.training.checkpoint import Progress, save_checkpoint
 from unbake.training.recovered import open_run
@@ -154,6 +154,23 @@ def test_errors_of_clipped_photographs_are_of_what_they_can_show(run):
     (photograph, _, error), _ = viewed.pictures(viewed.dataset.heldout[0], "albedo")
     assert photograph.pixels.mean() > 5
     np.testing.assert_array_equal(error.pixels, np.broadcast_to(MAGMA[0], error.pixels.shape))
+
+
+def test_errors_are_grey_where_a_mask_says_that_pixels_do_not_count(run):
+    data = run.parent / "data"
+    transforms = json.loads((data / "transforms.json").read_text())
+    height, width = (transforms["frames"][0].get(k, transforms.get(k)) for k in "hw")
+    mask = np.full((height, width), 255, np.uint8)
+    mask[: height // 2] = 0
+    write_png(data / "mask.png", mask)
+    for frame in transforms["frames"]:
+        frame["mask_path"] = "mask.png"
+    (data / "transforms.json").write_text(json.dumps(transforms))
+    viewed = ViewedRun(run)
+    assert viewed.follow()
+    for row in viewed.pictures(viewed.dataset.heldout[0], "albedo"):
+        grey = (row[-1].pixels == OUTSIDE_MASK).all(-1)
+        assert grey[: height // 2].all() and not grey[height // 2 :].all()
 
 
 def test_the_end_of_a_log_is_told():

@@ -31,7 +31,7 @@ from ..machine import distinct_machines, machine
 from ..memory import lack_told
 from ..ranks import Agreed, Ranks
 from ..report.page import write_report
-from ..training.checkpoint import Progress
+from ..training.checkpoint import Progress, newest_progress
 from ..training.defaults import told_unknown, with_data_defaults, with_defaults
 from ..training.fresh_fit import compile_kernels
 from ..training.loop import fit
@@ -160,7 +160,7 @@ def compare(
             try:
                 run = RunFolder(out / name)
                 with lack_told():
-                    if fits[name].seconds and not run.exists:
+                    if fits[name].seconds and _has_time_left(run, fits[name]):
                         compile_kernels(dataset, [fits[name]], clip_negative=clip_negative)
                     progress = _fitted(
                         data,
@@ -306,6 +306,12 @@ def _measure_ceilings(dataset: Dataset, fits: Sequence[FitConfig], console: Cons
             console.print(f"no ceiling: {error}", style="yellow", markup=False, soft_wrap=True)
         gc.collect()
         dr.flush_malloc_cache()
+
+
+def _has_time_left(run: RunFolder, settings: FitConfig) -> bool:
+    """Whether a run of some seconds has steps to take, at its beginning or after an interrupt."""
+    progress = newest_progress(run) if run.exists else None
+    return progress is None or progress.seconds < settings.seconds
 
 
 def _fitted(

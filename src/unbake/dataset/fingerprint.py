@@ -48,15 +48,19 @@ def fingerprint(dataset: Dataset) -> dict[str, str]:
 def truth_fingerprint(dataset: Dataset, quantities: Iterable[str]) -> dict[str, str]:
     """SHA-256 of the parts that decide which true materials are seen where.
 
-    `poses`, `views` and `scene` as in `fingerprint`, and `truth`: the true maps of the quantities.
+    `poses`, `views` and `scene` as in `fingerprint`, and `truth`: the true maps of the quantities,
+    with masks.
 
     Raises:
         UserError: a file cannot be read, or the scene is none.
     """
     chosen = [(name, view.truth.get(name)) for name in quantities for view in dataset.views]
     named = [[name, file is not None] for name, file in chosen]
-    files = _of_files(file for _, file in chosen if file is not None)
-    return _of_geometry(dataset) | {"truth": _of_values([named, files])}
+    truth = [named, _of_files(file for _, file in chosen if file is not None)]
+    masks = {view.name: view.mask for view in dataset.views if view.mask is not None}
+    if masks:
+        truth += [list(masks), _of_files(masks.values())]
+    return _of_geometry(dataset) | {"truth": _of_values(truth)}
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,13 +11,17 @@ from typing import Any
 import numpy as np
 
 from ..config import FitConfig
+from ..dataset.data_folder import DataFolder
 from ..dataset.fingerprint import changed, fingerprint
+from ..dataset.ground_truth import GroundTruth, counted_pixels
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.spread import evenly
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError
 from ..imaging.metrics import HIGHEST
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
+from ..io import read_object
+from ..memory import require_memory, size
 from ..quantities import ALIGNED, QUANTITIES
 from ..scene import edit
 from ..scene.parse import parse
@@ -26,10 +31,10 @@ from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, EvaluationFolder, RunFolder
 from ..training.run_lock import RunLock
 from ..training.validation import (
-    GroundTruth,
     MaterialBuffers,
     albedos,
     aligned,
+    known_pixels,
     psnr_keys,
 )
 from ..transport.objective import has_radiance
@@ -39,16 +44,24 @@ from .outliers import evaluate_outliers
 from .placing import placed_view, told_of_place
 from .renderings import (
     METRICS,
-    counted_pixels,
+    NOT_FINITE,
     exposure_of,
     mean_scores,
     render_camera,
     render_psnr,
     render_scores,
     scored_views,
+    told_not_finite,
 )
 from .settings import EvaluationSettings
 from .yardsticks import Seen, find_yardsticks, seen_materials
+
+#: Memory in bytes that a pixel of a view takes while it is evaluated, and of a view with true
+#: materials until all are.
+_PIXEL_BYTES, _TRUTH_BYTES = 310, 60
+
+#: Bytes of pictures that are told before they are written.
+_MUCH = 1e9
 
 DEFINITIONS = {
     "psnr": f"10 log10(1 / MSE), peak 1, {HIGHEST:g} at most; MSE over unmasked pixels and "
@@ -58,7 +71,9 @@ DEFINITIONS = {
     "compared as photographs show them: times the exposure of the view, and no brighter than the "
     "value at which it is clipped",
     "true_render_psnr": "render_psnr of the scene with its true materials and lights, with as many "
-    "samples: the limit that the noise of renderings and photographs sets",
+    "samples: the limit that the noise of renderings and photographs sets. Exposures and white "
+    "balances that the fit had to find are those that suit this picture best; vignetting, response "
+    "and places of cameras are as they were found",
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
@@ -108,8 +123,9 @@ def evaluate(
         The contents of the run's metrics file. Images are written beside it.
 
     Raises:
-        UserError: the run or its data set cannot be read, or the true materials are
-            asked for and the data set was not captured by unbake.
+        UserError: the run or its data set cannot be read, the true materials are asked for and the
+            data set was not captured by unbake, materials of a view are not finite, or there is no
+            room for it in memory or on the disk.
 
     Paper: Sec. 6, Fig. 6.
     """
@@ -141,6 +157,7 @@ def _evaluate(
         tell(f"warning: other {', '.join(data_changed)} than the run was fit to")
     true_scene = _true_scene(recovered) if settings.truth else None
     views = [*dataset.heldout, *evenly(dataset.train, settings.train_views)]
+    _require_memory(views)
     # First, as the true lighting may be damaged, and views take long
     recovered_lighting = _evaluate_lighting(recovered, out, tell)
     clip = settings.clip_negative or recovered.clip_negative
@@ -159,8 +176,10 @@ def _evaluate(
         gains.append(gain)
         materials.append((None if truth is None else seen, truth))
         told = [k for k in row if k.endswith("_psnr") and (seen is not None or k in METRICS)]
-        values = (f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told)
-        tell(f"{view.name}: {', '.join(values)}")
+        values = [f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told]
+        tell(f"{view.name}: {', '.join(filter(None, [*values, told_not_finite(row)]))}")
+        if len(rows) == 1:
+            _require_room(out, views, tell)
     if recovered.config.shares_scale:
         recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
     measures: dict[str, Any] = {}
@@ -197,6 +216,36 @@ def _evaluate(
     }
 
 
+def _require_memory(views: Sequence[View]) -> None:
+    """Refuse views that are too large, or too many with true materials, for the memory."""
+    pixels = {view: view.camera.width * view.camera.height for view in views}
+    need = _PIXEL_BYTES * max(pixels.values())
+    need += _TRUTH_BYTES * sum(count for view, count in pixels.items() if view.truth)
+    remedy = "Take smaller photographs: capture with a lower --resolution, import with --longest"
+    require_memory(need, "the evaluation of these views needs", remedy)
+
+
+def _require_room(
+    out: EvaluationFolder, views: Sequence[View], tell: Callable[[str], None]
+) -> None:
+    """Refuse views whose pictures have no room on the disk, by those of the first one.
+
+    How far pictures are compressed depends on what they show.
+
+    Args:
+        views: all of them. Pictures of the first one are written.
+    """
+    first, *others = (view.camera.width * view.camera.height for view in views)
+    written = sum(file.stat().st_size for file in out.path.rglob("*") if file.is_file())
+    need, free = written / first * sum(others), shutil.disk_usage(out.path).free
+    told = f"the pictures of {len(others)} more views need about {size(need)}"
+    if need > free:
+        remedy = "Make room there, or take smaller photographs or fewer views"
+        raise UserError(f"{told}, {size(free)} are free", out.path.parent, remedy)
+    if need > _MUCH:
+        tell(f"{told} on the disk")
+
+
 def description(config: FitConfig) -> dict:
     """The settings that tell runs apart: unknown, quantities, method, fields, estimator and rates.
 
@@ -220,14 +269,27 @@ def description(config: FitConfig) -> dict:
 
 
 def require_true_materials(dataset: Dataset) -> None:
-    """Check that the scene of a data set has its true materials.
+    """Check that the scene of a data set has its true materials, on the meshes of its photographs.
 
     Raises:
-        UserError: they are not known.
+        UserError: they are not known, or the meshes are others.
     """
     if not dataset.has_true_materials:
         known = "unbake capture SCENE --out DATA makes one that does"
         raise UserError("the data set does not hold its true materials", dataset.folder, known)
+    if _has_other_meshes(dataset):
+        what = "the meshes were displaced or decimated, and are not those of the photographs"
+        remedy = "Leave out --truth, or take the data set that was degraded"
+        raise UserError(what, dataset.folder, remedy)
+
+
+def _has_other_meshes(dataset: Dataset) -> bool:
+    """Whether `unbake degrade` has changed meshes, by what it wrote down of that."""
+    file = DataFolder(dataset.folder, dataset.allow_outside).degraded_file
+    if not file.is_file():
+        return False
+    changed = read_object(file).get("displaced")
+    return isinstance(changed, dict) and bool(changed.get("meshes"))
 
 
 def _true_scene(recovered: Recovered) -> SceneView:
@@ -256,7 +318,7 @@ def _evaluate_view(
     if recovered.config.learns_materials:
         seen = seen_materials(problem, view, settings.material_spp)
     alpha = photograph[..., 3] if seen is None else seen.coverage
-    mask = counted_pixels(photograph, seen, truth)
+    mask = counted_pixels(photograph, known_pixels(seen, truth))
     # All that follows is of pictures as the photograph shows them.
     dimmed = cameras.dimmed(view, radiance)
     counted = mask if mask.any() else np.ones_like(mask)
@@ -280,10 +342,15 @@ def _evaluate_view(
         row |= render_scores(radiance, compared, mask, exposure)
         if true_scene is not None:
             limit = render_camera(true_scene, view.camera, settings, problem.hide_emitters)
-            exposed = cameras.photographed(view, cameras.dimmed(view, limit), gain)
+            dimmed = cameras.dimmed(view, limit)
+            own = cameras.own_gain(view, dimmed[mask], photograph[mask][:, :3])
+            exposed = cameras.photographed(view, dimmed, own)
             row["true_render_psnr"] = render_psnr(exposed, compared, mask)
     if seen is not None and truth is not None:
-        row |= seen.psnr(truth)
+        try:
+            row |= seen.psnr(truth)
+        except UserError as error:
+            raise UserError(f"materials: {error.what}", view.name, error.remedy) from None
     return row, seen, truth, gain
 
 
@@ -395,7 +462,7 @@ def _convergence(recovered: Recovered, folder: RunFolder) -> dict | None:
 
 def _summaries(rows: list[dict]) -> dict[str, Any]:
     """Means of each split, and of how many views they are where that is not all."""
-    keys = [key for key in rows[0] if key not in ("name", "split")]
+    keys = [key for key in rows[0] if key not in ("name", "split", NOT_FINITE)]
     splits = {name: [r for r in rows if r["split"] == name] for name in ("heldout", "train")}
     scored = {name: scored_views(chosen, keys) for name, chosen in splits.items()}
     scored = {name: found for name, found in scored.items() if found}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.views import read_photograph
+from ..dataset.views import fitted_pixels, read_photograph
 from ..imaging.pictures import tonemap, write_png
 from ..training.recovered import Recovered
 from ..training.run_folder import EvaluationFolder
@@ -19,7 +19,8 @@ _TINT = np.array([255, 0, 255])
 
 DEFINITIONS = {
     "outliers": "share of the pixels of training photographs in blocks that lost over half of "
-    "their weight in the fit, because they stayed unexplained. Scores count all pixels alike",
+    "their weight in the fit, because they stayed unexplained; masked and hidden pixels are left "
+    "out. Scores count all others alike",
 }
 
 
@@ -34,14 +35,22 @@ def evaluate_outliers(
     model, views = recovered.problem.outliers, recovered.dataset.train
     if model is None:
         return {}
-    masks = model.masks()
-    shares = [float(mask.mean()) for mask in masks]
-    whole = sum(int(mask.sum()) for mask in masks) / sum(mask.size for mask in masks)
+    background, taken = recovered.dataset.background, model.taken()
+    lost, counts = [], []
+    for number, (view, blocks) in enumerate(zip(views, taken, strict=True)):
+        counted = model.pixels_in(number, fitted_pixels(view, background))
+        lost.append(int(counted[blocks].sum()))
+        counts.append(int(counted.sum()))
+    shares = [part / max(count, 1) for part, count in zip(lost, counts, strict=True)]
+    whole = sum(lost) / max(sum(counts), 1)
     most = sorted(range(len(views)), key=lambda i: -shares[i])[:_PICTURES]
     shown = sorted(i for i in most if shares[i] > 0)
     for i in shown:
         picture = tonemap(read_photograph(views[i], recovered.clip_negative)[..., :3])
-        picture[masks[i]] = (picture[masks[i]] // 2 + _TINT // 2).astype(np.uint8)
+        mask = model.mask(i, taken[i])
+        if (counted := fitted_pixels(views[i], background)) is not None:
+            mask &= counted
+        picture[mask] = (picture[mask] // 2 + _TINT // 2).astype(np.uint8)
         write_png(out.picture("train", views[i].name, "outliers", ".png"), picture)
     tell(
         f"outliers: {100 * whole:.1f} % of the pixels, {100 * max(shares):.1f} % of a view at most"

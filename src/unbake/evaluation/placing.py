@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -27,6 +27,8 @@ _PIXELS, _SAMPLES, _OF_EACH, _ROUNDS = 4096, 1 << 16, 64, 12
 _STILL = 0.01
 #: Of a correction in pixels, to differentiate by.
 _STEP = 1e-2
+#: By how much the sum of errors may rise from one round to another by noise alone, as a share.
+_NOISE = 0.02
 #: Errors weigh less from this multiple of their root mean square on.
 _LARGE = 3.0
 #: Added to the squared photograph, as a share of its mean square, that errors are relative to.
@@ -80,10 +82,24 @@ def told_of_place(scene: mi.Scene, given: Camera, found: Camera) -> dict[str, fl
 
 
 def _solved(moved: Callable[[np.ndarray], Camera], pixels: _Pixels, sigma: float) -> np.ndarray:
-    """The correction in pixels, (6,), whose renderings are most like the photograph."""
-    move = np.zeros(POSE)
+    """The correction in pixels, (6,), whose renderings are most like the photograph.
+
+    Steps end where one makes it worse by more than noise can, and that one is taken back: slopes
+    tell little of a place that is far off. What is not better than the given place is none.
+    """
+    move = found_at = np.zeros(POSE)
+    costs: list[float] = []
+    spread = 0.0
     for _ in range(_ROUNDS if pixels.count else 0):
-        error, slopes, points, variance = pixels.errors(moved(move))
+        found = pixels.errors(moved(move))
+        # All rounds are measured by the spread of the first one.
+        spread = spread or found.variance
+        cost = found.cost(spread) + spread / sigma**2 * float(move @ move)
+        if costs and not cost <= (1 + _NOISE) * min(costs):
+            break
+        costs.append(cost)
+        found_at = move
+        error, slopes, points, variance = found.weighed()
         here = moved(move).project(points)
         columns = [
             (moved(move + unit).project(points) - here) / _STEP for unit in _STEP * np.eye(POSE)
@@ -95,10 +111,58 @@ def _solved(moved: Callable[[np.ndarray], Camera], pixels: _Pixels, sigma: float
         matrix = jacobian.T @ jacobian + variance / sigma**2 * np.eye(POSE)
         right = jacobian.T @ error.ravel() - variance / sigma**2 * move
         step = np.linalg.solve(matrix, right)
-        move = move + step
         if np.abs(step).max() < _STILL:
             break
-    return move
+        move = move + step
+    return found_at if len(costs) > 1 and costs[-1] < costs[0] else np.zeros(POSE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """Errors of the rendering from a place.
+
+    Args:
+        values: of channels, shape (n, 3); not all are finite.
+        slopes: of the photograph, of the same scale, shape (n, 3, 2).
+        points: that the pixels see, shape (n, 3).
+        known: whether there is such a point, and the error is finite, shape (n,).
+    """
+
+    values: np.ndarray
+    slopes: np.ndarray
+    points: np.ndarray
+    known: np.ndarray
+
+    @property
+    def variance(self) -> float:
+        """Of those that are known; 1 where none is."""
+        return float((self.values[self.known] ** 2).mean()) if self.known.any() else 1.0
+
+    def cost(self, variance: float) -> float:
+        """Their sum, in which large ones count little (Cauchy); infinite where none is finite.
+
+        Args:
+            variance: of errors that are usual.
+        """
+        finite = np.isfinite(self.values).all(1)
+        if not finite.any():
+            return math.inf
+        size = np.log1p(_sizes(self.values[finite], variance)).mean()
+        return float(self.values.size * _LARGE**2 * variance * size)
+
+    def weighed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Errors and slopes with the weights of errors of that size, points and the variance.
+
+        What is not known has no weight.
+        """
+        values = np.where(self.known[:, None], self.values, 0)
+        weight = np.where(self.known, 1 / np.sqrt(1 + _sizes(values, self.variance)), 0)[:, None]
+        return weight * values, weight[..., None] * self.slopes, self.points, self.variance
+
+
+def _sizes(errors: np.ndarray, variance: float) -> np.ndarray:
+    """Squares of errors (n, 3) over that of a large one, (n,)."""
+    return (errors**2).mean(1) / max(_LARGE**2 * variance, 1e-24)
 
 
 class _Pixels:
@@ -133,13 +197,8 @@ class _Pixels:
         """How many there are."""
         return len(self._numbers)
 
-    def errors(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Errors of the rendering from a place, weighed.
-
-        Returns:
-            Errors (n, 3), slopes of the photograph with the same weights (n, 3, 2), points that the
-            pixels see (n, 3), and the variance of the errors.
-        """
+    def errors(self, camera: Camera) -> _Errors:
+        """Errors of the rendering from a place, relative to the photograph."""
         rays, settings, view = CameraRays.of([camera]), self._settings, self._view
         table = from_numpy(mi.UInt32, self._numbers)
         radiance = render_radiance(
@@ -161,7 +220,5 @@ class _Pixels:
         seen = seen_along(self._problem.scene_view.scene, origins, directions)
         known = np.isfinite(seen.distance)
         points = origins + directions * np.where(known, seen.distance, 1)[:, None]
-        variance = float((error[known] ** 2).mean()) if known.any() else 1.0
-        size = (error**2).mean(1) / max(_LARGE**2 * variance, 1e-24)
-        weight = np.where(known, 1 / np.sqrt(1 + size), 0)[:, None]
-        return weight * error, (weight * self._weight)[..., None] * self._slopes, points, variance
+        known &= np.isfinite(error).all(1)
+        return _Errors(error, self._weight[..., None] * self._slopes, points, known)

@@ -22,6 +22,7 @@ from ..backend import CUDA_VARIANT
 from ..config.light import LightConfig
 from ..dataset.camera import Camera
 from ..dataset.camera_files import frame_name, frame_of, read_named_cameras
+from ..dataset.ground_truth import GroundTruth, counted_pixels
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError, collected, printable, raise_together
 from ..fields.domain import Domain
@@ -32,27 +33,28 @@ from ..scene.geometry import CHANGED, differing, probe
 from ..scene.parse import parse
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
-from ..training.validation import GroundTruth
+from ..training.validation import known_pixels
 from ..version import VERSION
 from . import renderings
 from .evaluate import DEFINITIONS, description
 from .renderings import (
     METRICS,
-    counted_pixels,
     exposure_of,
+    finite_pixels,
     mean_scores,
     render_camera,
     render_psnr,
     render_scores,
     scored_views,
+    told_not_finite,
     told_unit,
 )
 from .settings import MOST_PICTURES, RENDER_FORMAT, RenderSettings
 from .turntable import turntable as make_turntable
 from .yardsticks import seen_materials
 
-#: Memory in bytes that a pixel of a picture takes, its copies included.
-_PIXEL_BYTES = 64
+#: Memory in bytes that a pixel of a picture takes, its copies included, and where it is scored.
+_PIXEL_BYTES, _SCORED_BYTES = 64, 150
 #: Of scenes that are not the same: how far bounding boxes differ, as a part of their extent.
 _ANOTHER = 0.1
 #: The score of pictures whose brightness was aligned, where the fit left that open.
@@ -254,7 +256,11 @@ def _render(
     tell_tilt(light, [view.camera for view in recovered.dataset.train], tell)
     shots, placed = _shots(recovered, settings, cameras, tell)
     largest = max(shot.camera.width * shot.camera.height for shot in shots)
-    require_memory(_PIXEL_BYTES * largest, "a picture needs", "Lower --width and --height")
+    if cameras.truth is None:
+        require_memory(_PIXEL_BYTES * largest, "a picture needs", "Lower --width and --height")
+    else:
+        remedy = "Capture a smaller truth, or leave it out"
+        require_memory(_SCORED_BYTES * largest, "a picture and its scores need", remedy)
     hide = recovered.problem.hide_emitters
     if cameras.truth is not None:
         hide = cameras.truth.background == "hidden"
@@ -267,7 +273,7 @@ def _render(
     with filled_folder(out) as folder:
         for number, shot in enumerate(shots):
             radiance = _picture(recovered, shot.camera, settings, hide, settings.seed + number)
-            brightest = max(brightest, float(radiance.max()))
+            brightest = max(brightest, float(radiance.max(initial=0, where=np.isfinite(radiance))))
             write_exr(folder / f"{shot.name}.exr", radiance)
             write_png(folder / f"{shot.name}.png", tonemap(radiance, settings.exposure))
             mask = _counted(recovered, shot, settings)
@@ -388,7 +394,7 @@ def _counted(recovered: Recovered, shot: _Shot, settings: RenderSettings) -> np.
     seen = None
     if recovered.config.learns_materials:
         seen = seen_materials(recovered.problem, shot.truth, settings.material_spp)
-    return counted_pixels(photograph, seen, truth)
+    return counted_pixels(photograph, known_pixels(seen, truth))
 
 
 def _scores(
@@ -406,8 +412,6 @@ def _scores(
     """
     if shot.truth is None or mask is None:
         return {}
-    if not mask.any():
-        return dict.fromkeys(METRICS)
     photograph = read_photograph(shot.truth, recovered.clip_negative)
     shown, compared = shot.truth.photographed(radiance), shot.truth.readable(photograph[..., :3])
     return render_scores(shown, compared, mask, exposure)
@@ -442,6 +446,7 @@ def _aligned(
         if shot.truth is not None and bits is not None:
             radiance, true = pictures(shot, shot.truth)
             shown, mask = radiance * np.float32(shot.truth.exposure), _unpacked(bits, radiance)
+            mask &= finite_pixels(radiance)
             told = mask[..., None] & (true < min(1.0, shot.truth.clipped or 1.0))
             above += np.where(told, shown * true, 0).sum((0, 1), dtype=np.float64)
             below += np.where(told, shown * shown, 0).sum((0, 1), dtype=np.float64)
@@ -477,6 +482,7 @@ def _tell_progress(
     """Tell scores of each picture, else progress at every quarter."""
     if METRICS[0] in frame:
         value = frame[METRICS[0]]
-        tell(f"{frame['name']}: {'—' if value is None else f'render {value:.1f} dB'}")
+        told = "—" if value is None else f"render {value:.1f} dB"
+        tell(f"{frame['name']}: {', '.join(filter(None, [told, told_not_finite(frame)]))}")
     elif (number + 1) * 4 // count > number * 4 // count:
         tell(f"rendered {number + 1} of {count} pictures")

@@ -12,22 +12,27 @@ from ..dataset.pixels import CameraRays
 from ..imaging import perceptual
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import encoded, fitting_exposure, sample
-from ..training.validation import GroundTruth, MaterialBuffers
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
 from .settings import EvaluationSettings, RenderSettings
 
 #: Scores of a rendering; those of materials come after them.
 METRICS = ("render_psnr", "render_psnr_unclamped", "render_ssim", "render_flip")
+#: How many pixels of a rendering are not finite; a view without any has no such key.
+NOT_FINITE = "not_finite"
 #: Stops of `display_exposure` beyond which a peak of 1 is that of no photograph.
 _FAR = 3.0
 #: What they are; `display_exposure` stands beside them.
 DEFINITIONS = {
     "render_ssim": "structural similarity of rendering and photograph as sRGB, clipped, at "
     "`display_exposure` stops; 1: equal. Gaussian window of 11 x 11 pixels with sigma 1.5, K1 "
-    "0.01, K2 0.03, mirrored borders; mean over channels and unmasked pixels, then over views",
+    "0.01, K2 0.03, mirrored borders; mean over channels and unmasked pixels, then over views. In "
+    "windows around these the rendering has the masked pixels of the photograph: they differ in "
+    "nothing",
     "render_flip": "LDR-FLIP of the same pictures at 67 pixels a degree: how visible the "
-    "difference is, from 0, not at all, to 1; mean over unmasked pixels, then over views",
+    "difference is, from 0, not at all, to 1; mean over unmasked pixels, then over views. Masked "
+    "pixels are as for render_ssim",
+    NOT_FINITE: "pixels of a rendering that count and are not numbers: scores leave them out",
     "display_exposure": "stops: the 95th percentile of the photographs' radiance becomes about 0.8",
     "scored": "how many views a mean is of, where it is not of all `views`: in the others no pixel "
     "counts, or the truth is not known",
@@ -71,23 +76,6 @@ def told_unit(exposure: float | None) -> str | None:
     return f"photographs are far {far}: render_psnr says little here; see render_ssim, render_flip"
 
 
-def counted_pixels(
-    photograph: np.ndarray, seen: MaterialBuffers | None, truth: GroundTruth | None
-) -> np.ndarray:
-    """The pixels of a view that scores of its rendering count, (H, W) bool.
-
-    Args:
-        photograph: (H, W, 4), with alpha, which is 0 where it is masked.
-        seen: the recovered materials; None where they are known.
-        truth: the true ones; None where they are not known: every pixel counts that
-            is not masked or transparent.
-    """
-    if truth is None:
-        return photograph[..., 3] >= 1
-    known = truth.known if seen is None else seen.mask(truth)
-    return known & (photograph[..., 3] > 0)
-
-
 def render_scores(
     radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray, exposure: float
 ) -> dict[str, float | None]:
@@ -96,22 +84,45 @@ def render_scores(
     Args:
         radiance: linear RGB.
         photograph: linear RGB, the same size.
-        mask: (H, W) bool, the pixels that count; one at least. SSIM and FLIP look at those around
-            them, too.
+        mask: (H, W) bool, the pixels that count. SSIM and FLIP see the photograph in the others.
         exposure: stops, of SSIM and FLIP alone.
+
+    Returns:
+        None for each score where no pixel counts. Pixels of the rendering that are not finite do
+        not; where there are some, `NOT_FINITE` is how many.
     """
-    image, reference = (encoded(x, exposure) for x in (radiance, photograph))
+    counted = mask & finite_pixels(radiance)
+    lost = int(np.count_nonzero(mask)) - int(np.count_nonzero(counted))
+    told: dict[str, float | None] = {NOT_FINITE: lost} if lost else {}
+    if not counted.any():
+        return dict.fromkeys(METRICS) | told
+    compared = np.where(counted[..., None], radiance, photograph)
+    image, reference = (encoded(x, exposure) for x in (compared, photograph))
     return {
-        "render_psnr": render_psnr(radiance, photograph, mask),
-        "render_psnr_unclamped": psnr(radiance, photograph, mask),
-        "render_ssim": float(perceptual.ssim(image, reference)[mask].mean()),
-        "render_flip": float(perceptual.flip(image, reference)[mask].mean()),
-    }
+        "render_psnr": render_psnr(radiance, photograph, counted),
+        "render_psnr_unclamped": psnr(radiance, photograph, counted),
+        "render_ssim": float(perceptual.ssim(image, reference)[counted].mean()),
+        "render_flip": float(perceptual.flip(image, reference)[counted].mean()),
+    } | told
 
 
-def render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> float:
-    """The score `render_psnr` alone; arguments as of `render_scores`."""
-    return psnr(radiance.clip(0, 1), photograph.clip(0, 1), mask)
+def render_psnr(radiance: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> float | None:
+    """The score `render_psnr` alone; arguments and None as of `render_scores`."""
+    counted = mask & finite_pixels(radiance)
+    return psnr(radiance.clip(0, 1), photograph.clip(0, 1), counted) if counted.any() else None
+
+
+def finite_pixels(picture: np.ndarray) -> np.ndarray:
+    """The pixels of a picture (H, W, C) all of whose channels are finite, (H, W) bool."""
+    return np.asarray(np.isfinite(picture).all(axis=2))
+
+
+def told_not_finite(row: Mapping[str, Any]) -> str | None:
+    """That pixels of a view are left out of its scores, as they are not finite; None: none are."""
+    lost = row.get(NOT_FINITE)
+    if not lost:
+        return None
+    return f"{lost} {'pixel is' if lost == 1 else 'pixels are'} not finite and left out"
 
 
 def mean_scores(rows: Sequence[Mapping[str, Any]], keys: Iterable[str]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ import numpy as np
 from ..config import FitConfig
 from ..dataset.data_folder import DataFolder
 from ..dataset.fingerprint import truth_fingerprint
+from ..dataset.ground_truth import GroundTruth
 from ..dataset.views import Dataset, View
 from ..errors import UserError
 from ..imaging.metrics import mean_psnr
@@ -29,7 +30,7 @@ from ..io import read_object, write_json
 from ..quantities import QUANTITIES
 from ..training.problem import Problem
 from ..training.truth_fit import TruthFit, known_quantities, true_means
-from ..training.validation import GroundTruth, MaterialBuffers, psnr_keys
+from ..training.validation import MaterialBuffers, psnr_keys
 from .settings import EvaluationSettings
 
 #: PSNRs over the held-out views, in dB, by keys such as `albedo_psnr`.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 
 from .metrics import require_alike
 from .srgb import from_srgb
+from .windows import bands
 
 #: Pixels per degree of visual angle: a display of 0.7 m and 3840 pixels, seen from 0.7 m.
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
@@ -53,6 +55,10 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     Source: Wang et al., Image Quality Assessment (2004).
     """
     require_alike(image, reference)
+    return _in_bands(_ssim, image, reference, _REACH)
+
+
+def _ssim(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     offsets = np.arange(-_REACH, _REACH + 1)
     window = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     window /= window.sum()
@@ -88,6 +94,14 @@ def flip(
     Source: Andersson et al., FLIP: A Difference Evaluator for Alternating Images (2020).
     """
     require_alike(image, reference)
+
+    def compare(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        return _flip(image, reference, pixels_per_degree)
+
+    return _in_bands(compare, image, reference, _reach(pixels_per_degree))
+
+
+def _flip(image: np.ndarray, reference: np.ndarray, pixels_per_degree: float) -> np.ndarray:
     both = [_opponent(from_srgb(x.astype(np.float64))) for x in (image, reference)]
     seen = [_perceived(x, pixels_per_degree) for x in both]
     green, blue = (_uniform(_TO_XYZ @ np.eye(3)[i]) for i in (1, 2))
@@ -105,6 +119,35 @@ def flip(
         features.append(np.abs(found[0] - found[1]))
     feature = np.clip((np.maximum(*features) / math.sqrt(2)) ** _QF, 0, 1)
     return colour ** (1 - feature)
+
+
+def _in_bands(
+    compare: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    image: np.ndarray,
+    reference: np.ndarray,
+    reach: int,
+) -> np.ndarray:
+    """A comparison (H, W) of two pictures, made of bands of rows: the whole needs much memory.
+
+    Args:
+        reach: rows above and below a pixel that are looked at.
+    """
+    found = np.empty(image.shape[:2])
+    for rows, needed, inside in bands(len(image), reach):
+        found[rows] = compare(image[needed], reference[needed])[inside]
+    return found
+
+
+def _reach(pixels_per_degree: float) -> int:
+    """Rows around a pixel that FLIP looks at."""
+    (along, _), *_ = _feature_kernels(pixels_per_degree)
+    return max(_blur(pixels_per_degree), len(along) // 2)
+
+
+def _blur(pixels_per_degree: float) -> int:
+    """Pixels around each one that contrast sensitivity takes in."""
+    widest = max(width for terms in _SENSITIVITY for _, width in terms)
+    return math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * pixels_per_degree)
 
 
 def _filtered(
@@ -133,8 +176,7 @@ def _opponent(linear: np.ndarray) -> np.ndarray:
 
 def _perceived(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
     """What contrast sensitivity leaves of a picture, (H, W, 3) in a uniform colour space."""
-    widest = max(width for terms in _SENSITIVITY for _, width in terms)
-    reach = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * pixels_per_degree)
+    reach = _blur(pixels_per_degree)
     squares = (np.arange(-reach, reach + 1) / pixels_per_degree) ** 2
     channels = []
     for number, terms in enumerate(_SENSITIVITY):

@@ -66,6 +66,17 @@ class _Curve:
     low: np.ndarray | None
     high: np.ndarray | None
 
+    def positive(self) -> _Curve:
+        """What a logarithmic axis can show of it."""
+        kept = self.y > 0
+        x, y = self.x[kept], self.y[kept]
+        if self.low is None or self.high is None or not kept.any():
+            return _Curve(self.run, x, y, None, None)
+        low, high = self.low[kept], self.high[kept]
+        edges = np.concatenate([y, low, high])
+        floor = edges[edges > 0].min()
+        return _Curve(self.run, x, y, np.maximum(low, floor), np.maximum(high, floor))
+
 
 def chart(
     logs: Sequence[list[Record]],
@@ -76,25 +87,34 @@ def chart(
 ) -> Figure | None:
     """Draw one quantity of several logs over steps or seconds.
 
-    More than 120 points of a run are summarised in equal intervals of x: the line is their mean
-    (geometric on a logarithmic axis), the band reaches from their 10th to their 90th percentile.
+    More than 120 points of a run are summarised in equal intervals of x: the line is their mean,
+    the band reaches from their 10th to their 90th percentile. Means are arithmetic on a logarithmic
+    axis, too: estimates without bias may be below zero, and stay so only in their mean.
 
     Args:
         logs: one list of log records a run.
         x_key: the key of the x value in a record.
         x_title: the x axis' title with its unit.
         y_of: gives a record's value; what is no finite number is left out.
-        logarithmic: whether y is logarithmic; values that are not positive are then left out.
+        logarithmic: whether y is logarithmic; points that are not positive are then left out, and
+            a band whose lower edge is not positive reaches down to the lowest number of its curve.
 
     Returns:
         A figure whose curves have the group ids `run-0`, `run-1`, …; None where no run has a value.
     """
-    curves = []
-    for run, log in enumerate(logs):
-        x, y = _points(log, x_key, y_of, logarithmic)
-        if len(x):
-            curves.append(_summarise(run, x, y, logarithmic))
+    curves = [_curve(run, log, x_key, y_of) for run, log in enumerate(logs)]
+    if logarithmic:
+        curves = [curve.positive() for curve in curves]
+    curves = [curve for curve in curves if len(curve.x)]
     return _draw(curves, x_title, logarithmic) if curves else None
+
+
+def not_positive(
+    logs: Sequence[list[Record]], x_key: str, y_of: Callable[[Record], object]
+) -> list[tuple[int, int]]:
+    """How many points of each run a chart with a logarithmic axis leaves out, and of how many."""
+    curves = [_curve(run, log, x_key, y_of) for run, log in enumerate(logs)]
+    return [(int(np.count_nonzero(curve.y <= 0)), len(curve.y)) for curve in curves]
 
 
 def inline_svg(figure: Figure, title: str, labels: Sequence[str]) -> str:
@@ -134,8 +154,13 @@ def inline_svg(figure: Figure, title: str, labels: Sequence[str]) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
+def _curve(run: int, log: list[Record], x_key: str, y_of: Callable[[Record], object]) -> _Curve:
+    """The points of a run, summarised where they are many."""
+    return _summarise(run, *_points(log, x_key, y_of))
+
+
 def _points(
-    log: list[Record], x_key: str, y_of: Callable[[Record], object], logarithmic: bool
+    log: list[Record], x_key: str, y_of: Callable[[Record], object]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Finite points in the order of x.
 
@@ -146,21 +171,19 @@ def _points(
         x, y = record.get(x_key), y_of(record)
         if not (isinstance(x, int | float) and isinstance(y, int | float)):
             continue
-        if math.isfinite(x) and math.isfinite(y) and (y > 0 or not logarithmic):
+        if math.isfinite(x) and math.isfinite(y):
             points[float(x)] = float(y)
     ordered = sorted(points.items())
     return np.array([x for x, _ in ordered]), np.array([y for _, y in ordered])
 
 
-def _summarise(run: int, x: np.ndarray, y: np.ndarray, logarithmic: bool) -> _Curve:
+def _summarise(run: int, x: np.ndarray, y: np.ndarray) -> _Curve:
     if len(x) <= BINS:
         return _Curve(run, x, y, None, None)
     edges = np.linspace(x[0], x[-1], BINS + 1)
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
     groups = [index == i for i in np.unique(index)]
-    scaled = np.log(y) if logarithmic else y
-    rows = [(scaled[g].mean(), *np.percentile(scaled[g], (10, 90))) for g in groups]
-    mean, low, high = np.exp(rows).T if logarithmic else np.array(rows).T
+    mean, low, high = np.array([(y[g].mean(), *np.percentile(y[g], (10, 90))) for g in groups]).T
     return _Curve(run, np.array([x[g].mean() for g in groups]), mean, low, high)
 
 

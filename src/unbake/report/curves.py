@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -112,8 +113,19 @@ def _panels(
     panels = []
     for x_key, (key, title) in product(axes, titles.items()):
         x_title = AXES[x_key]
-        figure = charts.chart(logs, x_key, x_title, lambda r, k=key: r.get(k), logarithmic)
+        value = partial(_value, key=key)
+        figure = charts.chart(logs, x_key, x_title, value, logarithmic)
         if figure is not None:
             svg = charts.inline_svg(figure, f"{title} over {x_title}", labels)
-            panels.append({"title": title, "unit": unit, "svg": svg})
+            lost = charts.not_positive(logs, x_key, value) if logarithmic else []
+            told = [
+                f"{label} {left} of {count}"
+                for label, (left, count) in zip(labels, lost, strict=False)
+                if left
+            ]
+            panels.append({"title": title, "unit": unit, "svg": svg, "lost": ", ".join(told)})
     return panels
+
+
+def _value(record: Mapping[str, Any], key: str) -> Any:
+    return record.get(key)

@@ -100,7 +100,7 @@ def evaluated(run: EvaluatedRun, picture: Path) -> Path:
 
 
 def rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) linear RGB and (H, W) bool, True where alpha (if any) is at least one half.
+    """(H, W, 3) linear RGB and (H, W) bool, True where alpha (if any) is 1.
 
     Photographs may hold code values of the sRGB curve; all other pictures are OpenEXR.
     """
@@ -108,7 +108,7 @@ def rgb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     pixels = read_picture(path) if coded else pictures.read_exr(path)
     if pixels.shape[2] < 3:
         pixels = pixels[..., :1].repeat(3, axis=2)
-    mask = pixels[..., 3] >= 0.5 if pixels.shape[2] > 3 else np.ones(pixels.shape[:2], bool)
+    mask = pixels[..., 3] >= 1 if pixels.shape[2] > 3 else np.ones(pixels.shape[:2], bool)
     return pixels[..., :3], mask
 
 
@@ -139,10 +139,15 @@ def tonemapped(linear: np.ndarray, exposure: float) -> str:
     return pictures.png_data_uri(pictures.tonemap(small, exposure))
 
 
+def shrunk(values: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (H, W) and their mask, averaged down to the size of an embedded picture."""
+    inside = pictures.shrink(mask, LONGEST_SIDE) >= 0.5
+    return pictures.shrink(values, LONGEST_SIDE), inside
+
+
 def painted(values: np.ndarray, scale: float, mask: np.ndarray) -> str:
     """Errors (H, W) as a false-colour picture to embed; `scale` is the brightest colour."""
-    inside = pictures.shrink(mask, LONGEST_SIDE) >= 0.5
-    small = pictures.shrink(values, LONGEST_SIDE)
+    small, inside = shrunk(values, mask)
     return pictures.png_data_uri(pictures.false_colour(small, scale, inside))
 
 

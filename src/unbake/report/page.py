@@ -19,7 +19,7 @@ from unbake.report.cameras import camera_section
 from unbake.report.definitions import definitions
 from unbake.report.lighting import lighting_section
 from unbake.report.outliers import outlier_section
-from unbake.report.pictures import UNITS, shared_scales, view_groups
+from unbake.report.pictures import UNITS, view_groups
 from unbake.report.relit import relit_sections
 from unbake.report.runs import EvaluatedRun, data_folder, labels, read_run, read_views
 from unbake.report.sheets import texture_sections
@@ -89,9 +89,9 @@ def _context(
 def _views(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any]:
     """Pictures of the views, and what they are drawn with."""
     views = read_views(dataset, runs)
-    scales = shared_scales(runs, views)
+    groups, scales = view_groups(dataset, views, runs)
     return {
-        "groups": view_groups(dataset, views, runs, scales),
+        "groups": groups,
         "scales": scales,
         "known": any(name in view.truth for view in views for name in QUANTITIES),
         "units": UNITS,

@@ -18,7 +18,8 @@ from unbake.training.run_folder import RunFolder
 #: Splits of the data in the order of the page.
 SHOWN_SPLITS = ("heldout", "train")
 TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
-HELDOUT_VIEWS = 24  # each has several pictures of every run, and all are in one file
+#: Of held-out views: most; least; and pictures of views of all runs, as all are in one file.
+HELDOUT_VIEWS, FEWEST_HELDOUT, HELDOUT_PICTURES = 24, 4, 48
 
 
 @final
@@ -169,6 +170,8 @@ def data_folder(runs: list[EvaluatedRun]) -> Path:
 def read_views(dataset: Dataset, runs: list[EvaluatedRun]) -> list[ShownView]:
     """The evaluated held-out views, then training views: some of many, evenly spaced.
 
+    The more runs there are, the fewer held-out views.
+
     Raises:
         UserError: an evaluated view is missing from the data set.
     """
@@ -182,7 +185,8 @@ def read_views(dataset: Dataset, runs: list[EvaluatedRun]) -> list[ShownView]:
         )
     heldout = [_view(view) for view in dataset.heldout if view.name in evaluated]
     training = [_view(view) for view in dataset.train if view.name in evaluated]
-    return evenly(heldout, HELDOUT_VIEWS) + evenly(training, TRAINING_VIEWS)
+    shown = max(FEWEST_HELDOUT, min(HELDOUT_VIEWS, HELDOUT_PICTURES // len(runs)))
+    return evenly(heldout, shown) + evenly(training, TRAINING_VIEWS)
 
 
 def _view(view: View) -> ShownView:

@@ -102,11 +102,14 @@ def _trend(run: EvaluatedRun) -> list[str]:
 
 
 def _warnings(run: EvaluatedRun) -> list[str]:
-    """Steps that were skipped, and what a fit's watchdog noted."""
+    """Steps that were skipped, what a fit's watchdog noted, and pixels that were left out."""
     skipped = sum(line.get("skipped", 0) for line in run.log)
     steps = max(run.taken, run.metrics.get("steps") or 0)
     told = [f"{display.count(skipped)} of {display.count(steps)} steps skipped"]
-    return [*(told if skipped else []), *(line["note"] for line in run.log if "note" in line)]
+    lost = sum(int(display.number(row.get("not_finite")) or 0) for row in run.metrics["per_view"])
+    pixels = [f"{display.count(lost)} pixels of renderings are not finite and left out"]
+    notes = [line["note"] for line in run.log if "note" in line]
+    return [*(told if skipped else []), *notes, *(pixels if lost else [])]
 
 
 def _described(run: EvaluatedRun) -> list[tuple[str, str, str]]:

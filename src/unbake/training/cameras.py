@@ -59,19 +59,21 @@ class Cameras:
         common = model.common_gain()
         if not self.solves:
             return common
-        limit = np.inf if view.clipped is None else view.clipped
-        light = model.light(photograph.astype(np.float64)).reshape(-1, 3) / view.exposure
-        expected = radiance.astype(np.float64).reshape(-1, 3) * common
-        finite = np.isfinite(light + expected).min(axis=-1)
-        if not finite.any():
-            return common
-        bright = [x > _DARK * x[finite].mean() for x in (light, expected)]
-        told = finite[:, None] & bright[0] & bright[1] & (photograph.reshape(-1, 3) < limit)
-        ratios = np.log(np.where(told, light, 1)) - np.log(np.where(told, expected, 1))
-        own = model.white_balance == "per-image" and told.any(0).all()
-        if own:
-            return np.exp([np.median(r[t]) for r, t in zip(ratios.T, told.T, strict=True)])
-        return common * (np.exp(np.median(ratios[told])) if told.any() else 1.0)
+        coloured = model.white_balance == "per-image"
+        return common * _ratio(model, view, radiance * common, photograph, coloured)
+
+    def own_gain(self, view: View, radiance: np.ndarray, photograph: np.ndarray) -> np.ndarray:
+        """The gain that brings any picture nearest to a photograph, whatever was fitted: as `gain`.
+
+        Exposure and white balance are told by the two alone, as far as they were unknown to the
+        fit. So it suits pictures that the fit has no part in.
+        """
+        model = self._model
+        if model is None or not (self.solves or model.white_balance == "common"):
+            return np.ones(3)
+        coloured = model.white_balance != "known"
+        found = _ratio(model, view, radiance.astype(np.float64), photograph, coloured)
+        return found if self.solves else found / found[1]
 
     def dimmed(
         self, view: View, radiance: np.ndarray, numbers: np.ndarray | None = None
@@ -133,6 +135,33 @@ class Cameras:
         if own:
             row |= {"red": float(gain[0] / gain[1]), "blue": float(gain[2] / gain[1])}
         return row
+
+
+def _ratio(
+    model: CameraModel, view: View, expected: np.ndarray, photograph: np.ndarray, coloured: bool
+) -> np.ndarray:
+    """The median ratio of a photograph and what was expected, of each channel or of all, (3,).
+
+    It is that of pixels that are bright enough and not clipped; 1 where there are none.
+
+    Args:
+        model: tells the response.
+        expected: radiance, float64, shape (..., 3).
+        photograph: of the same pixels, as the file has it.
+        coloured: whether channels have ratios of their own.
+    """
+    limit = np.inf if view.clipped is None else view.clipped
+    light = model.light(photograph.astype(np.float64)).reshape(-1, 3) / view.exposure
+    expected = expected.reshape(-1, 3)
+    finite = np.isfinite(light + expected).min(axis=-1)
+    if not finite.any():
+        return np.ones(3)
+    bright = [x > _DARK * x[finite].mean() for x in (light, expected)]
+    told = finite[:, None] & bright[0] & bright[1] & (photograph.reshape(-1, 3) < limit)
+    ratios = np.log(np.where(told, light, 1)) - np.log(np.where(told, expected, 1))
+    if coloured and told.any(0).all():
+        return np.exp([np.median(r[t]) for r, t in zip(ratios.T, told.T, strict=True)])
+    return np.full(3, np.exp(np.median(ratios[told])) if told.any() else 1.0)
 
 
 def radius2(camera: Camera, numbers: np.ndarray | None = None) -> np.ndarray:

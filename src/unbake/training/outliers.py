@@ -15,7 +15,7 @@ other unknowns stay unbiased.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -100,16 +100,37 @@ class OutlierModel:
         error = as_weight(photometric / dr.maximum(kept, 1e-3), _LEAST_ERROR, _LARGEST_ERROR)
         return self._tolerance * error * dr.mean(dr.square(roots - 1))
 
-    def masks(self) -> list[np.ndarray]:
-        """Which pixels of each training view are outliers, (height, width) bool."""
+    def taken(self) -> list[np.ndarray]:
+        """Which blocks of each training view are outliers, (rows, columns) bool."""
         odds = np.array(dr.detach(self._odds), np.float64) + _TRUSTED
         weights = np.square(1 / (1 + np.exp(-odds)))
         ends = np.cumsum([rows * columns for rows, columns in self._shapes])
-        masks = []
-        for part, shape, c in zip(
-            np.split(weights, ends[:-1]), self._shapes, self._cameras, strict=True
-        ):
-            edge = self.blocks.edge
-            block = np.kron(part.reshape(shape) < LEAST, np.ones((edge, edge), bool))
-            masks.append(block[: c.height, : c.width])
-        return masks
+        parts = zip(np.split(weights, ends[:-1]), self._shapes, strict=True)
+        return [part.reshape(shape) < LEAST for part, shape in parts]
+
+    def masks(self) -> Iterator[np.ndarray]:
+        """Which pixels of each training view are outliers, (height, width) bool, view by view."""
+        return (self.mask(view, blocks) for view, blocks in enumerate(self.taken()))
+
+    def mask(self, view: int, blocks: np.ndarray) -> np.ndarray:
+        """The pixels of blocks of a training view, (height, width) bool; blocks as of `taken`."""
+        camera, edge = self._cameras[view], self.blocks.edge
+        pixels = blocks.repeat(edge, axis=0).repeat(edge, axis=1)
+        return pixels[: camera.height, : camera.width]
+
+    def pixels_in(self, view: int, counted: np.ndarray | None) -> np.ndarray:
+        """How many pixels of each block of a training view count, (rows, columns).
+
+        Args:
+            counted: (height, width) bool; None: all.
+        """
+        camera, edge = self._cameras[view], self.blocks.edge
+        rows, columns = (np.arange(0, side, edge) for side in (camera.height, camera.width))
+        if counted is None:
+            heights, widths = (
+                np.diff(np.append(starts, side))
+                for starts, side in ((rows, camera.height), (columns, camera.width))
+            )
+            return heights[:, None] * widths
+        across = np.add.reduceat(counted, columns, axis=1, dtype=np.int64)
+        return np.add.reduceat(across, rows, axis=0)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..dataset.ground_truth import GroundTruth
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.small_views import block_of, small_camera
 from ..dataset.views import Dataset, View
@@ -15,7 +16,7 @@ from ..quantities import QUANTITIES
 from .checkpoint import Progress
 from .problem import Problem
 from .run_folder import RunFolder, require_no_link
-from .validation import SAMPLES, GroundTruth, MaterialBuffers
+from .validation import SAMPLES, MaterialBuffers
 
 #: Longer side of a picture in pixels, at most: a photograph may have 24 million, and a preview of
 #: all of them would take longer than many steps.

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import CameraConfig, FitConfig, ObjectiveConfig, with_method
+from ..dataset.ground_truth import GroundTruth
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
 from ..errors import UserError
@@ -24,7 +25,6 @@ from ..transport.vertex import find_vertex
 from .problem import Problem, problem_of
 from .state import State
 from .step import without_garbage_collection
-from .validation import GroundTruth
 
 #: Pixels of a step, and camera samples of each half of a pixel.
 PIXELS, HALF = 4096, 1

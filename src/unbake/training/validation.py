@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..dataset.ground_truth import GroundTruth
 from ..dataset.pixels import CameraRays
-from ..dataset.views import View, read_view
+from ..dataset.views import View
 from ..imaging.metrics import mean_psnr, psnr
-from ..quantities import ALIGNED, QUANTITIES
+from ..quantities import ALIGNED
 from ..transport.render import render_materials
 from .problem import Problem
 
@@ -19,33 +20,6 @@ SAMPLES = 4
 
 #: Recovered and true albedo of a view, (H, W, 3), and the pixels that count, (H, W) bool.
 Albedos = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True)
-class GroundTruth:
-    """The true materials that a view sees."""
-
-    values: Mapping[str, np.ndarray]  # by quantity, (H, W, channels)
-    known: np.ndarray  # (H, W) bool: the whole pixel sees a material that is optimized
-
-    @staticmethod
-    def of(view: View, names: Iterable[str] | None = None) -> GroundTruth | None:
-        """The truth images of a view; None where it has none.
-
-        Args:
-            names: quantities to read, as far as there are images of them; None: all.
-
-        Raises:
-            UserError: an image cannot be read.
-        """
-        chosen = set(view.truth if names is None else names)
-        files = {name: file for name, file in view.truth.items() if name in chosen}
-        images = {name: read_view(file, view) for name, file in files.items()}
-        if not images:
-            return None
-        values = {name: x[..., : QUANTITIES[name].channels] for name, x in images.items()}
-        known = np.all([x[..., 3] >= 1 for x in images.values()], axis=0)
-        return GroundTruth(values, known)
 
 
 @dataclass(frozen=True)
@@ -91,6 +65,17 @@ class MaterialBuffers:
             if name in truth.values and mask.any():
                 scores[f"{name}_psnr"] = psnr(value, truth.values[name], mask)
         return scores
+
+
+def known_pixels(seen: MaterialBuffers | None, truth: GroundTruth | None) -> np.ndarray | None:
+    """The pixels whose materials are compared with the truth, (H, W) bool; None without truth.
+
+    Args:
+        seen: the recovered materials; None where they are known.
+    """
+    if truth is None:
+        return None
+    return truth.known if seen is None else seen.mask(truth)
 
 
 def albedos(seen: MaterialBuffers | None, truth: GroundTruth | None) -> Albedos | None:

@@ -17,7 +17,7 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
 from ..dataset.small_views import block_of, small_camera
-from ..dataset.views import Dataset, View, read_photograph, read_view
+from ..dataset.views import Dataset, View, read_mask, read_photograph, read_view
 from ..errors import UserError
 from ..exports.bake import OwnTextures, look_up, own_textures
 from ..exports.observed import Views
@@ -163,7 +163,7 @@ class ViewedData:
         Raises:
             UserError: an image cannot be read.
         """
-        photograph, _ = _small(_photograph(view), view.camera)
+        photograph, _, _ = _small_photograph(view)
         row = [Picture("photograph", tonemap(photograph, exposure))]
         if choice in view.truth:
             truth, _ = _small(_truth(view, choice), view.camera)
@@ -311,19 +311,24 @@ class ViewedRun(ViewedData):
         See `ViewedData.pictures`. What is rendered is at most `LONGEST` pixels wide and high.
         """
         view = refined_view(self._problem.poses, self._run.dataset.train, view)
-        photograph, camera = _small(_photograph(view), view.camera)
+        photograph, counted, camera = _small_photograph(view)
         first = [Picture("photograph", tonemap(photograph, exposure))]
         if self.progress is None:
             return [first]
         image, how = self._rendered(camera)
         cameras = Cameras(self._problem.camera, self._run.dataset.train)
         dimmed = cameras.dimmed(replace(view, camera=camera), image)
-        image = cameras.photographed(view, dimmed, cameras.gain(view, dimmed, photograph))
+        told = counted if counted.any() else np.ones_like(counted)
+        image = cameras.photographed(
+            view, dimmed, cameras.gain(view, dimmed[told], photograph[told])
+        )
         gain = 2.0**exposure
         compared = view.readable(photograph)
         error = absolute_error(image.clip(0, 1 / gain), compared.clip(0, 1 / gain)) * gain
         first.append(Picture(how, tonemap(image, exposure)))
-        first.append(Picture(_error_to("radiance"), false_colour(error, SCALES["radiance"])))
+        first.append(
+            Picture(_error_to("radiance"), false_colour(error, SCALES["radiance"], counted))
+        )
         name = choice.removesuffix(_ERROR)
         if name not in (self._problem.materials or ()):
             return [first]
@@ -333,7 +338,7 @@ class ViewedRun(ViewedData):
         if name in view.truth:
             truth, _ = _small(_truth(view, name), view.camera)
             error = absolute_error(seen.values[name], truth)
-            known = seen.coverage >= 1
+            known = (seen.coverage >= 1) & _small_mask(view)
             second.insert(0, Picture(f"true {name}", shown(truth, display)))
             second.append(
                 Picture(_error_to("quantity"), false_colour(error, SCALES["quantity"], known))
@@ -426,8 +431,18 @@ def _error_to(what: str) -> str:
     return f"error, 0 to {SCALES[what]:g}"
 
 
-def _photograph(view: View) -> np.ndarray:
-    return read_photograph(view, clip_negative=True)[..., :3]
+def _small_photograph(view: View) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """A photograph (H, W, 3), pixels that are neither masked nor transparent, and its camera."""
+    pixels, camera = _small(read_photograph(view, clip_negative=True), view.camera)
+    return pixels[..., :3], pixels[..., 3] >= 1, camera
+
+
+def _small_mask(view: View) -> np.ndarray:
+    """Pixels of a small picture none of whose parts are masked, (H, W) bool."""
+    counted = read_mask(view)
+    if counted is None:
+        counted = np.ones((view.camera.height, view.camera.width), bool)
+    return _small(counted, view.camera)[0] >= 1
 
 
 def _truth(view: View, name: str) -> np.ndarray:
