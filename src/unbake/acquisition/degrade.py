@@ -327,25 +327,26 @@ def _change_meshes(
     """
     files, bare = [], False
     textured = any(node.props.plugin_name() in _LOOKED_INTO for node in parsed.state.nodes)
+    meshes = {}
     for number, node in enumerate(parsed.state.nodes):
         plugin = node.props.plugin_name()
         if node.type != mi.ObjectType.Shape or plugin not in _MESHES:
             continue
         kept = ("filename", "shape_index", "face_normals", "flip_tex_coords", "to_world")
         made = {key: node.props[key] for key in kept if key in node.props}
-        mesh = mi.load_dict({"type": plugin, **made})
-        params = mi.traverse(mesh)
-        positions = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        meshes[number] = mi.load_dict({"type": plugin, **made})
         if settings.displace:
-            positions += displacement(positions, settings, diagonal)
-        faces = np.array(params["faces"]).reshape(-1, 3)
-        if settings.decimate < 1 and len(faces) >= FEWEST:
-            bare |= textured and (mesh.has_vertex_texcoords() or mesh.has_mesh_attributes())
-            mesh = decimated(positions, faces, settings.decimate)
-        else:
-            params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
-            params.update()
-            dr.eval(params["vertex_positions"])
+            _displace(meshes[number], settings, diagonal)
+    dense = {n: mesh for n, mesh in meshes.items() if mesh.face_count() >= FEWEST}
+    if settings.decimate < 1:
+        of_coordinates = (
+            m.has_vertex_texcoords() or m.has_mesh_attributes() for m in dense.values()
+        )
+        bare = textured and any(of_coordinates)
+        few = decimated([_triangles(mesh) for mesh in dense.values()], settings.decimate)
+        meshes |= zip(dense, few, strict=True)
+    for number, mesh in meshes.items():
+        node = parsed.state.nodes[number]
         # The name of the file stays, as shapes and lamps without an id are named after it.
         name = f"{Path(node.props['filename']).stem}.ply"
         file = folder.scene / "meshes" / f"changed-{number}" / name
@@ -357,6 +358,23 @@ def _change_meshes(
         node.props["filename"] = str(file.resolve())
         files.append(file.relative_to(folder.scene).as_posix())
     return files, bare
+
+
+def _triangles(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and faces of a mesh."""
+    params = mi.traverse(mesh)
+    positions = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    return positions, np.array(params["faces"]).reshape(-1, 3)
+
+
+def _displace(mesh: mi.Mesh, settings: DegradeSettings, diagonal: float) -> None:
+    """Move the vertices of a mesh."""
+    positions = _triangles(mesh)[0]
+    positions += displacement(positions, settings, diagonal)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+    params.update()
+    dr.eval(params["vertex_positions"])
 
 
 def displacement(positions: np.ndarray, settings: DegradeSettings, diagonal: float) -> np.ndarray:

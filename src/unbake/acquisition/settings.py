@@ -118,7 +118,8 @@ class DegradeSettings:
     decimate: Annotated[
         float,
         Flag(
-            "Share of their triangles that meshes keep; those of fewer than 64 keep all",
+            "Share of their triangles that meshes keep together, dense ones less of theirs; those of "
+            "fewer than 64 keep all",
             metavar="SHARE",
         ),
     ] = 1.0
