@@ -41,6 +41,19 @@ def test_colour_of_jpeg_has_the_edges_of_brightness(tmp_path, subsampling, size)
     assert errors[0] < 0.6 * errors[1]
 
 
+@pytest.mark.parametrize("subsampling", ["4:2:2", "4:2:0"])
+def test_colour_jumps_where_surfaces_of_other_colours_meet(tmp_path, subsampling):
+    """Where brightness tells two surfaces apart, each has its own colour up to the edge."""
+    y, x = np.mgrid[:48, :64]
+    dark = (((y + 1) // 7 + (x + 1) // 9) % 2).astype(bool)
+    codes = np.where(dark[..., None], (120, 40, 30), (150, 190, 220)).astype(np.uint8)
+    file = save(tmp_path / "a.jpg", codes, quality=100, subsampling=subsampling)
+    with Image.open(file) as image:
+        smooth = np.array(image)
+    errors = [np.abs(found.astype(int) - codes).mean() for found in (read_codes(file), smooth)]
+    assert errors[0] < 0.5 * errors[1]
+
+
 def test_colour_that_brightness_says_nothing_of_keeps_its_means(tmp_path):
     rng, grey = np.random.default_rng(0), np.full((64, 64, 1), 128.0)
     colour = rng.uniform(-40, 40, (32, 32, 2)).repeat(2, 0).repeat(2, 1)

@@ -95,7 +95,7 @@ def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
         "blur": {"radius": RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
     if any(view.image.suffix.lower() in (".jpg", ".jpeg") for view in views):
-        key["colour of JPEG"] = "sharp"
+        key["colour of JPEG"] = "by regression"
     if any(view.exposure != 1 for view in views):
         key["exposures"] = [view.exposure for view in views]
     if any(view.noise is not None for view in views):

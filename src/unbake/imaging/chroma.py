@@ -2,11 +2,16 @@
 
 Most JPEG files hold colour (Cb, Cr) at half the resolution of brightness (Y), as means of two or
 four pixels, and decoders put smooth colour through these. Where two surfaces meet, each then has
-some of the other's colour. Brightness tells where the edge is: colour is taken to be a smooth
-multiple of it, as it is where more or less light falls on a surface, with the means of the file.
+some of the other's colour, in all photographs alike. Brightness tells where the edge is. Colour is
+taken to be a multiple of it, as it is where more or less light falls on a surface. The multiple is
+a line of brightness, by least squares in each 3 x 3 blocks of pixels (a guided filter, He et al.
+2010), so that it may jump where two surfaces meet. It stays within that of the blocks around, and
+colour has the means of the file.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,9 +21,11 @@ from .windows import bands
 _CORRECTIONS = 2
 #: Brightness, [0,1], below which colour is not divided by it.
 _DARK = 0.03
+#: Variance of brightness, code values squared, from which on the multiple follows it.
+_FLAT = 30.0
 #: Rows that are made at once, and rows above and below that they depend on: each correction looks
-#: at a block more than the one before. Both are even.
-_ROWS, _REACH = 128, 16
+#: at a block more than the one before, and so does each mean of blocks. Both are even.
+_ROWS, _REACH = 128, 20
 #: Code of Cb and Cr that is grey.
 _GREY = 128
 
@@ -49,9 +56,9 @@ def _sharp(codes: np.ndarray, across: int, down: int) -> np.ndarray:
     steps, padding = (down, across), [(0, -height % down), (0, -width % across), (0, 0)]
     planes = np.moveaxis(np.pad(codes, padding, mode="edge"), 2, 0).astype(np.float32)
     y, lowest = planes[0], np.float32(255 * _DARK)
-    y_means = np.maximum(_means(y, steps), lowest)
+    guide = _Guide.of(y, steps, lowest)
     blue, red = (
-        _sharp_plane(plane - np.float32(_GREY), y, y_means, steps)[:height, :width]
+        _sharp_plane(plane - np.float32(_GREY), guide, steps)[:height, :width]
         for plane in planes[1:]
     )
     y = y[:height, :width] + np.float32(0.5)
@@ -64,19 +71,39 @@ def _sharp(codes: np.ndarray, across: int, down: int) -> np.ndarray:
     return np.stack([np.clip(x, 0, 255).astype(np.uint8) for x in rgb], -1)
 
 
-def _sharp_plane(
-    smooth: np.ndarray, y: np.ndarray, y_means: np.ndarray, steps: tuple[int, int]
-) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class _Guide:
+    """What colour follows.
+
+    Args:
+        y: brightness, (H, W).
+        means: of its blocks, at least the darkest that is divided by.
+        near: means of the 3 x 3 about each of them.
+        variance: of these.
+    """
+
+    y: np.ndarray
+    means: np.ndarray
+    near: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def of(cls, y: np.ndarray, steps: tuple[int, int], lowest: np.float32) -> _Guide:
+        means = np.maximum(_means(y, steps), lowest)
+        near = _near(means)
+        return cls(y, means, near, _near(means * means) - near * near)
+
+
+def _sharp_plane(smooth: np.ndarray, guide: _Guide, steps: tuple[int, int]) -> np.ndarray:
     """Cb or Cr with the edges of Y, and with the means of the file.
 
     Args:
-        smooth: less the code of grey, (H, W) as the others; sides are multiples of the steps.
-        y: brightness.
-        y_means: of blocks, at least the darkest that is divided by.
+        smooth: less the code of grey, (H, W) as brightness; sides are multiples of the steps.
+        guide: brightness.
         steps: rows and columns of a block.
     """
     means = _means_in_file(_means(smooth, steps), steps)
-    sharp = y * _smooth(means / y_means, steps)
+    sharp = guide.y * _multiple(means / guide.means, guide, steps)
     # Corrections are smooth: what is left after each is known without making its picture.
     left = means - _means(sharp, steps)
     corrections = left
@@ -84,6 +111,29 @@ def _sharp_plane(
         left = left - _means_of_smooth(left, steps)
         corrections = corrections + left
     return sharp + _smooth(corrections, steps)
+
+
+def _multiple(ratio: np.ndarray, guide: _Guide, steps: tuple[int, int]) -> np.ndarray:
+    """Colour over brightness at each pixel, by that of blocks."""
+    near = _near(ratio)
+    slope = (_near(guide.means * ratio) - guide.near * near) / (guide.variance + np.float32(_FLAT))
+    slope = _near(slope)
+    multiple = guide.y * _smooth(slope, steps) + _smooth(ratio - slope * guide.means, steps)
+    for limit, bound in ((np.minimum, np.maximum), (np.maximum, np.minimum)):
+        bounds = ratio
+        for axis in range(2):
+            before, after = _neighbours(bounds, axis)
+            bounds = limit(limit(before, after), bounds)
+        bound(multiple, bounds.repeat(steps[0], 0).repeat(steps[1], 1), out=multiple)
+    return multiple
+
+
+def _near(means: np.ndarray) -> np.ndarray:
+    """Means of 3 x 3 blocks about each one."""
+    for axis in range(2):
+        before, after = _neighbours(means, axis)
+        means = np.float32(1 / 3) * (before + means + after)
+    return means
 
 
 def _means_in_file(wanted: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
