@@ -49,6 +49,7 @@ from unbake.training.fresh_fit import begin_fit
 from unbake.training.held_aside import HeldAside, HeldOutPhotographs
 from unbake.training.loop import fit
 from unbake.training.problem import make_problem, pixels_of, problem_of, training_pixels
+from unbake.training.recovered import load_run
 from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
@@ -568,8 +569,8 @@ VALUES = np.linspace(0, 1, 2000)
 NOISE, VIEWS, CORNER = 0.25, 24, 0.4
 
 
-def photographed_points(rng, points, stops, corner=0.0, shine=0.0):
-    """Points that up to eight views see, whose response is an S-shaped curve, as `SeenPoints`.
+def photographed_points(rng, points, stops, corner=0.0, shine=0.0, kind="contrast"):
+    """Points that up to eight views see, whose response is some curve, as `SeenPoints`.
 
     Every point is as noisy as path traced rooms are. What is clipped or dark is a bound.
     """
@@ -581,7 +582,7 @@ def photographed_points(rng, points, stops, corner=0.0, shine=0.0):
     light *= np.where(rng.uniform(size=len(point)) < shine, rng.uniform(2, 6, len(point)), 1)
     dark = 0.01 * light.mean()
     bound = (light >= 1).astype(int) - (light <= dark)
-    logs = np.log(response(np.clip(light, dark, 1), "contrast"))
+    logs = np.log(response(np.clip(light, dark, 1), kind))
     return SeenPoints(point, view, radius2, logs, np.log(2) * stops[view], bound)
 
 
@@ -610,6 +611,17 @@ def test_a_response_begins_at_what_exposures_that_differ_say():
     model = CameraModel(3, response=True)
     model.start_response(np.stack([told.curve] * 3))
     np.testing.assert_allclose(model.curves(), [told.curve] * 3, atol=1e-5)
+
+
+def test_a_response_whose_middle_is_bright_is_told_by_known_exposures():
+    """What is expected of white, which few photographs show, does not bend the curve below it."""
+    rng = np.random.default_rng(3)
+    seen = photographed_points(rng, 6000, rng.uniform(-1.5, 1.5, VIEWS), kind="lifted")
+    curve = first_response(seen).curve
+    places = np.linspace(0, 1, len(curve)) ** 2.2
+    truth = np.interp(places, response(VALUES, "lifted"), VALUES)
+    ratio = curve[2:-2] ** 2.2 / truth[2:-2]
+    np.testing.assert_allclose(ratio / ratio[6], 1, atol=0.08)
 
 
 def test_a_response_is_not_told_where_exposures_hardly_differ_or_nothing_is_shared():
@@ -726,6 +738,44 @@ def fitted(unknown, tiny, tmp_path_factory):
     fit(unknown, run, replace(settings, held_aside=0.25))
     few = EvaluationSettings(spp=16, max_depth=6, train_views=1, truth=True)
     return run, evaluate(run, few, tell=lambda line: None)
+
+
+@pytest.mark.parametrize("balance", ["known", "common", "per-image"])
+@pytest.mark.parametrize("exposure", [True, False])
+def test_the_limit_by_the_true_materials_does_not_depend_on_the_fit(balance, exposure, cornell):
+    view = Dataset.load(cornell).train[1]
+    rng = np.random.default_rng(0)
+    radiance = rng.uniform(0.1, 1, (6, 6, 3))
+    photograph = radiance * (1.5, 1.0, 0.8) * (0.25 if exposure else 1)
+    found = []
+    for start in (0.0, 1.0):
+        model = CameraModel(2, exposure=exposure, white_balance=balance)
+        model.assign({k: mi.Float(start, *x[1:]) for k, x in model.parameters().items()})
+        cameras = Cameras(model, [view, view])
+        found.append(cameras.own_gain(view, radiance, photograph))
+    np.testing.assert_array_equal(*found)
+    if balance != "known":
+        np.testing.assert_allclose(photograph, radiance * found[0])
+    elif exposure:
+        np.testing.assert_allclose(found[0], 0.25)  # the median of all channels
+    else:
+        np.testing.assert_array_equal(found[0], 1)
+
+
+def test_the_limit_in_an_evaluation_does_not_depend_on_the_fit(
+    unknown, tiny, tmp_path, monkeypatch
+):
+    config = replace(read_toml(tiny), method="direct", steps=0)
+    fit(unknown, tmp_path / "run", replace(config, camera=CameraConfig(exposure="per-image")))
+    recovered = load_run(tmp_path / "run")
+    monkeypatch.setattr("unbake.evaluation.evaluate.load_run", lambda *_, **__: recovered)
+    settings, limits, scores = EvaluationSettings(spp=2, max_depth=3, truth=True), [], []
+    for stops in (0.0, 2.0):
+        recovered.problem.camera.assign({"exposure.log": mi.Float(0.0, stops)})
+        found = evaluate(tmp_path / "run", settings, tell=lambda line: None)
+        limits.append([row["true_render_psnr"] for row in found["per_view"]])
+        scores.append(found["train"]["render_psnr"])
+    assert limits[0] == limits[1] and scores[0] != scores[1]
 
 
 def test_a_fit_finds_exposures_and_tells_them(fitted, tmp_path):

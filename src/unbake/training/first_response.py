@@ -15,9 +15,11 @@ _APART = 0.2
 _FEWEST = 200
 #: The most points that are taken, and where gains are unknown.
 _POINTS, _FEWER_POINTS = 1 << 16, 1 << 14
-#: Weights of curvature and of size of a curve's deviation, of that at white, which few photographs
-#: tell, and of the size of gains, against a photograph of a point.
-_CURVATURE, _SIZE, _WHITE, _GAINS = 1e-3, 1e-6, 3e-3, 1e-6
+#: Weights against a photograph of a point: of the curvature of a curve's deviation and of its size
+#: at white, which few photographs tell, where gains are known and where they are not.
+_TOLD, _UNTOLD = (1e-2, 3e-4), (1e-3, 3e-3)
+#: Those of its size elsewhere, and of gains.
+_SIZE, _GAINS = 1e-6, 1e-6
 #: Steps of the least absolute deviations, and the deviation that counts as none.
 _STEPS, _NOISE = 40, 0.02
 #: Light that photographs are explained by, as code values, where white is 1 if f(P) = P.
@@ -130,11 +132,11 @@ class _Fit:
             self._inside.append((number, seen.radius2 ** (i + 1)))
         size = np.full(_ENDS + views + len(terms), _GAINS)
         size[:_ENDS] = _SIZE
-        size[PIECES] = _WHITE
+        curvature, size[PIECES] = _UNTOLD if views else _TOLD
         size[PIECES // 2] = 1
         size[_ENDS : _ENDS + min(views, 1)] = 1
         bend = np.diff(np.eye(_ENDS, len(size)), 2, axis=0)
-        self._prior = len(self._code) * (_CURVATURE * bend.T @ bend + np.diag(size))
+        self._prior = len(self._code) * (curvature * bend.T @ bend + np.diag(size))
 
     def solved(self) -> np.ndarray:
         """The unknowns: B at the ends of pieces, then gains by view, then terms of vignetting."""
