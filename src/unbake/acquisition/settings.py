@@ -118,8 +118,8 @@ class DegradeSettings:
     decimate: Annotated[
         float,
         Flag(
-            "Share of their triangles that meshes keep together, dense ones less of theirs; those of "
-            "fewer than 64 keep all",
+            "Share of their triangles that meshes keep together; dense ones lose more of theirs, "
+            "those of fewer than 64 none",
             metavar="SHARE",
         ),
     ] = 1.0

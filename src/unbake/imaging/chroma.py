@@ -22,7 +22,7 @@ _CORRECTIONS = 2
 #: Brightness, [0,1], below which colour is not divided by it.
 _DARK = 0.03
 #: Variance of brightness, code values squared, from which on the multiple follows it.
-_FLAT = 30.0
+_FLAT = 100.0
 #: Rows that are made at once, and rows above and below that they depend on: each correction looks
 #: at a block more than the one before, and so does each mean of blocks. Both are even.
 _ROWS, _REACH = 128, 20
