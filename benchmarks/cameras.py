@@ -23,7 +23,8 @@ compare maps that are moved against each other. Any rendered data set will do, r
 
 Rows that FILE has of the same data and options are kept: a run that was stopped goes on, on another
 machine, too. Fits have a number of steps, so that scores are the same on all; `machine` of a row is
-the one that took its seconds.
+the one that took its seconds, and `made` the day. Rows of different versions do not compare: remove
+those of before a change that matters, or write another FILE.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +149,7 @@ def main() -> None:
             continue
         found = [scores(args.data, fault, fit, seed, options) for seed in args.seeds]
         row = {"fault": fault, "cameras": fit} | across_seeds(found, found[0])
-        row |= {"machine": result["machine"]}
+        row |= {"machine": result["machine"], "made": date.today().isoformat()}
         rows.append(row)
         known.add((fault, fit))
         told = ", ".join(f"{k} {v:.3f}" for k, v in row.items() if isinstance(v, float))

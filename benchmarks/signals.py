@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from unbake.backend import activate
 
 activate()  # before modules with types of Dr.Jit
 
+from unbake.dataset.data_folder import DataFolder  # noqa: E402
 from unbake.machine import machine  # noqa: E402
 from unbake.training.checkpoint import newest_progress  # noqa: E402
 from unbake.training.run_folder import RunFolder  # noqa: E402
@@ -40,6 +42,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Seconds that a command may take to end.
 _PATIENCE = 120
 _STOPPED = re.compile(r"stopped at step (\d+)")
+#: Commands that come to no end here, by the line with which they begin their work.
+_ENDLESS = {"fit": re.compile(r"\s*\d+ %\s+step"), "view": re.compile("http://")}
+_LIGHTS = """<scene version="3.0.0">
+  <emitter type="constant"><rgb name="radiance" value="0.5"/></emitter>
+</scene>
+"""
 
 
 def main() -> None:
@@ -66,23 +74,11 @@ def interrupt(folder: Path, each: int, seed: int, only: list[str]) -> dict[str, 
     """
     chance = random.Random(seed)
     data, fit = prepare(folder)
-    done, evaluated, out = folder / "done", folder / "evaluated", folder / "out"
+    done, out = folder / "done", folder / "out"
     start([*fit, "--out", str(done), "--steps", "20"]).communicate()
-    shutil.copytree(done, evaluated)
-    start(["evaluate", str(evaluated), "--spp", "4"]).communicate()
-    small = ["--views", "2", "--held-out", "1", "--resolution", "32", "--spp", "64"]
-    short = [*fit[2:4], "--steps", "50", "--evaluate-spp", "4"]
-    commands = {
-        "fit": [*fit, "--out", str(out)],
-        "resume": ["fit", str(data), "--resume", "--out", str(out), "--steps", "100000"],
-        "capture": ["capture", "cornell", "--out", str(out), *small],
-        "evaluate": ["evaluate", str(done), "--spp", "256"],
-        "report": ["report", str(evaluated), "--out", str(out)],
-        "compare": ["compare", str(data), "--methods", "direct", "--out", str(out), *short],
-        "bench": ["bench", "step", "--data", str(data), *fit[2:4], "--steps", "50"],
-        "reproduce": ["reproduce", "table2", "--scale", "smoke", "--out", str(out)],
-        "doctor": ["doctor"],
-    }
+    commands = _commands(folder, data, fit, done, out)
+    if unknown := set(only) - commands.keys():
+        raise ValueError(f"no command {', '.join(sorted(unknown))}: {', '.join(commands)}")
     found: dict[str, dict[str, int]] = {}
     failures = []
     for name, words in commands.items():
@@ -105,6 +101,56 @@ def interrupt(folder: Path, each: int, seed: int, only: list[str]) -> dict[str, 
         print(f"{name}, {whole:.1f} s: {found[name]}", file=sys.stderr, flush=True)
     sent = sum(sum(ends.values()) for ends in found.values())
     return {"sent": sent, "ends": found, "failures": failures, "seed": seed, "machine": machine()}
+
+
+def _commands(
+    folder: Path, data: Path, fit: list[str], done: Path, out: Path
+) -> dict[str, list[str]]:
+    """Every command by name, small, with what it needs beside a data set and a run."""
+    evaluated, lights = folder / "evaluated", folder / "lights.xml"
+    shutil.copytree(done, evaluated)
+    start(["evaluate", str(evaluated), "--spp", "4"]).communicate()
+    lights.write_text(_LIGHTS, encoding="utf-8")
+    photographs = _without_scene(data, folder / "photographs")
+    meshes = sorted(data.rglob("*.ply"))
+    to = ["--out", str(out)]
+    small = ["--views", "2", "--held-out", "1", "--resolution", "32", "--spp", "64"]
+    solved = ["--views", "1", "--resolution", "16", "--spp", "4", "--final-spp", "4"]
+    short = [*fit[2:4], "--steps", "50", "--evaluate-spp", "4"]
+    return {
+        "fit": [*fit, *to],
+        "resume": ["fit", str(data), "--resume", *to, "--steps", "100000"],
+        "capture": ["capture", "cornell", *to, *small],
+        "import": ["import", str(photographs), *to, *_each("--mesh", meshes), "--holdout", "0"],
+        "data check": ["data", "check", str(data), *to],
+        "evaluate": ["evaluate", str(done), "--spp", "256"],
+        "report": ["report", str(evaluated), *to],
+        "export": ["export", str(done), *to, "--texels", "8"],
+        "render": ["render", str(done), *to, "--spp", "64"],
+        "relight": ["relight", str(done), *to, "--lights", str(lights), "--spp", "64"],
+        "view": ["view", str(done), "--port", "0"],
+        "solve": ["solve", "cornell", *to, "--steps", "50", "--batch", "256", *solved],
+        "compare": ["compare", str(data), "--methods", "direct", *to, *short],
+        "bench": ["bench", "step", "--data", str(data), *fit[2:4], "--steps", "50"],
+        "degrade": ["degrade", str(data), *to, "--exposure", "0.5"],
+        "reproduce": ["reproduce", "table2", "--scale", "smoke", *to],
+        "doctor": ["doctor"],
+    }
+
+
+def _each(option: str, files: Sequence[Path]) -> list[str]:
+    """An option that is given for each of several files."""
+    return [word for file in files for word in (option, str(file))]
+
+
+def _without_scene(data: Path, out: Path) -> Path:
+    """The photographs and cameras of a data set, as another program would have written them."""
+    source, copy = DataFolder(data), DataFolder(out)
+    shutil.copytree(source.image("any").parent, copy.image("any").parent)
+    content = source.read_transforms()
+    del content["scene"]
+    copy.write_transforms(content)
+    return out
 
 
 def _one(words: list[str], number: signal.Signals, after: float, out: Path) -> tuple[str, str]:
@@ -143,15 +189,15 @@ def _one(words: list[str], number: signal.Signals, after: float, out: Path) -> t
 
 
 def _seconds(words: list[str], out: Path, done: Path) -> float:
-    """Seconds that a command takes; of a fit, until it has trained for a second."""
+    """Seconds that a command takes; of one without an end, until it has worked for a second."""
     _clear(out)
     if "--resume" in words:
         shutil.copytree(done, out)
     begun = time.monotonic()
     process = start(words)
-    if words[0] == "fit":
+    if words[0] in _ENDLESS:
         assert process.stdout is not None
-        while not re.match(r"\s*\d+ %\s+step", line := process.stdout.readline()) and line:
+        while not _ENDLESS[words[0]].match(line := process.stdout.readline()) and line:
             pass
         time.sleep(1)
         process.kill()

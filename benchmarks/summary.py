@@ -84,13 +84,19 @@ def summarized(comparisons: Sequence[Row]) -> Row:
 
 
 def machine_results(files: Sequence[Path]) -> tuple[str, Row]:
-    """Files of `unbake bench step` in one; and its name, which is that of the machine."""
+    """Files of `unbake bench step` in one, with the day of the last; and its machine's name.
+
+    Those of version 0.1.0 do not tell the day.
+    """
     steps = [read(file) for file in files]
     machine = steps[0]["machine"]
     words = f"{machine['processor']} {machine['cores']} cores {machine['variant'].split('_')[0]}"
     name = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
-    steps = [{key: value for key, value in step.items() if key != "machine"} for step in steps]
-    return name, {"machine": machine, "steps": steps}
+    days = [step["made"] for step in steps if "made" in step]
+    made = {"made": max(days)} if days else {}
+    told = ("machine", "made")
+    steps = [{key: value for key, value in step.items() if key not in told} for step in steps]
+    return name, {"machine": machine, **made, "steps": steps}
 
 
 def phases_of(step: Row) -> Row:

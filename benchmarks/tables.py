@@ -115,14 +115,13 @@ def targets(end: dict, runs: dict) -> list[dict]:
 
 
 def at_end(result: dict, quantity: str) -> list[dict]:
-    """When ours has what each rival has at the end of its time, seed by seed, in equal schedules.
+    """When each rival has what it ends with, and when ours does, seed by seed, in equal schedules.
 
     Returns:
-        For each rival with scores: `name`; `psnr` of its smoothed end in dB, `seconds` that its
-        fit took, `ours`: seconds after which ours first has it, `times`: the ratio; means over
-        seeds, with KEY_sd. `seeds` of them, `never` without ours, and `level`, the number whose
-        rival ends no higher than it began. `ours` and `times` are absent where one of these is not
-        zero.
+        For each rival with scores: `name`; `psnr` of its smoothed end in dB; seconds after which
+        it (`rival`) and ours (`ours`) first have that, and `times`, their ratio; means over seeds,
+        with KEY_sd. `seeds` of them, `never` without ours, and `level`, the number whose rival
+        ends no higher than it began. `ours` and `times` are absent where one of these is not zero.
     """
     rows, ours = [], scores(result["methods"]["ours"])
     for name, row in result["methods"].items():
@@ -139,10 +138,12 @@ def at_end(result: dict, quantity: str) -> list[dict]:
         times = [target.seconds["ours"] for target in ends]
         level = sum(target.seconds[name] == 0 for target in ends)
         found = {"name": name, "quantity": quantity, "seeds": len(ends), "level": level}
-        found |= {"never": times.count(None), "seconds": row["seconds"]}
+        found |= {"never": times.count(None)}
         found |= spread_of("psnr", [target.psnr for target in ends])
+        own = [target.seconds[name] for target in ends]
+        found |= spread_of("rival", own)
         if None not in times and not level:
-            ratios = [row["seconds"] / t for t in times if t]
+            ratios = [r / t for r, t in zip(own, times, strict=True) if t]
             found |= spread_of("ours", times) | spread_of("times", ratios)
         rows.append(found)
     return rows
@@ -158,8 +159,9 @@ def equal_schedules(result: dict) -> str:
             told = f"untrained fields have it in {row['level']} of {row['seeds']} runs", ""
         else:
             told = f"not in {row['never']} of {row['seeds']} runs", ""
-        rows.append([row["quantity"], f"`{row['name']}`", f"{plus_minus(row, 'psnr')} dB", *told])
-    titles = ["", "rival", "its end", "`ours` after", "times sooner"]
+        end = f"{plus_minus(row, 'psnr')} dB", f"{plus_minus(row, 'rival')} s"
+        rows.append([row["quantity"], f"`{row['name']}`", *end, *told])
+    titles = ["", "rival", "its end", "it has that after", "`ours` after", "times sooner"]
     return markdown(titles, rows) + over_seeds(result)
 
 
@@ -297,7 +299,10 @@ PRIOR = {
 
 
 def cameras(result: dict) -> str:
-    """Scores with each fault of cameras taken for known and fitted, and what was found of it."""
+    """Scores with each fault of cameras taken for known and fitted, and what was found of it.
+
+    Rows with a dagger are of earlier versions, which did not write when they were made.
+    """
     rows = {(row["fault"], row["cameras"]): row for row in result["rows"]}
     table = []
     for fault in dict.fromkeys(fault for fault, _ in rows):
@@ -309,7 +314,8 @@ def cameras(result: dict) -> str:
             for key, form in CAMERAS.items()
             if fitted.get(key) and not (scaled and key == "response_error_rms")
         ]
-        table.append([fault, *scores, ", ".join(found)])
+        older = any("made" not in row for row in (known, fitted) if row)
+        table.append([f"{fault} †" if older else fault, *scores, ", ".join(found)])
     return markdown(["fault", "known", "fitted", "error of what was found"], table)
 
 

@@ -2,10 +2,12 @@
 
     python benchmarks/variants.py --data DATA [DATA ...] --settings A.toml B.toml --out FILE.json
         [--seeds 0 1 2] [--steps 2400 | --seconds 120] [--methods ours] [--go-on]
+        [--also METHOD C.toml]
 
 The fits of a seed follow each other, and the file is written after each fit. With --go-on, fits
 that it has already are kept: those of the first seeds, of each data set, method and settings. A fit
-of a given time follows one of three steps, which compiles its kernels.
+of a given time follows one of three steps, which compiles its kernels. Each method has each
+settings file; --also adds one method with one more file, in turns with the others.
 Scores are PSNRs in dB of linear RGB by `unbake evaluate`, mean over held-out views, with those of
 the untrained fields and of the best constants; seconds are those of training.
 """
@@ -42,6 +44,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets")
     parser.add_argument("--settings", type=Path, nargs="+", required=True, help="settings files")
     parser.add_argument("--methods", nargs="+", default=["ours"])
+    parser.add_argument(
+        "--also",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("METHOD", "SETTINGS"),
+        help="a method with settings that the others do not have; may be given several times",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=int, default=2400)
@@ -51,14 +61,17 @@ def main() -> None:
     args = parser.parse_args()
     backend.activate()
     stop = ("steps", args.steps) if args.seconds is None else ("seconds", args.seconds)
+    fits = list(product(args.methods, args.settings))
+    fits += [(method, Path(settings)) for method, settings in args.also]
+    files = dict.fromkeys(settings for _, settings in fits)
     about = {
         "machine": machine(),
         "length": dict([stop]),
         "data": {data.name: described(data) for data in args.data},
-        "settings": {file.stem: file.read_text(encoding="utf-8") for file in args.settings},
+        "settings": {file.stem: file.read_text(encoding="utf-8") for file in files},
     }
     found = started(args.out, about, args.seeds) if args.go_on else {}
-    kinds = list(product(args.data, args.methods, args.settings))
+    kinds = [(data, *fit) for data, fit in product(args.data, fits)]
     names = [(data.name, method, settings.stem) for data, method, settings in kinds]
     if not found.keys() <= set(names):
         raise SystemExit(f"{args.out} is of other data sets, methods or settings")

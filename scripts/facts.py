@@ -17,6 +17,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path.append(str(ROOT / "tests"))
 
 import tables as benchmark_tables  # noqa: E402
 from summary import phases_of, read, roofline_of  # noqa: E402
@@ -26,6 +27,7 @@ from unbake.config import PAPER_DEPTH  # noqa: E402
 from unbake.evaluation.convergence import WINDOW  # noqa: E402
 from unbake.experiments.seeds import plus_minus  # noqa: E402
 from unbake.experiments.tables import markdown  # noqa: E402
+from unbake.imaging.metrics import HIGHEST  # noqa: E402
 from unbake.machine import same_machine  # noqa: E402
 
 Row = dict[str, Any]
@@ -138,13 +140,6 @@ class Facts:
         count = len(self.result(name)["seeds"])
         return "one seed" if count == 1 else f"{count} seeds"
 
-    def at_end(self, name: str, rival: str, quantity: str) -> Row:
-        """When ours has what a rival has at the end of its time, in an equal schedule."""
-        for row in benchmark_tables.at_end(self.result(name), quantity):
-            if row["name"] == rival:
-                return row
-        raise Unfounded(f"{name}.json has no scores of {rival}")
-
     def step(self, name: str, method: str, materials: str = "neural", spp: str = "") -> Row:
         """A row of `unbake bench methods`, the first that fits."""
         for row in self.result(name)["rows"]:
@@ -160,9 +155,9 @@ class Facts:
     def in_time(self) -> list[Row]:
         """Ours beside PRB after the same training time, a row a scene, by `benchmarks/variants.py`.
 
-        Rows have `data`, `seconds` and `seeds`, the row of each method by its name, and `how` they
-        were made: the processor, and what has changed since. Of a method with several settings it
-        is the row with the best mean of albedo and roughness.
+        Rows have `data`, `seconds` and `seeds`, the row of each method by its name, their
+        `yardsticks`, and `how` they were made: the processor, and what has changed since. Of a
+        method with several settings it is the row with the best mean of albedo and roughness.
         """
         rows = []
         for name in ("demo-in-time", "rooms", "objects", "lego-plant"):
@@ -178,11 +173,60 @@ class Facts:
                     "seconds": found["length"]["seconds"],
                     "seeds": len(found["seeds"]),
                     "how": ", ".join(filter(None, (on, found.get("note")))),
+                    "yardsticks": self.yardsticks(found, methods["ours"]),
                 }
                 | methods
                 for data, methods in by_scene.items()
             ]
         return rows
+
+    def yardsticks(self, found: Row, row: Row) -> dict[str, Row]:
+        """What the scores of a fit by `benchmarks/variants.py` are to be measured by.
+
+        Args:
+            found: the result.
+            row: a row of it.
+
+        Returns:
+            `untrained`, `constant` and `ceiling`, as far as they are known: PSNRs in dB by key.
+            Ceilings are those of the same views.
+        """
+        views = found["data"][row["data"]]
+        asked = (row["data"], views["train"], views["heldout"])
+        ceilings = self.result("ceilings")["rows"] if self.has("ceilings") else []
+        told: Row = {}
+        for other in ceilings:
+            if (other["data"], other["train_views"], other["heldout_views"]) == asked:
+                told = other
+        told = told | row
+        kinds = {}
+        for kind in ("untrained", "constant", "ceiling"):
+            scores = {key: told.get(f"{kind}_{key}") for key in MAPS}
+            if any(score is not None for score in scores.values()):
+                kinds[kind] = scores
+        return kinds
+
+    def of_one_value(self, quantity: str) -> list[str]:
+        """The scenes of `in_time` whose true map is one value, which a constant meets."""
+        constants = {row["data"]: self._constant(row, KEYS[quantity]) for row in self.in_time()}
+        return [f"`{data}`" for data, score in constants.items() if score and score >= HIGHEST]
+
+    def below_constant(self, method: str) -> list[str]:
+        """Where a method of `in_time` scores less than one value for the whole scene, in words.
+
+        Scenes that one value describes without error are left out.
+        """
+        told = []
+        for word, key in (("albedo", "albedo_psnr"), ("roughness", "roughness_psnr")):
+            for row in self.in_time():
+                score = self._constant(row, key)
+                if score is not None and row[method][key] < score < HIGHEST:
+                    told.append(f"{word} of `{row['data']}`")
+        return told
+
+    @staticmethod
+    def _constant(row: Row, key: str) -> float | None:
+        return row["yardsticks"].get("constant", {}).get(key)
 
     def behind_in_time(self) -> list[str]:
         """Where PRB is ahead of ours in `in_time` by more than seeds differ, in words."""
@@ -279,6 +323,28 @@ class Facts:
     def phases(self, name: str) -> str:
         """Where the time of the steps of a machine goes, as a table."""
         return benchmark_tables.phases(self.result(name))
+
+    def untried_commands(self) -> list[str]:
+        """The commands that got no signal in the campaign of `benchmarks/signals.py`, as code."""
+        from unbake.cli import COMMANDS
+
+        tried = {name.split()[0] for name in self.result("signals")["ends"]}
+        names = dict.fromkeys(name.split()[0] for name in COMMANDS)
+        return [f"`{name}`" for name in names if name not in tried]
+
+    def untried_formats(self) -> list[str]:
+        """The formats that `benchmarks/fuzz.py` has, and had not when its result was made."""
+        from fuzzing.formats import FORMATS
+
+        return [name for name in FORMATS if name not in self.result("fuzz")["formats"]]
+
+    def phase_sums(self, name: str) -> list[float]:
+        """The phases of each step of a machine together, over the whole step; the least first."""
+        return sorted(
+            sum(phase["milliseconds"] for phase in phases_of(step).values())
+            / step["milliseconds_per_step"]
+            for step in self.result(name)["steps"]
+        )
 
     def machine_file(self) -> str:
         """The name of the file of `unbake bench step` on the machine of the comparisons."""
@@ -508,13 +574,6 @@ def above(difference: float, spread: float = 0.0, digits: int = 1) -> str:
     return f"{'+' if difference > 0 else '−'}{shown} dB"
 
 
-def sooner(row: Row) -> str:
-    """When ours has what a rival has at its end, in words."""
-    if "ours" in row:
-        return f"after {plus_minus(row, 'ours', 1)} s, {row['times']:.0f} times sooner"
-    return "before its first step" if row["level"] else f"never in {row['never']} runs"
-
-
 def unit(form: str, factor: float = 1.0) -> Callable[[float, int], str]:
     """A filter that prints a number with a unit."""
 
@@ -526,7 +585,15 @@ def unit(form: str, factor: float = 1.0) -> Callable[[float, int], str]:
     return shown
 
 
+def psnr(value: float | None) -> str:
+    """A filter that prints a PSNR of a yardstick: nothing where it is not known."""
+    if value is None:
+        return ""
+    return "no error" if value >= HIGHEST else f"{value:.1f} dB"
+
+
 FILTERS: dict[str, Callable[..., str]] = {
+    "psnr": psnr,
     "number": unit("{}"),
     "dB": unit("{} dB"),
     "s": unit("{} s"),
@@ -553,5 +620,5 @@ def context(facts: Facts) -> dict[str, Any]:
     settings = {"rate_step": STEP, "light_share": SHARE, "least_depth": PAPER_DEPTH}
     settings |= {"score_window": WINDOW, "near_wanted": WANTED}
     settings["planned_gain"] = GAIN_OF_ROOMS
-    functions = {"sooner": sooner}
+    functions = {"above": above}
     return {name: getattr(facts, name) for name in public} | functions | settings

@@ -126,22 +126,21 @@ def page(name: str, results: Path = RESULTS, kept: Path = KEPT) -> str:
 
 
 def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
-    """Copy tables and data, pictures as JPEG, and licences, a folder an experiment."""
+    """Copy tables and data, pictures as JPEG, and licences, a folder an experiment.
+
+    Raises:
+        SystemExit: an experiment has another scale, or lacks scenes that are kept of it. Nothing
+            is copied then.
+    """
     import mitsuba as mi
 
     from unbake.experiments.scenes import SCENES
 
-    for data in sorted(results.glob("*/data.json")):
-        about = json.loads(data.read_text(encoding="utf-8"))
-        if about["scale"] != "cpu":
-            raise SystemExit(f"{data}: the page is of cpu scale, this is {about['scale']} scale")
-        rows, folder = about.pop("rows"), kept / data.parent.name
-        if joined := with_other_scenes(folder, about, rows):
-            about, texts = joined
-        else:
+    taken = {data: _taken(data, kept) for data in sorted(results.glob("*/data.json"))}
+    for data, (about, texts, whole) in taken.items():
+        folder = kept / data.parent.name
+        if whole:
             shutil.rmtree(folder, ignore_errors=True)
-            names = ("data.csv", "table.md")
-            texts = {name: data.with_name(name).read_text(encoding="utf-8") for name in names}
         folder.mkdir(parents=True, exist_ok=True)
         texts["about.json"] = json.dumps(about, indent=1) + "\n"
         for name, text in texts.items():
@@ -156,12 +155,41 @@ def take_over(results: Path, scenes: Path, kept: Path = KEPT) -> None:
         shutil.copy(scenes / scene.folder / "LICENSE.txt", licences / f"{scene.folder}.txt")
 
 
+def _taken(data: Path, kept: Path) -> tuple[Row, dict[str, str], bool]:
+    """What is taken over of an experiment: about it, its texts, and whether it replaces all."""
+    about = json.loads(data.read_text(encoding="utf-8"))
+    if about["scale"] != "cpu":
+        raise SystemExit(f"{data}: the page is of cpu scale, this is {about['scale']} scale")
+    rows, folder = about.pop("rows"), kept / data.parent.name
+    if joined := with_other_scenes(folder, about, rows):
+        return *joined, False
+    if missing := _lacks(folder, rows):
+        scenes = ", ".join(missing)
+        raise SystemExit(f"{data}: {scenes} of {folder} would be lost. Make it without --only")
+    names = ("data.csv", "table.md")
+    texts = {name: data.with_name(name).read_text(encoding="utf-8") for name in names}
+    return about, texts, True
+
+
+def _lacks(folder: Path, rows: list[Row]) -> list[str]:
+    """The scenes that are kept of an experiment of this version, and that new rows lack."""
+    if not (folder / "about.json").is_file():
+        return []
+    facts, name = Facts(RESULTS, folder.parent), folder.name
+    if "made_with" in facts.about(name):
+        return []
+    before = (row["scene"] for row in facts.rows(name) if "scene" in row)
+    new = {row.get("scene") for row in rows}
+    return [scene for scene in dict.fromkeys(before) if scene not in new]
+
+
 def with_other_scenes(
     folder: Path, about: Row, rows: list[Row]
 ) -> tuple[Row, dict[str, str]] | None:
     """Results of Figure 6 with those that are kept of scenes that they lack.
 
-    `unbake reproduce fig6 --only SCENES` makes it a part at a time.
+    `unbake reproduce fig6 --only SCENES` makes it a part at a time. Each scene counts the time of
+    the run that its rows are of.
 
     Returns:
         What is known of the run, and the texts of files; None if there is nothing to keep.
@@ -181,10 +209,19 @@ def with_other_scenes(
     every = [{k: v for k, v in row.items() if v is not None} for row in [*rows, *others]]
     every.sort(key=lambda row: order.index(row["scene"]))
     machines = [*before["machines"], *about["machines"]]
-    joined = about | {
-        "machines": list({json.dumps(machine): machine for machine in machines}.values()),
-        "seconds": before["seconds"] + about["seconds"],
-    }
+    if "seconds_by_scene" not in about:
+        again = "run `unbake reproduce fig6` with the same options again, which keeps its fits"
+        raise SystemExit(f"{folder.name}: times of scenes are missing; {again}")
+    spent = before["seconds_by_scene"] | about["seconds_by_scene"]
+    joined = (
+        before
+        | about
+        | {
+            "machines": list({json.dumps(machine): machine for machine in machines}.values()),
+            "seconds": round(sum(spent.values()), 1),
+            "seconds_by_scene": spent,
+        }
+    )
     return joined, {"data.csv": csv_text(every), "table.md": fig6.tables(every) + "\n"}
 
 

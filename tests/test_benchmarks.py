@@ -261,6 +261,15 @@ def test_tables_have_the_untrained_fields_first_and_tell_of_how_many_seeds(bench
     assert "SH error, aligned" in columns and "relighting, aligned" in columns
 
 
+def test_faults_of_cameras_are_marked_where_an_earlier_version_fitted_them(benchmarks):
+    row = {"albedo_psnr": 30.0, "roughness_psnr": 24.0}
+    rows = [{"fault": "none", "cameras": "known", "made": "2026-11-29"} | row]
+    rows += [{"fault": "poses", "cameras": cameras} | row for cameras in ("known", "fitted")]
+    rows[-1]["made"] = "2026-11-29"
+    lines = benchmarks("tables")["cameras"]({"rows": rows}).splitlines()[2:]
+    assert lines == ["| none | 30.0 / 24.0 |  |  |", "| poses † | 30.0 / 24.0 | 30.0 / 24.0 |  |"]
+
+
 def test_untrained_fields_of_several_files_are_told_once_if_they_are_the_same(benchmarks):
     def result(albedo, start=None):
         known = {} if start is None else {"untrained": {"albedo_psnr": start}}
@@ -309,9 +318,22 @@ def test_equal_schedules_tell_what_untrained_fields_have_as_well(benchmarks):
     methods["ad-pt"] = {"error": "no memory"}
     result = {"seeds": [0, 1], "methods": methods}
     rows = benchmarks("tables")["equal_schedules"](result).splitlines()
-    assert rows[2] == "| albedo | `prb` | 14.0 ± 0.0 dB | 22.5 ± 10.6 s | 3.0 ± 1.4 |"
+    assert (
+        rows[2] == "| albedo | `prb` | 14.0 ± 0.0 dB | 60.0 ± 0.0 s | 22.5 ± 10.6 s | 3.0 ± 1.4 |"
+    )
     assert "untrained fields have it in 1 of 2 runs" in rows[3] and "`direct`" in rows[3]
     assert "not in 1 of 2 runs" in rows[4] and "`no-prior`" in rows[4] and len(rows) == 7
+
+
+def test_a_rival_that_is_early_at_its_end_is_timed_by_that_and_not_by_its_whole_fit(benchmarks):
+    def fit(*curve):
+        points = [{"seconds": t, "albedo_psnr": psnr} for t, psnr in curve]
+        return {"per_seed": [{"seed": 0, "score": points}], "seconds": 60.0}
+
+    methods = {"ours": fit((0.0, 8.0), (60.0, 20.0))}
+    methods["prb"] = fit((0.0, 8.0), (15.0, 14.0), (60.0, 14.0))
+    rows = benchmarks("tables")["equal_schedules"]({"seeds": [0], "methods": methods}).splitlines()
+    assert rows[2] == "| albedo | `prb` | 14.0 dB | 15.0 s | 30.0 s | 0.5 |"
 
 
 def test_groups_of_held_out_views_are_scored_apart(benchmarks, tmp_path):
@@ -365,11 +387,14 @@ def test_cameras_of_half_a_room_never_see_the_other_half(repository, built_in):
 def test_files_of_steps_become_one_of_the_machine(benchmarks, tmp_path):
     machine = {"processor": "Some (TM) CPU", "cores": 2, "variant": "llvm_ad_rgb"}
     files = [tmp_path / name for name in ("a.json", "b.json")]
-    for file in files:
-        file.write_text(json.dumps({"machine": machine, "data": file.stem}))
-    name, result = benchmarks("summary")["machine_results"](files)
-    assert name == "some-tm-cpu-2-cores-llvm"
-    assert result == {"machine": machine, "steps": [{"data": "a"}, {"data": "b"}]}
+    steps = [{"data": "a"}, {"data": "b"}]
+    for days, made in (((), {}), (("2026-12-01", "2026-11-30"), {"made": "2026-12-01"})):
+        told = [{"made": day} for day in days] or [{}, {}]
+        for file, step, more in zip(files, steps, told, strict=True):
+            file.write_text(json.dumps({"machine": machine, **more, **step}))
+        name, result = benchmarks("summary")["machine_results"](files)
+        assert name == "some-tm-cpu-2-cores-llvm"
+        assert result == {"machine": machine, **made, "steps": steps}
 
 
 #: Results that are not committed yet.
@@ -559,6 +584,29 @@ def test_variants_go_on_where_they_ended_and_are_not_mixed_with_others(
     settings.write_text(settings.read_text() + "\n# others\n")
     with pytest.raises(SystemExit, match="settings"):
         run(*words, "--go-on")
+
+
+def test_variants_give_one_method_settings_that_others_do_not_have(
+    benchmarks, cornell, tiny, tmp_path, monkeypatch
+):
+    main, made, out = benchmarks("variants")["main"], [], tmp_path / "out.json"
+
+    def fit(data, settings, method, seed, stop):
+        made.append((seed, method, settings.stem))
+        return dict.fromkeys(("albedo_psnr", "roughness_psnr", "render_psnr"), 20.0)
+
+    files = [tmp_path / name for name in ("usual.toml", "own.toml")]
+    for file in files:
+        file.write_text(tiny.read_text())
+    words = ["--data", cornell, "--settings", files[0], "--methods", "ours", "prb"]
+    words += ["--also", "prb", files[1], "--seeds", 0, 1, "--steps", 5, "--out", out]
+    monkeypatch.setitem(main.__globals__, "fit", fit)
+    monkeypatch.setattr(sys, "argv", ["variants.py", *map(str, words)])
+    main()
+    turn = [("ours", "usual"), ("prb", "usual"), ("prb", "own")]
+    assert made == [(seed, *fit) for seed in (0, 1) for fit in turn]
+    assert [(row["method"], row["settings"]) for row in read(out)["rows"]] == turn
+    assert read(out)["settings"].keys() == {"usual", "own"}
 
 
 @pytest.mark.slow

@@ -133,7 +133,7 @@ def test_results_that_are_not_measured_yet_have_their_place(writer, tmp_path):
     assert "over 2 seeds; fits of `prb` take 30 s." in words
     assert "| two passes, as in Mitsuba | no |" in words
     assert "as many camera samples as `prb` traces in" in words
-    assert "`untrained` is not a method" in words and "Behind the door" not in words
+    assert "rows of each scene are no methods" in words and "Behind the door" not in words
     assert "`rivals-demo.json`" not in page
 
 
@@ -175,6 +175,117 @@ def test_where_a_rival_is_ahead_is_told_beyond_the_spread_alone(writer, tmp_path
     assert "| 30.0 ± 1.0 |" in readme
 
 
+def test_constants_and_ceilings_stand_beside_methods(writer, tmp_path):
+    """Ceilings of other views are left out."""
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    lego = json.loads((results / "lego-plant.json").read_text())
+    ours = next(r for r in lego["rows"] if (r["data"], r["method"]) == ("plant", "ours"))
+    both = {"ceiling_albedo_psnr": ours["albedo_psnr"] + 0.25, "ceiling_roughness_psnr": 41.5}
+    views = {"plant": (25, 6), "kitchen": (3, 6), "box": (16, 3)}
+    rows = [
+        {"data": name, "train_views": train, "heldout_views": heldout} | both
+        for name, (train, heldout) in views.items()
+    ]
+    (results / "ceilings.json").write_text(json.dumps({"rows": rows}))
+    page, readme = (writer["page"](n, results=results) for n in ("docs/comparison.md", "README.md"))
+    ceiling = f"{both['ceiling_albedo_psnr']:.1f} dB"
+    assert f"| `plant` | ceiling |  | {ceiling} | 41.5 dB |  |\n" in page
+    assert "| `kitchen` | ceiling" not in page and "| `kitchen` | constant |" in page
+    assert "| `dragon` | constant |  | no error | no error |  |\n" in page
+    words = " ".join(page.split())
+    assert f"its ceiling of albedo is {ceiling}, and `ours` is within 0.2 dB of it" in words
+    assert "Three rows of each scene" in words and "as [above]" in words
+    assert f" | {ceiling} | 17.3 dB |" in next(x for x in page.split("\n") if "| `box`" in x)
+    tables = re.findall(r"(?:^\|.*\n)+", page + readme, re.MULTILINE)
+    assert all(len({line.count("|") for line in table.splitlines()}) == 1 for table in tables)
+    assert "`dragon`, `lego`, `plant` have a single true roughness" in words
+    told = "a material. What the same fields can reach at best is [measured]"
+    assert told in (words := " ".join(readme.split())) and f"too: {ceiling} of albedo for" in words
+
+
+def test_scores_below_a_constant_are_told(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "rooms.json").read_text())
+    for row in content["rows"]:
+        row |= {"albedo_psnr": 10.0, "constant_albedo_psnr": 9.0, "roughness_psnr": 20.0}
+        row["constant_roughness_psnr"] = 21.0 if row["data"] == "staircase" else 19.0
+    (results / "rooms.json").write_text(json.dumps(content))
+    found = writer["Facts"](results, ROOT / "docs" / "reproduction").below_constant("prb")
+    assert "roughness of `staircase`" in found and not any("kitchen" in told for told in found)
+    assert not any("`dragon`" in told for told in found)
+
+
+def test_the_squared_prior_is_named_as_its_figure_names_it(writer, tmp_path):
+    kept = tmp_path / "reproduction"
+    shutil.copytree(ROOT / "docs" / "reproduction", kept)
+    file = kept / "fig7" / "about.json"
+    about = json.loads(file.read_text())
+    assert "made_with" in about and "PRB" not in about["made_with"]
+    newer = {key: value for key, value in about.items() if key != "made_with"}
+    for told in (about, newer):
+        file.write_text(json.dumps(told))
+        page = " ".join(writer["page"]("docs/reproduction.md", kept=kept).split())
+        assert ("the fits of Figure 6 where it has them" in page) == ("made_with" not in told)
+        assert "The squared prior is the row *+ prior*, which [Figure 8]" in page
+
+
+def test_a_prior_that_loses_to_direct_light_is_told(writer, tmp_path):
+    kept = tmp_path / "reproduction"
+    shutil.copytree(ROOT / "docs" / "reproduction", kept)
+    file = kept / "fig8" / "data.csv"
+    with open(file, encoding="utf-8", newline="") as text:
+        rows = list(csv.DictReader(text))
+    for error in (0.5, 0.001):
+        for row in rows:
+            if row["method"] == "with-prior":
+                row["sh_error"] = str(error)
+        with open(file, "w", encoding="utf-8", newline="") as text:
+            table = csv.DictWriter(text, rows[0])
+            table.writeheader()
+            table.writerows(rows)
+        page = " ".join(writer["page"]("docs/reproduction.md", kept=kept).split())
+        assert f"low frequencies are {100 * error:.1f} % off" in page
+        assert ("does not beat direct illumination by itself" in page) == (error > 0.1)
+
+
+def test_what_a_campaign_did_not_have_yet_is_told(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    facts = writer["Facts"](results, ROOT / "docs" / "reproduction")
+    signals, fuzz = (json.loads((results / f"{n}.json").read_text()) for n in ("signals", "fuzz"))
+    now = [*signals["ends"], *(name.strip("`") for name in facts.untried_commands())]
+    formats = [*fuzz["formats"], *facts.untried_formats()]
+    assert "data" in now and len(formats) >= 29
+    for lacking in (True, False):
+        ends = {name: {} for name in now if name != "solve" or not lacking}
+        kept = [name for name in formats if name != "lights" or not lacking]
+        told = signals | {"ends": ends, "sent": 36 * len(ends)}
+        (results / "signals.json").write_text(json.dumps(told))
+        (results / "fuzz.json").write_text(json.dumps(fuzz | {"formats": dict.fromkeys(kept)}))
+        page = " ".join(writer["page"]("docs/reliability.md", results=results).split())
+        assert ("which now has `solve` as well" in page) == lacking
+        assert ("which now has 1 format more (lights)" in page) == lacking
+        assert "signals.py --each 12`" in page and f"of {len(kept)} formats" in page
+
+
+def test_a_step_that_differs_from_that_of_the_table_of_steps_is_told(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    facts = writer["Facts"](results, ROOT / "docs" / "reproduction")
+    name, side = facts.machine_file(), facts.step("methods-demo", "ours")["milliseconds_per_step"]
+    content = json.loads((results / f"{name}.json").read_text()) | {"made": "2001-02-03"}
+    for times in (1.1, 1.6):
+        for step in content["steps"]:
+            step["milliseconds_per_step"] = times * side
+            step["phases"] = {"all": {"milliseconds": times * side * 1.13}}
+        (results / f"{name}.json").write_text(json.dumps(content))
+        page = " ".join(writer["page"]("docs/performance.md", results=results).split())
+        assert ("are of other states of the code or of the machine" in page) == (times > 1.5)
+        assert "from 113 % to 113 % of the whole step" in page and "on 2001-02-03" in page
+
+
 def test_what_has_changed_since_a_result_is_told_with_its_scenes(writer, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(ROOT / "benchmarks" / "results", results)
@@ -214,9 +325,12 @@ def test_a_figure_of_some_scenes_keeps_what_there_is_of_others(writer, tmp_path)
     about, scenes = facts.about("fig6"), facts.by_scene("fig6")
     again = [row | {"albedo_psnr": 77.7} for row in facts.rows("fig6") if row["scene"] == "KITCHEN"]
     assert join(kept / "fig6", about, facts.rows("fig6")) is None
-    joined, texts = join(kept / "fig6", about | {"machines": [{"processor": "a new one"}]}, again)
+    run = {"machines": [{"processor": "a new one"}], "seconds": 7.0}
+    run["seconds_by_scene"] = {"kitchen": 7.0}
+    joined, texts = join(kept / "fig6", about | run, again)
     assert joined["machines"] == [*about["machines"], {"processor": "a new one"}]
-    assert joined["seconds"] == 2 * about["seconds"]
+    others = sum(v for k, v in about["seconds_by_scene"].items() if k != "kitchen")
+    assert joined["seconds"] == pytest.approx(others + 7.0)
     for name, text in texts.items():
         (kept / "fig6" / name).write_text(text)
     after = type(facts)(RESULTS, kept)
@@ -229,6 +343,26 @@ def test_a_figure_of_some_scenes_keeps_what_there_is_of_others(writer, tmp_path)
     lines = facts.experiment_table("fig6").splitlines()
     other = [line for line in lines if line.startswith("| STAIRCASE |")]
     assert other and set(other) <= set(table.splitlines()) and "77.7" in table
+
+
+def test_results_without_some_scenes_do_not_replace_those_of_all(writer, tmp_path):
+    """Nothing is taken over then, also of other experiments."""
+    kept, results = tmp_path / "kept", tmp_path / "reproduction"
+    for name in ("fig3", "table2"):
+        shutil.copytree(ROOT / "docs" / "reproduction" / name, kept / name)
+        shutil.copytree(ROOT / "docs" / "reproduction" / name, results / name)
+        about = json.loads((kept / name / "about.json").read_text())
+        rows = [{"scene": "STAIRCASE"}] if name == "fig3" else [{"albedo": 0.3}]
+        (results / name / "data.json").write_text(json.dumps(about | {"rows": rows}))
+    (results / "table2" / "table.md").write_text("another")
+
+    def contents():
+        return {file: file.read_bytes() for file in kept.rglob("*") if file.is_file()}
+
+    before = contents()
+    with pytest.raises(SystemExit, match=r"KITCHEN.*fig3 would be lost.*without --only"):
+        writer["take_over"](results, tmp_path, kept)
+    assert contents() == before and len(before) > 5
 
 
 def test_methods_whose_steps_are_as_fast_as_ours_are_told(writer, tmp_path):

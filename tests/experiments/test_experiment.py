@@ -79,6 +79,21 @@ def test_jobs_that_are_done_are_not_done_again(tmp_path):
     assert (tmp_path / "squares" / "table.md").read_text().endswith("| 1 | — |\n")
 
 
+def test_the_time_of_each_scene_is_kept(tmp_path):
+    def jobs(_):
+        names = {"a-data": "a", "a-0": "a", "b": ""}
+        return [Job(n, {}, dict, 1.0, group=group) for n, group in names.items()]
+
+    by_scene = dataclasses.replace(squares([]), jobs=jobs, by_scene=True)
+    reproduce(by_scene, context(tmp_path))
+    for name, seconds in {"a-data": 1.25, "a-0": 2.5, "b": 4.0}.items():
+        file = tmp_path / "work" / "smoke" / "squares" / f"{name}.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"seconds": seconds}))
+    reproduce(by_scene, context(tmp_path))
+    data = json.loads((tmp_path / "squares" / "data.json").read_text())
+    assert data["seconds_by_scene"] == {"a": 3.8, "b": 4.0} and data["seconds"] == 7.8
+
+
 def test_jobs_with_other_settings_or_damaged_are_done_again(tmp_path):
     done = []
     reproduce(squares(done), context(tmp_path))

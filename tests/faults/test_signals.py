@@ -181,3 +181,23 @@ def test_interrupted_fits_are_saved(benchmark, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", SOURCE)
     result = benchmark("signals.py")["interrupt"](tmp_path, each=1, seed=0, only=["fit"])
     assert result["sent"] == 3 and not result["failures"]
+
+
+@pytest.mark.slow
+def test_commands_end_by_a_signal_at_any_instant(benchmark, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", SOURCE)
+    others = ["import", "data check", "export", "render", "relight", "view", "solve", "degrade"]
+    result = benchmark("signals.py")["interrupt"](tmp_path, each=1, seed=0, only=others)
+    assert result["ends"].keys() == set(others) and not result["failures"]
+
+
+def test_the_campaign_of_signals_has_every_command(benchmark, tmp_path, monkeypatch):
+    commands = benchmark("signals.py")["_commands"]
+    monkeypatch.setitem(commands.__globals__, "start", lambda words: subprocess.Popen(["true"]))
+    data, done = tmp_path / "data", tmp_path / "done"
+    for folder in (done, data / "images", data / "scene" / "meshes"):
+        folder.mkdir(parents=True)
+    (data / "transforms.json").write_text('{"scene": "scene/scene.xml", "frames": []}')
+    fit = ["fit", "data", "--settings", "settings.toml"]
+    tried = commands(tmp_path, data, fit, done, tmp_path / "out").values()
+    assert {words[0] for words in tried} == {name.split()[0] for name in cli.COMMANDS}

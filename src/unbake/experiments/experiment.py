@@ -161,7 +161,7 @@ def reproduce(
     if not ranks.leads:
         return
     result = experiment.result(context, outcome.findings)
-    _write(experiment, context, result, outcome.records)
+    _write(experiment, context, result, jobs, outcome.records)
     context.tell(result.tables)
     context.tell(f"wrote {context.out / experiment.name}")
 
@@ -176,6 +176,15 @@ def save_figure(figure: Figure, path: Path) -> None:
     write_atomically(path, lambda file: figure.savefig(file, dpi=130, format="png"))
 
 
+def _seconds_by_scene(jobs: Sequence[Job], records: Mapping[str, Record]) -> dict[str, float]:
+    """The time of the jobs of each scene, by its folder: their group, or else their name."""
+    spent: dict[str, float] = {}
+    for job in jobs:
+        scene = job.group or job.name
+        spent[scene] = spent.get(scene, 0.0) + records[job.name]["seconds"]
+    return {scene: round(seconds, 1) for scene, seconds in spent.items()}
+
+
 def _release_memory() -> None:
     gc.collect()
     dr.flush_malloc_cache()
@@ -185,6 +194,7 @@ def _write(
     experiment: Experiment,
     context: ExperimentContext,
     result: ExperimentResult,
+    jobs: Sequence[Job],
     records: Mapping[str, Record],
 ) -> None:
     folder = context.out / experiment.name
@@ -196,8 +206,10 @@ def _write(
         # Jobs that were continued elsewhere ran on several machines.
         "machines": list({json.dumps(machine): machine for machine in machines}.values()),
         "seconds": round(sum(record["seconds"] for record in records.values()), 1),
-        "rows": [dict(row) for row in result.rows],
     }
+    if experiment.by_scene:
+        data["seconds_by_scene"] = _seconds_by_scene(jobs, records)
+    data["rows"] = [dict(row) for row in result.rows]
     write_json(folder / "data.json", data)
     write_text(folder / "data.csv", csv_text(result.rows))
     write_text(folder / "table.md", result.tables.rstrip() + "\n")
