@@ -26,7 +26,14 @@ from unbake.dataset.views import Dataset, View
 from unbake.errors import UserError
 from unbake.exports import export as exporting
 from unbake.exports import gltf
-from unbake.exports.bake import WANTED, Baker, bake_texture, own_opacities, own_textures
+from unbake.exports.bake import (
+    WANTED,
+    Baker,
+    bake_texture,
+    look_up,
+    own_opacities,
+    own_textures,
+)
 from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
 from unbake.exports.lights import environment_picture
@@ -40,6 +47,7 @@ from unbake.exports.upright import Up
 from unbake.exports.usd import write_usd
 from unbake.imaging.metrics import psnr
 from unbake.imaging.pictures import read_exr, tonemap, write_exr, write_png
+from unbake.quantities import QUANTITIES
 from unbake.scene.triangles import write_mesh
 from unbake.training.loop import fit
 from unbake.training.recovered import Recovered, load_run
@@ -601,8 +609,16 @@ def test_the_environment_of_gltf_stands_upright(tmp_path):
     picture = np.zeros((32, 64, 3), np.float32)
     picture[12:14, 20:22] = 50
     up = Up.of(cameras_of(leaning(40)))
-    notes = exporting._environment_of_gltf(tmp_path, picture, up)
-    assert notes[0].endswith("for scene.glb it is environment_upright.exr") and len(notes) == 2
+    for formats, told in (
+        (["gltf"], ""),
+        (["gltf", "usd"], ", as in usd"),
+        (["gltf", "mitsuba", "usd"], ", as in mitsuba and usd"),
+    ):
+        notes = exporting._environment_of_gltf(tmp_path, picture, up, formats)
+        assert notes == [
+            "glTF has no environment: for scene.glb it is environment_upright.exr",
+            f"environment.exr has the axes of the scene{told}",
+        ]
     write_exr(tmp_path / "environment.exr", picture)
     d = np.random.default_rng(0).normal(size=(3, 4000))
     d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
@@ -616,7 +632,7 @@ def test_the_environment_of_gltf_stands_upright(tmp_path):
     assert np.linalg.norm(means[0]) > 0.9
     np.testing.assert_allclose(up.rotation("Y") @ means[0], means[1], atol=0.03)
     level = Up.of(cameras_of((0, 1, 0)))
-    (note,) = exporting._environment_of_gltf(tmp_path / "none", picture, level)
+    (note,) = exporting._environment_of_gltf(tmp_path / "none", picture, level, ["gltf"])
     assert note.endswith("for scene.glb it is environment.exr") and not (tmp_path / "none").exists()
 
 
@@ -936,6 +952,7 @@ def test_an_environment_that_was_known_is_taken_along(with_metallic, tmp_path, m
     for made in (file, out / "environment_upright.exr"):  # z is up
         np.testing.assert_allclose(read_exr(made), 0.5, rtol=1e-3)
     assert manifest["environment"] == file.name
+    assert manifest["environment_upright"] == "environment_upright.exr"
     stage = Usd.Stage.Open(str(out / "usd" / "scene.usdc"))
     (dome,) = (p for p in stage.Traverse() if p.IsA(UsdLux.DomeLight))
     found = UsdLux.DomeLight(dome).GetTextureFileAttr().Get().resolvedPath
@@ -1085,18 +1102,25 @@ def test_a_metal_in_several_materials_keeps_its_texture_in_all(tmp_path):
         assert (np.abs(found - truth).max(0) < 0.01).mean() > 0.9, x
 
 
-def striped(name, slot, folder):
-    """A texture of 16 stripes with sharp edges."""
-    stripes = np.broadcast_to(np.arange(64) // 4 % 2, (64, 64)).astype(np.float32)
-    write_exr(folder / f"{name}.exr", stripes)
+def striped(name, slot, folder, *, count=16, low=0.0, high=1.0):
+    """A texture of stripes with sharp edges."""
+    stripes = np.broadcast_to(np.arange(4 * count) // 4 % 2, (64, 4 * count))
+    write_exr(folder / f"{name}.exr", (low + (high - low) * stripes).astype(np.float32))
     return f'''<texture type="bitmap" name="{slot}"><string name="filename" value="{name}.exr"/>
       <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/></texture>'''
 
 
-@pytest.mark.parametrize("slot", ["metallic", "opacity"])
-def test_known_textures_are_as_fine_as_in_the_scene(slot, tmp_path):
+@pytest.mark.parametrize(
+    ("slot", "stripes", "size"),
+    [
+        ("metallic", {}, 512),
+        ("opacity", {"low": 0.3, "high": 0.7}, 512),
+        ("opacity", {"count": 60}, 256),  # a cut-out, which shows where it is above a half
+    ],
+)
+def test_known_textures_are_as_fine_as_in_the_scene(slot, stripes, size, tmp_path):
     """Smooth fields ask for less; a texture that stays coarse is told."""
-    texture = striped("stripes", slot, tmp_path)
+    texture = striped("stripes", slot, tmp_path, **stripes)
     inner = f'<bsdf type="principled" id="sheet">{texture if slot == "metallic" else ""}</bsdf>'
     bsdf = f'<bsdf type="mask">{texture}{inner}</bsdf>' if slot == "opacity" else inner
     (tmp_path / "scene.xml").write_text(
@@ -1110,7 +1134,7 @@ def test_known_textures_are_as_fine_as_in_the_scene(slot, tmp_path):
         for words in [("refine", "known"), ("known",), ("refine",), ()]
     }
     sizes = {words: one.atlas.resolution for words, one in baked.items()}
-    assert sizes == {("refine", "known"): 512, ("known",): 64, ("refine",): 64, (): 64}
+    assert sizes == {("refine", "known"): size, ("known",): 64, ("refine",): 64, (): 64}
     coarse = {words: one.coarse for words, one in baked.items()}
     assert coarse == {("refine", "known"): [], ("known",): [slot], ("refine",): [], (): []}
     (note,) = (n for n in exporting._notes(PARTS, [baked["known",]], [], "more") if slot in n)
@@ -1118,6 +1142,71 @@ def test_known_textures_are_as_fine_as_in_the_scene(slot, tmp_path):
 
 
 PARTS = SimpleNamespace(left_out=[])
+
+
+def test_soft_edges_of_cut_outs_ask_for_no_more_texels(tmp_path):
+    """What other programs show of them is right long before their opacities are."""
+    y, x = (np.mgrid[:64, :64] + 0.5) / 64
+    leaf = np.zeros((64, 64), np.float32)
+    for column, row in np.random.default_rng(0).random((12, 2)):
+        leaf[np.hypot((x - column) / 0.06, (y - row) / 0.12) < 1] = 1
+    write_exr(tmp_path / "leaf.exr", leaf)
+    bsdf = """<bsdf type="mask"><texture type="bitmap" name="opacity"><string name="filename"
+      value="leaf.exr"/><boolean name="raw" value="true"/></texture>
+      <bsdf type="principled" id="sheet"/></bsdf>"""
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><shape type="rectangle">{bsdf}</shape></scene>'
+    )
+    views = SeenFrom(-np.inf)
+    one = baked_of(tmp_path / "scene.xml", views, 2.0, refine=True, known=True)["sheet"]
+    assert one.atlas.resolution == 64 and not one.coarse and not one.blends
+    assert 0.99 < one.known_near["opacity"] < 1
+
+
+def test_thin_blades_do_not_vanish(tmp_path):
+    """They are 3 % of a sheet, and lie between the places where texels are looked up at first."""
+    column = np.arange(1024) % 256
+    grass = np.broadcast_to((column >= 45) & (column < 52), (4, 1024))
+    write_exr(tmp_path / "grass.exr", grass.astype(np.float32))
+    bsdf = f'<bsdf type="mask">{opacity_of("grass.exr")}<bsdf type="principled" id="sheet"/></bsdf>'
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><shape type="rectangle">{bsdf}</shape></scene>'
+    )
+    coarse, fine = (
+        baked_of(tmp_path / "scene.xml", SeenFrom(-np.inf), 2.0, refine=refine, known=True)["sheet"]
+        for refine in (False, True)
+    )
+    assert (coarse.opacity < 0.5).all() and coarse.coarse == ["opacity"]
+    assert (fine.opacity >= 0.5).mean() > 0.02 and not fine.coarse
+
+
+@pytest.mark.parametrize("value", [0.7, 5.0])
+def test_textures_of_one_number_stay_small(value, cut):
+    """Rounding is no detail."""
+    one = baked_of(cut, SeenFrom(-np.inf), 2.0)["leaves paint"]
+    picture = mi.Bitmap(np.full((16, 16, 3), value, np.float32))
+    texture = mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True})
+    pixels, is_near = bake_texture(one, texture, colour=False, refine=True)
+    assert is_near and len(pixels) == one.atlas.resolution == 64
+    np.testing.assert_allclose(pixels, value, rtol=1e-5)
+
+
+def test_all_materials_are_looked_up_by_one_kernel():
+    texture = mi.load_dict({"type": "uniform", "value": 0.5})
+    own = {material: dict.fromkeys(QUANTITIES, texture) for material in range(3)}
+    number = dr.opaque(mi.UInt32, 1, 64)
+    hashes = set()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for material in own:
+            si = dr.zeros(mi.SurfaceInteraction3f, 64)
+            si.uv = mi.Point2f(dr.opaque(mi.Float, 0.3, 64))
+            dr.kernel_history_clear()
+            found = look_up(None, own, (material,), si, number, None, mi.Bool(True))
+            dr.eval(found)
+            hashes.add(tuple(k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])))
+            is_one = np.array(found["metallic"][0]) == (0.5 if material == 1 else 0)
+            assert is_one.all()
+    assert len(hashes) == 1
 
 
 def test_what_is_finer_than_texels_is_averaged(cut):
@@ -1379,6 +1468,33 @@ def test_holes_are_no_surface(cut):
     assert baked["veil paint"].constant_opacity == pytest.approx(0.3, abs=1e-5)
     assert baked["fog paint"].constant_opacity is None
     assert baked_of(cut, SeenFrom(np.inf))["leaf paint"].unobserved_share == 1
+
+
+def test_curtains_beside_walls_of_their_material_are_seen(tmp_path):
+    """What is transparent to a part is blended, however small it is beside what is solid."""
+    fog = {"low": 0.3, "high": 0.4}
+    places = {"wall": ("paint", 0, 5), "curtain": ("veil", 11, 0.5), "steam": ("fog", 13, 0.5),
+              "board": ("cover", 19, 5)}  # fmt: skip
+    shapes = [
+        f"""<shape type="rectangle" id="{name}"><ref id="{bsdf}"/><transform name="to_world">
+          <scale value="{scale}"/><translate x="{x}"/></transform></shape>"""
+        for name, (bsdf, x, scale) in places.items()
+    ]
+    (tmp_path / "scene.xml").write_text(
+        f"""<scene version="3.0.0"><bsdf type="principled" id="paint"/>
+          <bsdf type="principled" id="cover"/>
+          <bsdf type="mask" id="veil"><float name="opacity" value="0.3"/><ref id="paint"/></bsdf>
+          <bsdf type="mask" id="fog">{striped("fog", "opacity", tmp_path, **fog)}
+            <ref id="cover"/></bsdf>{"".join(shapes)}</scene>"""
+    )
+    baked = baked_of(tmp_path / "scene.xml", SeenFrom(-np.inf), 2.0)
+    found = {placed.part.name: one for one in baked.values() for placed in one.atlas.placed}
+    assert found["wall"].opacity is None and not found["wall"].blends
+    assert found["curtain"].blends and found["curtain"].covered.all()
+    assert found["curtain"].constant_opacity == pytest.approx(0.3, abs=1e-5)
+    shared = found["steam"]
+    assert shared is found["board"] and shared.blends and shared.opacity.max() == 1
+    assert shared.known_near == {} and shared.opacity.min() == pytest.approx(0.3, abs=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -1805,6 +1921,21 @@ def test_views_see_through_holes_and_lamps_that_images_do_not_show(opacity, hidd
     up, both = mi.Normal3f(0, 0, mi.Float([1, 1, 1])), dr.ones(mi.Bool, 3)
     seen = np.array(Views(scene, [above], hide_emitters=hidden).see(p, up, ~both, both))
     assert seen.tolist() == [opacity < 0.5, hidden, True]
+
+
+def test_cameras_are_asked_until_all_is_seen(mixed, monkeypatch):
+    scene = parsed_principled(mixed, mixed.parent).instantiate()
+    above = LookAt((-0.7, 0.2, 3.0), (-0.7, 0.2, 0.0), (0, 1, 0), 50.0).camera(8, 8)
+    away = above.moved(np.array([0.0, 3.0, 0.0]), np.zeros(3))
+    asked, sees = [], Views._sees
+    monkeypatch.setattr(
+        Views, "_sees", lambda self, n, *rest: asked.append(n) or sees(self, n, *rest)
+    )
+    p = mi.Point3f(np.array([(-1.3, 0.2, 0), (0.1, 0.2, 0)], np.float32).T.copy())
+    up, both = mi.Normal3f(0, 0, mi.Float([1, 1])), dr.ones(mi.Bool, 2)
+    views = Views(scene, [away, above, away])
+    assert np.array(views.see(p, up, ~both, both)).all() and asked == [0, 1]
+    assert not np.array(views.see(p, up, ~both, ~both)).any() and asked == [0, 1]
 
 
 def test_views_see_nothing_in_pixels_that_do_not_count(mixed):

@@ -18,6 +18,7 @@ from ..imaging.pictures import encoded
 from ..memory import free_bytes, require_memory
 from ..quantities import QUANTITIES
 from ..scene.parse import ParsedScene, is_reference, is_spectrum, reason
+from .constants import CUTOFF, FRACTIONS
 from .observed import Views, filled
 from .tessellate import Triangles
 from .unwrap import LARGEST, Atlas, Placed, joined, parameterized, surface_points
@@ -40,10 +41,8 @@ _FINEST, _MOST = 8, 1 << 25
 #: Texels of one texture of the scene whose resolution rises, at most.
 _MOST_KNOWN = 1 << 22
 
-#: The opacity below which there is a hole, of cut-outs and of what is transparent to a part.
-_HOLE, _NOTHING = 0.5, 1 / 255
-#: Opacities between these are fractions, neither a hole nor solid.
-_FRACTIONS = 0.05, 0.95
+#: The opacity below which there is nothing, of what is transparent to a part.
+_NOTHING = 1 / 255
 
 #: Textures of a material that a scene gives: by its number, then by quantity.
 OwnTextures = dict[int, dict[str, "mi.Texture"]]
@@ -64,12 +63,13 @@ class Baked:
     #: By recovered quantity, the share of the surface that training views saw where the texture
     #: has the field's value, to `NEAR`.
     near: Mapping[str, float] = field(default_factory=dict)
-    #: The same, of the surface that is no hole, by what was not learned, opacity included; empty
-    #: where that was not asked for.
+    #: The same, of the surface that is no hole, by what was not learned; and of all the surface by
+    #: opacity: of cut-outs, the share that is solid, or a hole, as in the scene, or that of what is
+    #: solid there, if it is less. Empty where that was not asked for.
     known_near: Mapping[str, float] = field(default_factory=dict)
     #: What masks leave of the surface, (n, n) float32 in [0, 1]; None: all of it.
     opacity: np.ndarray | None = None
-    #: Most of the surface is transparent to a part; False: it is solid, with holes.
+    #: Some parts of it are mostly transparent to a part; False: it is solid, with holes.
     blends: bool = False
 
     @property
@@ -169,7 +169,7 @@ class Baker:
         n = atlas.resolution
         require_memory(_TEXEL_BYTES * n * n, "the textures need", "Lower --texels", atlas.name)
         _, uv = surface_points(atlas.placed, _TRIED)
-        surface = self._surface(atlas, uv)
+        surface = self._surface(atlas)
         points = self._at(surface, uv, atlas.materials if known else ())
         finest = min(_FINEST * n, LARGEST)
         while True:
@@ -203,25 +203,29 @@ class Baker:
             own = [name for name in QUANTITIES if name not in self._learned]
             others = {name: share(name, points.solid) for name in own}
         if known and baked.opacity is not None:
-            opacity = baked.opacity[..., None]
-            others["opacity"] = _share_near(opacity, uv, points.opacity, points.hit)
+            opacity, hit = baked.opacity[..., None], points.hit
+            share_near = _share_near if baked.blends else _share_cut
+            others["opacity"] = share_near(opacity, uv, points.opacity, hit)
         return replace(baked, near=near, known_near=others)
 
-    def _surface(self, atlas: Atlas, uv: np.ndarray) -> _Surface:
-        """An atlas to look things up in, of which some points (n, 2) tell what its holes are."""
+    def _surface(self, atlas: Atlas) -> _Surface:
+        """An atlas to look things up in; points under each of its masks tell what holes are."""
         masks = [] if self._opacities is None else atlas.masks
-        surface = _Surface(_lookup(atlas, masks), masks, _HOLE)
+        surface = _Surface(_lookup(atlas, masks), masks, CUTOFF)
         if not masks:
             return surface
+        under = [[each for each in atlas.placed if each.part.masks == mask] for mask in masks]
+        uv = np.concatenate([surface_points(placed, _TRIED)[1] for placed in under])
         si = surface.mesh.eval_parameterization(mi.Point2f(np.ascontiguousarray(uv.T)))
         valid = si.is_valid()
         info = surface.mesh.eval_attribute_3("face_info", si, valid)
         si = _in_own_coordinates(surface.mesh, si, valid)
-        opacity = np.array(self._opacity(surface, si, info, valid))[np.array(valid)]
+        opacity = np.array(dr.select(valid, self._opacity(surface, si, info, valid), 1))
         if (opacity >= 1 - _NOTHING).all():
             return surface._replace(masks=[])
-        low, high = _FRACTIONS
-        blends = ((opacity > low) & (opacity < high)).mean() > 0.5
+        low, high = FRACTIONS
+        fractions = ((opacity > low) & (opacity < high)).reshape(len(masks), _TRIED)
+        blends = (fractions.mean(1) > 0.5).any()
         return surface._replace(least=_NOTHING) if blends else surface
 
     def _baked(
@@ -261,7 +265,7 @@ class Baker:
             self._learned,
             unseen,
             opacity=opacity,
-            blends=bool(surface.masks) and surface.least < _HOLE,
+            blends=bool(surface.masks) and surface.least < CUTOFF,
         )
 
     def at(
@@ -278,7 +282,7 @@ class Baker:
             training view saw it, (n,) bool. Where there is no surface, values are zeros.
         """
         atlas = Atlas(placed.part.name, (), [placed], "own", 1.0, 1, 1)
-        points = self._at(self._surface(atlas, uv), uv)
+        points = self._at(self._surface(atlas), uv)
         flat = {k: x if x.shape[1] == 3 else x[:, 0] for k, x in points.values.items()}
         return flat, points.hit, points.seen
 
@@ -419,7 +423,7 @@ def look_up(
         value = mi.Color3f(quantity.default)
         for material in numbers:
             texture = own[material][name]
-            here = valid & (number == material)
+            here = valid & (number == dr.opaque(mi.UInt32, material))  # one kernel for all
             three = quantity.channels == 3
             looked_up = texture.eval(si, here) if three else texture.eval_1(si, here)
             value = dr.select(here, mi.Color3f(looked_up), value)
@@ -461,6 +465,28 @@ def _share_near(
         colour: it is compared as sRGB.
         scale: of its values, in which `NEAR` is told.
     """
+    value = _interpolated(texture, uv)
+    if colour:
+        value, truth = encoded(value), encoded(truth)
+    off = np.abs(value - truth).max(1)
+    return float((off[counted] <= NEAR * scale).mean()) if counted.any() else 1.0
+
+
+def _share_cut(
+    opacity: np.ndarray, uv: np.ndarray, truth: np.ndarray, counted: np.ndarray
+) -> float:
+    """The share of points that are solid, or a hole, as it should be; arguments as above.
+
+    Of all points, or of those that should be solid, where it is less: blades of grass are little of
+    the surface that they are cut out of.
+    """
+    solid = (truth[counted] >= CUTOFF)[:, 0]
+    same = (_interpolated(opacity, uv)[counted] >= CUTOFF)[:, 0] == solid
+    return min(float(each.mean()) for each in (same, same[solid], np.ones(1)) if each.size)
+
+
+def _interpolated(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """A texture (n, n, channels) at points (points, 2), bilinear: (points, channels)."""
     last = len(texture) - 1
     at = np.clip(uv * len(texture) - 0.5, 0, last)
     low = at.astype(np.int64)
@@ -470,11 +496,7 @@ def _share_near(
         (1 - right) * texture[y, low[:, 0]] + right * texture[y, high[:, 0]]
         for y in (low[:, 1], high[:, 1])
     ]
-    value = (1 - down) * found[0] + down * found[1]
-    if colour:
-        value, truth = encoded(value), encoded(truth)
-    off = np.abs(value - truth).max(1)
-    return float((off[counted] <= NEAR * scale).mean()) if counted.any() else 1.0
+    return (1 - down) * found[0] + down * found[1]
 
 
 def bake_texture(
@@ -490,14 +512,17 @@ def bake_texture(
 
     Returns:
         (n, n, 3) float32, averaged over four places a texel, as it is stored; and whether it has
-        the values of the texture, to 2/255 of their range, on `WANTED` of the surface.
+        the values of the texture, to 2/255 of their range, on `WANTED` of the surface. A range
+        below a thousandth of the largest value is taken as that: it may be rounding alone.
     """
     mesh = _lookup(baked.atlas)
     _, uv = surface_points(baked.atlas.placed, _TRIED)
     si = mesh.eval_parameterization(mi.Point2f(np.ascontiguousarray(uv.T)))
     hit = np.array(si.is_valid())
     truth = np.stack([np.array(channel) for channel in _read(mesh, si, texture, colour)], -1)
-    scale = max(float(np.ptp(truth[hit])), 1e-6) if hit.any() else 1.0
+    scale = 1.0
+    if hit.any():
+        scale = max(float(np.ptp(truth[hit])), 1e-3 * float(np.abs(truth[hit]).max()), 1e-6)
     n = baked.atlas.resolution
     finest = min(_FINEST * n, LARGEST)
     while True:

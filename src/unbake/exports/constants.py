@@ -17,6 +17,10 @@ from ..scene.parse import ParsedScene
 _UNKNOWN = ("anisotropic", "flatness", "sheen", "spec_tint", "spec_trans")
 #: Quantities that are written to glTF and OpenUSD.
 TEXTURED = ("albedo", "roughness", "metallic")
+#: Opacities between these are fractions, neither a hole nor solid.
+FRACTIONS = 0.05, 0.95
+#: The opacity from which a cut-out is solid.
+CUTOFF = 0.5
 #: From 12.5 on, no index of refraction belongs to `specular`.
 _MOST_SPECULAR = 12.0
 

@@ -82,7 +82,7 @@ _CONVENTIONS = {
     "environment": "latitude and longitude as Mitsuba's envmap reads them without to_world: +y is "
     "the first row, -y the last one, +z the middle column, -z the left and right border, +x at a "
     "quarter of the width; linear RGB; in axes of the scene, and environment_upright in those of "
-    "scene.glb",
+    "scene.glb, where these are others",
     "texels_per_unit": "at least, but for textures of the smallest and the largest size; where "
     "nobody chose it, textures have more that need it",
     "near": "by quantity, the share of the surface seen by training views where the texture "
@@ -114,7 +114,7 @@ def export(
         formats: of `FORMATS`.
         texels: along a scene unit; None: one for each pixel of the training views on the surfaces,
             or more where the recovered fields or known textures hold finer detail, until 95 % of
-            each surface differs from them by 2/255 at most.
+            each surface differs from them by 2/255 at most, or is as solid where it is cut out.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         console: where a progress bar is shown, if it is a terminal; None: nowhere.
         tell: called with lines of progress.
@@ -223,6 +223,7 @@ def _export(
             for light in lights
         ],
         "environment": None if environment is None else _ENVIRONMENT,
+        "environment_upright": _UPRIGHT if (out / _UPRIGHT).exists() else None,
         "colour_spaces": COLOUR_SPACES,
         "conventions": _CONVENTIONS,
         "notes": [
@@ -293,7 +294,7 @@ def _write(
     up = Up.of([view.camera for view in dataset.train])
     if "gltf" in formats:
         write_glb(out / "scene.glb", found.scene, visible, shown, lights, up)
-        notes += _environment_of_gltf(out, environment, up)
+        notes += _environment_of_gltf(out, environment, up, formats)
     if "usd" in formats:
         (out / "usd").mkdir()
         beside = None if environment is None else f"../{_ENVIRONMENT}"
@@ -317,7 +318,9 @@ def _write(
     return _Written(files, masks, notes)
 
 
-def _environment_of_gltf(out: Path, environment: Any, up: Up) -> list[str]:
+def _environment_of_gltf(
+    out: Path, environment: Any, up: Up, formats: Sequence[Format]
+) -> list[str]:
     """Write the environment in the axes of `scene.glb`, where these are others; what to tell."""
     if environment is None:
         return []
@@ -325,7 +328,10 @@ def _environment_of_gltf(out: Path, environment: Any, up: Up) -> list[str]:
     if not up.is_turned("Y"):
         return [f"{what} {_ENVIRONMENT}"]
     write_exr(out / _UPRIGHT, turned_latlong(environment, up.rotation("Y")))
-    kept = f"{_ENVIRONMENT} has the axes of the scene, as mitsuba and usd take it"
+    kept = f"{_ENVIRONMENT} has the axes of the scene"
+    others = " and ".join(name for name in ("mitsuba", "usd") if name in formats)
+    if others:
+        kept += f", as in {others}"
     return [f"{what} {_UPRIGHT}", kept]
 
 

@@ -29,7 +29,7 @@ from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from ..version import VERSION
 from .bake import Baked
-from .constants import Constants, constant_opacity, is_number, material_constants
+from .constants import CUTOFF, Constants, constant_opacity, is_number, material_constants
 from .lights import Light
 from .parts import Part
 from .tessellate import Triangles
@@ -49,8 +49,6 @@ PUNCTUAL = {"point": "point", "spot": "spot", "directional": "directional"}
 
 #: The node that turns the scene, where its up is not +y.
 UPRIGHT = "upright"
-#: The opacity from which a cut-out is solid.
-CUTOFF = 0.5
 #: Bytes that the header of a file can tell.
 LARGEST = 2**32 - 1
 

@@ -62,7 +62,10 @@ class Views:
         seen = dr.zeros(mi.Bool, dr.width(p))
         dr.eval(p, n, two_sided, active)
         for number in range(len(self._cameras)):
-            seen |= self._sees(number, p, n, two_sided, active & ~seen)
+            left = active & ~seen
+            if not dr.any(left):
+                break
+            seen |= self._sees(number, p, n, two_sided, left)
             dr.eval(seen)
         return seen
 

@@ -14,6 +14,7 @@ from ..scene.bumps import turned
 from ..scene.parse import ParsedScene
 from ..scene.transforms import chosen_id
 from ..scene.triangles import doubled_normals, mesh_of, numbered
+from .constants import FRACTIONS, constant_opacity
 from .parts import Part, unique_names
 from .tessellate import Triangles
 
@@ -77,8 +78,10 @@ def make_atlases(
 ) -> list[Atlas]:
     """An atlas for each material that parts have, those of lamps last.
 
-    Lamps have atlases of their own, whatever material they share: what a fit optimizes is not told
-    of them. One that shows a picture has an atlas alone, in which its own coordinates can stay.
+    Parts that are transparent to a part by one number have atlases of their own, whatever material
+    they share: other programs blend a material as a whole. So have lamps: what a fit optimizes is
+    not told of them. One that shows a picture has an atlas alone, in which its own coordinates can
+    stay.
 
     Args:
         scene: the nodes that the parts are of.
@@ -119,11 +122,16 @@ def _groups(scene: ParsedScene, parts: Sequence[Part]) -> list[list[Part]]:
 
 
 def _kind(scene: ParsedScene, part: Part) -> int:
-    """0 of surfaces that emit no light, 1 of lamps, and a number alone of each with a picture."""
+    """What parts must have in common to share an atlas.
+
+    0 of surfaces that emit no light, 1 of those that are transparent to a part by one number, 2 of
+    lamps, and a number alone of each lamp with a picture.
+    """
     if part.emitter is None:
-        return 0
+        opacity, (low, high) = constant_opacity(scene, part.masks), FRACTIONS
+        return int(opacity is not None and low < opacity < high)
     kinds = {scene.state.nodes[i].type for i in scene.references(part.emitter)}
-    return 2 + part.emitter if mi.ObjectType.Texture in kinds else 1
+    return 3 + part.emitter if mi.ObjectType.Texture in kinds else 2
 
 
 def _material_names(scene: ParsedScene, groups: list[list[Part]]) -> list[str]:

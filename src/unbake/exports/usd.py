@@ -27,8 +27,8 @@ from ..imaging.pictures import write_png
 from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from .bake import Baked
-from .constants import Constants, material_constants
-from .gltf import CUTOFF, Document, plain_material
+from .constants import CUTOFF, Constants, material_constants
+from .gltf import Document, plain_material
 from .lights import Light
 from .parts import Part
 from .tessellate import Triangles
