@@ -15,7 +15,7 @@ from unbake.dataset.data_folder import DataFolder
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation import evaluate as evaluate_module
-from unbake.evaluation.evaluate import evaluate, require_true_materials
+from unbake.evaluation.evaluate import _require_room, evaluate, require_true_materials
 from unbake.evaluation.placing import _Errors, _solved
 from unbake.evaluation.renderings import (
     METRICS,
@@ -29,6 +29,7 @@ from unbake.evaluation.yardsticks import seen_materials
 from unbake.imaging.metrics import HIGHEST
 from unbake.report.page import write_report
 from unbake.training.loop import fit
+from unbake.training.run_folder import EvaluationFolder
 
 FEW = EvaluationSettings(spp=2, max_depth=3, train_views=0)
 
@@ -147,6 +148,26 @@ def test_pictures_without_room_on_the_disk_are_told_after_the_first_view(
     assert len([line for line in lines if "render" in line]) == 1
     assert (run / "evaluation" / "metrics.json").read_bytes() == before
     assert not (run / "evaluation" / ".new").exists()
+
+
+def test_the_room_for_more_views_is_that_of_pictures_of_views(tmp_path, monkeypatch):
+    """Not of an environment map, which is written once however many views there are."""
+    out, told = EvaluationFolder(tmp_path), []
+    out.environment().write_bytes(bytes(1_000_000))
+    picture = out.picture("heldout", "a", "render")
+    picture.parent.mkdir()
+    picture.write_bytes(bytes(1000))
+    camera = SimpleNamespace(width=4, height=4)
+    views: Any = [SimpleNamespace(camera=camera, split="heldout")] * 3
+    monkeypatch.setattr(evaluate_module, "_MUCH", 1)
+    for free in (2000, 1999):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        if free == 2000:
+            _require_room(out, views, told.append)
+            continue
+        with pytest.raises(UserError, match="pictures of 2 more views need"):
+            _require_room(out, views, told.append)
+    assert len(told) == 1
 
 
 # ------------------------------------------------------------------------------- held-out poses

@@ -13,7 +13,7 @@ from unbake.errors import UserError
 from unbake.importing import meshes as meshes_module
 from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.import_data import import_data
-from unbake.importing.meshes import TO_Z_UP, Part, read_parts, write_scene
+from unbake.importing.meshes import TO_Z_UP, Part, check_place, read_parts, write_scene
 from unbake.importing.settings import ImportSettings
 from unbake.scene.edit import material_names
 from unbake.scene.parse import parse
@@ -29,6 +29,7 @@ CHART = ((0.01, 0.1), (0.15, 0.1), (0.15, 0.9), (0.01, 0.9))
 def parts_of(*files):
     faults = Faults()
     parts = read_parts(files, faults)
+    check_place(parts, faults)
     faults.require_none(files[0])
     return parts
 
@@ -186,6 +187,70 @@ def test_a_part_far_from_the_others_is_a_fault(tmp_path):
     far.apply_translation([-450_000, -5_399_000, 0])
     far.export(tmp_path / "far.obj")
     assert len(parts_of(tmp_path / "near.obj", tmp_path / "far.obj")) == 2
+
+
+#: Where UTM coordinates are.
+UTM = (450_000, 5_400_000, 100)
+
+
+def place_after(move, *files):
+    """Faults of the place of a mesh after a move, as import finds them."""
+    faults = Faults()
+    check_place([part.moved(move) for part in read_parts(files, faults)], faults)
+    return faults
+
+
+def test_a_mesh_in_double_precision_may_be_moved_to_the_origin_and_not_away(tmp_path):
+    sphere, move = trimesh.creation.icosphere(2), trimesh.transformations.translation_matrix(UTM)
+    sphere.export(tmp_path / "near.obj")
+    with pytest.raises(ImportFaults, match=r"2 units wide.*5.4e\+06 units from the origin"):
+        place_after(move, tmp_path / "near.obj").require_none(tmp_path)
+    sphere.apply_transform(move)
+    sphere.export(tmp_path / "far.obj")
+    assert place_after(np.eye(4), tmp_path / "far.obj")
+    assert not place_after(np.linalg.inv(move), tmp_path / "far.obj")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_a_mesh_that_has_lost_its_shape_in_the_file_cannot_be_moved_back(suffix, tmp_path):
+    """Told in units of after the move, which may be other ones."""
+    move = np.linalg.inv(trimesh.transformations.translation_matrix(UTM))
+    move[:3] *= 10
+    sphere = trimesh.creation.icosphere(2)
+    sphere.apply_translation(UTM)
+    file = tmp_path / f"far{suffix}"
+    sphere.export(file)
+    with pytest.raises(ImportFaults, match=r"2\d units wide.*read in steps of 5 units.*as OBJ"):
+        place_after(move, file).require_none(tmp_path)
+
+
+def test_polygons_of_a_ply_file_cannot_be_moved_back_either(tmp_path):
+    """Another reader has them."""
+    head = ["ply", "format ascii 1.0", f"element vertex {len(LETTER)}"]
+    head += [f"property float {axis}" for axis in "xyz"]
+    head += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    rows = [f"{x + UTM[0]} {y + UTM[1]} 0" for x, y in LETTER]
+    face = f"{len(LETTER)} {' '.join(map(str, range(len(LETTER))))}"
+    (tmp_path / "a.ply").write_text("\n".join([*head, *rows, face]) + "\n")
+    move = np.linalg.inv(trimesh.transformations.translation_matrix(UTM))
+    with pytest.raises(ImportFaults, match=r"2 units wide.*read in steps of 0.5 units"):
+        place_after(move, tmp_path / "a.ply").require_none(tmp_path)
+
+
+def test_a_node_may_take_its_mesh_far_from_the_origin_where_it_is_moved_back(tmp_path):
+    """As tiles of the globe have it: positions in the file are near its own origin."""
+    move = trimesh.transformations.translation_matrix(UTM)
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.icosphere(2), transform=move)
+    scene.export(tmp_path / "tile.glb")
+    assert place_after(np.eye(4), tmp_path / "tile.glb")
+    assert not place_after(np.linalg.inv(move), tmp_path / "tile.glb")
+
+
+def test_positions_beyond_single_precision_are_a_fault(tmp_path):
+    trimesh.creation.box().export(tmp_path / "a.obj")
+    with pytest.raises(ImportFaults, match="too large for single precision"):
+        place_after(np.diag([1e60, 1e60, 1e60, 1]), tmp_path / "a.obj").require_none(tmp_path)
 
 
 def test_a_node_that_flattens_its_mesh_is_a_fault(tmp_path):
@@ -346,7 +411,8 @@ def area_of(part):
 def polygon_files(points, folder):
     """A polygon on a slope as one face, beside a triangle: OBJ and PLY, each with uv = (x, y) / 4.
 
-    OBJ has it with and without normals; PLY with and without a texture of each vertex.
+    OBJ has it with and without normals; PLY with and without a texture of each vertex, and with
+    colours of faces.
     """
     places = [(x, y, x + 2 * y) for x, y in (*points, (0, -1))]
     numbers = [range(1, len(points) + 1), (1, 2, len(points) + 1)]
@@ -355,13 +421,15 @@ def polygon_files(points, folder):
     for kind, word in (("normals", "{0}/{0}/1"), ("textured", "{0}/{0}"), ("bare", "{0}")):
         faces = ["f " + " ".join(word.format(k) for k in face) for face in numbers]
         (folder / f"{kind}.obj").write_text("\n".join([*lines, "usemtl clay", *faces]) + "\n")
-    for kind in ("textured", "bare"):
+    for kind in ("textured", "bare", "coloured"):
         columns = ("x", "y", "z", "s", "t")[: 5 if kind == "textured" else 3]
         head = ["ply", "format ascii 1.0", f"element vertex {len(places)}"]
         head += [f"property float {name}" for name in columns]
-        head += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+        colours = ("red", "green", "blue") if kind == "coloured" else ()
+        head += ["element face 2", "property list uchar int vertex_indices"]
+        head += [*(f"property uchar {name}" for name in colours), "end_header"]
         rows = [(x, y, z, x / 4, y / 4)[: len(columns)] for x, y, z in places]
-        rows += [(len(face), *(k - 1 for k in face)) for face in numbers]
+        rows += [(len(face), *(k - 1 for k in face), *(200 for _ in colours)) for face in numbers]
         body = [" ".join(map(str, row)) for row in rows]
         (folder / f"{kind}.ply").write_text("\n".join([*head, *body]) + "\n")
     return sorted(file for file in folder.iterdir() if file.suffix in (".obj", ".ply"))
@@ -378,7 +446,7 @@ def test_polygons_that_are_not_convex_are_filled_and_nothing_else(shape, tmp_pat
             (part,) = parts_of(file)
             assert np.isclose(area_of(part), (area + beside) * np.sqrt(6)), file
             assert len(part.faces) == len(points) - 1
-            if file.stem != "bare":
+            if file.stem not in ("bare", "coloured"):
                 assert np.allclose(part.uv, part.positions[:, :2] / 4)
             if file.stem == "normals":
                 assert np.allclose(part.normals, (0.6, 0, 0.8))

@@ -214,6 +214,23 @@ def test_a_matrix_that_is_none_is_a_fault(given, told, captured, meshes, tmp_pat
         import_data(source, tmp_path / "data", meshes, mesh_matrix=["none"], tell=quiet)
 
 
+def test_a_mesh_of_another_frame_is_far_from_the_origin_only_where_it_is_moved_to(
+    captured, meshes, tmp_path
+):
+    """OBJ has double precision: a matrix brings it from UTM coordinates, but not there."""
+    source = write_turned(captured, tmp_path / "nerf", np.eye(4))
+    away = trimesh.transformations.translation_matrix((450_000, 5_400_000, 100))
+    near, far = trimesh.load(meshes[0], force="mesh", process=False), tmp_path / "far.obj"
+    near.export(tmp_path / "near.obj", digits=9)
+    near.apply_transform(away)
+    near.export(far, digits=9)
+    back = np.linalg.inv(away).ravel().tolist()
+    import_data(source, tmp_path / "moved", [far], mesh_matrix=back, tell=quiet)
+    assert same_geometry(tmp_path / "moved", [tmp_path / "near.obj"])
+    with pytest.raises(ImportFaults, match=r"from the origin, where single precision has steps"):
+        import_data(source, tmp_path / "none", meshes, mesh_matrix=away.ravel().tolist())
+
+
 # ------------------------------------------------------------------- meshes that no photograph sees
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from datetime import date, timedelta
 
 import pytest
 from support import TINY
@@ -80,6 +81,7 @@ def test_one_method_is_taken_apart(unbake, cornell, tiny, tmp_path, method, more
     assert done.status == 0, done.err
     result = json.loads(out.read_text())
     assert result["unbake"] == VERSION
+    assert abs(date.today() - date.fromisoformat(result["made"])) <= timedelta(1)
     assert result["method"] == method and result["compiled"] == 0 and result["launches"] > 0
     phases = result["phases"]
     wanted = PHASES | more if method != "prb" else more | {"batch", "gradients", "optimiser"}

@@ -1101,6 +1101,16 @@ def test_what_is_not_positive_is_counted_below_the_chart(made, tmp_path: Path):
     assert text.count("Not positive, left out: ours 1 of 4") == 2  # over steps, over seconds
 
 
+def test_a_chart_of_nothing_that_is_positive_says_so(made, tmp_path: Path):
+    log = made[1][0] / "log.jsonl"
+    lines = [{"step": s, "seconds": s, "photometric": -0.5} for s in range(4)]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    text = write_report(made[1][:1], tmp_path / "report.html").read_text()
+    assert text.count("Not positive, left out: ours 4 of 4") == 2
+    assert text.count("<b>Photometric loss</b>") == 2
+    assert "<title>Photometric loss over" not in text and ">None<" not in text
+
+
 def test_a_term_that_no_run_has_draws_no_chart():
     assert charts.chart([[{"step": 1, "v": 0.0}]], "step", "step", lambda r: r["v"], True) is None
 

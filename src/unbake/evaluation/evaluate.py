@@ -233,10 +233,10 @@ def _require_room(
     How far pictures are compressed depends on what they show.
 
     Args:
-        views: all of them. Pictures of the first one are written.
+        views: all of them. Of views, only pictures of the first one are written.
     """
     first, *others = (view.camera.width * view.camera.height for view in views)
-    written = sum(file.stat().st_size for file in out.path.rglob("*") if file.is_file())
+    written = sum(file.stat().st_size for file in (out.path / views[0].split).iterdir())
     need, free = written / first * sum(others), shutil.disk_usage(out.path).free
     told = f"the pictures of {len(others)} more views need about {size(need)}"
     if need > free:

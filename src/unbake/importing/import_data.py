@@ -26,7 +26,7 @@ from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
 from .lens import WIDEST
-from .meshes import TO_Z_UP, Part, read_parts, write_scene
+from .meshes import TO_Z_UP, Part, check_place, read_parts, write_scene
 from .photographs import Pictures, check_cameras, check_pictures
 from .progress import each_photograph
 from .raw import for_sensor, is_raw, raw_balances
@@ -93,7 +93,8 @@ def import_data(
         tell: called with what was found.
 
     Raises:
-        UserError: the input has faults, all of which are told, or no photograph sees the mesh.
+        UserError: the input has faults, no photograph sees the mesh, or the disk has no room. All
+            faults of cameras, files and meshes are told at once, and all of pixels.
     """
     source, out, settings = Path(source), Path(out), settings or ImportSettings()
     require_new_folder(out)
@@ -113,6 +114,7 @@ def import_data(
     found = _balanced(found)
     parts = read_parts(given, faults)
     parts = _placed(parts, found.world, settings, mesh_transform, mesh_matrix, faults)
+    check_place(parts, faults)
     known, told = exposures_of(found.shots)
     if exposures is not None:
         with faults.collected():

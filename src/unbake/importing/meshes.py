@@ -59,6 +59,7 @@ class Part:
         faces: (m, 3) indices.
         normals: (n, 3) of unit length as the file has them; None: it has none.
         uv: (n, 2), v upwards, as in OBJ and most PLY files; None where the file has none.
+        step: between positions as they were read, in units of the frame; 0: in double precision.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Part:
     faces: np.ndarray
     normals: np.ndarray | None
     uv: np.ndarray | None
+    step: float = 0.0
 
     @property
     def corners(self) -> np.ndarray:
@@ -75,10 +77,11 @@ class Part:
     def moved(self, matrix: np.ndarray) -> Part:
         """The part after a similarity (4, 4), float64."""
         linear = matrix[:3, :3]
-        normals = None
+        scale, normals = float(np.cbrt(np.linalg.det(linear))), None
         if self.normals is not None:
-            normals = self.normals @ (linear.T / np.cbrt(np.linalg.det(linear)))
-        return replace(self, positions=self.positions @ linear.T + matrix[:3, 3], normals=normals)
+            normals = self.normals @ (linear.T / scale)
+        positions = self.positions @ linear.T + matrix[:3, 3]
+        return replace(self, positions=positions, normals=normals, step=self.step * scale)
 
     def write(self, file: Path) -> None:
         """Write it as binary PLY for Mitsuba, to which v = 0 is the first row of an image.
@@ -114,19 +117,35 @@ def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
                 continue
             for name, mesh, to_file in _loaded(file):
                 parts.append(_part(names.unique(name or file.stem), mesh, to_file, file))
-    if parts:
-        _check_place(parts, faults)
     return parts
 
 
-def _check_place(parts: Sequence[Part], faults: Faults) -> None:
-    """Meshes far from the origin lose their shape, as Mitsuba has them in single precision."""
+def check_place(parts: Sequence[Part], faults: Faults) -> None:
+    """Find meshes that lose their shape in single precision, as they are far from the origin.
+
+    Mitsuba has positions in single precision, and so have most files, before the mesh is moved.
+
+    Args:
+        parts: all of the geometry, in the frame of the cameras.
+        faults: to add to.
+    """
+    if not parts:
+        return
     corners = np.stack([part.corners for part in parts])
     extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     farthest = np.abs(corners).max(axis=(1, 2))
-    steps = np.spacing(farthest.astype(np.float32)).astype(np.float64)
+    steps = _steps(farthest)
     if not extent:
         faults.add("all vertices of the mesh lie at one point")
+        return
+    if not np.isfinite(steps).all():
+        faults.add("the mesh has positions that are too large for single precision")
+        return
+    read = max(part.step for part in parts)
+    if read > max(_COARSEST * extent, steps.max()):
+        what = f"the mesh is {extent:.3g} units wide, and its positions were read in steps of "
+        what += f"{read:.2g} units, as they are far from the origin in single precision"
+        faults.add(what, remedy="Export it as OBJ, or near the origin")
         return
     units, step = f"{farthest.max():.3g} units", f"{steps.max():.2g} units"
     place = f"up to {units} from the origin, where single precision has steps of {step}"
@@ -139,6 +158,12 @@ def _check_place(parts: Sequence[Part], faults: Faults) -> None:
     if far and extent > _LOST * largest:
         what = f"the largest part of the mesh is {largest:.3g} units wide, and some lie {place}"
         faults.add(what, named(far), "Remove these parts, or move them to the others")
+
+
+def _steps(farthest: np.ndarray) -> np.ndarray:
+    """Steps of single precision at distances from the origin; NaN where it has none so large."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.spacing(np.asarray(farthest, np.float32)).astype(np.float64)
 
 
 def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Path:
@@ -197,12 +222,14 @@ def _read_ply(file: Path) -> Part | None:
     def table(name: str, columns: int) -> np.ndarray:
         return np.array(params[name], np.float64).reshape(-1, columns)
 
+    positions = table("vertex_positions", 3)
     return Part(
         file.stem,
-        table("vertex_positions", 3),
+        positions,
         np.array(params["faces"], np.int64).reshape(-1, 3),
         table("vertex_normals", 3) if _has_normals(file) else None,
         table("vertex_texcoords", 2) if mesh.has_vertex_texcoords() else None,
+        float(_steps(np.abs(positions).max())),
     )
 
 
@@ -308,7 +335,7 @@ def _refilled(mesh: Any, file: Path, options: dict[str, Any]) -> Any:
     if textures is not None:
         uv = np.concatenate(textures).reshape(-1, 2)
         data["texcoord"] = uv[corners].reshape(-1, 6)
-    raw["face"]["data"] = data
+    raw["face"] |= {"data": data, "properties": {}}  # colours of faces are not read
     fix_texture = options.get("fix_texture", True)
     kwargs = _elements_to_kwargs(raw, fix_texture, None)
     return trimesh.Trimesh(**kwargs, process=False)
@@ -370,9 +397,11 @@ def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:
     known = uv is not None and np.shape(uv) == (len(positions), 2) and np.isfinite(uv).all()
     # Corners of a PLY file's triangles may differ in their texture, but not in their normals.
     known = known and (normals is None or file.suffix.lower() != ".ply")
-    return Part(
-        name, positions[used], faces, normals, np.array(uv, np.float64)[used] if known else None
-    )
+    own = np.array(uv, np.float64)[used] if known else None
+    step = 0.0  # of OBJ, whose numbers are text
+    if file.suffix.lower() != ".obj":
+        step = float(_steps(np.abs(mesh.vertices[used]).max()) * np.linalg.norm(linear, 2))
+    return Part(name, positions[used], faces, normals, own, step)
 
 
 def _of_length_one(

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import datetime, timezone
 from pathlib import Path
 
 import drjit as dr
@@ -91,7 +92,8 @@ def bench_step(
     dataset = Dataset.load(data, allow_outside=allow_outside)
     fit = begin_fit(dataset, config, clip_negative=clip_negative)
     config = fit.config
-    result = {"unbake": VERSION, "machine": machine(), "data": dataset.folder.name}
+    made = datetime.now(timezone.utc).date().isoformat()
+    result = {"unbake": VERSION, "made": made, "machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(fit.step, fit.state, config, steps)
     result["phases"] = _phases(fit.step, fit.state)

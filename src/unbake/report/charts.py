@@ -100,7 +100,8 @@ def chart(
             a band whose lower edge is not positive reaches down to the lowest number of its curve.
 
     Returns:
-        A figure whose curves have the group ids `run-0`, `run-1`, …; None where no run has a value.
+        A figure whose curves have the group ids `run-0`, `run-1`, …; None where no run has a value
+        that the axis can show.
     """
     curves = [_curve(run, log, x_key, y_of) for run, log in enumerate(logs)]
     if logarithmic:

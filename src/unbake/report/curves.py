@@ -108,23 +108,28 @@ def _panels(
     axes: Sequence[str] = tuple(AXES),
     logarithmic: bool = False,
 ) -> list[dict[str, Any]]:
-    """A panel for each x axis and each key of `titles` that some log has."""
+    """A panel for each x axis and each key of `titles` that some log has.
+
+    Its `svg` is None where a logarithmic axis can show no value of any run.
+    """
     labels = [run.label for run in runs]
     panels = []
     for x_key, (key, title) in product(axes, titles.items()):
         x_title = AXES[x_key]
         value = partial(_value, key=key)
         figure = charts.chart(logs, x_key, x_title, value, logarithmic)
-        if figure is not None:
-            svg = charts.inline_svg(figure, f"{title} over {x_title}", labels)
-            lost = charts.not_positive(logs, x_key, value) if logarithmic else []
-            told = [
-                f"{label} {left} of {count}"
-                for label, (left, count) in zip(labels, lost, strict=False)
-                if left
-            ]
-            panels.append({"title": title, "unit": unit, "svg": svg, "lost": ", ".join(told)})
+        lost = _lost(labels, charts.not_positive(logs, x_key, value)) if logarithmic else ""
+        if figure is not None or lost:
+            named = f"{title} over {x_title}"
+            svg = None if figure is None else charts.inline_svg(figure, named, labels)
+            panels.append({"title": title, "unit": unit, "svg": svg, "lost": lost})
     return panels
+
+
+def _lost(labels: Sequence[str], counts: Sequence[tuple[int, int]]) -> str:
+    """How many points of each run are not positive, for people; empty where all are."""
+    told = zip(labels, counts, strict=True)
+    return ", ".join(f"{label} {left} of {count}" for label, (left, count) in told if left)
 
 
 def _value(record: Mapping[str, Any], key: str) -> Any:
