@@ -132,6 +132,10 @@ def test_settings_cannot_be_changed_in_place():
     [
         ("steps = ", "not valid TOML"),
         ("steps = 1\nsteps = 2", "not valid TOML"),
+        (
+            "stepz = 1\npreown = 2",
+            "unknown keys stepz, preown. Known keys: steps, precision, .* …$",
+        ),
         ("stepz = 1", "stepz: unknown key. Known keys: steps, .* …$"),
         (f"{'x' * 5000} = 1", "x+…x+: unknown key. Known keys: .{100,250} …$"),
         (

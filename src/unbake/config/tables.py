@@ -10,6 +10,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
+from itertools import chain
 from textwrap import shorten
 from typing import Any, Literal, TypeVar, cast
 
@@ -18,7 +19,7 @@ from ..errors import UserError, collected, printable, raise_together
 Settings = TypeVar("Settings")
 
 #: Characters of known keys in a message.
-_SHOWN = 250
+_SHOWN = 120
 
 
 def update(
@@ -42,13 +43,11 @@ def update(
         hints = typing.get_type_hints(type(settings))
         current = {key: getattr(settings, key) for key in hints}
     changes, faults = {}, []
-    for key, value in table.items():
-        here = (*path, key)
+    if unknown := [key for key in table if key not in current]:
+        faults.append(_unknown(unknown, list(current), path))
+    for key in (key for key in table if key in current):
         with collected(faults):
-            if key not in current:
-                known = _known(key, list(current))
-                raise UserError("unknown key", where=".".join(here), remedy=known)
-            changes[key] = _changed(current[key], value, hints[key], here)
+            changes[key] = _changed(current[key], table[key], hints[key], (*path, key))
     raise_together(faults)
     if isinstance(settings, Mapping):
         return cast(Settings, {**current, **changes})
@@ -78,13 +77,21 @@ def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             yield f"{prefix}{key}", value
 
 
-def _known(key: str, names: list[str]) -> str:
-    """The keys there are; where they are many, those that resemble `key` most."""
+def _unknown(keys: list[str], names: list[str], path: tuple[str, ...]) -> UserError:
+    """That a table has keys that there are not, and which there are.
+
+    Where they are many, those that resemble the unknown ones most.
+    """
     known = ", ".join(names)
     if len(known) > _SHOWN:
-        nearest = get_close_matches(key[:_SHOWN], names, len(names), cutoff=0)
+        ranked = [get_close_matches(key[:_SHOWN], names, len(names), cutoff=0) for key in keys]
+        nearest = dict.fromkeys(chain.from_iterable(zip(*ranked, strict=True)))
         known = shorten(", ".join(nearest), _SHOWN, placeholder=" …")
-    return f"Known keys: {known}"
+    remedy = f"Known keys: {known}"
+    if len(keys) == 1:
+        return UserError("unknown key", ".".join((*path, *keys)), remedy)
+    told = shorten(", ".join(keys), _SHOWN, placeholder=" …")
+    return UserError(f"unknown keys {told}", ".".join(path) or None, remedy)
 
 
 def typed(value: object, hint: Any, where: str) -> Any:
