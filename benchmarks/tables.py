@@ -301,7 +301,7 @@ PRIOR = {
 def cameras(result: dict) -> str:
     """Scores with each fault of cameras taken for known and fitted, and what was found of it.
 
-    Rows with a dagger are of earlier versions, which did not write when they were made.
+    Scores with a dagger are of earlier versions, which did not write when they were made.
     """
     rows = {(row["fault"], row["cameras"]): row for row in result["rows"]}
     table = []
@@ -314,8 +314,7 @@ def cameras(result: dict) -> str:
             for key, form in CAMERAS.items()
             if fitted.get(key) and not (scaled and key == "response_error_rms")
         ]
-        older = any("made" not in row for row in (known, fitted) if row)
-        table.append([f"{fault} †" if older else fault, *scores, ", ".join(found)])
+        table.append([fault, *scores, ", ".join(found)])
     return markdown(["fault", "known", "fitted", "error of what was found"], table)
 
 
@@ -323,7 +322,8 @@ def at_true_cameras(row: dict) -> str:
     """Albedo and roughness; where poses may be off, as the true cameras see the materials."""
     true = "true_albedo_psnr" in row
     keys = [f"{'true_' if true else ''}{name}_psnr" for name in ("albedo", "roughness")]
-    return " / ".join(plus_minus(row, key) or "" for key in keys)
+    scores = " / ".join(plus_minus(row, key) or "" for key in keys)
+    return scores if "made" in row else f"{scores} †"
 
 
 CAMERAS = {
