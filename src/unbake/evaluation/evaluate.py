@@ -179,6 +179,7 @@ def _evaluate(
         values = [f"{k.removesuffix('_psnr')} {_db(row[k])}" for k in told]
         tell(f"{view.name}: {', '.join(filter(None, [*values, told_not_finite(row)]))}")
         if len(rows) == 1:
+            lock.require_held()
             _require_room(out, views, tell)
     if recovered.config.shares_scale:
         recovered_lighting["albedo_scale"] = _align_albedo(rows, materials)
