@@ -34,7 +34,6 @@ import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +51,7 @@ from unbake.evaluation.settings import EvaluationSettings
 from unbake.experiments.commands import unbake
 from unbake.experiments.seeds import across_seeds
 from unbake.io import write_json
-from unbake.machine import machine
+from unbake.machine import machine, today
 
 LENGTH = ("samples", "seconds")
 #: Of a measurement, all of which rows have in common.
@@ -149,7 +148,7 @@ def main() -> None:
             continue
         found = [scores(args.data, fault, fit, seed, options) for seed in args.seeds]
         row = {"fault": fault, "cameras": fit} | across_seeds(found, found[0])
-        row |= {"machine": result["machine"], "made": date.today().isoformat()}
+        row |= {"machine": result["machine"], "made": today()}
         rows.append(row)
         known.add((fault, fit))
         told = ", ".join(f"{k} {v:.3f}" for k, v in row.items() if isinstance(v, float))

@@ -231,21 +231,30 @@ def test_the_squared_prior_is_named_as_its_figure_names_it(writer, tmp_path):
         assert "The squared prior is the row *+ prior*, which [Figure 8]" in page
 
 
-def test_a_prior_that_loses_to_direct_light_is_told(writer, tmp_path):
+def reproduced(writer, tmp_path, figure):
+    """The rows of a figure's data, and what makes the page of these or of others."""
     kept = tmp_path / "reproduction"
     shutil.copytree(ROOT / "docs" / "reproduction", kept)
-    file = kept / "fig8" / "data.csv"
-    with open(file, encoding="utf-8", newline="") as text:
-        rows = list(csv.DictReader(text))
-    for error in (0.5, 0.001):
-        for row in rows:
-            if row["method"] == "with-prior":
-                row["sh_error"] = str(error)
+    file = kept / figure / "data.csv"
+
+    def page(rows):
         with open(file, "w", encoding="utf-8", newline="") as text:
             table = csv.DictWriter(text, rows[0])
             table.writeheader()
             table.writerows(rows)
-        page = " ".join(writer["page"]("docs/reproduction.md", kept=kept).split())
+        return " ".join(writer["page"]("docs/reproduction.md", kept=kept).split())
+
+    with open(file, encoding="utf-8", newline="") as text:
+        return list(csv.DictReader(text)), page
+
+
+def test_a_prior_that_loses_to_direct_light_is_told(writer, tmp_path):
+    rows, page_of = reproduced(writer, tmp_path, "fig8")
+    for error in (0.5, 0.001):
+        for row in rows:
+            if row["method"] == "with-prior":
+                row["sh_error"] = str(error)
+        page = page_of(rows)
         assert f"low frequencies are {100 * error:.1f} % off" in page
         assert ("does not beat direct illumination by itself" in page) == (error > 0.1)
 
@@ -366,21 +375,13 @@ def test_results_without_some_scenes_do_not_replace_those_of_all(writer, tmp_pat
 
 
 def test_methods_whose_steps_are_as_fast_as_ours_are_told(writer, tmp_path):
-    kept = tmp_path / "reproduction"
-    shutil.copytree(ROOT / "docs" / "reproduction", kept)
-    file = kept / "fig3" / "data.csv"
-    with open(file, encoding="utf-8", newline="") as text:
-        rows = list(csv.DictReader(text))
+    rows, page_of = reproduced(writer, tmp_path, "fig3")
     for quick in (["DRAGON"], []):
         for row in rows:
             if row["method"].startswith(("PRB", "AD-PT")):
                 rival = row["method"] == "PRB, split halves" and row["scene"] in quick
                 row["times_ours"] = "0.875" if rival else "1.27"
-        with open(file, "w", encoding="utf-8", newline="") as text:
-            table = csv.DictWriter(text, rows[0])
-            table.writeheader()
-            table.writerows(rows)
-        page = " ".join(writer["page"]("docs/reproduction.md", kept=kept).split())
+        page = page_of(rows)
         told = "no longer than ours with PRB, split halves on DRAGON (0.88 times)."
         assert (told in page) == bool(quick) == ("no longer than ours" in page)
         assert "authors' ratios of PRB are smaller in 2 of 7 scenes" in page

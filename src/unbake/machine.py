@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,11 @@ def machine() -> dict[str, Any]:
         "mitsuba": mi.__version__,
         "drjit": dr.__version__,
     }
+
+
+def today() -> str:
+    """The day, UTC, on which a measurement is made."""
+    return datetime.now(timezone.utc).date().isoformat()
 
 
 def same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..scene.triangles import creased, doubled_normals, mesh_of, write_mesh
+from ..scene.triangles import creased, mesh_of, triangle_areas, triangles_of, write_mesh
 
 #: Meshes with fewer triangles stay as they are: a box has no tenth.
 FEWEST = 64
@@ -46,7 +46,10 @@ def decimated(meshes: Sequence[Mesh], share: float) -> list[mi.Mesh]:
     kept = _simplified(joined, share)
     # What is small beside the errors of all others becomes a flake, or nothing.
     for i, (few, old) in enumerate(zip(kept, joined, strict=True)):
-        if len(few[1]) < _SOLID or _area(*few) < _SHRUNK * _area(*old):
+        if (
+            len(few[1]) < _SOLID
+            or triangle_areas(*few).sum() < _SHRUNK * triangle_areas(*old).sum()
+        ):
             (alone,) = _simplified([old], share)
             kept[i] = alone if len(alone[1]) else old
     return [_creased(*mesh) for mesh in kept]
@@ -82,10 +85,6 @@ def _simplified(meshes: Sequence[Mesh], share: float) -> list[Mesh]:
     return [(positions, part[:-1]) for part in np.split(faces, last + 1)[:-1]]
 
 
-def _area(positions: np.ndarray, faces: np.ndarray) -> float:
-    return float(np.linalg.norm(doubled_normals(positions, faces), axis=1).sum()) / 2
-
-
 def _by_colmap(positions: np.ndarray, faces: np.ndarray, share: float) -> Mesh:
     """A mesh with so many of its triangles, in their order."""
     try:
@@ -101,9 +100,7 @@ def _by_colmap(positions: np.ndarray, faces: np.ndarray, share: float) -> Mesh:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
         write_mesh(before, positions, faces)
         pycolmap.simplify_mesh(before, after, options)
-        params = mi.traverse(mi.load_dict({"type": "ply", "filename": str(after)}))
-    positions = np.array(params["vertex_positions"]).reshape(-1, 3)
-    return positions, np.array(params["faces"]).reshape(-1, 3)
+        return triangles_of(mi.load_dict({"type": "ply", "filename": str(after)}))
 
 
 def _creased(positions: np.ndarray, faces: np.ndarray) -> mi.Mesh:

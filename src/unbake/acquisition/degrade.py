@@ -33,7 +33,7 @@ from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
 from ..scene import free_space
 from ..scene.parse import ParsedScene, parse, write
-from ..scene.triangles import save_mesh
+from ..scene.triangles import save_mesh, triangles_of
 from .decimate import FEWEST, decimated
 from .settings import DegradeSettings
 
@@ -343,7 +343,7 @@ def _change_meshes(
             m.has_vertex_texcoords() or m.has_mesh_attributes() for m in dense.values()
         )
         bare = textured and any(of_coordinates)
-        few = decimated([_triangles(mesh) for mesh in dense.values()], settings.decimate)
+        few = decimated([triangles_of(mesh) for mesh in dense.values()], settings.decimate)
         meshes |= zip(dense, few, strict=True)
     for number, mesh in meshes.items():
         node = parsed.state.nodes[number]
@@ -360,16 +360,9 @@ def _change_meshes(
     return files, bare
 
 
-def _triangles(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and faces of a mesh."""
-    params = mi.traverse(mesh)
-    positions = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    return positions, np.array(params["faces"]).reshape(-1, 3)
-
-
 def _displace(mesh: mi.Mesh, settings: DegradeSettings, diagonal: float) -> None:
     """Move the vertices of a mesh."""
-    positions = _triangles(mesh)[0]
+    positions, _ = triangles_of(mesh)
     positions += displacement(positions, settings, diagonal)
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())

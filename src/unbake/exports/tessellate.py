@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..scene.triangles import doubled_normals, unit
+from ..scene.triangles import triangle_areas, unit
 
 #: Around a circle, and from pole to pole.
 _AROUND, _ALONG = 128, 64
@@ -75,7 +75,7 @@ class Triangles:
 
     def areas(self) -> np.ndarray:
         """The areas of the triangles, (m,) float64."""
-        return np.linalg.norm(doubled_normals(self.positions, self.faces), axis=1) / 2
+        return triangle_areas(self.positions, self.faces)
 
 
 def tessellated(plugin: str) -> Triangles:

@@ -13,7 +13,7 @@ from ..errors import UserError
 from ..scene.bumps import turned
 from ..scene.parse import ParsedScene
 from ..scene.transforms import chosen_id
-from ..scene.triangles import doubled_normals, mesh_of, numbered
+from ..scene.triangles import mesh_of, numbered, triangle_areas
 from .constants import FRACTIONS, constant_opacity
 from .parts import Part, unique_names
 from .tessellate import Triangles
@@ -222,7 +222,7 @@ def surface_points(
         Positions (count, 3), float64, and texture coordinates (count, 2), float32.
     """
     positions, faces, uv = joined(placed)
-    areas = np.linalg.norm(doubled_normals(positions, faces), axis=1)
+    areas = triangle_areas(positions, faces)
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(faces), count, p=areas / areas.sum())
     weights = _barycentric(rng, count)

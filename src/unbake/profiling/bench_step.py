@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from datetime import datetime, timezone
 from pathlib import Path
 
 import drjit as dr
@@ -24,7 +23,7 @@ from ..config import FitConfig
 from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from ..io import write_json
-from ..machine import machine
+from ..machine import machine, today
 from ..signals import cleaned_up
 from ..training.fresh_fit import begin_fit
 from ..training.memory import memory_mb
@@ -92,8 +91,7 @@ def bench_step(
     dataset = Dataset.load(data, allow_outside=allow_outside)
     fit = begin_fit(dataset, config, clip_negative=clip_negative)
     config = fit.config
-    made = datetime.now(timezone.utc).date().isoformat()
-    result = {"unbake": VERSION, "made": made, "machine": machine(), "data": dataset.folder.name}
+    result = {"unbake": VERSION, "made": today(), "machine": machine(), "data": dataset.folder.name}
     result |= {"method": config.method, "settings": _settings(config)}
     result |= _replayed(fit.step, fit.state, config, steps)
     result["phases"] = _phases(fit.step, fit.state)

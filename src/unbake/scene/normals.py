@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.shapes import met_shapes
-from .triangles import doubled_normals, normal_sums, unit
+from .triangles import doubled_normals, normal_sums, triangles_of, unit
 
 #: Lengths of normals may differ from 1 by this much.
 _OFF = 0.1
@@ -43,8 +43,7 @@ def repair_normals(scene: mi.Scene) -> int:
         broken = np.asarray(~(np.abs(length - 1) < _OFF))
         if not broken.any():
             continue
-        positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-        faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+        positions, faces = triangles_of(shape)
         params = mi.traverse(shape)
         params["vertex_normals"] = repaired(normals, broken, positions, faces).ravel()
         params.update()
@@ -62,8 +61,7 @@ def turned_share(scene: mi.Scene) -> float:
     for shape in met_shapes(scene):
         if not shape.is_mesh():
             continue
-        positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-        faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+        positions, faces = triangles_of(shape)
         across = doubled_normals(positions, faces)
         area = np.linalg.norm(across, axis=1)
         whole += area.sum()

@@ -53,6 +53,12 @@ def mesh_of(
     return mesh
 
 
+def triangles_of(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Positions, (n, 3) float64, and faces, (m, 3) indices, of a mesh of Mitsuba."""
+    positions = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return positions, np.array(mesh.faces_buffer()).reshape(-1, 3)
+
+
 def write_mesh(
     file: Path,
     positions: np.ndarray,
@@ -88,6 +94,11 @@ def normal_sums(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     for corner in faces.T:
         np.add.at(sums, corner, normals)
     return sums
+
+
+def triangle_areas(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Areas of triangles, (m,)."""
+    return np.linalg.norm(doubled_normals(positions, faces), axis=1) / 2
 
 
 def doubled_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
