@@ -178,6 +178,7 @@ def coloured(file, fields, kind="float", value=0.4):
     [
         (("red", "green", "blue"), "float", None),
         (("r", "g", "b"), "double", None),
+        (("color_0", "color_1", "color_2"), "float", None),
         (("red", "green", "blue", "alpha"), "float", "has an alpha, and is not read"),
         ((), "float", "the mesh has no vertex_color"),
         (("red", "green", "blue"), "uchar", "has integers, of which Mitsuba makes albedo up to"),

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 _BENDING = ("bumpmap", "normalmap")
 _AREA = ("area", "directionalarea")
 _PATTERNS = ("checkerboard", "mesh_attribute")
-#: The properties of a PLY file that are colours, in either way.
-_COLOURS = ({"red", "green", "blue"}, {"r", "g", "b"})
+#: The properties of a PLY file that are colours, in any way; the last one is that of `write_ply`.
+_COLOURS = ({"red", "green", "blue"}, {"r", "g", "b"}, {"color_0", "color_1", "color_2"})
 _AS_COLOURS = "Write it as PLY with red, green and blue as float, linear from 0 to 1, without alpha"
 #: BSDFs that let light pass as it is.
 _OPEN = ("mask", "null", "thindielectric")
