@@ -26,7 +26,7 @@ OBJECT = """<scene version="3.0.0">
   <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
   <shape type="sphere"><point name="center" x="-1.1" y="0" z="0"/>
     <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.6 0.3 0.1"/>
-      <float name="alpha" value="0.09"/></bsdf></shape>
+      <float name="alpha" value="0.09"/><boolean name="nonlinear" value="true"/></bsdf></shape>
   <shape type="sphere"><point name="center" x="1.1" y="0" z="0"/>
     <bsdf type="dielectric"/></shape>
 </scene>
@@ -73,7 +73,8 @@ def objects(tmp_path, told):
 
 
 def test_an_object_stands_before_a_hidden_background(objects, told):
-    assert objects.background == "hidden" and "1 BSDFs made principled" in told
+    assert objects.background == "hidden" and "1 BSDF made principled" in told
+    assert "left out, as principled has no such property: 'nonlinear' of 1 BSDF" in told
     photograph = read_exr(objects.train[0].image)
     assert np.isfinite(photograph).all()
     assert (photograph[0] == 0).all() and (photograph[:, :2] == 0).all()

@@ -101,6 +101,21 @@ def test_vertex_normals_that_are_not_numbers_are_told(spoilt, unbake):
     assert "hint: " in outcome.out and "geometry   hint" in outcome.out
 
 
+def test_what_a_fit_leaves_out_of_rough_plastic_is_told(spoilt):
+    data = spoilt("cornell")
+    assert found(data.folder, "scene") == []
+    scene = data.folder / data.content["scene"]
+    ball = (
+        '<shape type="sphere"><float name="radius" value="0.1"/><bsdf type="twosided">'
+        '<bsdf type="roughplastic"><boolean name="nonlinear" value="true"/></bsdf></bsdf>'
+        "</shape></scene>"
+    )
+    scene.write_text(scene.read_text().replace("</scene>", ball))
+    (finding,) = found(data.folder, "scene")
+    assert finding.level == "hint" and finding.where == data.content["scene"]
+    assert finding.what == "fits make roughplastic principled, without 'nonlinear' of 1 BSDF"
+
+
 def test_meshes_that_are_smooth_across_sharp_edges_are_told(spoilt):
     data = spoilt("cornell")
     scene = data.folder / data.content["scene"]
@@ -217,7 +232,8 @@ def test_metres_for_centimetres_are_told(spoilt, unbake):
     outcome = unbake("data", "check", data.save())
     text = " ".join(outcome.out.split())
     assert outcome.status == 2
-    assert "poses seem to be in other units" in text and "Multiply positions by 100" in text
+    assert "poses seem to be in other units" in text
+    assert "Multiply positions by 100; or the mesh: import --mesh-scale 0.01" in text
 
 
 def test_a_world_that_is_turned_is_told(spoilt):
@@ -228,6 +244,22 @@ def test_a_world_that_is_turned_is_told(spoilt):
     (finding,) = found(data.save(), "alignment")
     assert finding.level == "error" and "of a world with z up" in finding.what
     assert finding.remedy.startswith("Turn them by -90° about x: y, z become z, -y; or the mesh")
+
+
+def test_a_mesh_with_y_up_and_in_centimetres_is_told(spoilt):
+    data = spoilt("cornell")
+    turn = np.eye(4)
+    turn[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+
+    def changed(pose):
+        pose = turn @ pose
+        pose[:3, 3] *= 0.01
+        return pose
+
+    data.poses(changed)
+    (finding,) = found(data.save(), "alignment")
+    assert "in other units and of a world with z up: " in finding.what
+    assert finding.remedy.endswith("; or the mesh: import --mesh-scale 0.01 --mesh-y-up")
 
 
 def test_masks_that_were_drawn_by_wrong_poses_do_not_confirm_them(spoilt):

@@ -32,7 +32,8 @@ def test_diffuse_and_rough_plastic_become_principled(wrapper, bsdf, roughness, p
     assert not parsed.principled_nodes()
     assert edit.to_principled(parsed) == 1
     (node,) = parsed.principled_nodes()
-    assert set(node.props.keys()) == {"base_color", "roughness"}
+    index = {"eta"} if bsdf == ROUGHPLASTIC else set()
+    assert set(node.props.keys()) == {"base_color", "roughness"} | index
     assert np.allclose(node.props["base_color"], [0.6, 0.3, 0.1])
     assert node.props["roughness"] == pytest.approx(roughness)
     assert not {"diffuse", "roughplastic"} & set(plugins(parsed))
@@ -48,6 +49,78 @@ def test_the_defaults_of_mitsuba_are_kept(parse):
     assert edit.to_principled(parsed) == 2
     found = [(n.props["base_color"], n.props["roughness"]) for n in parsed.principled_nodes()]
     assert found == [(0.5, 0.9), (0.5, pytest.approx(math.sqrt(0.1)))]
+    indices = [n.props.get("eta", None) for n in parsed.principled_nodes()]
+    assert indices == [None, pytest.approx(1.49 / 1.000277)]
+
+
+def plastic(*properties):
+    """Rough plastic with properties: type, name and value of each."""
+    inside = "".join(f'<{t} name="{name}" value="{value}"/>' for t, name, value in properties)
+    return f'<bsdf type="roughplastic">{inside}</bsdf>'
+
+
+@pytest.mark.parametrize(
+    ("indices", "eta"),
+    [
+        ([("float", "int_ior", 1.7), ("float", "ext_ior", 1.0)], 1.7),
+        ([("integer", "int_ior", 2)], 2 / 1.000277),
+        ([("string", "int_ior", "diamond"), ("string", "ext_ior", "vacuum")], 2.419),
+        ([("float", "int_ior", 1.5), ("string", "ext_ior", "water")], 1.5 / 1.333),
+        ([("float", "int_ior", 1.0)], 1.0),
+        # That of `principled` where it does not say: nothing changes
+        ([("float", "int_ior", 1.5), ("float", "ext_ior", 1.0)], None),
+        ([("float", "int_ior", 1.5)], None),
+    ],
+)
+def test_rough_plastic_keeps_its_index_of_refraction(indices, eta, parse):
+    """All of it was 1.5, in photographs and in fits."""
+    parsed = parse(BALL.format(plastic(*indices)))
+    edit.to_principled(parsed)
+    (node,) = parsed.principled_nodes()
+    assert node.props.get("eta", None) == (None if eta is None else pytest.approx(eta, rel=1e-3))
+    assert np.isfinite(render(parsed.instantiate(), 2)).all()
+
+
+@pytest.mark.parametrize(
+    ("indices", "told"),
+    [
+        ([("float", "int_ior", 1.0), ("float", "ext_ior", 1.5)], "'int_ior' 1.0 and 'ext_ior' 1.5"),
+        ([("string", "int_ior", "jam")], "'int_ior' 'jam' and 'ext_ior' 'air'"),
+        ([("float", "ext_ior", 0)], "'int_ior' 'polypropylene' and 'ext_ior' 0.0"),
+        ([("boolean", "int_ior", "true")], "'int_ior' True and 'ext_ior' 'air'"),
+    ],
+)
+def test_rough_plastic_has_an_index_of_refraction(indices, told, parse):
+    parsed = parse(BALL.format(plastic(*indices)))
+    with pytest.raises(UserError, match="roughplastic has no index of refraction") as caught:
+        edit.to_principled(parsed)
+    assert f"from 1 by {told}. Give numbers above 0" in str(caught.value)
+    assert "scene.xml (line " in str(caught.value)
+
+
+def test_what_principled_cannot_keep_is_told(parse):
+    white = '<bsdf type="roughplastic"><spectrum name="specular_reflectance" value="1"/></bsdf>'
+    kept = [
+        plastic(("string", "distribution", "ggx"), ("boolean", "nonlinear", "false")),
+        plastic(("float", "specular_reflectance", 1)),
+        plastic(("rgb", "specular_reflectance", "1 1 1")),
+        plastic(("string", "int_ior", "diamond"), ("boolean", "sample_visible", "false")),
+        white,
+        ROUGHPLASTIC,
+        DIFFUSE,
+    ]
+    assert edit.lost_properties(parse("".join(map(BALL.format, kept)))) is None
+    texture = '<texture type="checkerboard" name="specular_reflectance"/>'
+    lost = [
+        plastic(("boolean", "nonlinear", "true"), ("string", "distribution", "beckmann")),
+        plastic(("rgb", "specular_reflectance", "1 1 0.5"), ("boolean", "nonlinear", "true")),
+        f'<bsdf type="roughplastic">{texture}</bsdf>',
+    ]
+    told = edit.lost_properties(parse("".join(map(BALL.format, kept + lost))))
+    assert told == (
+        "'specular_reflectance' of 2 BSDFs, 'nonlinear' of 2 BSDFs, "
+        "'distribution' beckmann of 1 BSDF"
+    )
 
 
 def test_shapes_without_a_bsdf_share_a_new_one(parse):

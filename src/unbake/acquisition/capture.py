@@ -22,7 +22,7 @@ from ..dataset.data_folder import DataFolder
 from ..dataset.lighting import write_true_lighting
 from ..dataset.pixels import CameraRays
 from ..dataset.views import Dataset, View
-from ..errors import UserError, printable, raise_together
+from ..errors import UserError, printable, raise_together, require_kind
 from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
 from ..io import is_locked, locked, removed_with_parents, require_file, require_utf8
@@ -56,7 +56,7 @@ def capture(
     settings: CaptureSettings,
     *,
     cameras: Path | str | None = None,
-    light: LightConfig | None = None,
+    light: LightConfig | Path | str | None = None,
     allow_outside: bool = False,
     tell: Callable[[str], None] = print,
 ) -> Dataset:
@@ -66,7 +66,8 @@ def capture(
         scene: a Mitsuba XML file, or the name of a built-in scene.
         out: folder to write; it must not exist yet, and appears only when it is complete.
         cameras: a camera file; None: the built-in scene's own cameras, or automatic placement.
-        light: takes the place of the scene's own light.
+        light: takes the place of the scene's own light; or the file of an environment map that
+            does.
         allow_outside: read files that the scene names and that lie outside of its folder.
         tell: called with lines of progress.
 
@@ -76,6 +77,8 @@ def capture(
 
     Paper: Sec. 6.
     """
+    require_kind(settings, CaptureSettings, "settings", "unbake.CaptureSettings()")
+    light = None if light is None else LightConfig.of(light)
     out, cameras = Path(out), None if cameras is None else Path(cameras)
     require_scene(str(scene))
     require_utf8(out, _KIND)
@@ -289,9 +292,12 @@ def _copy_scene(
     scene, faults = checked_scene(source.parsed(lambda line: None), lit=True)
     raise_together(faults)
     assert scene is not None
+    lost = edit.lost_properties(parsed)
     changed = edit.to_principled(parsed)
     if changed:
-        tell(f"{changed} BSDFs made principled")
+        tell(f"{changed} BSDF{'s' * (changed != 1)} made principled")
+    if lost is not None:
+        tell(f"left out, as principled has no such property: {lost}")
     return write(parsed, folder), scene
 
 

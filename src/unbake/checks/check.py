@@ -36,10 +36,10 @@ from ..dataset.poses import check_cameras, pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, fitted, read_masked
 from ..errors import UserError, collected, named, printable
-from ..scene import free_space
+from ..scene import edit, free_space
 from ..scene.checked import checked_scene
 from ..scene.normals import turned_share
-from ..scene.parse import parse
+from ..scene.parse import ParsedScene, parse
 from .pictures import PictureFacts, blurred, percentage, picture_facts
 
 #: Share of the pixels of surfaces that may be clipped, of one view and of all; and of one view
@@ -169,9 +169,10 @@ def _grouped(faults: Sequence[UserError], folder: Path) -> list[Finding]:
 
 def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:
     faults: list[UserError] = []
-    parsed = scene = None
+    parsed = scene = lost = None
     with collected(faults):
         parsed = parse(dataset.scene, dataset.root)
+        lost = edit.lost_properties(parsed)
         scene, found = checked_scene(parsed, lit=dataset.light == "known")
         result.scene = scene
         faults += found
@@ -179,20 +180,7 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         result.findings += [replace(f, check="scene") for f in _grouped(faults, dataset.folder)]
         _check_files(result, dataset, clip_negative)
         return
-    where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
-    if parsed.repaired_normals:
-        what = f"vertex normals that are not numbers: {parsed.repaired_normals}"
-        remedy = "Normals of the triangles take their place. Compute them anew if you want others"
-        result.add(Finding("hint", "normals", what, where, remedy))
-    turned = turned_share(scene)
-    if turned > _TURNED:
-        what = f"{100 * turned:.0f} % of the surface is shaded as if its edges were round"
-        remedy = "Give these meshes normals of their own, or their shapes 'face_normals'"
-        result.add(Finding("hint", "normals", what, where, remedy))
-    if parsed.media:
-        what = f"participating media, which are left out: {parsed.media}"
-        remedy = "Fog and murky glass go into the materials behind them"
-        result.add(Finding("hint", "media", what, where, remedy))
+    _check_scene(result, dataset, parsed, scene, lost)
     count = sum(view.camera.width * view.camera.height for view in dataset.train)
     if count > MOST_PIXELS:
         what = f"the training views have {count:,} pixels, and a fit has {MOST_PIXELS:,} at most"
@@ -218,6 +206,30 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         what = f"{100 * result.coverage[0]:.0f} % of the surface is seen by no training view"
         remedy = "What no photograph shows is guessed: take more, or accept that"
         result.warn("coverage", what, None, remedy)
+
+
+def _check_scene(
+    result: DataCheck, dataset: Dataset, parsed: ParsedScene, scene: mi.Scene, lost: str | None
+) -> None:
+    """Hints to what fits take the scene for, where that is not all that its file says."""
+    where = str(dataset.scene).removeprefix(f"{dataset.folder}/")
+    if parsed.repaired_normals:
+        what = f"vertex normals that are not numbers: {parsed.repaired_normals}"
+        remedy = "Normals of the triangles take their place. Compute them anew if you want others"
+        result.add(Finding("hint", "normals", what, where, remedy))
+    turned = turned_share(scene)
+    if turned > _TURNED:
+        what = f"{100 * turned:.0f} % of the surface is shaded as if its edges were round"
+        remedy = "Give these meshes normals of their own, or their shapes 'face_normals'"
+        result.add(Finding("hint", "normals", what, where, remedy))
+    if parsed.media:
+        what = f"participating media, which are left out: {parsed.media}"
+        remedy = "Fog and murky glass go into the materials behind them"
+        result.add(Finding("hint", "media", what, where, remedy))
+    if lost is not None:
+        what = f"fits make roughplastic principled, without {lost}"
+        remedy = "What these change goes into the materials. Use principled BSDFs to choose others"
+        result.add(Finding("hint", "scene", what, where, remedy))
 
 
 def _check_files(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:

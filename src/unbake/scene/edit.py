@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..errors import UserError, collected, named, raise_together
 from ..fields.shapes import bsdf_classes, met_shapes
@@ -15,7 +17,7 @@ from ..fields.texture import painted_meshes_without_uv
 from ..quantities import QUANTITIES
 from .emitters import ENVIRONMENTS, STRENGTHS, NamedEmitter, emitter_nodes, named_emitters
 from .one_number import one_number
-from .parse import ParsedScene, is_reference, referenced
+from .parse import ParsedScene, is_reference, is_spectrum, referenced
 
 _NO_MATERIAL = "no material to fit: no surface has a principled, diffuse or roughplastic BSDF"
 _GIVE_ONE = "Give one a principled BSDF: all others are known"
@@ -34,6 +36,9 @@ _PROPERTIES = {
         "specular_reflectance",
     },
 }
+#: Index of refraction of a `principled` that does not say; those so near to it are the same, such
+#: as 1.5 in Mitsuba's air.
+_ETA, _NEAR = 1.5, 1e-3
 
 
 #: Shapes that stand for others.
@@ -43,16 +48,16 @@ _NO_SURFACES = ("instance", "merge", "shapegroup")
 def to_principled(scene: ParsedScene) -> int:
     """Turn every `diffuse` and rough plastic BSDF into `principled`, as the paper did (Sec. 6).
 
-    Diffuse becomes roughness 0.9; rough plastic keeps its colour, with roughness √α, the perceptual
-    roughness of the same microfacet width. Shapes without a BSDF are diffuse to Mitsuba, and share
-    a new one.
+    Diffuse becomes roughness 0.9; rough plastic keeps its colour and its index of refraction, with
+    roughness √α, the perceptual roughness of the same microfacet width. Shapes without a BSDF are
+    diffuse to Mitsuba, and share a new one.
 
     Returns:
         The number of BSDFs changed.
 
     Raises:
         UserError: some have a property that their plugin does not know, no width that is a number,
-            or a number out of range; it tells all of them.
+            no index of refraction from 1, or a number out of range; it tells all of them.
     """
     nodes = [n for n in scene.state.nodes if n.props.plugin_name() == "principled"]
     wrong = [fault for node in nodes for fault in _range_faults(scene, node)]
@@ -74,6 +79,26 @@ def turned_principled(scene: ParsedScene) -> tuple[int, list[UserError]]:
     return changed + _give_bare_shapes_a_bsdf(scene), faults
 
 
+def lost_properties(scene: ParsedScene) -> str | None:
+    """What `to_principled` will not keep of rough plastic, and of how many; None: it keeps all."""
+    lost: Counter[str] = Counter()
+    for node in scene.state.nodes:
+        props = node.props
+        if props.plugin_name() != "roughplastic":
+            continue
+        lost["'specular_reflectance'"] += not _is_one(props.get("specular_reflectance", 1.0))
+        lost["'nonlinear'"] += props.get("nonlinear", False) is True
+        lost["'distribution' beckmann"] += props.get("distribution", None) == "beckmann"
+    told = [f"{name} of {n} BSDF{'s' * (n != 1)}" for name, n in lost.items() if n]
+    return ", ".join(told) or None
+
+
+def _is_one(value: Any) -> bool:
+    """Whether a number, a colour or a spectrum is 1; textures are not."""
+    values = value.values if is_spectrum(value) else value
+    return not is_reference(value) and bool(np.all(np.array(values) == 1))
+
+
 def _made_principled(scene: ParsedScene, node: mi.parser.SceneNode) -> bool:
     """Turn a BSDF into `principled` if it is one of those; returns whether it was."""
     props = node.props
@@ -84,12 +109,14 @@ def _made_principled(scene: ParsedScene, node: mi.parser.SceneNode) -> bool:
             mi.parser.file_location(scene.state, node),
             f"It has {', '.join(sorted(_PROPERTIES[props.plugin_name()]))}",
         )
+    eta = _ETA
     match props.plugin_name():
         case "diffuse":
             colour, roughness = props.get("reflectance", 0.5), 0.9
         case "roughplastic":
             colour = props.get("diffuse_reflectance", 0.5)
             roughness = math.sqrt(_alpha(scene, node))
+            eta = _eta(scene, node)
         case _:
             return False
     for key in list(props.keys()):
@@ -97,6 +124,8 @@ def _made_principled(scene: ParsedScene, node: mi.parser.SceneNode) -> bool:
     props.set_plugin_name("principled")
     props["base_color"] = colour
     props["roughness"] = roughness
+    if abs(eta - _ETA) > _NEAR:
+        props["eta"] = eta
     return True
 
 
@@ -151,6 +180,29 @@ def _alpha(scene: ParsedScene, node: mi.parser.SceneNode) -> float:
         f"'alpha' of roughplastic is {given}, not a number from 0",
         mi.parser.file_location(scene.state, node),
         "Use a principled BSDF, whose roughness is the square root of alpha",
+    )
+
+
+def _eta(scene: ParsedScene, node: mi.parser.SceneNode) -> float:
+    """The index of refraction of rough plastic, relative to what is around it; 1 at least."""
+    # The defaults of `roughplastic`; other BSDFs have others.
+    given = {"int_ior": "polypropylene", "ext_ior": "air"}
+    given |= {key: node.props[key] for key in given if key in node.props}
+    # Mitsuba takes whole numbers for other ones in files, but not here.
+    exact = {k: float(v) if type(v) is int else v for k, v in given.items()}
+    try:
+        # It knows the names of `roughplastic`, and computes nothing beside the index.
+        dielectric = mi.traverse(mi.load_dict({"type": "dielectric", **exact}))
+        eta = float(np.ravel(np.array(dielectric["eta"]))[0])
+    except (RuntimeError, TypeError):
+        eta = math.nan
+    if 1 - _NEAR <= eta < math.inf:
+        return max(eta, 1.0)
+    told = " and ".join(f"{key!r} {value!r}"[:80] for key, value in given.items())
+    raise UserError(
+        f"roughplastic has no index of refraction from 1 by {told}",
+        mi.parser.file_location(scene.state, node),
+        "Give numbers above 0 or names that Mitsuba knows, the larger one as 'int_ior'",
     )
 
 
