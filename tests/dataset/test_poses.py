@@ -82,8 +82,11 @@ def moved(scale=1.0, turn=None, flip=None):
 OPENCV = np.diag([1.0, -1.0, -1.0])
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 MISTAKES = {
-    "millimetres": (moved(1000.0), "in other units (multiply positions by 0.001)"),
-    "kilometres": (moved(0.001), "in other units (multiply positions by 1000)"),
+    "millimetres": (
+        moved(1000.0),
+        "in other units (multiply positions by 0.001; or the mesh: import --mesh-scale 1000)",
+    ),
+    "kilometres": (moved(0.001), "in other units (multiply positions by 1000; or the mesh"),
     "OpenCV": (moved(flip=OPENCV), "in OpenCV's axes (negate columns 2 and 3 of the matrix)"),
     "both": (
         moved(1000.0, flip=OPENCV),
@@ -121,6 +124,9 @@ def test_a_world_with_another_axis_up_is_named(seen):
     scene, cameras, photographs = seen("still")
     (line,) = warnings(scene, [moved(turn=Z_UP)(c) for c in cameras], photographs)
     assert "of a world with z up (turn them by -90° about x: y, z become z, -y; or the mesh" in line
+    (line,) = warnings(scene, [moved(turn=Z_UP.T)(c) for c in cameras], photographs)
+    told = "y up (turn them by 90° about x: y, z become -z, y; or the mesh: import without --mesh-y"
+    assert told in line
 
 
 def test_poses_of_another_scene_are_told_without_a_guess(seen):

@@ -430,6 +430,22 @@ def test_exif_that_some_lack_is_told_and_not_used(
     told = []
     import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
     assert any(line in text for text in told)
+    assert not any(text.startswith("warning") for text in told)
+    assert not any("exposure" in frame for frame in frames_of(tmp_path / "data"))
+
+
+@pytest.mark.parametrize("lacks", [{}, {SECONDS: 0.01, ISO: 100, APERTURE: 0.0}])
+def test_exposures_that_one_photograph_takes_away_are_warned_of(
+    lacks, captured, nerfstudio, meshes, tmp_path
+):
+    known = [{SECONDS: seconds, ISO: 100, APERTURE: 2.0} for seconds in (0.01, 0.04)]
+    with_exif(nerfstudio, captured, [*known, lacks])
+    told = []
+    import_data(nerfstudio, tmp_path / "data", meshes, tell=told.append)
+    (line,) = (text for text in told if text.startswith("warning: exposures: 2 of 3 tell "))
+    assert f"in EXIF, but not images/{captured.views[2].name}.jpg; all are taken" in line
+    assert "although some are 2.0 stops apart. Give a table with --exposures table.csv" in line
+    assert line.endswith("or fit with --exposures per-image")
     assert not any("exposure" in frame for frame in frames_of(tmp_path / "data"))
 
 
@@ -440,14 +456,36 @@ def test_exposures_come_from_a_table(captured, nerfstudio, meshes, tmp_path):
     table.write_text(lines, encoding="utf-8-sig")  # as Excel does
     import_data(nerfstudio, tmp_path / "data", meshes, exposures=table, tell=quiet)
     assert [frame["exposure"] for frame in frames_of(tmp_path / "data")] == [1, 2, 3]
-    table.write_text(f"name,exposure\n{names[0]},-1\n{names[1]},2\n")
+    table.write_text(f"name,exposure\n{names[0]},-1\n{names[1]},2\n\n,\n")
     with pytest.raises(ImportFaults) as caught:
         import_data(nerfstudio, tmp_path / "other", meshes, exposures=table, tell=quiet)
     assert caught.value.faults == (
-        "a line of the table is no name and positive number: line 2",
-        "the table of exposures has no line for a photograph: "
-        f"images/{names[0]}.png, images/{names[2]}.png",
+        "a line of the table exposures.csv is no name and positive number: line 2. "
+        "Write numbers as 0.5 or 1/60",
+        f"the table exposures.csv has no line for a photograph: images/{names[2]}.png",
     )
+
+
+@pytest.mark.parametrize("first", ["0,5", "0.5", "1/2", "1/2,0", " 0,5 "])
+def test_a_table_of_exposures_may_have_semicolons_and_fractions(
+    first, captured, nerfstudio, meshes, tmp_path
+):
+    table = tmp_path / "exposures.csv"
+    one, two, three = (view.name for view in captured.views)
+    lines = f"name;exposure\r\n{one};{first}\r\n{two}.png;1/4\r\n{three};2\r\n;\r\n"
+    table.write_text(lines, encoding="utf-8-sig")
+    import_data(nerfstudio, tmp_path / "data", meshes, exposures=table, tell=quiet)
+    assert [frame["exposure"] for frame in frames_of(tmp_path / "data")] == [0.5, 0.25, 2]
+
+
+@pytest.mark.parametrize("value", ["1/0", "1/2/3", "1/", "/2", "a", "inf/inf", "0/1", "0,5"])
+def test_what_is_no_number_is_told_once(value, captured, nerfstudio, meshes, tmp_path):
+    table = tmp_path / "exposures.csv"
+    table.write_text("name,exposure\n" + "".join(f"{v.name},{value}\n" for v in captured.views))
+    with pytest.raises(ImportFaults) as caught:
+        import_data(nerfstudio, tmp_path / "data", meshes, exposures=table, tell=quiet)
+    (fault,) = caught.value.faults
+    assert "exposures.csv is no name and positive number: line 2, line 3, line 4. " in fault
 
 
 def test_a_table_of_exposures_names_folders(captured, meshes, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import trimesh
 from layouts import APPLIED, quiet, write_blender, write_nerfstudio
 
+from unbake.dataset.mistakes import UNITS, usual_mistakes
 from unbake.errors import UserError
 from unbake.importing import meshes as meshes_module
 from unbake.importing.faults import Faults, ImportFaults
@@ -320,6 +322,40 @@ def test_meshes_with_y_up_are_turned(captured, tmp_path):
     assert np.allclose(np.abs(part.normals).max(1), 1, atol=1e-5), "edges are sharp"
 
 
+@pytest.mark.parametrize("mistake", usual_mistakes((1.0, *UNITS)), ids=lambda m: m.told[:60])
+def test_what_is_told_of_the_mesh_cures_as_much_as_other_poses(mistake, captured):
+    """A mesh that is moved is seen from given cameras as it was from corrected ones, but for s."""
+    told = mistake.told
+    options = told.partition("; or the mesh: import ")[2]
+    camera = captured.views[0].camera
+    corrected = mistake.corrected(camera)
+    if not np.array_equal(mistake.flip, np.eye(3)):
+        corrected = replace(corrected, to_world=corrected.to_world @ with_corner(mistake.flip))
+    if mistake.scale == 1 and np.array_equal(mistake.turn, np.eye(3)):
+        assert not options
+        return
+    assert options.endswith(")") and told.count("import") == 1
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    moved = points
+    if "without --mesh-y-up" in options:
+        moved = moved @ TO_Z_UP[:3, :3]  # back
+    elif "--mesh-y-up" in options:
+        moved = moved @ TO_Z_UP[:3, :3].T
+    if "--mesh-scale" in options:
+        moved = moved * float(options.partition("--mesh-scale ")[2].rstrip(")").split()[0])
+    here, there = (
+        (at - c.origin) @ c.to_world[:3, :3] for at, c in ((moved, camera), (points, corrected))
+    )
+    assert np.allclose(mistake.scale * here, there, rtol=1e-4, atol=1e-4 * mistake.scale)
+
+
+def with_corner(matrix):
+    """A (3, 3) matrix as (4, 4)."""
+    full = np.eye(4)
+    full[:3, :3] = matrix
+    return full
+
+
 def test_meshes_of_ns_export_are_taken_back(captured, tmp_path):
     """Nerfstudio trains where `scale * transform` takes the cameras of COLMAP."""
     write_nerfstudio(captured, tmp_path / "nerf")
@@ -482,6 +518,16 @@ def test_a_ply_file_that_is_not_read_names_what_to_export(tmp_path):
     (tmp_path / "mixed.ply").write_bytes(head + body)
     with pytest.raises(ImportFaults, match=r"cannot be read .*with triangulated faces, or as GLB"):
         parts_of(tmp_path / "mixed.ply")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_a_mesh_that_is_cut_off_may_be_incomplete(suffix, tmp_path):
+    whole = tmp_path / f"whole{suffix}"
+    trimesh.creation.icosphere(2).export(whole)
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole.read_bytes()[:-1000])
+    with pytest.raises(ImportFaults, match=r"cannot be read .*It may be incomplete: export it ag"):
+        parts_of(cut)
 
 
 def test_many_parts_are_named_in_no_time_and_told(captured, tmp_path, monkeypatch):

@@ -130,6 +130,16 @@ def test_photographs_that_wait_to_be_turned_are_told(project, meshes, tmp_path):
         import_data(project, tmp_path / "data", meshes, tell=quiet)
 
 
+def test_photographs_that_were_turned_are_told(project, meshes, tmp_path):
+    cameras = project / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text().replace("16 16", "12 16", 1))
+    for file in sorted((project / "images").iterdir()):
+        Image.new("RGB", (32, 24)).save(file)  # twice as large
+    told = r"for 12 x 16 pixels, it has 32 x 24; it was turned by 90 degrees, .*\. Turn it back"
+    with pytest.raises(ImportFaults, match=told):
+        import_data(project, tmp_path / "data", meshes, tell=quiet)
+
+
 def test_photographs_that_programs_show_turned_are_told(project, meshes, tmp_path):
     """Square ones, and half turns, have the shape of their camera."""
     first, second, _ = sorted((project / "images").iterdir())
@@ -140,6 +150,10 @@ def test_photographs_that_programs_show_turned_are_told(project, meshes, tmp_pat
     told = imported(project, tmp_path / "data", meshes)[1]
     asks = "the EXIF of 2 photographs asks to turn them; they are taken as stored: "
     assert f"{asks}{first.name}, {second.name}" in told
+    Image.open(first).save(first, exif=Image.Exif())
+    told = imported(project, tmp_path / "one", meshes)[1]
+    asks = "the EXIF of one photograph asks to turn it; it is taken as stored: "
+    assert f"{asks}{second.name}" in told
 
 
 # ------------------------------------------------------------------------------------------ missing
@@ -156,8 +170,57 @@ def test_missing_photographs_may_be_left_out(captured, project, meshes, tmp_path
     assert {view.name for view in data.views} == left
     shutil.rmtree(project / "images")
     (project / "images").mkdir()
-    with pytest.raises(ImportFaults, match=r"no photograph of the source exists: COLMAP. --images"):
+    folder = project / "images"
+    none = f"None is in {folder}: name their folder with --images"
+    with pytest.raises(ImportFaults) as caught:
         imported(project, tmp_path / "none", meshes, leave_out_missing=True)
+    assert caught.value.faults == (f"no photograph of the source exists. {none}",)
+    with pytest.raises(ImportFaults) as caught:
+        imported(project, tmp_path / "none", meshes)
+    (fault,) = caught.value.faults
+    assert fault.startswith("the image does not exist: ")
+    assert fault.endswith(f". {none}")
+
+
+@pytest.mark.parametrize("suffix", [".JPG", ".jpg"])
+def test_suffixes_may_be_of_another_case(suffix, captured, project, meshes, tmp_path):
+    """Resizers write `.jpg` of the `.JPG` that was posed; the one that is named comes first."""
+    model, smaller = project / "sparse" / "0" / "images.txt", tmp_path / "smaller"
+    model.write_text(model.read_text().replace(".png", ".JPG"))
+    for view in captured.views:
+        save(codes(view), smaller / f"{view.name}{suffix}")
+        save(codes(view), smaller / "masks" / f"{view.name}{suffix}.png")
+    if suffix == ".JPG":
+        for view in captured.views:
+            save(np.zeros_like(codes(view)), smaller / f"{view.name}.jpg")
+    table = tmp_path / "exposures.csv"
+    rows = [f"{view.name}{suffix},2\n" for view in captured.views]
+    table.write_text("name,exposure\n" + "".join(rows))
+    more = {"masks": smaller / "masks", "exposures": table}
+    data, told = imported(project, tmp_path / "data", meshes, images=smaller, **more)
+    assert {view.name for view in data.views} == {view.name for view in captured.views}
+    assert all(view.exposure == 2 for view in data.views)
+    assert all(read_photograph(view)[..., :3].max() > 0.1 for view in data.views)
+    assert not any("another format" in line for line in told)
+
+
+def test_a_photograph_in_another_format_is_taken_where_there_is_one(
+    captured, project, meshes, tmp_path
+):
+    for file in sorted((project / "images").iterdir()):
+        file.rename(project / "images" / f"{file.stem}.TIFF")
+    for view in captured.views:
+        save(codes(view), project / "images" / f"{view.name}.TIFF")
+    data, told = imported(project, tmp_path / "data", meshes)
+    assert {view.name for view in data.views} == {view.name for view in captured.views}
+    (line,) = (line for line in told if line.startswith("photographs of another format are taken"))
+    first, second, _ = sorted(f"{view.name}.png" for view in captured.views)
+    assert f"these do not exist: {first}, {second}, " in line
+    save(np.zeros((16, 16, 3), np.uint8), project / "images" / f"{captured.views[0].name}.jpg")
+    with pytest.raises(
+        ImportFaults, match=r"does not exist: .*\.png\. --leave-out-missing imports"
+    ):
+        imported(project, tmp_path / "two", meshes)
 
 
 @pytest.mark.parametrize("layout", [write_nerfstudio, write_blender])
@@ -194,7 +257,7 @@ def test_masks_beside_the_images_of_colmap_are_taken(named, project, meshes, tmp
     for file in files[1:]:
         save(mask, project / "masks" / named.format(file.name, stem=file.stem))
     data, told = imported(project, tmp_path / "data", meshes)
-    assert f"1 photographs have no mask: {files[0].name}" in told
+    assert f"one photograph has no mask: {files[0].name}" in told
     first, *others = data.views
     assert read_masked(first)[1].all()
     for view in others:

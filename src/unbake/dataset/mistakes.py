@@ -20,13 +20,15 @@ _FLIPS = {
 }
 #: A quarter turn about x, either way: between worlds whose z and whose y points up.
 _TURNS = {
-    "z up (turn them by -90° about x: y, z become z, -y; or the mesh: import --mesh-y-up)": (
+    "z up (turn them by -90° about x: y, z become z, -y)": (
         np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     ),
     "y up (turn them by 90° about x: y, z become -z, y)": (
         np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     ),
 }
+#: What turns the mesh of an import instead, in the same order.
+_TURNS_OF_MESH = ("--mesh-y-up", "without --mesh-y-up")
 _INVERTED = "from world to camera (invert the matrices)"
 #: Units that are taken for each other: millimetres, centimetres, inches, decimetres, metres.
 UNITS = (0.001, 0.01, 0.0254, 0.1, 10.0, 1 / 0.0254, 100.0, 1000.0)
@@ -101,8 +103,20 @@ def _simplest_first(
         units = f"in other units (multiply positions by {scale:g})" if scale != 1 else ""
         parts = tuple(filter(None, (flipped, units, turned)))
         if parts:
-            found.append(Mistake(parts, scale, turn, flip))
+            found.append(Mistake(_or_the_mesh(parts, scale, turn), scale, turn, flip))
     return sorted(found, key=lambda mistake: len(mistake.parts))
+
+
+def _or_the_mesh(parts: tuple[str, ...], scale: float, turn: np.ndarray) -> tuple[str, ...]:
+    """The phrases, the last of which also says how to import the mesh for poses as they are."""
+    known = zip(_TURNS.values(), _TURNS_OF_MESH, strict=True)
+    options = [told for other, told in known if np.array_equal(turn, other)]
+    if scale != 1:
+        options.insert(0, f"--mesh-scale {1 / scale:g}")
+    if not options:
+        return parts
+    last = parts[-1].removesuffix(")")
+    return (*parts[:-1], f"{last}; or the mesh: import {' '.join(options)})")
 
 
 def _rotations() -> Iterator[np.ndarray]:

@@ -1,7 +1,7 @@
 """The scene as OpenUSD: meshes, UsdPreviewSurface materials with textures, and lights.
 
     usd/scene.usdc        binary; names of parts and materials are display names
-    usd/textures/         PNG, sRGB for albedo
+    usd/textures/         PNG, sRGB for albedo; and the environment
 
 A texture coordinate (u, v) of Mitsuba and glTF is (u, 1 − v) in USD: (0, 0) is below. Units
 stay those of the scene, and so do axes where y or z is up: the stage says which. Where neither is,
@@ -16,6 +16,7 @@ import importlib.util
 import json
 import math
 import os
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,8 @@ def write_usd(
         parts: all of them; those that no fit optimizes get materials without textures.
         baked: textures of the others.
         lights: those without extent are written as such, area lights as emission of their parts.
-        environment: path of the environment's file from the folder; None: there is none.
+        environment: path of the environment's file from the folder, which is copied to the
+            textures; None: there is none.
         up: what is up in the scene.
     """
     from pxr import Usd, UsdGeom, UsdLux
@@ -102,7 +104,10 @@ def write_usd(
             writer.light(light)
     if environment is not None:
         dome = UsdLux.DomeLight.Define(stage, writer.path("lights", "environment"))
-        dome.CreateTextureFileAttr(environment)
+        copied = f"textures/{Path(environment).name}"
+        (folder / "textures").mkdir(exist_ok=True)
+        shutil.copyfile(folder / environment, folder / copied)
+        dome.CreateTextureFileAttr(f"./{copied}")
         dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
     stage.GetRootLayer().Save()
 

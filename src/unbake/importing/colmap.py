@@ -69,12 +69,7 @@ def read_colmap(model: Path, reading: Reading, faults: Faults) -> Source:
             if reading.has(file, image.name):
                 shots.append(_shot(image, lenses[image.camera_id], file))
     if not shots and not reading.missing and not faults:
-        what = (
-            "no photograph of the model exists"
-            if reading.missing
-            else "no image of the model has a pose"
-        )
-        faults.add(what, model)
+        faults.add("no image of the model has a pose", model)
     ordered = tuple(sorted(shots, key=lambda shot: shot.name))
     masks = None if found is None else found.parent / _MASKS
     return Source(

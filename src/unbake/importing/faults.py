@@ -48,6 +48,13 @@ class Faults:
         places = self._places.setdefault((what, remedy), [])
         places.extend([] if place is None else [printable(place)])
 
+    def remedy(self, what: str, remedy: str) -> None:
+        """Tell the remedy of a fault that was added without one."""
+        self._places = {
+            (told, remedy if (told, known) == (what, None) else known): places
+            for (told, known), places in self._places.items()
+        }
+
     def extend(self, others: Faults) -> None:
         """Add all of these."""
         for fault, places in others._places.items():

@@ -18,6 +18,7 @@ from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.photographs import MOST_PIXELS
 from ..dataset.views import LONGEST_NAME
 from ..errors import UserError, named, printable
+from ..imaging.headers import CODED_SUFFIXES
 from ..io import filled_folder, require_new_folder, require_utf8
 from ..scene import free_space, relight
 from ..scene.parse import parse, write
@@ -168,10 +169,11 @@ def import_data(
 def _found(source: Path, reading: Reading, masks: Path | None, faults: Faults) -> Source:
     """What the source holds, with masks."""
     found = _read_source(source, reading, faults)
-    if reading.missing and not found.shots and not faults:
-        faults.add("no photograph of the source exists", found.kind, "--images names their folder")
+    reading.tell_missing(faults)
     found = masks_in(found, masks, reading, faults)
-    told = (*_scaled(found.shots), *_turned(found.shots), *_raw_beside(found.shots))
+    told = [
+        note for of in (_scaled, _turned, _raw_beside, _reformatted) for note in of(found.shots)
+    ]
     return replace(found, notes=(*found.notes, *reading.notes(), *told))
 
 
@@ -314,8 +316,11 @@ def _turned(shots: Sequence[Shot]) -> list[str]:
     names = [shot.name for shot in shots if orientation(shot.image) != 1]
     if not names:
         return []
-    told = "asks to turn them; they are taken as stored"
-    return [f"the EXIF of {len(names)} photographs {told}: {named(names)}"]
+    if len(names) == 1:
+        told = "one photograph asks to turn it; it is taken as stored"
+    else:
+        told = f"{len(names)} photographs asks to turn them; they are taken as stored"
+    return [f"the EXIF of {told}: {named(names)}"]
 
 
 def _raw_beside(shots: Sequence[Shot]) -> list[str]:
@@ -328,6 +333,21 @@ def _raw_beside(shots: Sequence[Shot]) -> list[str]:
         return []
     what = f"camera RAW beside its photograph is not read ({len(names)}): {named(names)}"
     return [f"{what}; move it to a folder of its own, and name that with --images"]
+
+
+def _reformatted(shots: Sequence[Shot]) -> list[str]:
+    """A note of photographs that others take the place of, which differ in their suffix."""
+    suffixes = {shot.name: PurePosixPath(shot.name).suffix.lower() for shot in shots}
+    names = [
+        shot.name
+        for shot in shots
+        if suffixes[shot.name] in CODED_SUFFIXES
+        and suffixes[shot.name] != shot.image.suffix.lower()
+        and not shot.raw
+    ]
+    if not names:
+        return []
+    return [f"photographs of another format are taken, as these do not exist: {named(names)}"]
 
 
 def _straightening(shots: Sequence[Shot]) -> list[str]:
@@ -612,7 +632,8 @@ def _summary(
         ]
     blind = [shot.name for shot, value in zip(shots, seen, strict=True) if value == 0]
     if blind:
-        lines += [f"{len(blind)} photographs do not see the mesh: {', '.join(blind[:3])}"]
+        count = "one photograph does" if len(blind) == 1 else f"{len(blind)} photographs do"
+        lines += [f"{count} not see the mesh: {named(blind)}"]
     return lines
 
 

@@ -298,7 +298,8 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
         raise
     except Exception as error:  # readers of damaged files raise whatever they meet
         told = " ".join(str(error).split())[:160] or type(error).__name__
-        remedy = "Export it with triangulated faces, or as GLB" if suffix == ".ply" else None
+        remedy = "It may be incomplete: export it again, with triangulated faces, or as GLB"
+        remedy = remedy if suffix == ".ply" else "It may be incomplete: export it again"
         raise UserError(f"the mesh cannot be read ({told})", file, remedy) from None
     if not found:
         raise UserError("the mesh has no triangles", file)

@@ -22,6 +22,8 @@ from .world import World
 
 #: Suffixes that are tried where the name of an image has none: radiance before code values.
 _TRIED = tuple(s for suffix in (".exr", *CODED_SUFFIXES) for s in (suffix, suffix.upper()))
+#: What is wrong with a photograph that is not there, as `require_file` says it.
+MISSING = "the image does not exist"
 #: Suffixes of masks.
 _MASKS = (".png", ".PNG")
 #: Difference of the factors of width and height that rounding may cause, at most.
@@ -82,7 +84,8 @@ class Reading:
         keep_applied_transform: leave cameras in the frame of nerfstudio's file.
         leave_out_missing: go on without photographs that do not exist.
         other_masks: masks that frames name may be missing: others take their place.
-        missing: names of those that were left out; `has` adds to it.
+        present: names of those that exist; `has` adds to it, and to the next one.
+        missing: files of those that do not, by name.
         contradicting: names of those whose focal length and angle of view are not of one camera.
         scaled: names of those whose pose has a scale, which is taken out.
     """
@@ -92,7 +95,8 @@ class Reading:
     keep_applied_transform: bool = False
     leave_out_missing: bool = False
     other_masks: bool = False
-    missing: list[str] = field(default_factory=list)
+    present: list[str] = field(default_factory=list)
+    missing: dict[str, Path] = field(default_factory=dict)
     contradicting: list[str] = field(default_factory=list)
     scaled: list[str] = field(default_factory=list)
 
@@ -106,11 +110,30 @@ class Reading:
         Raises:
             UserError: it is missing and not left out, or is no file.
         """
-        if self.leave_out_missing and not image.exists():
-            self.missing.append(name)
-            return False
-        require_file(image, "image", "--leave-out-missing imports the others")
+        try:
+            require_file(image, "image")
+        except UserError as error:
+            if error.what == MISSING:
+                self.missing[name] = image
+                if self.leave_out_missing:
+                    return False
+            raise
+        self.present.append(name)
         return True
+
+    def tell_missing(self, faults: Faults) -> None:
+        """Say what may help where photographs do not exist, once all of them are known."""
+        if not self.missing:
+            return
+        if self.present:
+            faults.remedy(MISSING, "--leave-out-missing imports the others")
+            return
+        folder = os.path.commonpath([file.parent.absolute() for file in self.missing.values()])
+        remedy = f"None is in {folder}: name their folder with --images"
+        if self.leave_out_missing:
+            faults.add("no photograph of the source exists", remedy=remedy)
+        else:
+            faults.remedy(MISSING, remedy)
 
     def notes(self) -> tuple[str, ...]:
         """What was left out, and what cameras contradict themselves in, for people."""
@@ -180,7 +203,9 @@ def image_header(path: Path) -> ImageHeader:
 def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Path:
     """The file of a folder that a name means, which may lack its suffix; it need not exist.
 
-    Camera RAW takes the place of the photograph that a program has posed, which was made of it.
+    Its suffix may be of another case, as `.JPG` and `.jpg`. Camera RAW takes the place of the
+    photograph that a program has posed, which was made of it. So does a photograph in another
+    format, where only one has the name.
 
     Args:
         folder: that it must not leave.
@@ -199,9 +224,30 @@ def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Pa
     if path.is_file() or given.name in ("", ".."):
         return path
     others = [given.with_name(given.name + suffix) for suffix in _TRIED]
-    others += [given.with_suffix(case) for s in RAW_SUFFIXES for case in (s, s.upper())]
+    if given.suffix.lower() in (*CODED_SUFFIXES, *SUFFIXES):
+        others += _cases(given, given.suffix.lower())
+    others += [other for suffix in RAW_SUFFIXES for other in _cases(given, suffix)]
     found = next((other for other in others if (folder / other).is_file()), None)
+    if found is None:
+        found = _in_another_format(folder, given)
     return path if found is None else checked(os.fspath(found))
+
+
+def _cases(path: PurePath, suffix: str) -> list[PurePath]:
+    """A path with another suffix, in small and in capital letters."""
+    return [path.with_suffix(case) for case in (suffix, suffix.upper())]
+
+
+def _in_another_format(folder: Path, given: PurePath) -> PurePath | None:
+    """The photograph with the name of another, but for its suffix; None: there is not just one."""
+    if given.suffix.lower() not in CODED_SUFFIXES:
+        return None
+    found = [
+        next((case for case in _cases(given, suffix) if (folder / case).is_file()), None)
+        for suffix in CODED_SUFFIXES
+    ]
+    there = [other for other in found if other is not None]
+    return there[0] if len(there) == 1 else None
 
 
 def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faults) -> Source:
@@ -250,13 +296,15 @@ def masks_in(source: Source, folder: Path | None, reading: Reading, faults: Faul
             return replace(source, notes=(*source.notes, f"{what} {folder.name}. {remedy}"))
         faults.add(what, folder, remedy)
         return source
-    note = (f"{len(bare)} photographs have no mask: {named(bare)}",) if bare else ()
+    count = "one photograph has" if len(bare) == 1 else f"{len(bare)} photographs have"
+    note = (f"{count} no mask: {named(bare)}",) if bare else ()
     return replace(source, shots=tuple(shots), notes=(*source.notes, *note))
 
 
 def _mask_of(shot: Shot, folder: Path, reading: Reading) -> Path | None:
     for end in ends_of(shot.name):
-        for name in (f"{stem}{case}" for stem in (end, end.with_suffix("")) for case in _MASKS):
+        stems = (end, end.with_suffix(shot.image.suffix), end.with_suffix(""))
+        for name in (f"{stem}{case}" for stem in stems for case in _MASKS):
             if (folder / name).is_file():
                 outside = reading.allow_outside
                 return inside(folder, name, name, "folder of masks", allow_outside=outside)
@@ -291,11 +339,13 @@ def suited(lens: Lens, image: Path) -> Lens:
     if not is_raw(image) and same_shape(size, (lens.width, lens.height)):
         return lens.scaled(*size)
     what = f"its camera is for {lens.width} x {lens.height} pixels, it has {size[0]} x {size[1]}"
-    quarter = orientation(image) in (5, 6, 7, 8)
-    if quarter and same_shape((size[1], size[0]), (lens.width, lens.height)):
-        told = f"{what}; its EXIF says that it is to be turned"
-        remedy = "Save the photographs turned (ImageMagick: mogrify -auto-orient)"
-        raise UserError(told, image, remedy)
+    if not is_raw(image) and same_shape((size[1], size[0]), (lens.width, lens.height)):
+        if orientation(image) in (5, 6, 7, 8):
+            told = f"{what}; its EXIF says that it is to be turned"
+            remedy = "Save the photographs turned (ImageMagick: mogrify -auto-orient)"
+            raise UserError(told, image, remedy)
+        told = f"{what}; it was turned by 90 degrees, perhaps by an editor that follows EXIF"
+        raise UserError(told, image, "Turn it back, or give the photograph that was posed")
     raise UserError(what, image, "Give the photographs that were posed, whole or scaled as a whole")
 
 
