@@ -148,7 +148,8 @@ def test_paths_may_be_texts(tmp_path):
     tried = {"Dataset.save", "DataFolder.known", "DataFolder.relative"}
     tried |= {"RunFolder.tidy_checkpoints"}
     assert "none" in str(unbake.check_data(none).findings)
-    tried |= {"check_data"}
+    assert unbake.LightConfig.of(none) == light
+    tried |= {"check_data", "LightConfig.of"}
     elsewhere = {"Run.export", "Run.relight", "Run.report"}  # in test_run.py
     assert found.keys() == refused.keys() | tried | elsewhere
 
@@ -173,3 +174,58 @@ help(unbake)
     assert text.startswith("DRJIT_LIBLLVM_PATH: there is no file")
     assert "class UserError" in text
     assert [n for n in unbake.__all__ if not re.search(rf"    .*\b{n}\b", text)] == []
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda path: unbake.fit(path, path, "cpu"), "config: must be FitConfig, not str"),
+        (lambda path: unbake.fit(path, path, {"steps": 2}), "config: must be FitConfig, not dict"),
+        (lambda path: unbake.fit(path, path, None), "config: must be FitConfig, not NoneType"),
+        (lambda path: unbake.with_defaults({}, None), "config: must be FitConfig, not dict"),
+        (
+            lambda path: unbake.compare(path, [], path, "cpu", evaluation=None),
+            "config: must be FitConfig, not str",
+        ),
+        (
+            lambda path: unbake.compare(path, [], path, unbake.preset("cpu"), evaluation=None),
+            "evaluation: must be EvaluationSettings, not NoneType",
+        ),
+        (
+            lambda path: unbake.evaluate(path, {"spp": 3}),
+            "settings: must be EvaluationSettings, not dict",
+        ),
+        (lambda path: unbake.render(path, path, 64), "settings: must be RenderSettings, not int"),
+        (
+            lambda path: unbake.relight(path, path, "sky.exr", 64),
+            "settings: must be RenderSettings, not int",
+        ),
+        (lambda path: unbake.relight(path, path, None), "light: must be LightConfig, not NoneType"),
+        (lambda path: unbake.solve("cube", path, 9), "settings: must be SolveSettings, not int"),
+        (lambda path: unbake.fine_tune(path, path, 9), "settings: must be SolveSettings, not int"),
+        (
+            lambda path: unbake.capture("cube", path, None),
+            "settings: must be CaptureSettings, not NoneType",
+        ),
+        (
+            lambda path: unbake.capture("cube", path, unbake.CaptureSettings(), light=1),
+            "light: must be LightConfig, not int",
+        ),
+        (
+            lambda path: unbake.degrade(path, path, "png"),
+            "settings: must be DegradeSettings, not str",
+        ),
+    ],
+)
+def test_an_argument_of_a_wrong_class_is_told_first(call, message, tmp_path):
+    path = tmp_path / "none"
+    with pytest.raises(unbake.UserError, match=f"^{message}. Give one, such as unbake\\."):
+        call(path)
+    assert not path.exists()
+
+
+def test_the_file_of_an_environment_map_is_a_light():
+    for path in ("sky.exr", Path("sky.exr")):
+        assert unbake.LightConfig.of(path) == unbake.LightConfig(envmap="sky.exr")
+    light = unbake.LightConfig(lights="lamps.xml")
+    assert unbake.LightConfig.of(light) is light

@@ -73,6 +73,11 @@ def test_a_picture_of_a_camera_a_view_or_a_name(run):
         run.render("nothing")
     with pytest.raises(unbake.UserError, match="spp"):
         run.render(view, spp=0)
+    with pytest.raises(unbake.UserError, match="spp: must be int, not float"):
+        run.render(view, spp=2.5)
+    with pytest.raises(unbake.UserError, match="width: must be int, not float"):
+        run.render(view, width=33.5)
+    assert run.render(view, spp=np.int64(1), width=np.int32(8)).shape == (8, 8, 3)
 
 
 def test_materials_are_those_of_the_surfaces_that_rays_meet(run):
@@ -106,6 +111,8 @@ def test_materials_are_those_of_the_surfaces_that_rays_meet(run):
         ([[0, 0, 0]] * 2, [[0, 0, 1]], "2 origins and 1 directions"),
         ([[0, 0, 0]] * 2, [0, 1], "like shapes"),
         (["a"], ["b"], "like shapes"),
+        (np.zeros((0, 3)), np.zeros((0, 3)), "^no rays are given. Give origins and directions of"),
+        (None, [0, 0, 1], "^no rays are given"),
     ],
 )
 def test_bad_rays_are_refused(run, origins, directions, what):
@@ -142,6 +149,9 @@ def test_materials_are_those_of_texture_coordinates(run):
         ("left", [[0, 0, 0]], "have shape"),
         ("left", [["a", "b"]], "no array of numbers"),
         ("left", [[0, np.inf]], "not finite"),
+        ("left", np.zeros((0, 2)), "^no texture coordinates are given. Give texture coord"),
+        ("left", [], "^no texture coordinates are given"),
+        ("left", None, "^no texture coordinates are given"),
     ],
 )
 def test_texture_coordinates_that_cannot_be_asked_are_refused(run, mesh, uv, what):

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import re
 import shlex
 import sys
+import types
+import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
+from typing import Any, Literal, cast
 
 #: Characters that are shown of a name, and of each part of a message.
 _LONGEST_NAME, _LONGEST_PART = 80, 1000
@@ -146,22 +151,90 @@ def require(good: bool, key: str, wanted: str, value: object) -> None:
         raise UserError(f"must be {wanted}, not {printable(repr(value))}", where=key)
 
 
-def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Raise a `UserError` that names all numbers of some settings that are out of range.
+def require_kind(value: object, kind: type, where: str, example: str) -> None:
+    """Raise a `UserError` unless an argument of a public function is of a class.
 
     Args:
-        settings: an object with the numbers as attributes; None is one that is left open.
-        ranges: the least and the most of each, by its name.
+        value: what was given.
+        kind: the class.
+        where: name of the argument.
+        example: an expression that makes one.
     """
-    wrong = []
+    if not isinstance(value, kind):
+        what = f"must be {kind.__name__}, not {type(value).__name__}"
+        raise UserError(what, where, f"Give one, such as {example}")
+
+
+def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raise a `UserError` that names all values of a wrong type, and all numbers out of range.
+
+    Scalars of numpy become Python's own, which files can hold.
+
+    Args:
+        settings: a dataclass; its numbers, texts, names of a `Literal` and dataclasses must have
+            the types that it declares.
+        ranges: the least and the most of numbers, by their names; None is one that is left open.
+    """
+    wrong = {}
+    for key, hint in _checked(type(settings)).items():
+        value = getattr(settings, key)
+        if getattr(value, "shape", None) == ():
+            value = value.item()
+            object.__setattr__(settings, key, value)
+        if (told := mistyped(value, hint)) is not None:
+            wrong[key] = told
     for key, (least, most) in ranges.items():
         value = getattr(settings, key)
-        wanted = None if value is None else _wanted(value, least, most)
+        wanted = None if value is None or key in wrong else _wanted(value, least, most)
         if wanted is not None:
-            wrong.append((key, f"must be {wanted}, not {value!r}"))
+            wrong[key] = f"must be {wanted}, not {value!r}"
     if wrong:
-        (key, first), *others = wrong
+        (key, first), *others = wrong.items()
         raise UserError("; ".join([first, *(f"{k}: {told}" for k, told in others)]), where=key)
+
+
+def mistyped(value: object, hint: Any) -> str | None:
+    """What is wrong with the type of a value, or with a name; None where nothing is.
+
+    An integer is good for `float`, a bool for neither number.
+
+    Args:
+        value: of a setting.
+        hint: its annotation: a class, a `Literal`, or one of these or None.
+    """
+    kind = _without_none(hint)
+    if value is None and kind is not hint:
+        return None
+    if typing.get_origin(kind) is Literal:
+        names = typing.get_args(kind)
+        good = isinstance(value, str | int) and value in names
+        told = f"must be one of {', '.join(map(str, names))}, not {printable(repr(value))}"
+    else:
+        good = isinstance(value, int | float if kind is float else kind)
+        good = good and (kind is bool or not isinstance(value, bool))
+        told = f"must be {kind.__name__}, not {type(value).__name__}"
+    return None if good else told
+
+
+@cache
+def _checked(kind: type) -> dict[str, Any]:
+    """The annotations of those fields of a dataclass whose types are checked, by name."""
+    hints = typing.get_type_hints(kind)
+    fields = {field.name: hints[field.name] for field in dataclasses.fields(cast(Any, kind))}
+    return {name: hint for name, hint in fields.items() if _is_checked(_without_none(hint))}
+
+
+def _is_checked(kind: Any) -> bool:
+    plain = kind in (bool, int, float, str) or typing.get_origin(kind) is Literal
+    return plain or dataclasses.is_dataclass(kind)
+
+
+def _without_none(hint: Any) -> Any:
+    """The annotation X of `X | None`; any other as it is."""
+    if typing.get_origin(hint) not in (types.UnionType, typing.Union):
+        return hint
+    kinds = [kind for kind in typing.get_args(hint) if kind is not types.NoneType]
+    return kinds[0] if len(kinds) == 1 else hint
 
 
 def _wanted(value: float, least: float, most: float) -> str | None:

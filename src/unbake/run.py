@@ -255,9 +255,8 @@ class Run:
         Args:
             formats: one, or several.
         """
-        chosen = [formats] if isinstance(formats, str) else formats
         return export(
-            self.path, out, chosen, texels=texels, allow_outside=self._allow_outside, tell=tell
+            self.path, out, formats, texels=texels, allow_outside=self._allow_outside, tell=tell
         )
 
     def relight(
@@ -276,8 +275,6 @@ class Run:
         Args:
             light: the file of an environment map, or a light with more to say.
         """
-        if not isinstance(light, LightConfig):
-            light = LightConfig(envmap=Path(light))
         return rendering.relight(
             self.path,
             out,
@@ -367,14 +364,16 @@ def _coordinates(uv: np.ndarray) -> np.ndarray:
     """Texture coordinates, (n, 2) float32.
 
     Raises:
-        UserError: they have another shape, or are not finite.
+        UserError: there are none, they have another shape, or are not finite.
     """
     remedy = "Give texture coordinates of shape (n, 2)"
     try:
         found = np.atleast_2d(np.asarray(uv, np.float32))
     except (ValueError, TypeError):
         raise UserError("texture coordinates are no array of numbers", None, remedy) from None
-    if found.ndim != 2 or found.shape[1] != 2 or not len(found):
+    if uv is None or not found.size:
+        raise UserError("no texture coordinates are given", None, remedy)
+    if found.ndim != 2 or found.shape[1] != 2:
         raise UserError(f"texture coordinates have shape {found.shape}", None, remedy)
     if not np.isfinite(found).all():
         raise UserError("a texture coordinate is not finite", None, "Leave such ones out")
@@ -385,7 +384,7 @@ def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.n
     """Origins and unit directions, (n, 3) float32 each.
 
     Raises:
-        UserError: they have other shapes, are not finite, or a direction is zero.
+        UserError: there are none, they have other shapes, are not finite, or a direction is zero.
     """
     remedy = "Give origins and directions of shape (n, 3)"
     try:
@@ -398,7 +397,9 @@ def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.n
         raise UserError(
             "origins and directions are not arrays of like shapes", None, remedy
         ) from None
-    if o.ndim != 2 or o.shape[1] != 3 or not len(o):
+    if origins is None or directions is None or not o.size:
+        raise UserError("no rays are given", None, remedy)
+    if o.ndim != 2 or o.shape[1] != 3:
         raise UserError(f"origins and directions have shape {o.shape}", None, remedy)
     length = np.linalg.norm(d, axis=1, keepdims=True)
     if not (np.isfinite(o).all() and np.isfinite(length).all() and (length > 0).all()):

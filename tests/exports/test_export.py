@@ -351,6 +351,23 @@ def test_a_scene_without_a_sensor_gets_that_of_the_first_photograph(aspect, tmp_
     assert ["mean of two focal lengths" in note for note in made.notes] == [True] * (aspect != 1)
 
 
+def test_a_scene_without_an_integrator_gets_one(tmp_path):
+    (tmp_path / "scene.xml").write_text(WITHOUT_SENSOR)
+    (tmp_path / "out").mkdir()
+    scene, scratch = (parsed_principled(tmp_path / "scene.xml", tmp_path) for _ in range(2))
+    camera = LookAt((0, 0, 3), (0, 0, 0), (0, 1, 0), 40).camera(4, 4)
+    made = write_scene(tmp_path / "out", scene, scratch, [], [], [], None, camera)
+    assert np.array(mi.render(mi.load_file(str(made.path)), spp=1)).shape[:2] == (4, 4)
+    # A scene keeps its own
+    own = made.path.read_text().replace('type="path"', 'type="direct"')
+    assert own.count("<integrator") == 1
+    (tmp_path / "own.xml").write_text(own)
+    (tmp_path / "again").mkdir()
+    scene, scratch = (parsed_principled(tmp_path / "own.xml", tmp_path) for _ in range(2))
+    made = write_scene(tmp_path / "again", scene, scratch, [], [], [], None, camera)
+    assert re.findall(r'<integrator .*type="(\w+)"', made.path.read_text()) == ["direct"]
+
+
 def test_a_gltf_file_that_would_be_too_large_is_told(monkeypatch):
     document = Document()
     document.view(bytes(1000))
@@ -879,7 +896,8 @@ def test_usd_has_the_lights(exported):
     np.testing.assert_allclose(-matrix[:3, 2], ahead, atol=1e-5)
     (dome,) = (p for p in stage.Traverse() if p.IsA(UsdLux.DomeLight))
     found = UsdLux.DomeLight(dome).GetTextureFileAttr().Get().resolvedPath
-    assert Path(found).resolve().parent == exported.folder
+    assert Path(found) == exported.folder / "usd" / "textures" / "environment.exr"
+    np.testing.assert_array_equal(read_exr(found), read_exr(exported.folder / "environment.exr"))
     (lamp,) = (p for p in stage.Traverse() if p.GetDisplayName() == "lamp" and p.IsA(UsdGeom.Mesh))
     surface = UsdShade.MaterialBindingAPI(lamp).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
     np.testing.assert_allclose(surface.GetInput("emissiveColor").Get(), [6, 4, 2], rtol=1e-5)
@@ -956,7 +974,8 @@ def test_an_environment_that_was_known_is_taken_along(with_metallic, tmp_path, m
     stage = Usd.Stage.Open(str(out / "usd" / "scene.usdc"))
     (dome,) = (p for p in stage.Traverse() if p.IsA(UsdLux.DomeLight))
     found = UsdLux.DomeLight(dome).GetTextureFileAttr().Get().resolvedPath
-    assert Path(found).resolve() == file.resolve()
+    assert Path(found) == out / "usd" / "textures" / file.name
+    assert Path(found).read_bytes() == file.read_bytes()
     text = (out / "mitsuba" / "scene.xml").read_text()
     assert 'type="constant"' in text and 'type="envmap"' not in text
     assert any(note.startswith("glTF has no environment") for note in manifest["notes"])
@@ -2006,6 +2025,14 @@ def test_names_of_files_are_safe_and_different():
     names = file_names(["a/b", "A_b", "..", "", "x" * 300, "père"])
     assert names[:4] == ["a_b", "A_b-2", "material", "material-2"]
     assert all(len(name) <= 60 and "/" not in name for name in names)
+
+
+def test_one_format_needs_no_list(tmp_path):
+    with pytest.raises(UserError) as error:
+        exporting.export(tmp_path / "none", tmp_path / "out", "gltf")
+    assert "no run" in str(error.value) and "no format" not in str(error.value)
+    with pytest.raises(UserError, match="no format named 'obj'"):
+        exporting.export(tmp_path / "none", tmp_path / "out", "obj")
 
 
 @pytest.mark.parametrize("words", [{"formats": ["obj"]}, {"texels": -1.0}, {"formats": []}])

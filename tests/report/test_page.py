@@ -156,6 +156,16 @@ def test_the_page_shows_every_view_run_and_number(made, tmp_path: Path):
     assert "10 log10(1/MSE)" in text
 
 
+def test_one_run_needs_no_list(made, tmp_path: Path):
+    run = made[1][0]
+    listed = write_report([run], tmp_path / "listed.html").read_bytes()
+    for number, given in enumerate((run, str(run))):
+        assert write_report(given, tmp_path / f"{number}.html").read_bytes() == listed
+    for key in ("exported", "relit"):
+        with pytest.raises(UserError, match="nothing"):
+            write_report(run, tmp_path / "page.html", **{key: str(tmp_path / "nothing")})
+
+
 def test_of_many_held_out_views_some_are_shown(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "HELDOUT", 30)
     data = _make_data(tmp_path / "room")

@@ -244,8 +244,8 @@ def log_of(errors, spread=0.0, by="step"):
     found = []
     for number, error in enumerate(errors, start=1):
         groups = error * (1 + fixed) + spread * rng.normal(size=HELD_GROUPS)
-        line = {by: 10 * number, "held_aside": error, "held_aside_groups": groups.tolist()}
-        found += [{by: 10 * number - 5}, line]
+        line = {by: 100 * number, "held_aside": error, "held_aside_groups": groups.tolist()}
+        found += [{by: 100 * number - 50}, line]
     return found
 
 
@@ -267,6 +267,42 @@ def test_a_change_counts_where_it_is_larger_than_its_noise(errors, spread, trend
     assert found.share == pytest.approx(0.25)
     assert all(len(line) <= 80 for line in found.told().splitlines())
     assert convergence(log_of(errors, spread, "seconds"), "seconds") == found
+
+
+def log_of_rises(rises):
+    """Lines of a log whose last quarter changed the errors of groups, which were 1, by so much."""
+    lines = log_of([4, 2, 1, 1])
+    for line in lines[-3:]:
+        line |= {"held_aside": 1.0, "held_aside_groups": [1.0] * HELD_GROUPS}
+    lines[-1] |= {"held_aside": 1 + np.mean(rises), "held_aside_groups": list(1 + rises)}
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("rises", "trend"),
+    [
+        ([0.02, 0.03] * 8, "rising"),
+        ([0.02, 0.03] * 6 + [-0.001] * 4, "rising"),
+        ([0.02, 0.03] * 5 + [-0.001] * 6, "plateau"),
+        ([3.0, 3.5, 3.2, 3.1, 2.9] + [-0.2] * 11, "unclear"),
+        ([0.3, 0.2, 0.25] * 3 + [-0.01] * 7, "unclear"),
+        ([1.0, 0.01] * 7 + [-0.5, -0.4], "unclear"),
+    ],
+    ids=["all", "most", "little", "few", "about half", "2 to 3 standard errors"],
+)
+def test_a_fit_gets_worse_where_most_groups_do(rises, trend):
+    found = convergence(log_of_rises(np.array(rises)))
+    assert found.change > 2 * found.noise
+    assert found.trend == trend
+
+
+def test_a_fit_of_a_few_steps_is_at_no_plateau_and_no_ratio_is_told_within_noise():
+    flat = log_of([8, 4, 2, 1, 1, 1, 1, 1.002])
+    few = [line | {"step": line["step"] // 100} for line in flat]
+    assert [convergence(log).trend for log in (flat, few)] == ["plateau", "unclear"]
+    about_zero = convergence(log_of_rises(np.linspace(-9, 5, HELD_GROUPS) - 2))
+    assert about_zero.noise >= 1
+    assert "error changed by less than its noise in the last quarter" in about_zero.told()
 
 
 def test_too_few_errors_say_nothing():
@@ -309,9 +345,25 @@ ENTRY = {
 def test_the_line_of_progress_fits_the_terminal(width, line, tmp_path):
     said = io.StringIO()
     with Monitor(tmp_path / "log.jsonl", Console(file=said, width=width), 2400) as monitor:
-        monitor.record(240, ENTRY)
+        for step, seconds in ((1, 0.1), (4, 0.5), (240, 30.0)):
+            monitor.record(step, ENTRY | {"step": step, "seconds": seconds})
     assert len(line) <= width
-    assert said.getvalue() == line + "\n"
+    assert said.getvalue().splitlines()[-1] == line
+
+
+@pytest.mark.parametrize(
+    ("begin", "told"), [(0, ["5 min left", "3 min left"]), (300, ["2 min left", "50 s left"])]
+)
+def test_time_left_is_told_by_steps_that_compile_nothing(begin, told, tmp_path):
+    """A fit of 87 s began with "1.9 h left": its first step had taken 11 s."""
+    said = io.StringIO()
+    with Monitor(tmp_path / "log.jsonl", Console(file=said, width=200), 600) as monitor:
+        for step, seconds in ((1, 11.0), (20, 21.0), (40, 31.0), (200, 111.0)):
+            entry = {"step": begin + step, "seconds": begin + seconds}
+            monitor.record(begin + step, ENTRY | entry)
+    lines = said.getvalue().splitlines()
+    assert ["left" in line for line in lines] == [False, False, True, True]
+    assert all(map(str.endswith, lines[2:], told))
 
 
 def test_the_bar_of_a_terminal_is_one_line(tmp_path):

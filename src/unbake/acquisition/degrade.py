@@ -27,7 +27,7 @@ from ..dataset.camera import Camera
 from ..dataset.data_folder import DataFolder
 from ..dataset.small_views import seen_by, small_camera
 from ..dataset.views import TRUE_MATERIALS, Dataset, SensorNoise, View, fitted, read_masked
-from ..errors import UserError
+from ..errors import UserError, require_kind
 from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
@@ -92,6 +92,7 @@ def degrade(
         UserError: the data set cannot be read, is degraded already, or is of a camera, or `out` is
             not empty.
     """
+    require_kind(settings, DegradeSettings, "settings", "unbake.DegradeSettings(exposure=1)")
     out = Path(out)
     require_new_folder(out)
     dataset = Dataset.load(data, allow_outside=allow_outside)

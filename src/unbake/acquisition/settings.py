@@ -23,7 +23,7 @@ class CaptureSettings:
     """How a data set is rendered.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: a value has the wrong type, or a number is out of range.
     """
 
     #: Without a camera file.
@@ -75,7 +75,7 @@ class DegradeSettings:
     """What a camera does to photographs. The defaults leave everything as it is.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: a value has the wrong type, or a number is out of range.
     """
 
     exposure: Annotated[

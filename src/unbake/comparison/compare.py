@@ -16,7 +16,7 @@ from .. import backend, signals
 from ..config import FitConfig, to_toml
 from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.views import Dataset
-from ..errors import UserError
+from ..errors import UserError, require_kind
 from ..evaluation.convergence import (
     WINDOW,
     milliseconds_per_step,
@@ -232,6 +232,8 @@ def _checked(
     Raises:
         UserError: see `compare`.
     """
+    require_kind(config, FitConfig, "config", 'unbake.preset("cpu")')
+    require_kind(evaluation, EvaluationSettings, "evaluation", "unbake.EvaluationSettings()")
     names = [variant.name for variant in variants]
     if len(set(names)) < len(names) or not names:
         what = "a method is given twice" if names else "no method given"

@@ -119,12 +119,12 @@ class LightingConfig:
     scale_told_by: ScaleToldBy = "pixels"
 
     def __post_init__(self) -> None:
-        known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
-        require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
-        require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
         # The map is up to e^20 times as bright as it starts: `fields/envmap.py`.
         ranges = {"initial_radiance": (0, 1e20), "anchor": (0, 1e6), "learning_rate": RATES}
         require_ranges(self, ranges)
+        known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
+        require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
+        require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ..errors import UserError, require_ranges
+from ..errors import UserError, require_kind, require_ranges
 from .flag import Flag
 
 #: World axes, with their signs.
@@ -25,7 +25,7 @@ class LightConfig:
         lights: a Mitsuba XML file with emitters and shapes that emit light.
 
     Raises:
-        UserError: none of the two is given, or both are, or a number is out of range.
+        UserError: none of the two is given, or both are, or a value has the wrong type or range.
     """
 
     envmap: Path | str | None = None  #: kept as a `Path`
@@ -56,6 +56,18 @@ class LightConfig:
         require_ranges(self, {"envmap_scale": (0, 1e9), "envmap_rotate": (-1e6, 1e6)})
         if self.envmap_scale == 0:
             raise UserError("must be more than 0", "envmap_scale")
+
+    @classmethod
+    def of(cls, light: LightConfig | Path | str) -> LightConfig:
+        """A light as it is, or that of the file of an environment map.
+
+        Raises:
+            UserError: it is neither.
+        """
+        if isinstance(light, str | os.PathLike):
+            return cls(envmap=Path(light))
+        require_kind(light, cls, "light", 'unbake.LightConfig(envmap="sky.exr")')
+        return light
 
     @property
     def up(self) -> tuple[float, float, float]:

@@ -6,15 +6,14 @@ Unknown keys and wrong types are errors, so that a misspelt setting is never sil
 from __future__ import annotations
 
 import dataclasses
-import types
 import typing
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from itertools import chain
 from textwrap import shorten
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-from ..errors import UserError, collected, printable, raise_together
+from ..errors import UserError, collected, mistyped, raise_together
 
 Settings = TypeVar("Settings")
 
@@ -96,22 +95,15 @@ def _unknown(keys: list[str], names: list[str], path: tuple[str, ...]) -> UserEr
 
 def typed(value: object, hint: Any, where: str) -> Any:
     """The value as the type that an annotation asks for; raises a `UserError` otherwise."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        if value not in inner:
-            told = ", ".join(map(str, inner))
-            raise UserError(f"must be one of {told}, not {printable(repr(value))}", where=where)
-        return value
-    if origin in (types.UnionType, typing.Union):  # such as `int | None`: TOML has no None
-        (kind,) = (kind for kind in inner if kind is not types.NoneType)
-        return typed(value, kind, where)
-    if origin is tuple:
-        item = inner[0]
+    if typing.get_origin(hint) is tuple:
+        item = typing.get_args(hint)[0]
         if not isinstance(value, list | tuple):
             raise UserError(f"must be a list, not {type(value).__name__}", where=where)
         return tuple(typed(x, item, where) for x in value)
-    if hint is float and type(value) is int and abs(value) < 1 << 53:
+    if (wrong := mistyped(value, hint)) is not None:
+        raise UserError(wrong, where)
+    if type(value) is int and float in (hint, *typing.get_args(hint)):
+        if abs(value) >= 1 << 53:  # where floats leave out integers
+            raise UserError("must be float, not int", where)
         return float(value)
-    if type(value) is not hint:
-        raise UserError(f"must be {hint.__name__}, not {type(value).__name__}", where=where)
     return value

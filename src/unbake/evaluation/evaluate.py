@@ -17,7 +17,7 @@ from ..dataset.ground_truth import GroundTruth, counted_pixels
 from ..dataset.lighting import ROWS, true_environment
 from ..dataset.spread import evenly
 from ..dataset.views import Dataset, View, read_photograph
-from ..errors import UserError
+from ..errors import UserError, require_kind
 from ..imaging.metrics import HIGHEST
 from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
 from ..io import read_object
@@ -130,6 +130,7 @@ def evaluate(
     Paper: Sec. 6, Fig. 6.
     """
     settings = settings or EvaluationSettings()
+    require_kind(settings, EvaluationSettings, "settings", "unbake.EvaluationSettings(spp=256)")
     run = Path(run)
     recovered, folder = load_run(run, allow_outside=allow_outside), RunFolder(run)
     if not (recovered.dataset.heldout or settings.train_views):

@@ -24,7 +24,7 @@ from ..dataset.camera import Camera
 from ..dataset.camera_files import frame_name, frame_of, read_named_cameras
 from ..dataset.ground_truth import GroundTruth, counted_pixels
 from ..dataset.views import Dataset, View, read_photograph
-from ..errors import UserError, collected, printable, raise_together
+from ..errors import UserError, collected, printable, raise_together, require_kind
 from ..fields.domain import Domain
 from ..imaging.pictures import tonemap, write_exr, write_png
 from ..io import filled_folder, require_new_folder, write_json
@@ -116,7 +116,7 @@ def render(
 
     Paper: Sec. 6.
     """
-    settings = settings or RenderSettings()
+    settings = _given(settings)
     _require_sound(run, Path(out), settings, cameras, turntable)
     recovered = load_run(Path(run), allow_outside=allow_outside)
     chosen = _Cameras(None if cameras is None else Path(cameras), turntable)
@@ -126,7 +126,7 @@ def render(
 def relight(
     run: Path | str,
     out: Path | str,
-    light: LightConfig,
+    light: LightConfig | Path | str,
     settings: RenderSettings | None = None,
     *,
     cameras: Path | str | None = None,
@@ -141,7 +141,8 @@ def relight(
     Args:
         run: folder of a fit.
         out: folder to write; it must be new or empty, and is filled only when all is complete.
-        light: takes the place of all light of the scene, unless it says otherwise.
+        light: takes the place of all light of the scene, unless it says otherwise; or the file of
+            an environment map that does.
         settings: how to render; without cameras they say which views of the data set.
         cameras: a camera file or a `transforms.json`.
         turntable: number of cameras on a circle around the scene.
@@ -160,7 +161,7 @@ def relight(
 
     Paper: Sec. 6.
     """
-    settings = settings or RenderSettings()
+    settings, light = _given(settings), LightConfig.of(light)
     _require_sound(run, Path(out), settings, cameras, turntable, truth, light)
     true = None if truth is None else Dataset.load(Path(truth), allow_outside=allow_outside)
     change = partial(change_light, light=light, allow_outside=allow_outside, tell=tell)
@@ -170,6 +171,13 @@ def relight(
         _require_truth_of(recovered.problem.scene_view.scene, true, light, tell)
     chosen = _Cameras(None if cameras is None else Path(cameras), turntable, true)
     return _render(recovered, Path(run), Path(out), settings, chosen, light, tell)
+
+
+def _given(settings: RenderSettings | None) -> RenderSettings:
+    """The settings, or the usual ones; a `UserError` where they are of another kind."""
+    settings = settings or RenderSettings()
+    require_kind(settings, RenderSettings, "settings", "unbake.RenderSettings(spp=256)")
+    return settings
 
 
 def _require_sound(

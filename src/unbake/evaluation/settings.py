@@ -22,7 +22,7 @@ class EvaluationSettings:
     """How the recovered scene is rendered.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: a value has the wrong type, or a number is out of range.
     """
 
     #: Camera samples a pixel.
@@ -54,7 +54,7 @@ class RenderSettings:
     """How new pictures of a recovered scene are rendered and shown.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: a value has the wrong type, or a number is out of range.
     """
 
     #: Without a camera file and without a turntable.

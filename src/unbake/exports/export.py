@@ -33,6 +33,7 @@ from ..training.grid_sizes import surface_seen
 from ..training.problem import known_materials
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
+from ..transport.render import path_integrator
 from ..version import VERSION
 from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
 from .bake import WANTED, Baked, Baker, own_opacities, own_textures
@@ -99,7 +100,7 @@ _CONVENTIONS = {
 def export(
     run: Path | str,
     out: Path | str,
-    formats: Collection[str] = DEFAULT_FORMATS,
+    formats: str | Collection[str] = DEFAULT_FORMATS,
     *,
     texels: float | None = None,
     allow_outside: bool = False,
@@ -111,7 +112,7 @@ def export(
     Args:
         run: folder of a fit.
         out: folder to write; it must be new or empty, and is filled only when all is complete.
-        formats: of `FORMATS`.
+        formats: one of `FORMATS`, or several.
         texels: along a scene unit; None: one for each pixel of the training views on the surfaces,
             or more where the recovered fields or known textures hold finer detail, until 95 % of
             each surface differs from them by 2/255 at most, or is as solid where it is cut out.
@@ -127,6 +128,7 @@ def export(
             unknown, or the textures do not fit into memory or onto the disk.
     """
     run, out = Path(run), Path(out)
+    formats = [formats] if isinstance(formats, str) else formats
     chosen = _require_sound(run, out, formats, texels)
     recovered = load_run(run, allow_outside=allow_outside)
     with filled_folder(out) as partial:
@@ -312,6 +314,7 @@ def _write(
             lights,
             recovered_environment,
             recovered.camera(dataset.train[0]),
+            integrator=path_integrator(recovered.problem.scene_view.scene),
             refine=refine,
         )
         notes += scene.notes

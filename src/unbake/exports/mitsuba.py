@@ -55,6 +55,7 @@ def write_scene(
     environment: np.ndarray | None,
     camera: Camera,
     *,
+    integrator: str = "path",
     refine: bool = False,
 ) -> Written:
     """Write `scene.xml`, meshes and textures.
@@ -72,6 +73,7 @@ def write_scene(
         lights: with recovered strengths.
         environment: the recovered one, as `envmap` reads it.
         camera: of the sensor that is added where the scene has none.
+        integrator: plugin of the integrator that is added where the scene has none.
         refine: textures that move to other coordinates may become finer than their material's.
 
     Raises:
@@ -95,6 +97,7 @@ def write_scene(
     if environment is not None:
         _replace_environment(folder, scene, environment)
     notes += _require_sensor(scene, camera)
+    _require_integrator(scene, integrator)
     _forget_unused(scene)
     _name_shapes(scene, names)
     return Written(write(scene, folder), notes)
@@ -390,6 +393,16 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> list[str]:
     sensor.props["film"] = mi.Properties.ResolvedReference(scene.append(film))
     scene.append_to_root("exported sensor", sensor)
     return notes
+
+
+def _require_integrator(scene: ParsedScene, plugin: str) -> None:
+    """Append an integrator where there is none, without which `mi.render` fails."""
+    if any(node.type == mi.ObjectType.Integrator for node in scene.state.nodes):
+        return
+    integrator = mi.parser.SceneNode()
+    integrator.type = mi.ObjectType.Integrator
+    integrator.props.set_plugin_name(plugin)
+    scene.append_to_root("exported integrator", integrator)
 
 
 def _forget_unused(scene: ParsedScene) -> None:

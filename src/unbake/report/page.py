@@ -28,12 +28,12 @@ TEMPLATE = Path(__file__).with_name("report.html.jinja")
 
 
 def write_report(
-    runs: Sequence[str | Path],
+    runs: str | Path | Sequence[str | Path],
     out: str | Path,
     failed: Mapping[str, str] | None = None,
     *,
-    exported: Sequence[str | Path] = (),
-    relit: Sequence[str | Path] = (),
+    exported: str | Path | Sequence[str | Path] = (),
+    relit: str | Path | Sequence[str | Path] = (),
     allow_outside: bool = False,
 ) -> Path:
     """Write one HTML page that compares evaluated runs with the ground truth and each other.
@@ -44,11 +44,11 @@ def write_report(
     the evaluation, from full resolution.
 
     Args:
-        runs: run folders, all evaluated on the same data.
+        runs: run folders, all evaluated on the same data; or one.
         out: the page's file; it appears complete or not at all.
         failed: further runs that failed: name to reason.
-        exported: folders of `export`, with textures, whose sheets are shown.
-        relit: folders of `relight` or `render`, whose pictures are shown.
+        exported: folders of `export`, with textures, whose sheets are shown; or one.
+        relit: folders of `relight` or `render`, whose pictures are shown; or one.
         allow_outside: read files of the data set that lie outside of its folder.
 
     Returns:
@@ -58,24 +58,29 @@ def write_report(
         UserError: a run was not evaluated, runs differ in data, a file is gone or malformed, or a
             folder was made of another run.
     """
-    out = Path(out)
-    if not runs:
+    out, folders = Path(out), _listed(runs)
+    if not folders:
         raise UserError("a report needs at least one run")
-    loaded = [read_run(path, label) for path, label in labels(runs)]
+    loaded = [read_run(path, label) for path, label in labels(folders)]
     data = data_folder(loaded)
     dataset = Dataset.load(data, allow_outside=allow_outside)
-    context = _context(loaded, dataset, exported, relit)
+    context = _context(loaded, dataset, _listed(exported), _listed(relit))
     context |= {"scene": data.name, "failed": failed or {}}
     template = _environment().from_string(TEMPLATE.read_text(encoding="utf-8"))
     write_text(out, template.render(context))
     return out
 
 
+def _listed(folders: str | Path | Sequence[str | Path]) -> list[Path]:
+    """One folder or several, as a list."""
+    return [Path(x) for x in ([folders] if isinstance(folders, str | Path) else folders)]
+
+
 def _context(
     runs: list[EvaluatedRun],
     dataset: Dataset,
-    exported: Sequence[str | Path],
-    relit: Sequence[str | Path],
+    exported: Sequence[Path],
+    relit: Sequence[Path],
 ) -> dict[str, Any]:
     """What the template shows of the runs, by its names."""
     context = _views(runs, dataset)
@@ -103,15 +108,14 @@ def _views(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any]:
 def _sections(
     runs: list[EvaluatedRun],
     dataset: Dataset,
-    exported: Sequence[str | Path],
-    relit: Sequence[str | Path],
+    exported: Sequence[Path],
+    relit: Sequence[Path],
 ) -> dict[str, Any]:
     """Sections that only some runs or folders have; each is empty or None without them."""
-    folders = [Path(folder) for folder in relit]
     return {
         "light": lighting_section(runs, dataset),
-        "textures": texture_sections([Path(folder) for folder in exported], runs),
-        "strips": relit_sections(folders, runs, dataset.allow_outside),
+        "textures": texture_sections(exported, runs),
+        "strips": relit_sections(relit, runs, dataset.allow_outside),
         "cameras": camera_section(runs),
         "outliers": outlier_section(runs),
     }

@@ -43,7 +43,7 @@ class SolveSettings:
     """How the radiance of a known scene is learned, and how it is measured.
 
     Raises:
-        UserError: a number is out of range, or the numbers do not fit each other.
+        UserError: a value has the wrong type or range, or the numbers do not fit each other.
     """
 
     #: Not counted where `seconds` is given.

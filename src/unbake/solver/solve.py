@@ -21,7 +21,7 @@ from ..acquisition.settings import CaptureSettings
 from ..config.light import LightConfig
 from ..dataset.camera import Camera
 from ..dataset.camera_files import named_by_split, read_named_cameras
-from ..errors import UserError
+from ..errors import UserError, require_kind
 from ..fields.domain import Domain
 from ..fields.grid_sizes import USUAL, sized
 from ..fields.radiance import make_radiance
@@ -50,7 +50,7 @@ def solve(
     settings: SolveSettings | None = None,
     *,
     cameras: Path | str | None = None,
-    light: LightConfig | None = None,
+    light: LightConfig | Path | str | None = None,
     allow_outside: bool = False,
     console: Console | None = None,
     tell: Callable[[str], None] = print,
@@ -65,8 +65,8 @@ def solve(
             before and after the pictures of each measurement; pictures are written in the end.
         settings: how L_θ is learned and measured.
         cameras: a camera file; None: the built-in scene's own cameras, or automatic placement.
-        light: takes the place of all light of the scene, unless it says otherwise; None: the
-            scene's own light.
+        light: takes the place of all light of the scene, unless it says otherwise, or the file of
+            an environment map that does; None: the scene's own light.
         allow_outside: read files that the scene or the light names and that lie outside of its
             folder.
         console: shows progress; None: none is shown.
@@ -81,7 +81,8 @@ def solve(
 
     Paper: Eq. 3, Eq. 4, Sec. 3.1.
     """
-    settings, out = settings or SolveSettings(), Path(out)
+    settings, out = _given(settings), Path(out)
+    light = None if light is None else LightConfig.of(light)
     require_scene(str(scene))
     require_new_folder(out)
     known = _known_scene(str(scene), settings, cameras, light, allow_outside, tell)
@@ -101,7 +102,7 @@ def fine_tune(
     settings: SolveSettings | None = None,
     *,
     cameras: Path | str | None = None,
-    light: LightConfig | None = None,
+    light: LightConfig | Path | str | None = None,
     allow_outside: bool = False,
     console: Console | None = None,
     tell: Callable[[str], None] = print,
@@ -121,8 +122,7 @@ def fine_tune(
             not count.
         cameras: a camera file, whose pictures have the sizes that it says; None: the held-out views
             of the run's data set, at most `LARGEST` pixels wide and high.
-        light: takes the place of all light of the scene, unless it says otherwise; None: the run's
-            own light.
+        light: as of `solve`; None: the run's own light.
         allow_outside: read files of the data set, its scene and the light that lie outside of their
             folders.
 
@@ -135,7 +135,8 @@ def fine_tune(
 
     Paper: Eq. 3, Eq. 4, Sec. 3.1.
     """
-    settings, out, run = settings or SolveSettings(), Path(out), Path(run)
+    settings, out, run = _given(settings), Path(out), Path(run)
+    light = None if light is None else LightConfig.of(light)
     RunFolder(run).require_fitted()
     require_new_folder(out)
     change = None
@@ -166,6 +167,13 @@ def fine_tune(
         tell(f"L of the run is taken times {factor:.3g}: so bright is the new light")
     start = Start(radiance, config.radiance_representation, config.radiance_settings)
     return learn(known, start, settings, out, console, tell)
+
+
+def _given(settings: SolveSettings | None) -> SolveSettings:
+    """The settings, or the usual ones; a `UserError` where they are of another kind."""
+    settings = settings or SolveSettings()
+    require_kind(settings, SolveSettings, "settings", "unbake.SolveSettings(steps=1000)")
+    return settings
 
 
 def _known_scene(

@@ -18,6 +18,7 @@ from ..config.fit import (
 from ..config.method_defaults import MethodDefaults, method_defaults
 from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
+from ..errors import require_kind
 from ..quantities import QUANTITIES
 from ..transport.methods import METHODS
 from ..transport.objective import has_radiance
@@ -31,8 +32,10 @@ def with_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     """The settings of a new fit, with what they leave to the method and to the data set.
 
     Raises:
-        UserError: the method has a term that does not exist, or the scene cannot be loaded.
+        UserError: the settings are no `FitConfig`, the method has a term that does not exist, or
+            the scene cannot be loaded.
     """
+    require_kind(config, FitConfig, "config", 'unbake.preset("cpu")')
     return with_method_defaults(with_data_defaults(config, dataset), dataset.kind)
 
 

@@ -30,7 +30,12 @@ _SHARE = 0.005
 LAST = 0.25
 #: The least relative change of the error that is told as one, and how many standard errors it is.
 _LEAST, _SURE = 0.005, 2.0
-#: A plateau is told only where a relative change of this size would have been seen.
+#: The same of a rise, and the share of the groups that must rise: errors have heavy tails, so that
+#: a few pixels may raise the mean of a fit that improves.
+_SURE_OF_RISE, _RISING = 3.0, 0.75
+#: A fit of fewer steps has learned next to nothing, and its error is where it was for this reason.
+_FEWEST_STEPS = 50
+#: A plateau is told only where a relative change of this size would have been seen, and none was.
 _SEEN = 0.05
 #: Keys of a line of the log: the error, and those of groups of the pixels.
 ERROR, GROUPS = "held_aside", "held_aside_groups"
@@ -317,7 +322,9 @@ class Convergence:
         """Two lines for a terminal: what happened, and what can be done."""
         verb = "rose" if self.change > 0 else "fell"
         part = "the last quarter" if abs(self.share - LAST) < 0.05 else f"the last {self.share:.0%}"
-        sizes = f"{100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
+        sizes = f"{verb} {100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
+        if self.noise >= 1:  # errors have no bias, and those of a good fit may be about zero
+            sizes = "changed by less than its noise"
         word, advice = {
             "improving": ("still improving", "a longer fit may be better: --quality high"),
             "plateau": (
@@ -330,7 +337,7 @@ class Convergence:
                 "held-out views of a longer fit would show whether it is better",
             ),
         }[self.trend]
-        return f"held-aside pixels: {word}; error {verb} {sizes} in {part}\n  {advice}"
+        return f"held-aside pixels: {word}; error {sizes} in {part}\n  {advice}"
 
 
 def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergence | None:
@@ -353,12 +360,15 @@ def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergen
     before, error = start[ERROR], end[ERROR]
     if not before > 0:
         return None
-    falls = np.subtract(end[GROUPS], start[GROUPS])
+    rises = np.subtract(end[GROUPS], start[GROUPS])
     change = (error - before) / before
-    noise = float(falls.std(ddof=1) / math.sqrt(len(falls)) / before)
-    trend: Trend = "plateau" if _SURE * noise <= _SEEN else "unclear"
-    if abs(change) > max(_LEAST, _SURE * noise):
-        trend = "improving" if change < 0 else "rising"
+    noise = float(rises.std(ddof=1) / math.sqrt(len(rises)) / before)
+    still = max(change, _SURE * noise) <= _SEEN and end.get("step", _FEWEST_STEPS) >= _FEWEST_STEPS
+    trend: Trend = "plateau" if still else "unclear"
+    if -change > max(_LEAST, _SURE * noise):
+        trend = "improving"
+    elif change > max(_LEAST, _SURE_OF_RISE * noise) and (rises > 0).mean() >= _RISING:
+        trend = "rising"
     return Convergence(trend, error, before, change, noise, 1 - start[by] / last)
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from ..config import FitConfig, to_toml
 from ..config.fit import READ_EVERY
-from ..errors import UserError
+from ..errors import UserError, require_kind
 from ..machine import machine
 from ..ranks import Ranks
 from ..signals import deferred
@@ -84,6 +84,7 @@ def fit(
 
     Paper: Sec. 4, 5.4.
     """
+    require_kind(config, FitConfig, "config", 'unbake.preset("cpu")')
     ranks = ranks or Ranks()
     console = console or Console()
     if not ranks.leads:

@@ -18,6 +18,8 @@ from .event_log import EventLog
 
 #: Seconds between lines where there is no terminal.
 QUIET_SECONDS = 10.0
+#: Steps that may compile something, and as many more that tell how long one takes.
+_WARM_UP = 3
 #: Columns of the bar, and of what stands beside it: percentage, time left, and spaces between them.
 _BAR, _BESIDE = 10, 16
 #: Short names of loss terms in the line of progress.
@@ -54,6 +56,9 @@ class Monitor:
         self._console = console
         self._total = total
         self._last_line = -QUIET_SECONDS
+        self._first_step: int | None = None
+        #: Step, seconds and what was done when nothing was compiled any more.
+        self._warm: tuple[int, float, float] | None = None
         self._bar = Progress(
             TextColumn("{task.percentage:3.0f} %"),
             BarColumn(bar_width=_BAR),
@@ -112,16 +117,31 @@ class Monitor:
         parts.append(f"{entry['samples_per_second'] / 1e3:.0f} k samples/s")
         parts.append(f"{entry['memory_mb']:.0f} MB")
         width = self._console.width
+        ahead = self._ahead(done, entry["step"], entry["seconds"])
         self._bar.update(
             self._task, completed=done, description=_fitting(parts, width - _BAR - _BESIDE)
         )
         if not self._console.is_terminal and entry["seconds"] - self._last_line >= QUIET_SECONDS:
             self._last_line = entry["seconds"]
-            ahead = entry["seconds"] * max(0.0, self._total / done - 1) if done else None
             left = "" if ahead is None else f"  {_duration(ahead)} left"
             share = min(1.0, done / self._total) if self._total else 1.0
             start = f"{100 * share:3.0f} %  "
             self.say(f"{start}{_fitting(parts, width - len(start) - len(left))}{left}")
+
+    def _ahead(self, done: float, step: int, seconds: float) -> float | None:
+        """Seconds that are left at the pace since the first steps; None: that is not known yet."""
+        if done >= self._total:
+            return 0.0
+        if self._first_step is None:
+            self._first_step = step  # a run that goes on compiles again
+        if self._warm is None:
+            if step >= self._first_step + _WARM_UP:
+                self._warm = (step, seconds, done)
+            return None
+        warm_step, warm_seconds, warm_done = self._warm
+        if step < warm_step + _WARM_UP:
+            return None
+        return (seconds - warm_seconds) * (self._total - done) / (done - warm_done)
 
     def validation(self, entry: dict) -> None:
         """Log and print how good the materials or pictures are by now, or how strong the lights."""
