@@ -1,20 +1,24 @@
 """Settings: TOML gives back what was written, and every mistake is named."""
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
 import typing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import of_format
 
+from unbake.acquisition.settings import CaptureSettings, DegradeSettings
 from unbake.config import (
     BitmapConfig,
     DenseGridConfig,
     FitConfig,
     GridConfig,
+    LightingConfig,
     NetworkConfig,
     PathConfig,
     PresetName,
@@ -24,8 +28,10 @@ from unbake.config import (
     read_toml,
     to_toml,
 )
+from unbake.config.light import LightConfig
 from unbake.config.migration import as_before
 from unbake.errors import UserError
+from unbake.evaluation.settings import EvaluationSettings, RenderSettings
 from unbake.fields.settings import LEAK, PieceConfig
 from unbake.training.run_folder import RunFolder
 from unbake.training.schedule import learning_rates
@@ -351,7 +357,7 @@ roughness_smoothness = 2.0
 def test_settings_of_format_1_mean_the_same_today(number):
     old = from_toml(number + FORMAT_1)
     # What a user gives has the defaults of today, and what a run has those of its time.
-    assert old == from_toml(FORMAT_2 if number else FORMAT_2.replace("format = 2", "format = 6"))
+    assert old == from_toml(FORMAT_2 if number else FORMAT_2.replace("format = 2", "format = 7"))
     assert old.materials["albedo"]["neural"] == NetworkConfig(
         dataclasses.replace(preset("paper").materials["albedo"]["neural"].grid, levels=3),
         width=11,
@@ -364,7 +370,7 @@ def test_settings_of_format_1_mean_the_same_today(number):
 
 
 def test_keys_that_are_absent_today_are_those_of_the_preset():
-    assert from_toml("format = 6\n") == preset("cpu") != from_toml("format = 2\n")
+    assert from_toml("format = 7\n") == preset("cpu") != from_toml("format = 2\n")
 
 
 def test_the_radiance_field_has_no_pieces():
@@ -410,8 +416,8 @@ def test_a_file_without_a_format_may_have_keys_of_today():
     ("text", "message"),
     [
         (
-            "format = 7",
-            r"format: was written by a newer unbake \(format 7; .* up to 6\). Update unbake",
+            "format = 8",
+            r"format: was written by a newer unbake \(format 8; .* up to 7\). Update unbake",
         ),
         ("format = true", "format: 'format' is True, not a positive whole number"),
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),
@@ -456,6 +462,59 @@ def test_a_mistake_in_an_old_file_is_named(text, message):
 def test_a_field_that_there_is_not_is_named(text, message):
     with pytest.raises(UserError, match=f"^here.toml: {message}"):
         from_toml("format = 2\n" + text, "here.toml")
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        (FitConfig, {"steps": 20.5}, "steps: must be int, not float"),
+        (FitConfig, {"steps": True}, "steps: must be int, not bool"),
+        (FitConfig, {"steps": "a"}, "steps: must be int, not str"),
+        (FitConfig, {"steps": None}, "steps: must be int, not NoneType"),
+        (
+            FitConfig,
+            {"pixels": 100.5, "seed": 1.5},
+            "seed: must be int, not float; pixels: must be int, not float",
+        ),
+        (FitConfig, {"bounces": 1.5, "steps": -1}, "bounces: must be int, not float; steps: must "),
+        (FitConfig, {"spp": [4]}, "spp: must be int, not list"),
+        (FitConfig, {"seconds": "a"}, "seconds: must be float, not str"),
+        (FitConfig, {"warm_up": 1.5}, "warm_up: must be int, not float"),
+        (FitConfig, {"unknown": "light"}, "unknown: must be one of auto, materials, lighting, mat"),
+        (FitConfig, {"method": 3}, "method: must be str, not int"),
+        (FitConfig, {"path": {"max_depth": 3}}, "path: must be PathConfig, not dict"),
+        (LightingConfig, {"mean_albedo": "a"}, "mean_albedo: must be float, not str"),
+        (GridConfig, {"levels": 2.5}, "levels: must be int, not float"),
+        (CaptureSettings, {"views": 1.5}, "views: must be int, not float"),
+        (DegradeSettings, {"clip": "all"}, "clip: must be float, not str"),
+        (EvaluationSettings, {"truth": 1}, "truth: must be bool, not int"),
+        (RenderSettings, {"spp": 2.5}, "spp: must be int, not float"),
+        (RenderSettings, {"spp": "a"}, "spp: must be int, not str"),
+        (RenderSettings, {"width": 33.5}, "width: must be int, not float"),
+        (RenderSettings, {"views": "test"}, "views: must be one of heldout, train, all, not 'tes"),
+    ],
+)
+def test_settings_of_a_wrong_type_are_refused(kind, changes, message):
+    with pytest.raises(UserError, match=f"^{message}"):
+        kind(**changes)
+    with pytest.raises(UserError, match=f"^{message}"):
+        dataclasses.replace(kind(), **changes)
+
+
+def test_numbers_of_numpy_and_whole_numbers_are_numbers():
+    config = FitConfig(
+        steps=np.int64(20), seed=np.uint8(3), held_aside=np.float32(0.25), seconds=5, warm_up=None
+    )
+    assert (config.steps, config.seed, config.held_aside, config.seconds) == (20, 3, 0.25, 5)
+    assert from_toml(to_toml(config)) == config
+    assert json.dumps(dataclasses.asdict(RenderSettings(width=np.int32(7), exposure=1)))
+
+
+@pytest.mark.parametrize("up", ["+Z", "-Y", "up", "z", "", None])
+def test_the_up_axis_of_a_map_is_one_of_six(up):
+    with pytest.raises(UserError, match=r"^envmap_up: must be one of \+x, -x, \+y, -y, \+z, -z, n"):
+        LightConfig(envmap="sky.exr", envmap_up=up)
+    assert LightConfig(envmap="sky.exr", envmap_up="-z").up == (0, 0, -1)
 
 
 def test_quantities_are_no_text():

@@ -13,7 +13,7 @@ from support import of_format, randomised, seeded
 from unbake.config import FitConfig, from_toml, to_toml
 from unbake.errors import UserError
 from unbake.fields.domain import SurfacePoint
-from unbake.fields.field import FieldSpec
+from unbake.fields.field import FieldSpec, PlaceNumbers
 from unbake.fields.materials import make_materials
 from unbake.fields.network import Network
 from unbake.fields.perceptron import can_record_layout
@@ -27,6 +27,7 @@ SMALL = PieceConfig(most=5, brightnesses=4, gain=3.0)
 SHARED = replace(SMALL, colours=3)
 COLOURED = replace(SHARED, own_colours=2)
 VARIED = replace(COLOURED, variation=True)
+PLACED = replace(VARIED, places=2)
 NETWORK = NetworkConfig(GridConfig(2, 2, 8), width=8, hidden=1, pieces=COLOURED)
 ENGINES = ("tensor", "coopvec", *(["fused"] if can_record_layout() else []))
 
@@ -101,6 +102,50 @@ def test_colours_of_a_piece_are_linear_between_corners_that_it_has_by_itself():
     assert set(np.flatnonzero(reached.any(axis=(1, 2, 3)))) == {3}
     (unknown,) = table.evaluate(points(colour, number=3, strength=0.0))
     np.testing.assert_array_equal(np.array(unknown), 0)
+
+
+def at_corner(piece, corner, value):
+    """A number of a piece at one corner of a lattice."""
+    where = mi.Point3u(*[mi.UInt32(x) for x in corner])
+    return PlaceNumbers(mi.UInt32(piece), where, [mi.Float(value)])
+
+
+def test_numbers_by_place_are_linear_between_corners_of_the_piece_that_has_them():
+    table = PieceValues(PLACED, 1)
+    assert table.place_cells == (2, 4, 8)
+    values = {key: x * 0 + (key == "variation") for key, x in randomised(table).items()}
+    # The corner at (0.5, 0, 1) of the coarsest lattice, and that at (0.25, 0.25, 0) of the next.
+    found = table.placed([at_corner(3, (1, 0, 2), 5.0), at_corner(3, (1, 1, 0), -2.0)])
+    table.assign(values | found)
+
+    def at(position, number=3, strength=1.0):
+        piece = Piece(mi.UInt32(number), mi.Float(strength))
+        point = SurfacePoint(mi.Point3f(*position), piece=piece, albedo=mi.Color3f(0.5))
+        return float(table.evaluate(point)[0][0])
+
+    assert at((0.5, 0, 1)) == pytest.approx(5)
+    assert at((0.5, 0, 0.75)) == pytest.approx(2.5)
+    assert at((0.25, 0.25, 0.875)) == pytest.approx(5 * 0.5 * 0.5 * 0.75)
+    assert at((0.25, 0.25, 0)) == pytest.approx(-2)
+    assert at((0.375, 0.25, 0)) == pytest.approx(-1)
+    assert at((1, 0.5, 0)) == 0
+    assert at((7, float("nan"), 1)) == at((1, 0, 1))
+    for number, strength in ((2, 1.0), (3, 0.0)):
+        assert at((0.5, 0, 1), number, strength) == 0
+    table.assign(values | table.placed([]))
+    assert at((0.5, 0, 1)) == 0
+
+
+def test_pieces_have_numbers_of_their_own_at_one_corner():
+    table = PieceValues(replace(PLACED, most=64), 1)
+    zero = {key: x * 0 for key, x in table.parameters().items()}
+    every = np.arange(64)
+    corner = mi.Point3u(*[mi.UInt32(1)] * 3)
+    wanted = (every + 1).astype(np.float32)
+    number = mi.UInt32(every.astype(np.uint32))
+    table.assign(zero | table.placed([PlaceNumbers(number, corner, [mi.Float(wanted)])]))
+    point = SurfacePoint(mi.Point3f(0.5), piece=Piece(number, mi.Float(1)))
+    np.testing.assert_allclose(np.array(table.evaluate(point)[0]), wanted, rtol=1e-6)
 
 
 def test_deviations_are_those_of_the_pieces_that_are_asked_for():
@@ -196,11 +241,11 @@ def test_surfaces_of_which_nothing_is_known_have_no_factor():
 
 
 def test_no_gradient_reaches_factors():
-    network = Network(replace(NETWORK, pieces=VARIED), FieldSpec(1, bounded=True, seed=2))
+    network = Network(replace(NETWORK, pieces=PLACED), FieldSpec(1, bounded=True, seed=2))
     values = randomised(network)
     dr.backward(dr.sum(network.evaluate(points())[0]))
     reached = {k for k, v in values.items() if np.abs(np.array(dr.grad(v).array)).max() > 0}
-    assert reached == values.keys() - {"variation", "own_colours.0"}
+    assert reached == values.keys() - {"variation", "own_colours.0", "places.0", "placed"}
 
 
 def test_searches_move_colours_of_pieces_and_steps_do_not():
@@ -321,6 +366,7 @@ def test_sizes_tell_the_memory():
         {"network": 0.0},
         {"colours": -1},
         {"own_colours": 13},
+        {"places": 2000},
     ],
 )
 def test_sizes_out_of_range_are_refused(wrong):
@@ -362,4 +408,7 @@ def test_runs_of_before_have_no_pieces_and_what_a_user_gives_has():
     assert pieces("steps = 5").own_colours > 0
     older = re.sub("(?m)^own_colours = .+\n", "", of_format(now, 5))
     assert pieces(older) == replace(pieces(now), own_colours=0)
+    assert pieces("steps = 5").places > 0
+    older = re.sub("(?m)^places = .+\n", "", of_format(now, 6))
+    assert pieces(older) == replace(pieces(now), places=0)
     assert pieces(re.sub("(?m)^colours = .+\n", "", old)) == replace(pieces(now), colours=0)

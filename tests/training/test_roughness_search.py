@@ -558,7 +558,7 @@ def test_time_of_searches_is_not_that_of_steps(built_in):
     count, spp = step.pixels.photographs.count, 4 * SEARCH.spp
     each = count * spp * 20 / (10_000 * config.samples_per_step)
     assert done(seconds=20.0) == pytest.approx(20 / (100 - 2 * each)), "all pixels there are"
-    by_steps = replace(config, steps=20_000, seconds=None)
+    by_steps = replace(config, steps=20_000, seconds=0.0)
     assert loop._fraction(by_steps, Progress(step=10_000, searching=9.0), search) == 0.5
     short = Progress(step=4, seconds=50.0)
     assert loop._fraction(config, short, search) == 0.5, "none will be made"

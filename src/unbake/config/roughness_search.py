@@ -45,6 +45,10 @@ class RoughnessSearchConfig:
     one_roughness: float = 0.7
     #: The same of albedo, which keeps an eighth of what was found at least, to be learned on
     one_albedo: float = 0.7
+    #: How probable it is that roughness does not differ from place to place beyond that; and cells
+    #: along an edge of the scene's cube, in each of which albedo has its own factor then
+    no_places: float = 0.999
+    place_cells: int = 16
     #: Of the fit's steps before the first search, and after it, as multiples of the field's own
     rate_before: float = 0.25
     rate_between: float = 0.0
@@ -56,5 +60,6 @@ class RoughnessSearchConfig:
         ranges |= {"rate": (POSITIVE, 1e4), "rate_before": (0, 1e4), "rate_between": (0, 1e4)}
         ranges |= {"pixels_as_one": (0, 1e6), "pixels_at_most": (0, 1 << 30)}
         ranges |= {"like_colours": (1e-3, 1e3), "one_roughness": (0, 1), "one_albedo": (0, 1)}
+        ranges |= {"no_places": (0, 1), "place_cells": (1, 1024)}
         spreads = ("piece_spread", "brightness_spread", "colour_spread", "own_colour_spread")
         require_ranges(self, ranges | dict.fromkeys(spreads, (POSITIVE, 1e6)))

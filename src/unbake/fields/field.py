@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -54,6 +54,14 @@ class Cost:
         return Cost(self.multiply_adds + other.multiply_adds, self.bytes + other.bytes)
 
 
+class PlaceNumbers(NamedTuple):
+    """Numbers of pieces at corners of one lattice over the unit cube."""
+
+    piece: mi.UInt32  # its number, at each corner
+    corner: mi.Point3u  # from 0 to the number of cells
+    values: list[mi.Float]  # of each output
+
+
 class Field(Protocol):
     """A trainable function of points on surfaces.
 
@@ -68,6 +76,8 @@ class Field(Protocol):
     symbolic: bool = True
     #: How many pieces of surface have numbers of their own; all further ones share the last.
     most_pieces: int = 0
+    #: Cells of the lattices by which pieces may differ from place to place, coarsest first.
+    place_cells: tuple[int, ...] = ()
 
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays by name; `assign` takes them back."""
@@ -117,6 +127,18 @@ class Field(Protocol):
             about: of each output, the value on each piece that stays as it is.
             factor: how much others differ from it, in units of how much they would if no piece had
                 a factor.
+
+        Returns:
+            Those that change; here none.
+        """
+        return {}
+
+    def placed(self, levels: Sequence[PlaceNumbers]) -> dict[str, mi.Float | mi.TensorXf]:
+        """Shared parameters with which outputs before their bounds differ from place to place.
+
+        Args:
+            levels: what is added, of each lattice of `place_cells`, from the coarsest one on.
+                Between corners it is linear; other pieces have nothing.
 
         Returns:
             Those that change; here none.

@@ -12,7 +12,7 @@ import numpy as np
 
 from .arrays import first_value, from_numpy, sigmoid
 from .domain import SurfacePoint
-from .field import Cost, Engine, Field, FieldSpec
+from .field import Cost, Engine, Field, FieldSpec, PlaceNumbers
 from .grid_sizes import USUAL, sized_grid
 from .perceptron import Perceptron, can_record_layout
 from .piece_values import PieceValues
@@ -46,6 +46,7 @@ class Network(Field):
         pieces = settings.pieces
         self.pieces = PieceValues(pieces, spec.outputs) if pieces.most else None
         self.most_pieces = pieces.most
+        self.place_cells = self.pieces.place_cells if self.pieces is not None else ()
         self._pace, self._learned = pieces.network, pieces.learned
         self._bounded = spec.bounded and self.pieces is not None
         self._least_slope = spec.least_slope
@@ -89,6 +90,10 @@ class Network(Field):
     ) -> dict[str, mi.Float | mi.TensorXf]:
         """The numbers and factors of pieces, if there are any."""
         return {} if self.pieces is None else dict(self.pieces.varied(piece, about, factor))
+
+    def placed(self, levels: Sequence[PlaceNumbers]) -> dict[str, mi.Float | mi.TensorXf]:
+        """The numbers of pieces by place, if there are any."""
+        return {} if self.pieces is None else dict(self.pieces.placed(levels))
 
     def evaluate(
         self,

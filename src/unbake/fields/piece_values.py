@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import drjit as dr
@@ -10,10 +10,14 @@ import mitsuba as mi
 
 from .arrays import differences
 from .domain import SurfacePoint, bounded
-from .field import FieldSpec
+from .field import FieldSpec, PlaceNumbers
 from .grid import DenseGrid
 from .pieces import Piece
-from .settings import DenseGridConfig, PieceConfig
+from .settings import PLACE_LEVELS, PLACES_LOG2, DenseGridConfig, PieceConfig
+
+#: Factors of a hash of a corner's coordinates, of its piece and of its lattice.
+_FACTORS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1)
+_CORNERS = tuple(product((0, 1), repeat=3))
 
 
 class PieceValues:
@@ -37,6 +41,11 @@ class PieceValues:
     such a grid of its own, too. These are many numbers, and steps would fill them with noise: only
     searches of roughness move them, which say what is to be expected of them.
 
+    What differs from place to place on a piece, whatever its colour, may have numbers, too, which
+    searches find: on lattices over the scene's cube, linear between corners, each with twice the
+    cells of the one before. A table has them all, by a hash of piece and corner; a piece that no
+    search gave any reads nothing of it.
+
     What differs within a piece may be noise. So a piece may have a factor of all that it has beside
     its numbers by brightness. No gradient reaches it: searches find it. Where numbers are not
     learned, either, a piece is as it would be without until a search changes it.
@@ -57,11 +66,19 @@ class PieceValues:
         self._own_colours = [
             dr.opaque(mi.Float, 0, settings.most * settings.own_corners) for _ in range(outputs)
         ]
+        #: Cells of each lattice by place.
+        self.place_cells = tuple(
+            settings.places << level for level in range(PLACE_LEVELS) if settings.places
+        )
+        if self.place_cells:
+            self._set_places(self.placed(()))
 
     def parameters(self) -> dict[str, mi.Float]:
         """The numbers of each output, `pieces.0`, …; what there is of others.
 
-        Those are `colours`, the factors `variation`, and `own_colours.0`, … of each output.
+        Those are `colours`, the factors `variation`, `own_colours.0`, … of each output, and by
+        place `places.0`, … of each output with `placed`, which is above zero for pieces that have
+        any.
         """
         found = {f"pieces.{i}": values for i, values in enumerate(self._values)}
         if self._colours is not None:
@@ -70,6 +87,9 @@ class PieceValues:
             found["variation"] = self._factors
         if self._settings.own_colours:
             found |= {f"own_colours.{i}": values for i, values in enumerate(self._own_colours)}
+        if self.place_cells:
+            found |= {f"places.{i}": values for i, values in enumerate(self._places)}
+            found["placed"] = self._placed
         return found
 
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
@@ -82,6 +102,12 @@ class PieceValues:
         if self._settings.own_colours:
             numbers = range(len(self._own_colours))
             self._own_colours = [parameters[f"own_colours.{i}"] for i in numbers]
+        if self.place_cells:
+            self._set_places(parameters)
+
+    def _set_places(self, parameters: Mapping[str, mi.Float | mi.TensorXf]) -> None:
+        self._places = [parameters[f"places.{i}"] for i in range(len(self._values))]
+        self._placed = parameters["placed"]
 
     def evaluate(
         self,
@@ -123,7 +149,11 @@ class PieceValues:
             others = [factor * x for x in others]
         own = self._own(number, dr.mean(albedo))
         weight = gain * point.piece.strength
-        return [dr.fma(weight, x, y) for x, y in zip(own, others, strict=True)]
+        found = [dr.fma(weight, x, y) for x, y in zip(own, others, strict=True)]
+        if self.place_cells:
+            of_place = self._of_place(number, point)
+            found = [x + y for x, y in zip(found, of_place, strict=True)]
+        return found
 
     def _own(self, number: mi.UInt32, mean: mi.Float) -> list[mi.Float]:
         """The numbers of pieces where the mean of linear RGB albedo is so much, an output each."""
@@ -152,7 +182,7 @@ class PieceValues:
         below = dr.minimum(mi.Point3u(at), cells - 1)
         share = at - mi.Point3f(below)
         first = ((number * side + below.z) * side + below.y) * side + below.x
-        apart = [(z * side + y) * side + x for z, y, x in product((0, 1), repeat=3)]
+        apart = [(z * side + y) * side + x for z, y, x in _CORNERS]
         found = []
         for values in tables:
             corners = [dr.gather(mi.Float, values, first + offset) for offset in apart]
@@ -161,6 +191,40 @@ class PieceValues:
                 corners = [dr.lerp(low, high, part) for low, high in pairs]
             found += corners
         return found
+
+    def _of_place(self, number: mi.UInt32, point: SurfacePoint) -> list[mi.Float]:
+        """The numbers of pieces for a place, an output each; no gradient reaches them."""
+        assert point.piece is not None
+        has = dr.gather(mi.Float, dr.detach(self._placed), number) > 0
+        has &= point.piece.strength > 0
+        found = [mi.Float(0)] * len(self._values)
+        for level, cells in enumerate(self.place_cells):
+            at = bounded(dr.detach(point.position), 0, 1) * cells
+            below = dr.minimum(mi.Point3u(at), cells - 1)
+            share = at - mi.Point3f(below)
+            where = [_hashed(number, below + mi.Point3u(x, y, z), level) for z, y, x in _CORNERS]
+            for i, values in enumerate(self._places):
+                corners = [dr.gather(mi.Float, dr.detach(values), k, has) for k in where]
+                for part in share:
+                    pairs = zip(corners[::2], corners[1::2], strict=True)
+                    corners = [dr.lerp(low, high, part) for low, high in pairs]
+                found[i] = found[i] + corners[0]
+        return found
+
+    def placed(self, levels: Sequence[PlaceNumbers]) -> dict[str, mi.Float]:
+        """See `Field.placed`."""
+        if not self.place_cells:
+            return {}
+        tables = [dr.zeros(mi.Float, 1 << PLACES_LOG2) for _ in self._values]
+        placed = dr.zeros(mi.Float, self._settings.most)
+        for level, (piece, corner, values) in enumerate(levels):
+            number = dr.minimum(piece, self._settings.most - 1)
+            where = _hashed(number, corner, level)
+            for table, value in zip(tables, values, strict=True):
+                dr.scatter(table, value, where)
+            dr.scatter(placed, dr.ones(mi.Float, dr.width(number)), number)
+        dr.make_opaque(tables, placed)
+        return {f"places.{i}": table for i, table in enumerate(tables)} | {"placed": placed}
 
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
         """See `Field.deviations`."""
@@ -231,5 +295,15 @@ class PieceValues:
         """Numbers that are looked up at a point."""
         outputs = len(self._values)
         grids = (self._colours is not None) + bool(self._settings.own_colours)
-        own = min(self._settings.brightnesses, 2) + 8 * grids
-        return own * outputs + (0 if self._factors is None else 1)
+        own = min(self._settings.brightnesses, 2) + 8 * (grids + len(self.place_cells))
+        return own * outputs + (self._factors is not None) + bool(self.place_cells)
+
+
+def _hashed(piece: mi.UInt32, corner: mi.Point3u, level: int) -> mi.UInt32:
+    """Where the table of all lattices has the number of a piece at a corner."""
+    parts = [*corner, piece, mi.UInt32(level)]
+    found = mi.UInt32(0)
+    for part, factor in zip(parts, _FACTORS, strict=True):
+        found = (found ^ part) * mi.UInt32(factor)
+        found ^= found >> 15
+    return found & ((1 << PLACES_LOG2) - 1)

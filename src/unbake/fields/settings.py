@@ -24,6 +24,9 @@ _PERCEPTRON = {"width": (1, 1024), "hidden": (1, 32), "leak": (0, 0.99)}
 #: neurons of a layer came to lie below zero in the brightest or darkest part of some rooms (1 to
 #: 26 % of what cameras saw), where the output then was a constant that no gradient moved.
 LEAK = 0.01
+#: Lattices of a piece by place, each with twice the cells of the one before; log2 of the numbers
+#: that all of them have together.
+PLACE_LEVELS, PLACES_LOG2 = 3, 19
 
 
 class FieldSettings(Protocol):
@@ -97,6 +100,9 @@ class PieceConfig:
     #: Cells along each channel of a table by colour of the albedo, which all pieces share; 0: none
     colours: int = 0
     own_colours: int = 0  #: the same of a table that each piece has by itself; 0: none
+    #: Cells along the scene's cube of the coarsest lattice of a piece, for what differs from place
+    #: to place; 0: none
+    places: int = 0
     #: Whether each piece has a factor of what it has from the network and from colours, which
     #: searches find
     variation: bool = False
@@ -107,6 +113,7 @@ class PieceConfig:
     def __post_init__(self) -> None:
         sizes = {"most": (0, 1 << 20), "brightnesses": (1, 64)}
         sizes |= {"colours": (0, 64), "own_colours": (0, 12)}
+        sizes |= {"places": (0, 1 << 10)}
         require_ranges(self, sizes | {"gain": (POSITIVE, 1e4), "network": (POSITIVE, 1.0)})
 
     def numbers(self, outputs: int) -> int:
@@ -115,7 +122,9 @@ class PieceConfig:
             return 0
         grid = features_of(outputs) * (self.colours + 1) ** 3 if self.colours else 0
         factors = self.most if self.variation else 0
-        return outputs * (self.brightnesses + self.own_corners) * self.most + grid + factors
+        places = (outputs << PLACES_LOG2) + self.most if self.places else 0
+        own = outputs * (self.brightnesses + self.own_corners) * self.most
+        return own + grid + factors + places
 
     @property
     def own_corners(self) -> int:

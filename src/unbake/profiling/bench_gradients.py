@@ -208,8 +208,9 @@ def _parts(name: str, materials: Materials) -> Iterator[Part]:
     yield Part("network", layers)
     if inner.pieces is None:
         return
-    # No step moves the colours of each piece.
-    keys = [key for key in inner.pieces.parameters() if not key.startswith("own_colours.")]
+    # No step moves the colours and places of each piece.
+    still = ("own_colours.", "places.", "placed")
+    keys = [key for key in inner.pieces.parameters() if not key.startswith(still)]
     own = [(f"{name}.{key}", everything) for key in keys]
     shared = [piece for piece in own if piece[0].endswith(".colours")]
     yield Part("pieces", tuple(piece for piece in own if piece not in shared))

@@ -44,6 +44,7 @@ from ..transport.by_roughness import PLACE, row_type
 from .checkpoint import Progress
 from .gradients import flat_gradients, set_gradients
 from .piece_levels import with_expected_levels
+from .piece_places import with_expected_places
 from .piece_variation import expected_albedo, with_all_variation, with_expected_variation
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
@@ -223,7 +224,7 @@ class RoughnessSearch:
             ranks = self._ranks if len(rows) >= self._ranks.size else Ranks()
             curves = Curves.of(rows, search.cells, search.colours, albedo, ranks, shown)
             own = self._config.material_settings["roughness"].learning_rate
-            found = searched(field, curves, search, search.rate * own, ranks)
+            found = searched(field, curves, search, search.rate * own, ranks, rows)
             before = {key: dr.detach(state.phi[f"roughness.{key}"]) for key in found}
             found = averaged(field, curves, (before, found), part, ranks)
             found = {key: self._of_first(x) for key, x in found.items()}
@@ -256,15 +257,25 @@ def searched(
     settings: RoughnessSearchConfig,
     rate: float,
     ranks: Ranks | None = None,
+    rows: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """What a search finds: where a field descends to, with pieces as they are to be expected.
 
-    Args and returns as of `descend`; the field stays as it is.
+    Args:
+        field, curves, settings, rate, ranks: as of `descend`; the field stays as it is.
+        rows: of `row_type`, of all ranks, whose curves these are; None: nothing differs from place
+            to place.
+
+    Returns:
+        As of `descend`.
     """
     with holding(field, with_all_variation(field, curves, ranks)):
         found = descend(field, curves, settings, rate, ranks)
         if settings.pixels_as_one:
             found = with_expected_variation(field, curves, found, settings, ranks)
+            if rows is not None:
+                albedo = curves.point.albedo is not None
+                found = with_expected_places(field, rows, found, settings, albedo=albedo)
             found = with_expected_levels(field, curves, found, settings, ranks)
     return found
 

@@ -1,0 +1,259 @@
+"""What differs in roughness from place to place on a piece of surface (ours).
+
+Most pieces have one roughness, or one for each of their colours. Where a texture of roughness has
+a pattern of its own, photographs tell it in patches of many pixels. So after a descent each piece
+gets numbers on lattices over the scene's cube: those that are most probable where they are expected
+to differ by some spread, and half as much or less on finer lattices.
+
+Noise of the photographs looks like such a pattern, too. So the pixels are dealt into two halves,
+and what one half says of a piece is asked of the other one, with each spread and with none. A pixel
+that was drawn twice is in one half, with the noise of its photograph. With this evidence, and with
+`no_places`, follows how probable each spread is, and the numbers that are to be expected. Few
+pieces need numbers; the others have none.
+
+Within a patch roughness may be what it is in no other one, and albedo has adapted to it: so it has
+its factors in smaller cells here than for the descent (`place_cells`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..config import RoughnessSearchConfig
+from ..fields.arrays import from_numpy
+from ..fields.field import Field, PlaceNumbers
+from .piece_levels import errors_of
+from .roughness_curves import Curves
+from .seen_pieces import SeenPieces, chances, normalized
+
+#: By how much outputs before their bounds are changed on trial.
+SHIFTS = np.linspace(-3, 3, 25)
+#: How much numbers of the coarsest lattice are expected to differ, and those of each further one,
+#: as a part of that of the one before.
+SPREADS, _FINER = np.array([0.2, 0.4, 0.8]), 0.6
+#: Cells along the cube, in each of which pixels of a piece are taken together.
+_CELLS = 32
+#: Steps of Adam, their rate, and the part of it that is left at the end.
+_STEPS, _RATE, _FINAL_RATE = 60, 0.2, 0.05
+#: Pieces whose numbers are less probable than that have none.
+_SURE = 0.01
+#: Tells the halves from other random numbers.
+_SEED = 0x504C4143
+
+
+def with_expected_places(
+    field: Field,
+    rows: np.ndarray,
+    found: dict[str, Any],
+    settings: RoughnessSearchConfig,
+    *,
+    albedo: bool,
+) -> dict[str, Any]:
+    """Let roughness differ from place to place, as far as photographs tell.
+
+    Args:
+        field: of roughness, with numbers of pieces.
+        rows: of `row_type`, whose weights are inverse variances, from all ranks.
+        found: numbers that points share, in the place of the field's; none differs by place yet.
+        settings: how probable that is, and how many pixels tell as much as one.
+        albedo: whether it is unknown.
+
+    Returns:
+        What was found, with numbers by place; the same where the field has none.
+    """
+    if not field.place_cells or "placed" not in found or not len(rows):
+        return found
+    curves = Curves.of(rows, settings.place_cells, settings.colours, albedo)
+    seen = SeenPieces(field, curves.point, curves.pieces, found)
+    (outputs,) = seen.outputs
+    where = rows["position"].astype(np.float64)
+    cells = _Cells.of(seen.piece_of, where, field.place_cells)
+    errors = [errors_of(curves, outputs + shift) for shift in SHIFTS]
+    first = _first_half(rows)
+    halves = [cells.sums(errors, of) for of in (first, ~first)]
+    both = halves[0] + halves[1]
+    numbers, shifts = cells.solved([*halves, both], settings.pixels_as_one)
+    # What one half has found is asked of the other one.
+    gains = np.zeros_like(shifts[0])
+    for table, shift in zip(halves[::-1], shifts[:2], strict=True):
+        gains += _at(table, shift) - _at(table, np.zeros_like(shift))
+    asked = np.stack([np.bincount(cells.piece, gain, len(seen.pixels)) for gain in gains], 1)
+    prior = np.full(1 + len(SPREADS), (1 - settings.no_places) / len(SPREADS))
+    prior[0] = settings.no_places
+    evidence = np.concatenate([np.zeros((len(asked), 1)), asked], 1)
+    probable = normalized(chances(evidence, seen.pixels, settings) * prior)[:, 1:]
+    # A number that pieces share stands for none of them.
+    sure = (probable.sum(1) > _SURE) & (np.array(seen.pieces.strength) > 0)
+    if not sure.any():
+        return found
+    number = np.array(seen.pieces.number)
+    levels = []
+    for lattice, values in zip(cells.lattices, numbers, strict=True):
+        here = np.flatnonzero(sure[lattice.piece])
+        own = lattice.piece[here]
+        expected = (probable[own] * values[:, here].T).sum(1)
+        corner = [from_numpy(mi.UInt32, x.astype(np.uint32)) for x in lattice.corner[here].T]
+        of_piece = from_numpy(mi.UInt32, number[own].astype(np.uint32))
+        one = from_numpy(mi.Float, expected.astype(np.float32))
+        levels.append(PlaceNumbers(of_piece, mi.Point3u(corner), [one]))
+    return found | field.placed(levels)
+
+
+def _first_half(rows: np.ndarray) -> np.ndarray:
+    """Whether pixels are of the first of two random halves, shape (n,).
+
+    A pixel is known by its photograph: drawn twice, it is in the same half.
+    """
+    of_pixel = np.unique(rows["target"], axis=0, return_inverse=True)[1].ravel()
+    return np.random.default_rng(_SEED).random(of_pixel.max() + 1)[of_pixel] < 1 / 2
+
+
+def _at(table: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Rows of a table (cells, shifts) at shifts (…, cells), linear between `SHIFTS`."""
+    place = np.clip((shift - SHIFTS[0]) / (SHIFTS[1] - SHIFTS[0]), 0, len(SHIFTS) - 1)
+    left = np.minimum(place.astype(int), len(SHIFTS) - 2)
+    rows = np.arange(len(table))
+    low, high = table[rows, left], table[rows, left + 1]
+    return low + (place - left) * (high - low)
+
+
+@dataclass(frozen=True)
+class _Lattice:
+    """The corners of a lattice that cells of pieces are between.
+
+    `piece` and `corner` are of each corner; `place` and `share`, both (cells, 8), tell by which
+    corners a cell is, and how much of each it has.
+    """
+
+    piece: np.ndarray
+    corner: np.ndarray
+    place: np.ndarray
+    share: np.ndarray
+
+    @staticmethod
+    def of(piece: np.ndarray, where: np.ndarray, cells: int) -> _Lattice:
+        """That of cells of pieces (n,) at points of the unit cube (n, 3)."""
+        at = np.clip(where, 0, 1) * cells
+        below = np.minimum(np.floor(at), cells - 1)
+        part = at - below
+        keys, share = [], []
+        for offset in product((0, 1), repeat=3):
+            corner = below + np.array(offset)
+            keys.append(np.concatenate([piece[:, None], corner], 1).astype(np.int64))
+            share.append(np.where(offset, part, 1 - part).prod(1))
+        every, place = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
+        return _Lattice(
+            every[:, 0], every[:, 1:], place.reshape(len(share), -1).T, np.stack(share, 1)
+        )
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells of pieces, in each of which pixels are taken together.
+
+    Args:
+        piece: of each cell, from 0.
+        of_pixel: the cell of each pixel.
+        lattices: coarsest first.
+    """
+
+    piece: np.ndarray
+    of_pixel: np.ndarray
+    lattices: list[_Lattice]
+
+    @staticmethod
+    def of(piece: np.ndarray, where: np.ndarray, lattices: tuple[int, ...]) -> _Cells:
+        """Those of pixels of pieces (n,) at points of the unit cube (n, 3)."""
+        cell = np.floor(np.clip(where, 0, 1) * _CELLS)
+        key = np.concatenate([piece[:, None], cell], 1).astype(np.int64)
+        every, of_pixel = np.unique(key, axis=0, return_inverse=True)
+        of_pixel = of_pixel.ravel()
+        middle = np.stack([np.bincount(of_pixel, x) for x in where.T], 1)
+        middle /= np.bincount(of_pixel)[:, None]
+        own = every[:, 0]
+        return _Cells(own, of_pixel, [_Lattice.of(own, middle, n) for n in lattices])
+
+    def sums(self, columns: list[np.ndarray], chosen: np.ndarray) -> np.ndarray:
+        """Sums over the chosen pixels of each cell, shape (cells, columns)."""
+        of, count = self.of_pixel[chosen], len(self.piece)
+        return np.stack([np.bincount(of, column[chosen], count) for column in columns], 1)
+
+    def solved(
+        self, tables: list[np.ndarray], as_one: float
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """The most probable numbers by errors of cells at `SHIFTS`, for each of `SPREADS`.
+
+        Args:
+            tables: shape (cells, shifts), each of other pixels.
+            as_one: how many pixels tell as much as one.
+
+        Returns:
+            Of the last table, the numbers of each lattice, shape (spreads, corners); and how far
+            cells are shifted, shape (tables, spreads, cells).
+        """
+        jobs, count = len(tables) * len(SPREADS), len(self.piece)
+        every = np.concatenate(tables)
+        table = [
+            from_numpy(mi.Float, x.astype(np.float32)) for x in (every, np.gradient(every, axis=1))
+        ]
+        number = np.arange(jobs)[:, None]
+        row = number // len(SPREADS) * count + np.arange(count)
+        first = from_numpy(mi.UInt32, (row * len(SHIFTS)).astype(np.uint32))
+        corners, weights, places, shares = [], [], [], []
+        for level, lattice in enumerate(self.lattices):
+            size = len(lattice.piece)
+            corners.append(dr.opaque(mi.Float, 0, jobs * size))
+            spread = np.tile(SPREADS * _FINER**level, len(tables))
+            weights.append(from_numpy(mi.Float, np.repeat(spread**-2.0, size).astype(np.float32)))
+            place = [number * size + k for k in lattice.place.T]
+            places.append([from_numpy(mi.UInt32, k.astype(np.uint32)) for k in place])
+            share = [np.tile(k, jobs) for k in lattice.share.T]
+            shares.append([from_numpy(mi.Float, k.astype(np.float32)) for k in share])
+        optimizer = mi.ad.Adam(_RATE, {str(i): x for i, x in enumerate(corners)})
+        one = dr.opaque(mi.Float, 1 / as_one)
+
+        def shift(numbers: Any) -> mi.Float:
+            found = mi.Float(0)
+            for level, (place, share) in enumerate(zip(places, shares, strict=True)):
+                for k, part in zip(place, share, strict=True):
+                    found = dr.fma(part, dr.gather(mi.Float, numbers[str(level)], k), found)
+            return found
+
+        for step in range(_STEPS):
+            rate = _RATE * _FINAL_RATE ** (step / _STEPS)
+            optimizer.set_learning_rate({key: dr.opaque(mi.Float, rate) for key in optimizer})
+            loss = one * dr.sum(_between(table, first, shift(optimizer)))
+            for level, weight in enumerate(weights):
+                loss += dr.sum(weight * dr.square(optimizer[str(level)]))
+            dr.backward(loss)
+            optimizer.step()
+        numbers = {key: dr.detach(x) for key, x in optimizer.items()}
+        shifts = np.array(shift(numbers)).reshape(len(tables), len(SPREADS), count)
+        last = [
+            np.array(numbers[str(i)]).reshape(len(tables), len(SPREADS), -1)[-1]
+            for i in range(len(corners))
+        ]
+        return last, shifts
+
+
+def _between(table: list[mi.Float], first: mi.UInt32, shift: mi.Float) -> mi.Float:
+    """Errors at shifts, cubic between `SHIFTS`.
+
+    Args:
+        table: errors at all of them, and their slopes, row by row.
+        first: where the row of each lane begins.
+        shift: of each lane.
+    """
+    at = dr.clip((shift - SHIFTS[0]) / (SHIFTS[1] - SHIFTS[0]), 0, len(SHIFTS) - 1.001)
+    left = mi.UInt32(dr.detach(at))
+    t = at - mi.Float(left)
+    (a, b), (p, q) = (
+        [dr.gather(mi.Float, values, first + left + i) for i in (0, 1)] for values in table
+    )
+    return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))

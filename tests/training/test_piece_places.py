@@ -1,0 +1,134 @@
+"""Roughness differs from place to place on a piece of surface as far as photographs tell."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from searches import SEARCH, SMALL, made_up
+from support import of_format
+
+from unbake.config import FitConfig, from_toml, to_toml
+from unbake.fields.field import FieldSpec, holding
+from unbake.fields.network import Network
+from unbake.training.piece_places import _first_half, with_expected_places
+from unbake.training.piece_variation import with_all_variation
+from unbake.training.roughness_curves import Curves, points, roughness_of
+from unbake.training.roughness_search import averaged, searched
+
+PLACED = replace(SMALL, pieces=replace(SMALL.pieces, places=4, variation=True))
+NOISE = 0.02
+#: The test has less noise than photographs: pixels count one by one, and albedo is as it should be.
+SURE = replace(SEARCH, pixels_as_one=1.0, place_cells=1, cells=1)
+
+
+def roughness_by_place(position):
+    return 0.4 + 0.2 * np.sin(2 * np.pi * position[:, 0]) * np.cos(2 * np.pi * position[:, 1])
+
+
+def photographed(count=20_000, seed=2):
+    """Rows of two pieces, of which the first differs from place to place, and the truth."""
+    rows = made_up(count)
+    rng = np.random.default_rng(seed)
+    true = np.where(rows["piece"] == 0, roughness_by_place(rows["position"]), 0.55)
+    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
+    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] += NOISE * rng.standard_normal((count, 3))
+    rows["weight"] = NOISE**-2
+    return rows, true
+
+
+def field_of(settings=PLACED):
+    return Network(settings, FieldSpec(1, bounded=True, initial=0.4, seed=2))
+
+
+def values(field, numbers, rows):
+    with holding(field, numbers):
+        return np.array(roughness_of(field, points(rows, albedo=True)), np.float64)
+
+
+def found_of(field, rows, settings=SURE, placed=True):
+    curves = Curves.of(rows, settings.cells, settings.colours, albedo=True)
+    return searched(field, curves, settings, 0.02, None, rows if placed else None)
+
+
+def test_what_differs_from_place_to_place_is_found_where_it_does():
+    rows, true = photographed()
+    field = field_of()
+    first, second = rows["piece"] == 0, rows["piece"] == 1
+    without = values(field, found_of(field, rows, placed=False), rows)
+    found = found_of(field, rows)
+    roughness = values(field, found, rows)
+    assert np.std(without[first] - true[first]) > 0.09
+    assert np.std(roughness[first] - true[first]) < 0.04
+    # The other piece has one roughness, and nothing by place.
+    np.testing.assert_array_equal(np.array(found["placed"])[:2], [1, 0])
+    assert np.std(roughness[second]) < 0.01
+    assert roughness[second].mean() == pytest.approx(0.55, abs=0.04)
+    # The next search begins without.
+    with holding(field, found):
+        every = with_all_variation(field, Curves.of(rows, 1, 6, albedo=True))
+    assert not np.array(every["placed"]).any() and not np.array(every["places.0"]).any()
+
+
+def test_searches_are_averaged_by_place_too():
+    rows, _ = photographed()
+    field = field_of()
+    before = {key: dr.detach(field.parameters()[key]) for key in field.shared()}
+    found = found_of(field, rows)
+    curves = Curves.of(rows, 1, 6, albedo=True)
+    mixed = averaged(field, curves, (before, found), 0.5)
+    whole, half = (np.array(x["places.0"]) for x in (found, mixed))
+    np.testing.assert_allclose(half, whole / 2, atol=1e-6)
+    assert (np.array(mixed["placed"]) > 0).sum() == 1
+
+
+def test_noise_differs_from_place_to_place_and_is_not_found():
+    field = field_of()
+    for seed in range(3):
+        rows, _ = photographed(4000, seed)
+        rows["piece"] = 1
+        noisy = np.random.default_rng(seed).standard_normal((len(rows), 3))
+        sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
+        clean = (sharp * np.exp(-3 * 0.55) + rows["coloured"][:, :1])[:, 0]
+        rows["target"] = clean + 0.3 * noisy
+        rows["weight"] = 0.3**-2
+        # Every pixel is there four times, each time with the noise of its photograph.
+        rows = np.concatenate([rows] * 4)
+        found = found_of(field, rows)
+        assert not np.array(found["placed"]).any()
+
+
+def test_a_pixel_that_was_drawn_twice_is_in_one_half():
+    rows, _ = photographed(1000)
+    twice = np.concatenate([rows, rows[::-1]])
+    half = _first_half(twice)
+    np.testing.assert_array_equal(half[:1000], half[1000:][::-1])
+    assert 0.4 < half.mean() < 0.6
+
+
+@pytest.mark.parametrize("settings", [SMALL, PLACED])
+def test_without_places_or_pixels_nothing_changes(settings):
+    rows, _ = photographed(400)
+    field = field_of(settings)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    rows = rows if settings is SMALL else rows[:0]
+    assert with_expected_places(field, rows, numbers, SURE, albedo=True) is numbers
+
+
+def test_pieces_that_share_a_number_unlike_have_none_by_place():
+    rows, _ = photographed()
+    rows["piece"] += 70  # the field has 64 numbers
+    rows["strength"] = np.where(rows["piece"] == 70, 0.5, 0.1)
+    field = field_of()
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    found = with_expected_places(field, rows, numbers, SURE, albedo=True)
+    assert not np.array(found["placed"]).any()
+
+
+def test_runs_of_before_go_on_without_places():
+    text = of_format(to_toml(FitConfig()), 6)
+    kept = [x for x in text.splitlines() if not x.startswith(("places =", "no_places", "place_"))]
+    before = from_toml("\n".join(kept))
+    assert before.materials["roughness"]["neural"].pieces.places == 0
+    assert before.roughness_search == SEARCH
