@@ -508,6 +508,11 @@ def test_numbers_of_numpy_and_whole_numbers_are_numbers():
     assert (config.steps, config.seed, config.held_aside, config.seconds) == (20, 3, 0.25, 5)
     assert from_toml(to_toml(config)) == config
     assert json.dumps(dataclasses.asdict(RenderSettings(width=np.int32(7), exposure=1)))
+    config = FitConfig(rate_factors={"roughness": np.float32(0.5), "albedo": 2})
+    assert from_toml(to_toml(config)) == config
+    for wrong in (True, "0.5"):
+        with pytest.raises(UserError, match=r"^rate_factors.albedo: must be positive and 10000"):
+            FitConfig(rate_factors={"albedo": wrong})
 
 
 @pytest.mark.parametrize("up", ["+Z", "-Y", "up", "z", "", None])

@@ -177,9 +177,8 @@ def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) 
     """
     wrong = {}
     for key, hint in _checked(type(settings)).items():
-        value = getattr(settings, key)
-        if getattr(value, "shape", None) == ():
-            value = value.item()
+        value = plain(given := getattr(settings, key))
+        if value is not given:
             object.__setattr__(settings, key, value)
         if (told := mistyped(value, hint)) is not None:
             wrong[key] = told
@@ -191,6 +190,11 @@ def require_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) 
     if wrong:
         (key, first), *others = wrong.items()
         raise UserError("; ".join([first, *(f"{k}: {told}" for k, told in others)]), where=key)
+
+
+def plain(value: Any) -> Any:
+    """A scalar of numpy as Python's own, which files can hold; anything else as it is."""
+    return value.item() if getattr(value, "shape", None) == () else value
 
 
 def mistyped(value: object, hint: Any) -> str | None:

@@ -19,7 +19,7 @@ from unbake.fields.network import Network
 from unbake.fields.perceptron import can_record_layout
 from unbake.fields.piece_values import PieceValues
 from unbake.fields.pieces import Piece, Pieces
-from unbake.fields.settings import GridConfig, NetworkConfig, PieceConfig
+from unbake.fields.settings import PLACES_LOG2, GridConfig, NetworkConfig, PieceConfig
 from unbake.quantities import QUANTITIES
 
 LANES = 300
@@ -146,6 +146,18 @@ def test_pieces_have_numbers_of_their_own_at_one_corner():
     table.assign(zero | table.placed([PlaceNumbers(number, corner, [mi.Float(wanted)])]))
     point = SurfacePoint(mi.Point3f(0.5), piece=Piece(number, mi.Float(1)))
     np.testing.assert_allclose(np.array(table.evaluate(point)[0]), wanted, rtol=1e-6)
+
+
+def test_corners_that_would_share_a_number_have_none():
+    table = PieceValues(replace(PLACED, most=4096), 1)
+    every = np.arange(4096 * 200, dtype=np.uint32)
+    corner = mi.Point3u(*[mi.UInt32(every // 4096 % 9)] * 2, mi.UInt32(every // 4096 // 9))
+    one = mi.Float(np.ones(len(every), np.float32))
+    found = table.placed([PlaceNumbers(mi.UInt32(every % 4096), corner, [one])])
+    kept = int(np.array(found["places.0"]).sum())
+    # Of n corners dealt to m places, n exp(-n / m) are alone.
+    alone = len(every) * np.exp(-len(every) / (1 << PLACES_LOG2))
+    assert kept == pytest.approx(alone, rel=0.02)
 
 
 def test_deviations_are_those_of_the_pieces_that_are_asked_for():
@@ -366,7 +378,7 @@ def test_sizes_tell_the_memory():
         {"network": 0.0},
         {"colours": -1},
         {"own_colours": 13},
-        {"places": 2000},
+        {"places": 17},
     ],
 )
 def test_sizes_out_of_range_are_refused(wrong):

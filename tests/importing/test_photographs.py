@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import PurePath
 from unittest.mock import patch
 
 import numpy as np
@@ -221,6 +222,24 @@ def test_a_photograph_in_another_format_is_taken_where_there_is_one(
         ImportFaults, match=r"does not exist: .*\.png\. --leave-out-missing imports"
     ):
         imported(project, tmp_path / "two", meshes)
+
+
+def test_neither_a_photograph_nor_its_mask_takes_the_place_of_the_other(captured, meshes, tmp_path):
+    folder = tmp_path / "nerf"
+    write_nerfstudio(captured, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    first, *others = content["frames"]
+    photograph = folder / first["file_path"]
+    mask = photograph.with_suffix(".jpg")
+    first["mask_path"] = str(PurePath(first["file_path"]).with_suffix(".jpg"))
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(ImportFaults, match="the mask does not exist"):
+        imported(folder, tmp_path / "no-mask", meshes)
+    save(np.full((16, 16, 3), 255, np.uint8), mask)
+    photograph.unlink()
+    data, told = imported(folder, tmp_path / "data", meshes, leave_out_missing=True)
+    assert len(data.views) == len(others)
+    assert not any("another format" in line for line in told)
 
 
 @pytest.mark.parametrize("layout", [write_nerfstudio, write_blender])

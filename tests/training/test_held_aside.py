@@ -300,9 +300,16 @@ def test_a_fit_of_a_few_steps_is_at_no_plateau_and_no_ratio_is_told_within_noise
     flat = log_of([8, 4, 2, 1, 1, 1, 1, 1.002])
     few = [line | {"step": line["step"] // 100} for line in flat]
     assert [convergence(log).trend for log in (flat, few)] == ["plateau", "unclear"]
-    about_zero = convergence(log_of_rises(np.linspace(-9, 5, HELD_GROUPS) - 2))
+    about_zero = convergence(log_of_rises(np.linspace(-9, 8, HELD_GROUPS)))
     assert about_zero.noise >= 1
     assert "error changed by less than its noise in the last quarter" in about_zero.told()
+    lines = log_of([4, 2, 1, 1])
+    for line in lines:  # it begins about zero, and rises by more than that
+        line |= {"held_aside": 0.001, "held_aside_groups": [0.001] * HELD_GROUPS}
+    rises = np.linspace(0.3, 0.5, HELD_GROUPS) * np.tile([1, 4], HELD_GROUPS // 2)
+    lines[-1] |= {"held_aside": 0.001 + rises.mean(), "held_aside_groups": list(0.001 + rises)}
+    told = convergence(lines).told()
+    assert "getting worse; error rose by more than its noise in the last quarter" in told
 
 
 def test_too_few_errors_say_nothing():

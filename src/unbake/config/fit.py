@@ -9,7 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from ..errors import POSITIVE, UserError, require, require_name, require_ranges
+from ..errors import (
+    POSITIVE,
+    UserError,
+    mistyped,
+    plain,
+    require,
+    require_name,
+    require_ranges,
+)
 from ..fields.grid_sizes import USUAL, sized
 from ..fields.registry import representation, representations
 from ..fields.settings import RATES, FieldSettings, GuideConfig, require_no_pieces
@@ -458,7 +466,8 @@ class FitConfig:
         factors = dict(self.rate_factors)
         for name, factor in factors.items():
             require_name(name, UNKNOWNS, "unknown", "rate_factors")
-            good = factor is None or 0 < factor <= 1e4
+            factors[name] = factor = plain(factor)
+            good = mistyped(factor, float | None) is None and (factor is None or 0 < factor <= 1e4)
             require(good, f"rate_factors.{name}", "positive and 10000 or less", factor)
         factors = {name: factors.get(name) for name in UNKNOWNS}
         of_radiance = {form: representation(form).radiance for form in representations()}

@@ -134,7 +134,9 @@ class Field(Protocol):
         return {}
 
     def placed(self, levels: Sequence[PlaceNumbers]) -> dict[str, mi.Float | mi.TensorXf]:
-        """Shared parameters with which outputs before their bounds differ from place to place.
+        """Parameters with which outputs before their bounds differ from place to place.
+
+        They are not among the shared ones: no descent moves them.
 
         Args:
             levels: what is added, of each lattice of `place_cells`, from the coarsest one on.

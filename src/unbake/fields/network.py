@@ -75,7 +75,11 @@ class Network(Field):
 
     def shared(self) -> Set[str]:
         """The numbers and factors of pieces and those of colours, if steps learn them."""
-        return self.pieces.parameters().keys() if self.pieces and self._learned else frozenset()
+        if self.pieces is None or not self._learned:
+            return frozenset()
+        by_place = self.pieces.by_place()
+        # In the order of `parameters`, which is the same in all processes; that of a set is not.
+        return {key: None for key in self.pieces.parameters() if key not in by_place}.keys()
 
     def deviations(self, point: SurfacePoint) -> dict[str, mi.Float]:
         """Those of the numbers of pieces and colours, if there are any."""

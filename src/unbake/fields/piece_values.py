@@ -92,6 +92,11 @@ class PieceValues:
             found["placed"] = self._placed
         return found
 
+    def by_place(self) -> set[str]:
+        """Names of the parameters that tell what differs from place to place."""
+        names = [f"places.{i}" for i in range(len(self._values))]
+        return {*names, "placed"} if self.place_cells else set()
+
     def assign(self, parameters: dict[str, mi.Float | mi.TensorXf]) -> None:
         """Use these arrays from now on; others than those of `parameters` are ignored."""
         self._values = [parameters[f"pieces.{i}"] for i in range(len(self._values))]
@@ -217,11 +222,19 @@ class PieceValues:
             return {}
         tables = [dr.zeros(mi.Float, 1 << PLACES_LOG2) for _ in self._values]
         placed = dr.zeros(mi.Float, self._settings.most)
-        for level, (piece, corner, values) in enumerate(levels):
-            number = dr.minimum(piece, self._settings.most - 1)
-            where = _hashed(number, corner, level)
-            for table, value in zip(tables, values, strict=True):
-                dr.scatter(table, value, where)
+        often = dr.zeros(mi.UInt32, 1 << PLACES_LOG2)
+        numbers = [dr.minimum(each.piece, self._settings.most - 1) for each in levels]
+        places = [
+            _hashed(number, each.corner, level)
+            for level, (number, each) in enumerate(zip(numbers, levels, strict=True))
+        ]
+        for where in places:
+            dr.scatter_add(often, mi.UInt32(1), where)
+        for number, where, each in zip(numbers, places, levels, strict=True):
+            # What two corners would share is of neither.
+            alone = dr.gather(mi.UInt32, often, where) == 1
+            for table, value in zip(tables, each.values, strict=True):
+                dr.scatter(table, value, where, alone)
             dr.scatter(placed, dr.ones(mi.Float, dr.width(number)), number)
         dr.make_opaque(tables, placed)
         return {f"places.{i}": table for i, table in enumerate(tables)} | {"placed": placed}

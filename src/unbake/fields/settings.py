@@ -113,7 +113,7 @@ class PieceConfig:
     def __post_init__(self) -> None:
         sizes = {"most": (0, 1 << 20), "brightnesses": (1, 64)}
         sizes |= {"colours": (0, 64), "own_colours": (0, 12)}
-        sizes |= {"places": (0, 1 << 10)}
+        sizes |= {"places": (0, 16)}
         require_ranges(self, sizes | {"gain": (POSITIVE, 1e4), "network": (POSITIVE, 1.0)})
 
     def numbers(self, outputs: int) -> int:

@@ -64,7 +64,11 @@ def read_colmap(model: Path, reading: Reading, faults: Faults) -> Source:
             if image.camera_id not in lenses:
                 lenses[image.camera_id] = _lens(image.camera)
             file = find_image(
-                found, image.name, "folder of images", allow_outside=reading.allow_outside
+                found,
+                image.name,
+                "folder of images",
+                allow_outside=reading.allow_outside,
+                exact=reading.leave_out_missing,
             )
             if reading.has(file, image.name):
                 shots.append(_shot(image, lenses[image.camera_id], file))

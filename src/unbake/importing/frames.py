@@ -238,7 +238,7 @@ def _own_mask(folder: Path, frame: dict[str, Any], name: str, reading: Reading) 
     """The mask that a frame names; None where it is missing and others may take its place."""
     said = text(frame, "mask_path", name)
     try:
-        mask = _named_file(folder, said, reading)[1]
+        mask = _named_file(folder, said, reading, exact=True)[1]
         require_file(mask, "mask")
     except UserError:
         if reading.other_masks:
@@ -261,14 +261,20 @@ def _own_split(frame: dict[str, Any]) -> str | None:
     return _SPLITS[said]
 
 
-def _named_file(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
+def _named_file(
+    folder: Path, name: str, reading: Reading, *, exact: bool = False
+) -> tuple[str, Path]:
     """A file that a frame names, and its name as it is here: Windows separates by backslashes."""
-    outside = reading.allow_outside
-    file = find_image(folder, name, "source", allow_outside=outside)
+
+    def found(name: str) -> Path:
+        outside, only = reading.allow_outside, exact or reading.leave_out_missing
+        return find_image(folder, name, "source", allow_outside=outside, exact=only)
+
+    file = found(name)
     if file.is_file() or "\\" not in name:
         return name, file
     name = _slashed(name)
-    return name, find_image(folder, name, "source", allow_outside=outside)
+    return name, found(name)
 
 
 def _image(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
@@ -284,8 +290,10 @@ def _image(folder: Path, name: str, reading: Reading) -> tuple[str, Path]:
         return _named_file(folder, name, reading)
     name = _slashed(name)
     ends = [str(end) for end in ends_of(name)] or [name]
-    outside = reading.allow_outside
-    files = [find_image(reading.images, end, "source", allow_outside=outside) for end in ends]
+    outside, only = reading.allow_outside, reading.leave_out_missing
+    files = [
+        find_image(reading.images, end, "source", allow_outside=outside, exact=only) for end in ends
+    ]
     return name, next((file for file in files if file.is_file()), files[0])
 
 

@@ -200,7 +200,9 @@ def image_header(path: Path) -> ImageHeader:
     return header
 
 
-def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Path:
+def find_image(
+    folder: Path, name: str, what: str, *, allow_outside: bool, exact: bool = False
+) -> Path:
     """The file of a folder that a name means, which may lack its suffix; it need not exist.
 
     Its suffix may be of another case, as `.JPG` and `.jpg`. Camera RAW takes the place of the
@@ -212,6 +214,8 @@ def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Pa
         name: relative to the folder, from a file that others may have written.
         what: what the folder is, for the error message.
         allow_outside: accept files that lie elsewhere.
+        exact: no other format takes its place: beside a mask there may be the photograph of its
+            name, and beside a photograph that is left out its mask.
 
     Raises:
         UserError: the name is no path, or leads out of the folder.
@@ -228,7 +232,7 @@ def find_image(folder: Path, name: str, what: str, *, allow_outside: bool) -> Pa
         others += _cases(given, given.suffix.lower())
     others += [other for suffix in RAW_SUFFIXES for other in _cases(given, suffix)]
     found = next((other for other in others if (folder / other).is_file()), None)
-    if found is None:
+    if found is None and not exact:
         found = _in_another_format(folder, given)
     return path if found is None else checked(os.fspath(found))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ def write_report(
 
 def _listed(folders: str | Path | Sequence[str | Path]) -> list[Path]:
     """One folder or several, as a list."""
-    return [Path(x) for x in ([folders] if isinstance(folders, str | Path) else folders)]
+    return [Path(x) for x in ([folders] if isinstance(folders, str | os.PathLike) else folders)]
 
 
 def _context(

@@ -324,7 +324,8 @@ class Convergence:
         part = "the last quarter" if abs(self.share - LAST) < 0.05 else f"the last {self.share:.0%}"
         sizes = f"{verb} {100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
         if self.noise >= 1:  # errors have no bias, and those of a good fit may be about zero
-            sizes = "changed by less than its noise"
+            more = abs(self.change) > self.noise
+            sizes = f"{verb} by more than its noise" if more else "changed by less than its noise"
         word, advice = {
             "improving": ("still improving", "a longer fit may be better: --quality high"),
             "plateau": (

@@ -28,6 +28,7 @@ import numpy as np
 from ..config import RoughnessSearchConfig
 from ..fields.arrays import from_numpy
 from ..fields.field import Field, PlaceNumbers
+from ..fields.settings import PLACES_LOG2
 from .piece_levels import errors_of
 from .roughness_curves import Curves
 from .seen_pieces import SeenPieces, chances, normalized
@@ -43,6 +44,8 @@ _CELLS = 32
 _STEPS, _RATE, _FINAL_RATE = 60, 0.2, 0.05
 #: Pieces whose numbers are less probable than that have none.
 _SURE = 0.01
+#: Corners that have numbers, at most: of more, some would share a place in the table.
+_MOST_CORNERS = 1 << (PLACES_LOG2 - 4)
 #: Tells the halves from other random numbers.
 _SEED = 0x504C4143
 
@@ -67,7 +70,7 @@ def with_expected_places(
     Returns:
         What was found, with numbers by place; the same where the field has none.
     """
-    if not field.place_cells or "placed" not in found or not len(rows):
+    if not field.place_cells or not len(rows):
         return found
     curves = Curves.of(rows, settings.place_cells, settings.colours, albedo)
     seen = SeenPieces(field, curves.point, curves.pieces, found)
@@ -78,9 +81,13 @@ def with_expected_places(
     first = _first_half(rows)
     halves = [cells.sums(errors, of) for of in (first, ~first)]
     both = halves[0] + halves[1]
-    numbers, shifts = cells.solved([*halves, both], settings.pixels_as_one)
+    as_one = np.full(len(seen.pixels), settings.pixels_as_one)
+    if settings.pixels_at_most:
+        as_one = np.maximum(as_one, seen.pixels / settings.pixels_at_most)
+    less = as_one[cells.piece, None]
+    numbers, shifts = cells.solved([table / less for table in (*halves, both)])
     # What one half has found is asked of the other one.
-    gains = np.zeros_like(shifts[0])
+    gains = np.zeros_like(shifts[0])  # not in units of `as_one`, which `chances` counts
     for table, shift in zip(halves[::-1], shifts[:2], strict=True):
         gains += _at(table, shift) - _at(table, np.zeros_like(shift))
     asked = np.stack([np.bincount(cells.piece, gain, len(seen.pixels)) for gain in gains], 1)
@@ -90,6 +97,7 @@ def with_expected_places(
     probable = normalized(chances(evidence, seen.pixels, settings) * prior)[:, 1:]
     # A number that pieces share stands for none of them.
     sure = (probable.sum(1) > _SURE) & (np.array(seen.pieces.strength) > 0)
+    sure &= cells.fitting(np.where(sure, asked.min(1), np.inf))
     if not sure.any():
         return found
     number = np.array(seen.pieces.number)
@@ -184,14 +192,24 @@ class _Cells:
         of, count = self.of_pixel[chosen], len(self.piece)
         return np.stack([np.bincount(of, column[chosen], count) for column in columns], 1)
 
-    def solved(
-        self, tables: list[np.ndarray], as_one: float
-    ) -> tuple[list[np.ndarray], np.ndarray]:
+    def fitting(self, gains: np.ndarray) -> np.ndarray:
+        """Which pieces a table of numbers has room for, those first that tell the most of places.
+
+        Args:
+            gains: the error of each piece with numbers less that without.
+        """
+        every = np.concatenate([lattice.piece for lattice in self.lattices])
+        count = np.bincount(every, minlength=len(gains))
+        order = np.argsort(gains, kind="stable")
+        fits = np.zeros(len(gains), bool)
+        fits[order[np.cumsum(count[order]) <= _MOST_CORNERS]] = True
+        return fits
+
+    def solved(self, tables: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
         """The most probable numbers by errors of cells at `SHIFTS`, for each of `SPREADS`.
 
         Args:
-            tables: shape (cells, shifts), each of other pixels.
-            as_one: how many pixels tell as much as one.
+            tables: shape (cells, shifts), each of other pixels, in units of their variance.
 
         Returns:
             Of the last table, the numbers of each lattice, shape (spreads, corners); and how far
@@ -216,7 +234,6 @@ class _Cells:
             share = [np.tile(k, jobs) for k in lattice.share.T]
             shares.append([from_numpy(mi.Float, k.astype(np.float32)) for k in share])
         optimizer = mi.ad.Adam(_RATE, {str(i): x for i, x in enumerate(corners)})
-        one = dr.opaque(mi.Float, 1 / as_one)
 
         def shift(numbers: Any) -> mi.Float:
             found = mi.Float(0)
@@ -228,7 +245,7 @@ class _Cells:
         for step in range(_STEPS):
             rate = _RATE * _FINAL_RATE ** (step / _STEPS)
             optimizer.set_learning_rate({key: dr.opaque(mi.Float, rate) for key in optimizer})
-            loss = one * dr.sum(_between(table, first, shift(optimizer)))
+            loss = dr.sum(_between(table, first, shift(optimizer)))
             for level, weight in enumerate(weights):
                 loss += dr.sum(weight * dr.square(optimizer[str(level)]))
             dr.backward(loss)

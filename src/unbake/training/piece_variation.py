@@ -68,7 +68,9 @@ def with_all_variation(field: Field, curves: Curves, ranks: Ranks | None = None)
         curves: of the pieces that are asked for.
         ranks: that have a part of the curves each; None: there is one.
     """
-    numbers = {key: field.parameters()[key] for key in field.shared()} | field.placed(())
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    if field.place_cells:
+        numbers |= field.placed(())
     if "variation" not in numbers:
         return numbers
     seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks)

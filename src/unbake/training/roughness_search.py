@@ -267,10 +267,11 @@ def searched(
             to place.
 
     Returns:
-        As of `descend`.
+        As of `descend`, and what differs from place to place.
     """
     with holding(field, with_all_variation(field, curves, ranks)):
-        found = descend(field, curves, settings, rate, ranks)
+        nowhere = field.placed(()) if field.place_cells else {}
+        found = descend(field, curves, settings, rate, ranks) | nowhere
         if settings.pixels_as_one:
             found = with_expected_variation(field, curves, found, settings, ranks)
             if rows is not None:
