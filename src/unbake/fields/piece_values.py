@@ -191,10 +191,7 @@ class PieceValues:
         found = []
         for values in tables:
             corners = [dr.gather(mi.Float, values, first + offset) for offset in apart]
-            for part in share:
-                pairs = zip(corners[::2], corners[1::2], strict=True)
-                corners = [dr.lerp(low, high, part) for low, high in pairs]
-            found += corners
+            found.append(_trilinear(corners, share))
         return found
 
     def _of_place(self, number: mi.UInt32, point: SurfacePoint) -> list[mi.Float]:
@@ -210,10 +207,7 @@ class PieceValues:
             where = [_hashed(number, below + mi.Point3u(x, y, z), level) for z, y, x in _CORNERS]
             for i, values in enumerate(self._places):
                 corners = [dr.gather(mi.Float, dr.detach(values), k, has) for k in where]
-                for part in share:
-                    pairs = zip(corners[::2], corners[1::2], strict=True)
-                    corners = [dr.lerp(low, high, part) for low, high in pairs]
-                found[i] = found[i] + corners[0]
+                found[i] = found[i] + _trilinear(corners, share)
         return found
 
     def placed(self, levels: Sequence[PlaceNumbers]) -> dict[str, mi.Float]:
@@ -310,6 +304,14 @@ class PieceValues:
         grids = (self._colours is not None) + bool(self._settings.own_colours)
         own = min(self._settings.brightnesses, 2) + 8 * (grids + len(self.place_cells))
         return own * outputs + (self._factors is not None) + bool(self.place_cells)
+
+
+def _trilinear(corners: list[mi.Float], share: mi.Point3f) -> mi.Float:
+    """The value between those at the corners of a cell, which are in the order of `_CORNERS`."""
+    for part in share:
+        pairs = zip(corners[::2], corners[1::2], strict=True)
+        corners = [dr.lerp(low, high, part) for low, high in pairs]
+    return corners[0]
 
 
 def _hashed(piece: mi.UInt32, corner: mi.Point3u, level: int) -> mi.UInt32:

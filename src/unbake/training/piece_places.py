@@ -3,7 +3,7 @@
 Most pieces have one roughness, or one for each of their colours. Where a texture of roughness has
 a pattern of its own, photographs tell it in patches of many pixels. So after a descent each piece
 gets numbers on lattices over the scene's cube: those that are most probable where they are expected
-to differ by some spread, and half as much or less on finer lattices.
+to differ by some spread, and less on finer lattices.
 
 Noise of the photographs looks like such a pattern, too. So the pixels are dealt into two halves,
 and what one half says of a piece is asked of the other one, with each spread and with none. A pixel
@@ -30,8 +30,8 @@ from ..fields.arrays import from_numpy
 from ..fields.field import Field, PlaceNumbers
 from ..fields.settings import PLACES_LOG2
 from .piece_levels import errors_of
-from .roughness_curves import Curves
-from .seen_pieces import SeenPieces, chances, normalized
+from .roughness_curves import Curves, cubic
+from .seen_pieces import SeenPieces, as_one, chances, normalized
 
 #: By how much outputs before their bounds are changed on trial.
 SHIFTS = np.linspace(-3, 3, 25)
@@ -81,10 +81,7 @@ def with_expected_places(
     first = _first_half(rows)
     halves = [cells.sums(errors, of) for of in (first, ~first)]
     both = halves[0] + halves[1]
-    as_one = np.full(len(seen.pixels), settings.pixels_as_one)
-    if settings.pixels_at_most:
-        as_one = np.maximum(as_one, seen.pixels / settings.pixels_at_most)
-    less = as_one[cells.piece, None]
+    less = as_one(seen.pixels, settings)[cells.piece, None]
     numbers, shifts = cells.solved([table / less for table in (*halves, both)])
     # What one half has found is asked of the other one.
     gains = np.zeros_like(shifts[0])  # not in units of `as_one`, which `chances` counts
@@ -273,4 +270,4 @@ def _between(table: list[mi.Float], first: mi.UInt32, shift: mi.Float) -> mi.Flo
     (a, b), (p, q) = (
         [dr.gather(mi.Float, values, first + left + i) for i in (0, 1)] for values in table
     )
-    return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
+    return cubic(a, b, p, q, t)

@@ -61,7 +61,9 @@ def with_expected_variation(
 
 
 def with_all_variation(field: Field, curves: Curves, ranks: Ranks | None = None) -> dict[str, Any]:
-    """The numbers that points share, as if no search had taken anything from what differs.
+    """The numbers of pieces, as if no search had taken anything from what differs.
+
+    Nothing differs from place to place.
 
     Args:
         field: of roughness.

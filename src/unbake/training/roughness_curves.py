@@ -99,7 +99,12 @@ class Curves:
         width = right - left
         p, q = (width * dr.gather(mi.Float, self.slopes, first + i) for i in (0, 1))
         t = (dr.log(inside) - left) / width
-        return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
+        return cubic(a, b, p, q, t)
+
+
+def cubic(a: mi.Float, b: mi.Float, p: mi.Float, q: mi.Float, t: mi.Float) -> mi.Float:
+    """The cubic with values a, b and slopes p, q at 0 and 1, at t between them."""
+    return a + t * (p + t * (3 * (b - a) - 2 * p - q + t * (2 * (a - b) + p + q)))
 
 
 def _slopes(losses: np.ndarray, piece: np.ndarray) -> np.ndarray:

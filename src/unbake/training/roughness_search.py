@@ -269,9 +269,9 @@ def searched(
     Returns:
         As of `descend`, and what differs from place to place.
     """
-    with holding(field, with_all_variation(field, curves, ranks)):
-        nowhere = field.placed(()) if field.place_cells else {}
-        found = descend(field, curves, settings, rate, ranks) | nowhere
+    first = with_all_variation(field, curves, ranks)
+    with holding(field, first):
+        found = first | descend(field, curves, settings, rate, ranks)
         if settings.pixels_as_one:
             found = with_expected_variation(field, curves, found, settings, ranks)
             if rows is not None:

@@ -137,11 +137,20 @@ def chances(errors: np.ndarray, pixels: np.ndarray, settings: RoughnessSearchCon
         pixels: of each piece, shape (pieces,).
         settings: how many pixels tell as much as one.
     """
-    as_one = np.full(len(pixels), settings.pixels_as_one)
-    if settings.pixels_at_most:
-        as_one = np.maximum(as_one, pixels / settings.pixels_at_most)
     above = errors - errors.min(1, keepdims=True)
-    return np.exp(-above / (2 * as_one[:, None])) + _ASTRAY
+    return np.exp(-above / (2 * as_one(pixels, settings)[:, None])) + _ASTRAY
+
+
+def as_one(pixels: np.ndarray, settings: RoughnessSearchConfig) -> np.ndarray:
+    """How many pixels of each piece tell as much as one would by itself, shape (pieces,).
+
+    Args:
+        pixels, settings: as of `chances`.
+    """
+    found = np.full(len(pixels), settings.pixels_as_one)
+    if settings.pixels_at_most:
+        found = np.maximum(found, pixels / settings.pixels_at_most)
+    return found
 
 
 def normalized(distributions: np.ndarray) -> np.ndarray:
