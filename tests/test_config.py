@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import typing
@@ -522,9 +523,30 @@ def test_the_up_axis_of_a_map_is_one_of_six(up):
     assert LightConfig(envmap="sky.exr", envmap_up="-z").up == (0, 0, -1)
 
 
-def test_quantities_are_no_text():
-    with pytest.raises(TypeError, match="a tuple of names, not the text 'albedo'"):
-        FitConfig(quantities="albedo")
+@pytest.mark.parametrize(
+    ("key", "wrong", "wanted"),
+    [
+        *(("quantities", wrong, "a tuple of names") for wrong in ("albedo", 3.5, None)),
+        *(("rate_factors", wrong, "a dictionary") for wrong in ("a", 3.5, None, [1])),
+        *(("materials", wrong, "a dictionary") for wrong in ("a", 3.5, None, [1])),
+        *(("radiance", wrong, "a dictionary") for wrong in ("a", 3.5, None, [1])),
+    ],
+)
+def test_settings_of_another_kind_are_told(key, wrong, wanted):
+    with pytest.raises(UserError, match=f"^{key}: must be {wanted}, not {re.escape(repr(wrong))}"):
+        FitConfig(**{key: wrong})
+
+
+def test_settings_of_one_material_are_a_dictionary():
+    with pytest.raises(UserError, match=r"^materials\.albedo: must be a dictionary, not 3"):
+        FitConfig(materials={"albedo": 3})
+
+
+@pytest.mark.parametrize("key", ["envmap", "lights"])
+@pytest.mark.parametrize("wrong", [3.5, [1], {"a": 1}])
+def test_a_light_is_the_path_of_a_file(key, wrong):
+    with pytest.raises(UserError, match=f"^{key}: must be the path of a file, not "):
+        LightConfig(**{key: wrong})
 
 
 def test_quantities_stand_in_the_order_of_the_table():

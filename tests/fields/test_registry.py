@@ -171,9 +171,11 @@ def test_the_same_again_is_no_error(strips):
 
 
 def test_settings_of_another_representation_are_refused():
-    with pytest.raises(TypeError, match="settings of 'neural' are NetworkConfig, not DenseGrid"):
+    with pytest.raises(UserError, match="neural: must be a NetworkConfig, not DenseGrid"):
         FitConfig(materials={"albedo": {"neural": DenseGridConfig()}})
-    with pytest.raises(ValueError, match="'mesh' is none of neural, grid, bitmap"):
+    with pytest.raises(
+        UserError, match=r"no representation named 'mesh'\. There are neural, grid, bitmap"
+    ):
         FitConfig(materials={"albedo": {"mesh": DenseGridConfig()}})
 
 

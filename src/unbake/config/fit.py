@@ -5,7 +5,7 @@ Fields cite the section of the paper, or say that the choice is ours, where one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -437,8 +437,11 @@ class FitConfig:
 
     def _complete_fields(self) -> None:
         """Check quantities and representations, and fill in the field settings not given."""
-        if isinstance(self.quantities, str):
-            raise TypeError(f"quantities are a tuple of names, not the text {self.quantities!r}")
+        a_tuple = isinstance(self.quantities, Iterable) and not isinstance(self.quantities, str)
+        require(a_tuple, "quantities", "a tuple of names", self.quantities)
+        for key in ("rate_factors", "materials", "radiance"):
+            value = getattr(self, key)
+            require(isinstance(value, Mapping), key, "a dictionary", value)
         try:
             chosen = in_order(self.quantities)
         except UserError as error:
@@ -457,6 +460,7 @@ class FitConfig:
             require(value in names, key, f"one of {', '.join(names)}", value)
         materials = {
             name: _completed(
+                f"materials.{name}",
                 self.materials.get(name, {}),
                 {form: default_settings(name, form) for form in representations()},
             )
@@ -471,7 +475,9 @@ class FitConfig:
             require(good, f"rate_factors.{name}", "positive and 10000 or less", factor)
         factors = {name: factors.get(name) for name in UNKNOWNS}
         of_radiance = {form: representation(form).radiance for form in representations()}
-        radiance = _completed(self.radiance, {f: s for f, s in of_radiance.items() if s})
+        radiance = _completed(
+            "radiance", self.radiance, {f: s for f, s in of_radiance.items() if s}
+        )
         for form, settings in radiance.items():
             require_no_pieces(settings, f"radiance.{form}")
         # Frozen: the completed settings take the place of what was given.
@@ -616,13 +622,16 @@ def default_settings(name: str, form: str) -> FieldSettings:
 
 
 def _completed(
-    given: Mapping[str, FieldSettings], defaults: Mapping[str, FieldSettings]
+    key: str, given: Mapping[str, FieldSettings], defaults: Mapping[str, FieldSettings]
 ) -> dict[str, FieldSettings]:
-    """The settings given and the defaults of the others, by representation."""
+    """The settings given and the defaults of the others, by representation.
+
+    Args:
+        key: their name.
+    """
+    require(isinstance(given, Mapping), key, "a dictionary", given)
     for form, settings in given.items():
-        if form not in defaults:
-            raise ValueError(f"{form!r} is none of {', '.join(defaults)}")
-        if type(settings) is not type(defaults[form]):
-            kinds = type(defaults[form]).__name__, type(settings).__name__
-            raise TypeError("settings of {form!r} are {}, not {}".format(*kinds, form=form))
+        require_name(form, defaults, "representation", key)
+        kind = type(defaults[form])
+        require(type(settings) is kind, f"{key}.{form}", f"a {kind.__name__}", settings)
     return {**defaults, **given}

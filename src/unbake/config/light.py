@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ..errors import UserError, require_kind, require_ranges
+from ..errors import UserError, require, require_kind, require_ranges
 from .flag import Flag
 
 #: World axes, with their signs.
@@ -48,6 +48,7 @@ class LightConfig:
         for name in ("envmap", "lights"):
             value = getattr(self, name)
             if value is not None:
+                require(isinstance(value, str | os.PathLike), name, "the path of a file", value)
                 object.__setattr__(self, name, Path(value))
         if self.envmap is not None and self.lights is not None:
             raise UserError("cannot be given together with --envmap", "--lights", "Give one")
