@@ -186,6 +186,11 @@ def test_a_quantity_without_true_maps_has_no_ceiling(data, tiny, tmp_path, short
     assert line == "metallic 2.50 dB above its ceiling, 40.00 (untrained 20.00)"
     (line,) = told_yardsticks({"metallic_psnr": 42.5}, found | {"ceiling": None})
     assert line == "metallic: untrained fields 20.00 dB"
+    found["constant"] = {"metallic_psnr": 43.0}
+    for ceiling in (found["ceiling"], None):
+        _, line = told_yardsticks({"metallic_psnr": 42.5}, found | {"ceiling": ceiling})
+        assert line == "metallic is worse than a constant: what was found of it is of no use"
+    assert len(told_yardsticks({"metallic_psnr": 43.0}, found)) == 1
 
 
 def test_where_nothing_is_known_there_is_no_ceiling(data, tiny, tmp_path, unbake):

@@ -72,6 +72,8 @@ def evaluate(
         if not metrics["quantities"]:  # of known materials there are no scores
             values = {k: v for k, v in values.items() if v is not None}
         views, scored = metrics[split]["views"], metrics.get("scored", {}).get(split, {})
+        if not views:
+            continue
         say(f"{split} ({views} views): {_scores(values, views, scored)}")
         if split == "heldout":
             for line in told:

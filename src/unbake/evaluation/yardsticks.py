@@ -203,11 +203,13 @@ def told_yardsticks(scores: Mapping[str, Any], found: Mapping[str, Any]) -> list
         if top is None:
             told = ", ".join(f"{_SCORES_OF[kind]} {value:.2f} dB" for kind, value in rest)
             lines.append(f"{name}: {told}")
-            continue
-        side = "below" if result <= top else "above"
-        told = ", ".join(f"{kind} {value:.2f}" for kind, value in rest)
-        line = f"{name} {abs(top - result):.2f} dB {side} its ceiling, {top:.2f}"
-        lines.append(f"{line} ({told})" if told else line)
+        else:
+            side = "below" if result <= top else "above"
+            told = ", ".join(f"{kind} {value:.2f}" for kind, value in rest)
+            line = f"{name} {abs(top - result):.2f} dB {side} its ceiling, {top:.2f}"
+            lines.append(f"{line} ({told})" if told else line)
+        if (constant := known["constant"]) is not None and result < constant:
+            lines.append(f"{name} is worse than a constant: what was found of it is of no use")
     return lines
 
 
