@@ -12,7 +12,7 @@ from unbake.config import FitConfig, from_toml, to_toml
 from unbake.fields.field import FieldSpec, holding
 from unbake.fields.network import Network
 from unbake.training import piece_places
-from unbake.training.piece_places import _first_half, with_expected_places
+from unbake.training.piece_places import SHIFTS, _Cells, _first_half, expected_places
 from unbake.training.piece_variation import with_all_variation
 from unbake.training.roughness_curves import Curves, points, roughness_of
 from unbake.training.roughness_search import averaged, searched
@@ -100,6 +100,49 @@ def test_noise_differs_from_place_to_place_and_is_not_found():
         assert not np.array(found["placed"]).any()
 
 
+def test_small_cells_of_albedo_are_no_places():
+    """Factors of few pixels each take up noise, and prefer another roughness all over the piece."""
+    rows, rng = made_up(8000), np.random.default_rng(0)
+    rows["piece"], rows["albedo"] = 1, rng.uniform(0.2, 0.9, (len(rows), 3))
+    rows["target"] = rows["plain"][:, 4] + rows["coloured"][:, 4]
+    rows["target"] += 0.3 * rng.standard_normal((len(rows), 3))
+    rows["weight"] = 0.3**-2
+    found = found_of(field_of(), rows, replace(SURE, place_cells=16))
+    assert not np.array(found["placed"]).any()
+
+
+def test_the_smallest_error_is_found_beyond_a_hump():
+    """What is least lies at another shift on each side of the cube, and a hump is on the way."""
+    where = np.random.default_rng(0).uniform(0, 1, (400, 3))
+    cells = _Cells.of(np.zeros(400, int), where, (4, 8, 16))
+    valley = np.where(where[:, 0] < 0.5, -1.5, 1.0)[:, None]
+    curve = 100 - 60 * np.exp(-(((SHIFTS - valley) / 0.3) ** 2))
+    curve += 20 * np.exp(-(((SHIFTS - valley / 2) / 0.3) ** 2))
+    of_cell = cells.sums(list(curve.T), np.ones(400, bool))
+    _, shifts = cells.solved([of_cell])
+    far = shifts[0, -1, cells.of_pixel]
+    assert np.mean(np.abs(far - valley[:, 0]) < 0.4) > 0.8
+
+
+def test_colours_leave_to_places_what_is_theirs():
+    """Roughness rises along a wall, and most of its dark spots are where it is smooth."""
+    rows, _ = photographed()
+    along, rng = rows["position"][:, 0], np.random.default_rng(0)
+    rows["piece"] = 0
+    rows["albedo"] = np.where(rng.uniform(0, 1, len(rows)) < along, 0.7, 0.2)[:, None]
+    true = 0.25 + 0.5 * along
+    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
+    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] += NOISE * rng.standard_normal((len(rows), 3))
+    field = field_of()
+    found = found_of(field, rows)
+    other = rows.copy()
+    other["albedo"] = 0.9 - rows["albedo"]
+    apart = values(field, found, rows) - values(field, found, other)
+    assert np.abs(apart).mean() < 0.06
+    assert np.std(values(field, found, rows) - true) < 0.06
+
+
 def test_pieces_that_show_most_come_first_where_there_is_no_room(monkeypatch):
     rows, _ = photographed()
     rows["piece"] = np.where(rows["position"][:, 2] > 0.5, rows["piece"], 2 + rows["piece"])
@@ -123,13 +166,14 @@ def test_a_pixel_that_was_drawn_twice_is_in_one_half():
     assert 0.4 < half.mean() < 0.6
 
 
-@pytest.mark.parametrize("settings", [SMALL, PLACED])
-def test_without_places_or_pixels_nothing_changes(settings):
+@pytest.mark.parametrize(("settings", "count"), [(SMALL, 400), (PLACED, 0), (PLACED, 1)])
+def test_without_places_or_pixels_nothing_changes(settings, count):
     rows, _ = photographed(400)
     field = field_of(settings)
     numbers = {key: field.parameters()[key] for key in field.shared()}
-    rows = rows if settings is SMALL else rows[:0]
-    assert with_expected_places(field, rows, numbers, SURE, albedo=True) is numbers
+    found = expected_places(field, rows[:count], numbers, SURE, albedo=True)
+    assert set(found) == set(field.placed(()))
+    assert not any(np.array(x).any() for x in found.values())
 
 
 def test_pieces_that_share_a_number_unlike_have_none_by_place():
@@ -138,7 +182,7 @@ def test_pieces_that_share_a_number_unlike_have_none_by_place():
     rows["strength"] = np.where(rows["piece"] == 70, 0.5, 0.1)
     field = field_of()
     numbers = {key: field.parameters()[key] for key in field.shared()}
-    found = with_expected_places(field, rows, numbers, SURE, albedo=True)
+    found = expected_places(field, rows, numbers, SURE, albedo=True)
     assert not np.array(found.get("placed", 0)).any()
 
 

@@ -48,7 +48,7 @@ class RoughnessSearchConfig:
     #: How probable it is that roughness does not differ from place to place beyond that; and cells
     #: along an edge of the scene's cube, in each of which albedo has its own factor then
     no_places: float = 0.999
-    place_cells: int = 16
+    place_cells: int = 8
     #: Of the fit's steps before the first search, and after it, as multiples of the field's own
     rate_before: float = 0.25
     rate_between: float = 0.0

@@ -30,14 +30,14 @@ from ..fields.arrays import from_numpy
 from ..fields.field import Field, PlaceNumbers
 from ..fields.settings import PLACES_LOG2
 from .piece_levels import errors_of
-from .roughness_curves import Curves, cubic
+from .roughness_curves import Curves, cubic, pieces_of, points
 from .seen_pieces import SeenPieces, as_one, chances, normalized
 
 #: By how much outputs before their bounds are changed on trial.
 SHIFTS = np.linspace(-3, 3, 25)
 #: How much numbers of the coarsest lattice are expected to differ, and those of each further one,
 #: as a part of that of the one before.
-SPREADS, _FINER = np.array([0.2, 0.4, 0.8]), 0.6
+SPREADS, _FINER = np.array([0.25, 0.6, 1.5]), 0.6
 #: Cells along the cube, in each of which pixels of a piece are taken together.
 _CELLS = 32
 #: Steps of Adam, their rate, and the part of it that is left at the end.
@@ -50,7 +50,7 @@ _MOST_CORNERS = 1 << (PLACES_LOG2 - 4)
 _SEED = 0x504C4143
 
 
-def with_expected_places(
+def expected_places(
     field: Field,
     rows: np.ndarray,
     found: dict[str, Any],
@@ -58,7 +58,7 @@ def with_expected_places(
     *,
     albedo: bool,
 ) -> dict[str, Any]:
-    """Let roughness differ from place to place, as far as photographs tell.
+    """What is to differ in roughness from place to place, as far as photographs tell.
 
     Args:
         field: of roughness, with numbers of pieces.
@@ -68,25 +68,29 @@ def with_expected_places(
         albedo: whether it is unknown.
 
     Returns:
-        What was found, with numbers by place; the same where the field has none.
+        Of `Field.placed`.
     """
-    if not field.place_cells or not len(rows):
-        return found
-    curves = Curves.of(rows, settings.place_cells, settings.colours, albedo)
-    seen = SeenPieces(field, curves.point, curves.pieces, found)
+    first = _first_half(rows)
+    if not field.place_cells or first.all() or not first.any():
+        return field.placed(())
+    seen = SeenPieces(field, points(rows, albedo), pieces_of(rows), found)
     (outputs,) = seen.outputs
     where = rows["position"].astype(np.float64)
     cells = _Cells.of(seen.piece_of, where, field.place_cells)
-    errors = [errors_of(curves, outputs + shift) for shift in SHIFTS]
-    first = _first_half(rows)
-    halves = [cells.sums(errors, of) for of in (first, ~first)]
-    both = halves[0] + halves[1]
+
+    def errors(chosen: np.ndarray) -> np.ndarray:
+        curves = Curves.of(rows[chosen], settings.place_cells, settings.colours, albedo)
+        here = outputs[chosen]
+        return cells.sums([errors_of(curves, here + shift) for shift in SHIFTS], chosen)
+
+    # Factors of albedo are of each half by itself, or one would know of the other.
+    *halves, both = (errors(chosen) for chosen in (first, ~first, np.ones_like(first)))
     less = as_one(seen.pixels, settings)[cells.piece, None]
     numbers, shifts = cells.solved([table / less for table in (*halves, both)])
     # What one half has found is asked of the other one.
     gains = np.zeros_like(shifts[0])  # not in units of `as_one`, which `chances` counts
-    for table, shift in zip(halves[::-1], shifts[:2], strict=True):
-        gains += _at(table, shift) - _at(table, np.zeros_like(shift))
+    for own, other, shift in zip(halves, halves[::-1], shifts, strict=False):
+        gains += _at(other, shift) - _at(other, cells.level(own))
     asked = np.stack([np.bincount(cells.piece, gain, len(seen.pixels)) for gain in gains], 1)
     prior = np.full(1 + len(SPREADS), (1 - settings.no_places) / len(SPREADS))
     prior[0] = settings.no_places
@@ -96,7 +100,7 @@ def with_expected_places(
     sure = (probable.sum(1) > _SURE) & (np.array(seen.pieces.strength) > 0)
     sure &= cells.fitting(np.where(sure, asked.min(1), np.inf))
     if not sure.any():
-        return found
+        return field.placed(())
     number = np.array(seen.pieces.number)
     levels = []
     for lattice, values in zip(cells.lattices, numbers, strict=True):
@@ -107,7 +111,7 @@ def with_expected_places(
         of_piece = from_numpy(mi.UInt32, number[own].astype(np.uint32))
         one = from_numpy(mi.Float, expected.astype(np.float32))
         levels.append(PlaceNumbers(of_piece, mi.Point3u(corner), [one]))
-    return found | field.placed(levels)
+    return field.placed(levels)
 
 
 def _first_half(rows: np.ndarray) -> np.ndarray:
@@ -115,8 +119,8 @@ def _first_half(rows: np.ndarray) -> np.ndarray:
 
     A pixel is known by its photograph: drawn twice, it is in the same half.
     """
-    of_pixel = np.unique(rows["target"], axis=0, return_inverse=True)[1].ravel()
-    return np.random.default_rng(_SEED).random(of_pixel.max() + 1)[of_pixel] < 1 / 2
+    pixels, of_pixel = np.unique(rows["target"], axis=0, return_inverse=True)
+    return np.random.default_rng(_SEED).random(len(pixels))[of_pixel.ravel()] < 1 / 2
 
 
 def _at(table: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -185,9 +189,28 @@ class _Cells:
         return _Cells(own, of_pixel, [_Lattice.of(own, middle, n) for n in lattices])
 
     def sums(self, columns: list[np.ndarray], chosen: np.ndarray) -> np.ndarray:
-        """Sums over the chosen pixels of each cell, shape (cells, columns)."""
+        """Sums over the chosen pixels of each cell, of columns of these pixels."""
         of, count = self.of_pixel[chosen], len(self.piece)
-        return np.stack([np.bincount(of, column[chosen], count) for column in columns], 1)
+        return np.stack([np.bincount(of, column, count) for column in columns], 1)
+
+    def level(self, table: np.ndarray) -> np.ndarray:
+        """By how much each cell is shifted if all of a piece are shifted alike, shape (cells,).
+
+        Factors of albedo in smaller cells may prefer another roughness, but not by place.
+
+        Args:
+            table: errors of cells at `SHIFTS`, shape (cells, shifts).
+        """
+        count = self.piece.max() + 1
+        errors = np.stack([np.bincount(self.piece, x, count) for x in table.T], 1)
+        best = errors.argmin(1)
+        inner = np.clip(best, 1, len(SHIFTS) - 2)
+        before, here, after = (errors[np.arange(count), inner + i] for i in (-1, 0, 1))
+        bend = before - 2 * here + after
+        part = np.divide(before - after, 2 * bend, out=np.zeros(count), where=bend > 0)
+        step = SHIFTS[1] - SHIFTS[0]
+        found = np.where(best == inner, SHIFTS[inner] + step * np.clip(part, -1, 1), SHIFTS[best])
+        return found[self.piece]
 
     def fitting(self, gains: np.ndarray) -> np.ndarray:
         """Which pieces a table of numbers has room for, those first that tell the most of places.
@@ -220,10 +243,12 @@ class _Cells:
         number = np.arange(jobs)[:, None]
         row = number // len(SPREADS) * count + np.arange(count)
         first = from_numpy(mi.UInt32, (row * len(SHIFTS)).astype(np.uint32))
+        starts = [self._one_by_one(table, spread) for table, spread in product(tables, SPREADS)]
         corners, weights, places, shares = [], [], [], []
         for level, lattice in enumerate(self.lattices):
             size = len(lattice.piece)
-            corners.append(dr.opaque(mi.Float, 0, jobs * size))
+            start = np.concatenate([found[level] for found in starts])
+            corners.append(from_numpy(mi.Float, start.astype(np.float32)))
             spread = np.tile(SPREADS * _FINER**level, len(tables))
             weights.append(from_numpy(mi.Float, np.repeat(spread**-2.0, size).astype(np.float32)))
             place = [number * size + k for k in lattice.place.T]
@@ -254,6 +279,30 @@ class _Cells:
             for i in range(len(corners))
         ]
         return last, shifts
+
+    def _one_by_one(self, table: np.ndarray, spread: float) -> list[np.ndarray]:
+        """Numbers that a descent starts from, one lattice after the other, coarsest first.
+
+        Curves may have several minima, and a descent ends at the nearest one. So each corner gets
+        the best number of all, by the cells around it and what coarser lattices say of them.
+
+        Args:
+            table: errors of cells at `SHIFTS`, shape (cells, shifts).
+            spread: of the coarsest lattice.
+        """
+        shift, found = np.zeros(len(table)), []
+        for level, lattice in enumerate(self.lattices):
+            errors = np.empty((len(lattice.piece), len(SHIFTS)))
+            for number, more in enumerate(SHIFTS):
+                share = lattice.share * _at(table, shift + more)[:, None]
+                errors[:, number] = np.bincount(
+                    lattice.place.ravel(), share.ravel(), len(lattice.piece)
+                )
+            prior = np.square(SHIFTS / (spread * _FINER**level))
+            best = SHIFTS[(errors + prior).argmin(1)]
+            shift = shift + (lattice.share * best[lattice.place]).sum(1)
+            found.append(best)
+        return found
 
 
 def _between(table: list[mi.Float], first: mi.UInt32, shift: mi.Float) -> mi.Float:

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from ..config import RoughnessSearchConfig
@@ -52,10 +53,15 @@ def with_expected_variation(
     """
     if "variation" not in found:
         return found
-    seen = SeenPieces(field, curves.point, curves.pieces, found, ranks)
+    everywhere = found | field.placed(())
+    seen = SeenPieces(field, curves.point, curves.pieces, everywhere, ranks)
     (outputs,), about = seen.outputs, seen.middles(curves.shown)
-    here = about[0, seen.piece_of]
-    errors = (errors_of(curves, here + part * (outputs - here)) for part in PARTS)
+    here, apart = about[0, seen.piece_of], 0.0
+    if "placed" in found and dr.any(
+        found["placed"] > 0
+    ):  # no factor is of what differs from place to place
+        apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
+    errors = (errors_of(curves, here + part * (outputs - here) + apart) for part in PARTS)
     parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
     return found | seen.varied(about, parts)
 

@@ -44,7 +44,7 @@ from ..transport.by_roughness import PLACE, row_type
 from .checkpoint import Progress
 from .gradients import flat_gradients, set_gradients
 from .piece_levels import with_expected_levels
-from .piece_places import with_expected_places
+from .piece_places import expected_places
 from .piece_variation import expected_albedo, with_all_variation, with_expected_variation
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
@@ -227,23 +227,26 @@ class RoughnessSearch:
             found = searched(field, curves, search, search.rate * own, ranks, rows)
             before = {key: dr.detach(state.phi[f"roughness.{key}"]) for key in found}
             found = averaged(field, curves, (before, found), part, ranks)
-            found = {key: self._of_first(x) for key, x in found.items()}
+            found = of_first(found, self._ranks)
             changed = {f"roughness.{key}": x for key, x in found.items()}
             if settled and search.pixels_as_one and albedo:
                 with holding(field, found):
                     now = roughness_of(field, points(rows, albedo)).numpy()
                 told = expected_albedo(materials["albedo"], rows, now, search, shown)
-                changed |= {f"albedo.{key}": self._of_first(x) for key, x in told.items()}
+                changed |= {f"albedo.{key}": x for key, x in of_first(told, self._ranks).items()}
             state.replace(changed)
         state.publish(self._problem)
         return batches * each * spp * self._ranks.size
 
-    def _of_first(self, array: mi.Float | mi.TensorXf) -> mi.Float | mi.TensorXf:
-        """What rank 0 has found: sums of many threads differ in their last bits."""
-        if self._ranks.size == 1:
-            return array
-        found = from_numpy(mi.Float, self._ranks.as_first(array.numpy()))
-        return shaped_like(found, array)
+
+def of_first(arrays: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
+    """What rank 0 has found: sums of many threads differ in their last bits."""
+    if ranks.size == 1:
+        return arrays
+    return {
+        key: shaped_like(from_numpy(mi.Float, ranks.as_first(x.numpy())), x)
+        for key, x in arrays.items()
+    }
 
 
 def _as_bytes(rows: np.ndarray) -> np.ndarray:
@@ -270,15 +273,26 @@ def searched(
         As of `descend`, and what differs from place to place.
     """
     first = with_all_variation(field, curves, ranks)
-    with holding(field, first):
-        found = first | descend(field, curves, settings, rate, ranks)
+
+    def descended(start: dict[str, Any]) -> dict[str, Any]:
+        with holding(field, start):
+            found = start | descend(field, curves, settings, rate, ranks)
         if settings.pixels_as_one:
             found = with_expected_variation(field, curves, found, settings, ranks)
-            if rows is not None:
-                albedo = curves.point.albedo is not None
-                found = with_expected_places(field, rows, found, settings, albedo=albedo)
-            found = with_expected_levels(field, curves, found, settings, ranks)
-    return found
+        return found
+
+    with holding(field, first):
+        found = descended(first)
+        if not settings.pixels_as_one:
+            return found
+        if rows is not None:
+            albedo = curves.point.albedo is not None
+            places = expected_places(field, rows, found, settings, albedo=albedo)
+            places = of_first(places, ranks or Ranks())  # all go the same way
+            if "placed" in places and dr.any(places["placed"] > 0):
+                # Colours have taken up what they could of the places.
+                found = descended(first | places)
+        return with_expected_levels(field, curves, found, settings, ranks)
 
 
 def averaged(
