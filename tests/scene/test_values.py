@@ -114,6 +114,9 @@ def test_values_that_a_mesh_does_not_have_are_told(shape, parse):
     assert [fault.what for fault in attribute_faults(scene, parsed.path)] == [
         f"the shape '{x}' has no 'vertex_tint', which its material reads" for x in "ab"
     ]
+    (fault,) = attribute_faults(parse(f'<shape type="{shape}">{bsdf}</shape>').instantiate(), "a")
+    assert "the shape ''" not in fault.what and "'vertex_tint'" in fault.what
+    assert "tint_x" in str(fault)
 
 
 def test_values_that_a_mesh_has_are_taken():

@@ -75,8 +75,13 @@ def attribute_faults(scene: mi.Scene, path: Path) -> list[UserError]:
                 continue
             name = _ATTRIBUTE.search(str(node))
             if name is not None and not np.all(shape.has_attribute(name[1])):
-                what = f"the shape {shape.id()!r} has no {name[1]!r}, which its material reads"
-                found[what] = UserError(what, path, "Correct the name, or give a bitmap")
+                which = f"the shape {shape.id()!r}" if shape.id() else "a shape without an id"
+                what = f"{which} has no {name[1]!r}, which its material reads"
+                remedy = "Correct the name, or give a bitmap"
+                if name[1].startswith("vertex_"):  # other numbers of PLY files are not read
+                    one = name[1].removeprefix("vertex_")
+                    remedy += f". Of a PLY file it is what is called {one}_x, or {one}_r, _g and _b"
+                found[what] = UserError(what, path, remedy)
     return [*found.values()]
 
 
