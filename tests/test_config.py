@@ -526,7 +526,10 @@ def test_the_up_axis_of_a_map_is_one_of_six(up):
 @pytest.mark.parametrize(
     ("key", "wrong", "wanted"),
     [
-        *(("quantities", wrong, "a tuple of names") for wrong in ("albedo", 3.5, None)),
+        *(
+            ("quantities", wrong, "a tuple of names")
+            for wrong in ("albedo", 3.5, None, [["albedo"]], (3,))
+        ),
         *(("rate_factors", wrong, "a dictionary") for wrong in ("a", 3.5, None, [1])),
         *(("materials", wrong, "a dictionary") for wrong in ("a", 3.5, None, [1])),
         *(("radiance", wrong, "a dictionary") for wrong in ("a", 3.5, None, [1])),

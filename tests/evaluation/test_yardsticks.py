@@ -189,8 +189,10 @@ def test_a_quantity_without_true_maps_has_no_ceiling(data, tiny, tmp_path, short
     found["constant"] = {"metallic_psnr": 43.0}
     for ceiling in (found["ceiling"], None):
         _, line = told_yardsticks({"metallic_psnr": 42.5}, found | {"ceiling": ceiling})
-        assert line == "metallic is worse than a constant: what was found of it is of no use"
+        assert line == "metallic is 0.50 dB worse than the mean of the truth everywhere"
     assert len(told_yardsticks({"metallic_psnr": 43.0}, found)) == 1
+    found["constant"] = {"metallic_psnr": 120.0}  # there is no other value
+    assert len(told_yardsticks({"metallic_psnr": 42.5}, found)) == 1
 
 
 def test_where_nothing_is_known_there_is_no_ceiling(data, tiny, tmp_path, unbake):

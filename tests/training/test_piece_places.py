@@ -166,14 +166,39 @@ def test_a_pixel_that_was_drawn_twice_is_in_one_half():
     assert 0.4 < half.mean() < 0.6
 
 
-@pytest.mark.parametrize(("settings", "count"), [(SMALL, 400), (PLACED, 0), (PLACED, 1)])
-def test_without_places_or_pixels_nothing_changes(settings, count):
+@pytest.mark.parametrize(("count", "noise"), [(1, 0.05), (3, 0.05), (12, 0.02), (12, 0.05)])
+def test_pieces_of_few_pixels_have_none(count, noise):
+    """They are as they should be; some have no pixel in one of the halves."""
+    field, rows, rng = field_of(), made_up(60 * count), np.random.default_rng(0)
+    numbers = {key: field.parameters()[key] for key in field.shared()}
+    rows["piece"] = np.arange(len(rows)) % 60
+    rows["position"] = rng.uniform(0, 0.9, (60, 3))[rows["piece"]]
+    rows["position"] += rng.uniform(0, 0.1, (len(rows), 3))
+    true = values(field, numbers, rows)[:, None]
+    sharp = rows["plain"][:, 0] / np.exp(-3 * 0.1)
+    rows["target"] = sharp * np.exp(-3 * true) + rows["coloured"][:, 0]
+    rows["target"] += noise * rng.standard_normal((len(rows), 3))
+    rows["weight"] = noise**-2
+    found = expected_places(field, rows, numbers, SEARCH, albedo=False)
+    assert not np.array(found["placed"]).any()
+
+
+def test_fields_without_places_are_searched_as_without():
     rows, _ = photographed(400)
-    field = field_of(settings)
+    both = (found_of(field_of(SMALL), rows, placed=placed) for placed in (True, False))
+    first, second = ({key: np.array(x) for key, x in found.items()} for found in both)
+    assert first.keys() == second.keys() and "placed" not in first
+    for key, value in first.items():
+        np.testing.assert_allclose(value, second[key], atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_without_pixels_nothing_differs(count):
+    rows, _ = photographed(400)
+    field = field_of()
     numbers = {key: field.parameters()[key] for key in field.shared()}
     found = expected_places(field, rows[:count], numbers, SURE, albedo=True)
-    assert set(found) == set(field.placed(()))
-    assert not any(np.array(x).any() for x in found.values())
+    assert not np.array(found["placed"]).any() and not np.array(found["places.0"]).any()
 
 
 def test_pieces_that_share_a_number_unlike_have_none_by_place():

@@ -5,7 +5,7 @@ Fields cite the section of the paper, or say that the choice is ours, where one 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -437,8 +437,10 @@ class FitConfig:
 
     def _complete_fields(self) -> None:
         """Check quantities and representations, and fill in the field settings not given."""
-        a_tuple = isinstance(self.quantities, Iterable) and not isinstance(self.quantities, str)
-        require(a_tuple, "quantities", "a tuple of names", self.quantities)
+        names = self.quantities
+        a_tuple = isinstance(names, Collection) and not isinstance(names, str)
+        a_tuple = a_tuple and all(isinstance(name, str) for name in names)
+        require(a_tuple, "quantities", "a tuple of names", names)
         for key in ("rate_factors", "materials", "radiance"):
             value = getattr(self, key)
             require(isinstance(value, Mapping), key, "a dictionary", value)

@@ -43,6 +43,8 @@ STEPS = 2400
 #: The yardsticks that need no training.
 _UNLEARNED = ("constant", "untrained")
 _SCORES_OF = {"constant": "a constant scores", "untrained": "untrained fields"}
+#: Where a constant has so many dB, there is one true value, which no result can beat.
+_ONE_VALUE = 50.0
 #: Changes where ceilings that were kept are no longer those that would be measured.
 _FORMAT = 1
 
@@ -208,8 +210,9 @@ def told_yardsticks(scores: Mapping[str, Any], found: Mapping[str, Any]) -> list
             told = ", ".join(f"{kind} {value:.2f}" for kind, value in rest)
             line = f"{name} {abs(top - result):.2f} dB {side} its ceiling, {top:.2f}"
             lines.append(f"{line} ({told})" if told else line)
-        if (constant := known["constant"]) is not None and result < constant:
-            lines.append(f"{name} is worse than a constant: what was found of it is of no use")
+        worse = (known["constant"] or 0) - result
+        if worse > 0 and result + worse < _ONE_VALUE:
+            lines.append(f"{name} is {worse:.2f} dB worse than the mean of the truth everywhere")
     return lines
 
 

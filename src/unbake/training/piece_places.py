@@ -6,10 +6,11 @@ gets numbers on lattices over the scene's cube: those that are most probable whe
 to differ by some spread, and less on finer lattices.
 
 Noise of the photographs looks like such a pattern, too. So the pixels are dealt into two halves,
-and what one half says of a piece is asked of the other one, with each spread and with none. A pixel
-that was drawn twice is in one half, with the noise of its photograph. With this evidence, and with
-`no_places`, follows how probable each spread is, and the numbers that are to be expected. Few
-pieces need numbers; the others have none.
+and what one half says of a piece, with each spread, is asked of the other one, and held against no
+change and against one shift of the whole piece, whichever is better. A pixel that was drawn twice
+is in one half, with the noise of its photograph; factors of albedo are of each half by itself. With
+this evidence, and with `no_places`, follows how probable each spread is, and the numbers that are
+to be expected. Few pieces need numbers; the others have none.
 
 Within a patch roughness may be what it is in no other one, and albedo has adapted to it: so it has
 its factors in smaller cells here than for the descent (`place_cells`).
@@ -70,8 +71,10 @@ def expected_places(
     Returns:
         Of `Field.placed`.
     """
+    if not field.place_cells or not len(rows):
+        return field.placed(())
     first = _first_half(rows)
-    if not field.place_cells or first.all() or not first.any():
+    if first.all() or not first.any():
         return field.placed(())
     seen = SeenPieces(field, points(rows, albedo), pieces_of(rows), found)
     (outputs,) = seen.outputs
@@ -88,10 +91,13 @@ def expected_places(
     less = as_one(seen.pixels, settings)[cells.piece, None]
     numbers, shifts = cells.solved([table / less for table in (*halves, both)])
     # What one half has found is asked of the other one.
-    gains = np.zeros_like(shifts[0])  # not in units of `as_one`, which `chances` counts
-    for own, other, shift in zip(halves, halves[::-1], shifts, strict=False):
-        gains += _at(other, shift) - _at(other, cells.level(own))
-    asked = np.stack([np.bincount(cells.piece, gain, len(seen.pixels)) for gain in gains], 1)
+    asked = np.zeros((len(seen.pixels), len(SPREADS)))  # `chances` has them in units of `as_one`
+    for own, other, shift in zip(halves, halves[::-1], shifts[:2], strict=True):
+        found_by_place, alike, none = (
+            np.stack([np.bincount(cells.piece, x, len(seen.pixels)) for x in _at(other, by)], 1)
+            for by in (shift, cells.level(own)[None], np.zeros((1, len(other))))
+        )
+        asked += found_by_place - np.minimum(alike, none)
     prior = np.full(1 + len(SPREADS), (1 - settings.no_places) / len(SPREADS))
     prior[0] = settings.no_places
     evidence = np.concatenate([np.zeros((len(asked), 1)), asked], 1)
@@ -216,7 +222,7 @@ class _Cells:
         """Which pieces a table of numbers has room for, those first that tell the most of places.
 
         Args:
-            gains: the error of each piece with numbers less that without.
+            gains: the error of each piece with numbers less that with none, or one shift of it.
         """
         every = np.concatenate([lattice.piece for lattice in self.lattices])
         count = np.bincount(every, minlength=len(gains))
@@ -288,7 +294,7 @@ class _Cells:
 
         Args:
             table: errors of cells at `SHIFTS`, shape (cells, shifts).
-            spread: of the coarsest lattice.
+            spread: of the coarsest lattice; that of each further one is `_FINER` times as large.
         """
         shift, found = np.zeros(len(table)), []
         for level, lattice in enumerate(self.lattices):

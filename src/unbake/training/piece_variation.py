@@ -57,9 +57,8 @@ def with_expected_variation(
     seen = SeenPieces(field, curves.point, curves.pieces, everywhere, ranks)
     (outputs,), about = seen.outputs, seen.middles(curves.shown)
     here, apart = about[0, seen.piece_of], 0.0
-    if "placed" in found and dr.any(
-        found["placed"] > 0
-    ):  # no factor is of what differs from place to place
+    # No factor is of what differs from place to place.
+    if "placed" in found and dr.any(found["placed"] > 0):
         apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
     errors = (errors_of(curves, here + part * (outputs - here) + apart) for part in PARTS)
     parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)

@@ -101,7 +101,7 @@ class RoughnessSearch:
         left, rest = len(self._places) - self.made, seconds - progress.searching
         if left <= 0 or rest <= 0:
             return 0.0
-        if progress.last_search:  # they are equally large
+        if progress.last_search:  # they are about equally large
             fitting = int(max(seconds - progress.seconds, 0) / progress.last_search)
             return min(left, fitting) * progress.last_search
         steps = progress.seconds - progress.searching
@@ -227,19 +227,19 @@ class RoughnessSearch:
             found = searched(field, curves, search, search.rate * own, ranks, rows)
             before = {key: dr.detach(state.phi[f"roughness.{key}"]) for key in found}
             found = averaged(field, curves, (before, found), part, ranks)
-            found = of_first(found, self._ranks)
+            found = _as_first(found, self._ranks)
             changed = {f"roughness.{key}": x for key, x in found.items()}
             if settled and search.pixels_as_one and albedo:
                 with holding(field, found):
                     now = roughness_of(field, points(rows, albedo)).numpy()
                 told = expected_albedo(materials["albedo"], rows, now, search, shown)
-                changed |= {f"albedo.{key}": x for key, x in of_first(told, self._ranks).items()}
+                changed |= {f"albedo.{key}": x for key, x in _as_first(told, self._ranks).items()}
             state.replace(changed)
         state.publish(self._problem)
         return batches * each * spp * self._ranks.size
 
 
-def of_first(arrays: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
+def _as_first(arrays: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
     """What rank 0 has found: sums of many threads differ in their last bits."""
     if ranks.size == 1:
         return arrays
@@ -270,7 +270,8 @@ def searched(
             to place.
 
     Returns:
-        As of `descend`, and what differs from place to place.
+        As of `descend`, and what differs from place to place; where anything does, the descent was
+        made once more beside it.
     """
     first = with_all_variation(field, curves, ranks)
 
@@ -286,9 +287,10 @@ def searched(
         if not settings.pixels_as_one:
             return found
         if rows is not None:
-            albedo = curves.point.albedo is not None
+            albedo, every = curves.point.albedo is not None, ranks or Ranks()
+            every.announce()  # it takes longer than a step
             places = expected_places(field, rows, found, settings, albedo=albedo)
-            places = of_first(places, ranks or Ranks())  # all go the same way
+            places = _as_first(places, every)  # all go the same way
             if "placed" in places and dr.any(places["placed"] > 0):
                 # Colours have taken up what they could of the places.
                 found = descended(first | places)
