@@ -210,9 +210,10 @@ def told_yardsticks(scores: Mapping[str, Any], found: Mapping[str, Any]) -> list
             told = ", ".join(f"{kind} {value:.2f}" for kind, value in rest)
             line = f"{name} {abs(top - result):.2f} dB {side} its ceiling, {top:.2f}"
             lines.append(f"{line} ({told})" if told else line)
-        worse = (known["constant"] or 0) - result
-        if worse > 0 and result + worse < _ONE_VALUE:
-            lines.append(f"{name} is {worse:.2f} dB worse than the mean of the truth everywhere")
+        constant = known["constant"]
+        if constant is not None and result < constant < _ONE_VALUE:
+            worse = f"{constant - result:.2f} dB worse"
+            lines.append(f"{name} is {worse} than the mean of the truth everywhere")
     return lines
 
 

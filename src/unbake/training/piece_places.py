@@ -93,11 +93,11 @@ def expected_places(
     # What one half has found is asked of the other one.
     asked = np.zeros((len(seen.pixels), len(SPREADS)))  # `chances` has them in units of `as_one`
     for own, other, shift in zip(halves, halves[::-1], shifts[:2], strict=True):
-        found_by_place, alike, none = (
-            np.stack([np.bincount(cells.piece, x, len(seen.pixels)) for x in _at(other, by)], 1)
+        by_place, alike, none = (
+            cells.of_pieces(_at(other, by))
             for by in (shift, cells.level(own)[None], np.zeros((1, len(other))))
         )
-        asked += found_by_place - np.minimum(alike, none)
+        asked += by_place - np.minimum(alike, none)
     prior = np.full(1 + len(SPREADS), (1 - settings.no_places) / len(SPREADS))
     prior[0] = settings.no_places
     evidence = np.concatenate([np.zeros((len(asked), 1)), asked], 1)
@@ -199,6 +199,10 @@ class _Cells:
         of, count = self.of_pixel[chosen], len(self.piece)
         return np.stack([np.bincount(of, column, count) for column in columns], 1)
 
+    def of_pieces(self, columns: np.ndarray) -> np.ndarray:
+        """Sums over the cells of each piece, shape (pieces, columns); columns (columns, cells)."""
+        return np.stack([np.bincount(self.piece, column) for column in columns], 1)
+
     def level(self, table: np.ndarray) -> np.ndarray:
         """By how much each cell is shifted if all of a piece are shifted alike, shape (cells,).
 
@@ -207,9 +211,8 @@ class _Cells:
         Args:
             table: errors of cells at `SHIFTS`, shape (cells, shifts).
         """
-        count = self.piece.max() + 1
-        errors = np.stack([np.bincount(self.piece, x, count) for x in table.T], 1)
-        best = errors.argmin(1)
+        errors = self.of_pieces(table.T)
+        count, best = len(errors), errors.argmin(1)
         inner = np.clip(best, 1, len(SHIFTS) - 2)
         before, here, after = (errors[np.arange(count), inner + i] for i in (-1, 0, 1))
         bend = before - 2 * here + after

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from ..config import RoughnessSearchConfig
@@ -28,7 +27,7 @@ from ..fields.field import Field
 from ..ranks import Ranks
 from .piece_levels import errors_of
 from .roughness_curves import Curves, albedo_errors, pieces_of, points
-from .seen_pieces import SeenPieces, chances, normalized, values_of
+from .seen_pieces import SeenPieces, chances, differ_by_place, normalized, values_of
 
 #: Parts of the variation. Of the least one, which stands for none, all can be had back.
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
@@ -58,7 +57,7 @@ def with_expected_variation(
     (outputs,), about = seen.outputs, seen.middles(curves.shown)
     here, apart = about[0, seen.piece_of], 0.0
     # No factor is of what differs from place to place.
-    if "placed" in found and dr.any(found["placed"] > 0):
+    if differ_by_place(found):
         apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
     errors = (errors_of(curves, here + part * (outputs - here) + apart) for part in PARTS)
     parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
@@ -75,9 +74,7 @@ def with_all_variation(field: Field, curves: Curves, ranks: Ranks | None = None)
         curves: of the pieces that are asked for.
         ranks: that have a part of the curves each; None: there is one.
     """
-    numbers = {key: field.parameters()[key] for key in field.shared()}
-    if field.place_cells:
-        numbers |= field.placed(())
+    numbers = {key: field.parameters()[key] for key in field.shared()} | field.placed(())
     if "variation" not in numbers:
         return numbers
     seen = SeenPieces(field, curves.point, curves.pieces, numbers, ranks)

@@ -49,7 +49,7 @@ from .piece_variation import expected_albedo, with_all_variation, with_expected_
 from .problem import Problem
 from .roughness_curves import NODES, Curves, in_range, points, precision, roughness_of
 from .search_samples import SearchSamples
-from .seen_pieces import SeenPieces
+from .seen_pieces import SeenPieces, differ_by_place
 from .state import State
 from .step import TrainingStep, without_garbage_collection
 
@@ -282,19 +282,18 @@ def searched(
             found = with_expected_variation(field, curves, found, settings, ranks)
         return found
 
-    with holding(field, first):
-        found = descended(first)
-        if not settings.pixels_as_one:
-            return found
-        if rows is not None:
-            albedo, every = curves.point.albedo is not None, ranks or Ranks()
-            every.announce()  # it takes longer than a step
-            places = expected_places(field, rows, found, settings, albedo=albedo)
-            places = _as_first(places, every)  # all go the same way
-            if "placed" in places and dr.any(places["placed"] > 0):
-                # Colours have taken up what they could of the places.
-                found = descended(first | places)
-        return with_expected_levels(field, curves, found, settings, ranks)
+    found = descended(first)
+    if not settings.pixels_as_one:
+        return found
+    if rows is not None:
+        albedo, every = curves.point.albedo is not None, ranks or Ranks()
+        every.announce()  # it takes longer than a step
+        places = expected_places(field, rows, found, settings, albedo=albedo)
+        places = _as_first(places, every)  # all go the same way
+        if differ_by_place(places):
+            # Colours have taken up what they could of the places.
+            found = descended(first | places)
+    return with_expected_levels(field, curves, found, settings, ranks)
 
 
 def averaged(

@@ -112,6 +112,11 @@ class SeenPieces:
             return self._field.varied(self.pieces, levels, _of_field(factor))
 
 
+def differ_by_place(numbers: dict[str, Any]) -> bool:
+    """Whether any piece has numbers by place, among those of a field of roughness."""
+    return "placed" in numbers and bool(dr.any(numbers["placed"] > 0))
+
+
 def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """The median of values (n,) in each group, from 0; NaN where there is none."""
     ordered = np.append(values[np.lexsort((values, group))], np.nan)
