@@ -21,7 +21,7 @@ from unbake.dataset.camera_files import read_cameras, write_camera_file
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation.rendering import relight, render
-from unbake.evaluation.renderings import METRICS, render_camera, told_unit
+from unbake.evaluation.renderings import METRICS, render_camera, told_noise, told_unit
 from unbake.evaluation.settings import RenderSettings
 from unbake.evaluation.turntable import turntable
 from unbake.imaging.metrics import psnr
@@ -566,6 +566,11 @@ def test_a_light_file_must_not_leave_its_folder(folder, tmp_path):
     relighting.put_lights(scene, file, tmp_path)
     # The environment of the file has taken the place of the scene's own.
     assert len(scene.instantiate().emitters()) == 3
+
+
+def test_renderings_of_few_samples_are_told_to_be_noise():
+    assert "of 4 samples a pixel: raise --spp" in (told_noise(4) or "")
+    assert told_noise(16) is told_noise(64) is None
 
 
 @pytest.mark.parametrize(

@@ -244,8 +244,8 @@ def log_of(errors, spread=0.0, by="step"):
     found = []
     for number, error in enumerate(errors, start=1):
         groups = error * (1 + fixed) + spread * rng.normal(size=HELD_GROUPS)
-        line = {by: 100 * number, "held_aside": error, "held_aside_groups": groups.tolist()}
-        found += [{by: 100 * number - 50}, line]
+        line = {by: 200 * number, "held_aside": error, "held_aside_groups": groups.tolist()}
+        found += [{by: 200 * number - 100}, line]
     return found
 
 
@@ -294,6 +294,18 @@ def test_a_fit_gets_worse_where_most_groups_do(rises, trend):
     found = convergence(log_of_rises(np.array(rises)))
     assert found.change > 2 * found.noise
     assert found.trend == trend
+
+
+def test_a_fit_of_a_few_steps_does_not_get_worse():
+    rise = np.array([0.02, 0.03] * 8)
+    few, many = log_of_rises(rise), log_of_rises(rise)
+    few[-1]["step"], many[-1]["step"] = 400, 600
+    for lines in (few, many):
+        for number, line in enumerate(lines):
+            line["step"] = round(lines[-1]["step"] * (number + 1) / len(lines))
+    assert convergence(few) is None
+    found = convergence(many)
+    assert found is not None and found.trend == "rising"
 
 
 def test_a_fit_of_a_few_steps_is_at_no_plateau_and_no_ratio_is_told_within_noise():

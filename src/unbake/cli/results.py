@@ -59,7 +59,7 @@ def evaluate(
     settings = with_options(EvaluationSettings(), given(evaluate))
     backend.activate()
     from ..evaluation.evaluate import evaluate as run_evaluate
-    from ..evaluation.renderings import told_unit
+    from ..evaluation.renderings import told_noise, told_unit
     from ..evaluation.yardsticks import told_yardsticks
 
     metrics = run_evaluate(run, settings, allow_outside=allow_outside, tell=say)
@@ -78,8 +78,9 @@ def evaluate(
         if split == "heldout":
             for line in told:
                 say(f"  {line}")
-    if note := told_unit(metrics["display_exposure"]):
-        say(f"note: {note}")
+    for note in (told_unit(metrics["display_exposure"]), told_noise(settings.spp)):
+        if note:
+            say(f"note: {note}")
     if told and found and found["ceiling"] is None:
         folder = RunFolder(run)
         data, config_file = quoted(folder.data(metrics["data"])), quoted(folder.config_file)

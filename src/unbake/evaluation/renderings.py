@@ -22,6 +22,8 @@ METRICS = ("render_psnr", "render_psnr_unclamped", "render_ssim", "render_flip")
 NOT_FINITE = "not_finite"
 #: Stops of `display_exposure` beyond which a peak of 1 is that of no photograph.
 _FAR = 3.0
+#: Samples a pixel below which the noise of a rendering outweighs errors of a fit, as a rule.
+_FEW = 16
 #: What they are; `display_exposure` stands beside them.
 DEFINITIONS = {
     "render_ssim": "structural similarity of rendering and photograph as sRGB, clipped, at "
@@ -74,6 +76,13 @@ def told_unit(exposure: float | None) -> str | None:
         return None
     far = "darker than white, 1" if exposure > 0 else "brighter than white, 1"
     return f"photographs are far {far}: render_psnr says little here; see render_ssim, render_flip"
+
+
+def told_noise(spp: int) -> str | None:
+    """A line where renderings of so many samples a pixel differ from photographs by noise first."""
+    if spp >= _FEW:
+        return None
+    return f"scores of renderings are those of the noise of {spp} samples a pixel: raise --spp"
 
 
 def render_scores(

@@ -35,6 +35,8 @@ _LEAST, _SURE = 0.005, 2.0
 _SURE_OF_RISE, _RISING = 3.0, 0.75
 #: A fit of fewer steps has learned next to nothing, and its error is where it was for this reason.
 _FEWEST_STEPS = 50
+#: And what it has learned first may raise it: no fit of fewer steps knows photographs by heart.
+_FEWEST_TO_RISE = 500
 #: A plateau is told only where a relative change of this size would have been seen, and none was.
 _SEEN = 0.05
 #: Keys of a line of the log: the error, and those of groups of the pixels.
@@ -342,7 +344,7 @@ class Convergence:
 
 
 def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergence | None:
-    """What the errors in a log say of the fit; None where they are too few.
+    """What the errors in a log say of the fit; None where they, or its steps, are too few.
 
     Args:
         log: lines of the log.
@@ -369,6 +371,8 @@ def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergen
     if -change > max(_LEAST, _SURE * noise):
         trend = "improving"
     elif change > max(_LEAST, _SURE_OF_RISE * noise) and (rises > 0).mean() >= _RISING:
+        if end.get("step", _FEWEST_TO_RISE) < _FEWEST_TO_RISE:
+            return None
         trend = "rising"
     return Convergence(trend, error, before, change, noise, 1 - start[by] / last)
 
