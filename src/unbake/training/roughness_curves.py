@@ -17,7 +17,7 @@ from ..quantities import QUANTITIES
 from ..ranks import Ranks
 
 #: Values of roughness at which pixels are known; curves are cubic between them, in their logarithm.
-NODES = (0.1, 0.16, 0.24, 0.33, 0.43, 0.55, 0.7, 0.9)
+NODES = (0.1, 0.16, 0.24, 0.33, 0.43, 0.55, 0.7, 0.8, 0.9)
 #: The part of a mean group's knowledge of its albedo that says: it is as it is.
 _CAUTION = 1e-3
 #: Brightnesses of pixels, in each of which errors have one variance.
