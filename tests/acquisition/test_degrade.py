@@ -283,6 +283,7 @@ def test_open_rims_leave_triangles_to_the_rest():
 PAINTS = {
     "bitmap": '<string name="filename" value="paint.exr"/>',
     "checkerboard": '<rgb name="color0" value="0.2 0.5 0.4"/>',
+    "mesh_attribute": '<string name="name" value="vertex_color"/>',
 }
 
 
@@ -301,9 +302,15 @@ def test_textures_are_lost_with_the_coordinates_of_decimated_meshes(
     name = re.search(r'name="(\w+)"', text[colour:end])[1]
     texture = f'<texture type="{paint}" name="{name}">{PAINTS[paint]}</texture>'
     scene.write_text(text[:colour] + texture + text[end:])
+    for file in scene.parent.rglob("*.ply"):
+        mesh = mi.load_dict({"type": "ply", "filename": str(file)})
+        mesh.add_attribute("vertex_color", 3, [0.5] * 3 * mesh.vertex_count())
+        mesh.write_ply(str(file))
     assert Dataset.load(data).has_true_materials
     few = degrade(data, tmp_path / "few", DegradeSettings(decimate=0.5), tell=said.append)
     assert not few.has_true_materials and "no longer has its true materials" in " ".join(said)
+    kinds = {node.props.plugin_name() for node in parse(few.scene, few.root).state.nodes}
+    assert (paint in kinds) == (paint != "mesh_attribute")  # a fit would miss what meshes have lost
     with pytest.raises(UserError, match="does not hold its true materials"):
         require_true_materials(few)
 

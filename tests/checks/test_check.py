@@ -2,6 +2,7 @@
 
 import re
 import typing
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -618,6 +619,46 @@ def test_of_poses_with_the_same_edges_those_count_that_cover_a_cut_out(cut_out, 
     found = aligning.alignment(None, views)
     assert found.mistake is (right if cut_out else wrong)
     assert found.best == pytest.approx(1)
+
+
+def test_no_pose_that_covers_less_is_better(monkeypatch):
+    """Poses that fill a cut-out are not given up for others that leave a part of it empty."""
+    rng = np.random.default_rng(0)
+    pictures, shown = rng.random((4, 32, 32)), np.zeros((32, 32), bool)
+    shown[8:24] = True
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 40.0, 32, 32)
+    views = [
+        SmallView(str(i), camera, p[..., None], shown.astype(float), 0 * p)
+        for i, p in enumerate(pictures)
+    ]
+    other, less = [rng.random((32, 32)) for _ in views], shown & (np.arange(32) < 28)
+
+    def drawn(scene, cameras, mistakes):
+        return [
+            (list(pictures) if m.parts else other, [less if m.parts else shown] * 4)
+            for m in mistakes
+        ]
+
+    monkeypatch.setattr(aligning, "photograph_edges", lambda view: view.rgb[..., 0])
+    monkeypatch.setattr(aligning, "_drawn", drawn)
+    monkeypatch.setattr(aligning, "_likely", lambda scene, views: [Mistake(("turned",))])
+    found = aligning.alignment(None, views)
+    assert found.mistake is None and found.share == pytest.approx(0.5)
+
+
+def test_a_background_that_jpeg_made_nearly_black_hides_no_edges():
+    rng = np.random.default_rng(0)
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 40.0, 32, 32)
+    shown, rgb = np.zeros((32, 32), bool), np.zeros((32, 32, 3))
+    shown[12:20, 12:20] = True
+    rgb[shown] = 0.5
+    rgb[12:16, 12:20] = 0.25
+    black = SmallView("black", camera, rgb, shown.astype(float), 0 * rgb[..., 0])
+    nearly = rgb + np.where(shown, 0, 0.001 * rng.random((32, 32)))[..., None]
+    ringing = replace(black, rgb=nearly)
+    np.testing.assert_allclose(
+        aligning.photograph_edges(ringing), aligning.photograph_edges(black), atol=0.05
+    )
 
 
 def test_mistakes_are_undone():

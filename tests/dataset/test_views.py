@@ -15,7 +15,15 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.fingerprint import fingerprint
 from unbake.dataset.image_files import counted_by, counted_in, read_image
 from unbake.dataset.poses import check_cameras
-from unbake.dataset.views import Dataset, View, fitted_pixels, read_photograph
+from unbake.dataset.views import (
+    Dataset,
+    View,
+    fitted,
+    fitted_pixels,
+    may_ring,
+    read_masked,
+    read_photograph,
+)
 from unbake.errors import UserError
 
 WIDTH, HEIGHT = 6, 4
@@ -572,3 +580,32 @@ def test_cameras_outside_an_object_are_fine_and_inside_are_named():
     inside = Camera.look_at((0, 0, 0.3), (0, 0, 0), (0, 1, 0), 40.0, 8, 8)
     assert check_cameras(scene, {"outside": outside, "inside": inside}) == ["inside"]
     assert check_cameras(scene, {}) == []
+
+
+def test_values_beside_clipped_ones_of_jpeg_files_are_not_fitted(tmp_path):
+    """A lamp on a dark wall, in whose photograph some pixels of the lamp read as no lamp would."""
+    light = np.full((24, 24, 3), 0.02)
+    light[9:15, 9:15] = 1.0
+    light[4, 4] = (1.0, 0.3, 0.1)  # clipped in red alone
+    codes = np.round(255 * (1.055 * light ** (1 / 2.4) - 0.055)).astype(np.uint8)
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, 24, 24)
+    for suffix in ("jpg", "png"):
+        file = tmp_path / f"lamp.{suffix}"
+        Image.fromarray(codes).save(file, **({"quality": 80} if suffix == "jpg" else {}))
+        view = View("lamp", "train", camera, file, {}, encoding="srgb", clipped=0.95)
+        pixels, mask = read_masked(view)
+        counted = fitted(pixels, mask, "visible", view)
+        assert may_ring(view) == (suffix == "jpg")
+        if suffix == "png":
+            assert counted.all() and fitted_pixels(view, "visible") is None
+            continue
+        clipped = pixels[..., :3] >= np.float32(0.95)
+        whole = clipped.all(-1)
+        assert whole.any() and counted[:3].all() and counted[whole].all()
+        for row, column in zip(*np.nonzero(whole), strict=True):
+            near = np.s_[row - 1 : row + 2, column - 1 : column + 2]
+            assert not counted[near][~whole[near]].any()
+        np.testing.assert_array_equal(fitted_pixels(view, "visible"), counted)
+        for other in (replace(view, clipped=None), None):
+            assert fitted(pixels, mask, "visible", other).all()
+        assert fitted_pixels(replace(view, clipped=None), "visible") is None

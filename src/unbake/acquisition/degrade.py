@@ -32,7 +32,7 @@ from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..imaging.srgb import from_srgb, to_srgb
 from ..io import filled_folder, require_new_folder, write_atomically, write_json
 from ..scene import free_space
-from ..scene.parse import ParsedScene, parse, write
+from ..scene.parse import ParsedScene, parse, referenced, write
 from ..scene.triangles import save_mesh, triangles_of
 from .decimate import FEWEST, decimated
 from .settings import DegradeSettings
@@ -315,6 +315,8 @@ def _moved(scene: mi.Scene, cameras: list[Camera], settings: DegradeSettings) ->
 
 #: Textures that differ over a mesh, by its coordinates or its attributes.
 _LOOKED_INTO = ("bitmap", "checkerboard", "mesh_attribute")
+#: What stands for values that meshes have lost.
+_LOST = 0.5
 
 
 def _change_meshes(
@@ -346,6 +348,8 @@ def _change_meshes(
         bare = textured and any(of_coordinates)
         few = decimated([triangles_of(mesh) for mesh in dense.values()], settings.decimate)
         meshes |= zip(dense, few, strict=True)
+    if bare:
+        _without_attributes(parsed)
     for number, mesh in meshes.items():
         node = parsed.state.nodes[number]
         # The name of the file stays, as shapes and lamps without an id are named after it.
@@ -359,6 +363,17 @@ def _change_meshes(
         node.props["filename"] = str(file.resolve())
         files.append(file.relative_to(folder.scene).as_posix())
     return files, bare
+
+
+def _without_attributes(parsed: ParsedScene) -> None:
+    """Make constants of what BSDFs look up in colours of vertices, which meshes have lost."""
+    for node in parsed.state.nodes:
+        if node.type != mi.ObjectType.BSDF:
+            continue
+        for key in list(node.props):
+            texture = referenced(parsed, node.props[key])
+            if texture is not None and texture.props.plugin_name() == "mesh_attribute":
+                node.props[key] = _LOST
 
 
 def _displace(mesh: mi.Mesh, settings: DegradeSettings, diagonal: float) -> None:

@@ -247,7 +247,7 @@ def _checked(
     camera, hidden = view.camera, dataset.background == "hidden"
     photograph, mask = read_masked(view, clip_negative)
     pixels = photograph.reshape(-1, 4)
-    counted = fitted(photograph, mask, dataset.background).ravel()
+    counted = fitted(photograph, mask, dataset.background, view).ravel()
     cleaned, hot_pixels = without_hot_pixels(pixels, counted, view.name, camera.width)
     if hot_pixels is not None and (told := told_hot_pixels([hot_pixels])):
         result.warn("hot pixels", told, None, "Remove them where they are no light that is seen")
@@ -402,13 +402,14 @@ def _check_pictures(result: DataCheck) -> None:
         remedy = "Check the lights, the cameras and the exposures that they were made with"
         result.add(Finding("error", "black", "all photographs are black", None, remedy))
         return
+    told = all(view.view.clipped is not None for view in views)
     _share(
         result,
         "clipped",
         [_untold(v) for v in views],
         (_CLIPPED, _CLIPPED_IN_ALL),
         "of the pixels of surfaces are clipped: their light is not known",
-        "Expose less, or say from which value on pixels are clipped ('clipped')",
+        "Expose less" + ("" if told else ", or say from which value on they are ('clipped')"),
     )
     _share(
         result,

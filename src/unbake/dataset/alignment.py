@@ -94,8 +94,11 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     if not better:
         return result
     if not any(view.of_mesh for view in views) and not all(s.all() for s in shown):
-        most = max(other.covered for other in better)
+        # Poses as they are may cover more of what is shown than any others
+        most = max(_share(hits, shown), *(other.covered for other in better))
         better = [other for other in better if other.covered >= most - _UNCOVERED]
+        if not better:
+            return result
     top = max(other.scores.mean() for other in better)
     best = next(other for other in better if other.scores.mean() >= top - _NEARLY)
     return replace(
@@ -181,7 +184,8 @@ def _scores(photographed: list[np.ndarray], drawn: list[np.ndarray]) -> np.ndarr
 def photograph_edges(view: SmallView) -> np.ndarray:
     """Slope of the logarithm of brightness, blurred: (height, width), in [0, 1]."""
     luminance = view.rgb.mean(axis=-1)
-    positive = luminance[luminance > 0]
+    # Behind a scene that hides its background JPEG files are nearly black, and not black.
+    positive = luminance[(luminance > 0) & (view.alpha > 0)]
     floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
     logarithm = np.log(np.maximum(luminance, 0) + floor)
     slope = np.hypot(*np.gradient(logarithm))

@@ -25,6 +25,7 @@ from .clipped_noise import BRIGHT
 from .clipped_noise import RADIUS as BLACK_RADIUS
 from .data_folder import DataFolder
 from .decoding import PEAK, RADIUS, WITH_BLURRED, Decoded, Plan, Totals
+from .views import JPEG, may_ring
 
 #: Share of the free memory up to which the system is to read ahead in a mapped file.
 _FITTING = 0.5
@@ -94,8 +95,10 @@ def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
         "blur": {"radius": RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
     }
-    if any(view.image.suffix.lower() in (".jpg", ".jpeg") for view in views):
+    if any(view.image.suffix.lower() in JPEG for view in views):
         key["colour of JPEG"] = "by regression"
+    if any(may_ring(view) for view in views):
+        key["beside clipped values of JPEG"] = [view.clipped for view in views]
     if any(view.exposure != 1 for view in views):
         key["exposures"] = [view.exposure for view in views]
     if any(view.noise is not None for view in views):

@@ -17,7 +17,7 @@ from .clipped_noise import without_clipped_noise
 from .hot_pixels import without_hot_pixels
 from .image_files import PIXEL_BYTES
 from .shares import dealt
-from .views import Dataset, SensorNoise, View, fitted, read_masked
+from .views import Dataset, SensorNoise, View, fitted, may_ring, read_masked
 
 #: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
 COLUMNS, WITH_BLURRED = 3, 6
@@ -112,7 +112,8 @@ class Plan:
     @property
     def chooses(self) -> bool:
         """Whether there are pixels that are not trained on, in any view."""
-        return self.hidden or any(view.mask is not None for view in self.dataset.train)
+        views = self.dataset.train
+        return self.hidden or any(view.mask is not None or may_ring(view) for view in views)
 
     def decode_into(
         self,
@@ -141,7 +142,7 @@ class Plan:
 
         def put(view: View, start: int) -> Filled:
             pixels, mask = read_masked(view, self.clip_negative)
-            counted = fitted(pixels, mask, self.dataset.background).ravel()
+            counted = fitted(pixels, mask, self.dataset.background, view).ravel()
             pixels, camera = pixels.reshape(-1, 4), view.camera
             pixels, found = without_hot_pixels(pixels, counted, view.name, camera.width)
             noise = None if view.noise is None else view.noise.divided(view.exposure)

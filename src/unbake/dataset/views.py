@@ -27,8 +27,9 @@ LIGHTS = ("known", "unknown")
 #: A key of `render`: false where the scene has lost the materials that it was rendered with.
 TRUE_MATERIALS = "true_materials"
 
-#: Suffixes of images that cannot hold alpha.
-_OPAQUE = (".jpg", ".jpeg", ".hdr", ".rgbe", ".pfm")
+#: Suffixes of JPEG files, and of all images that cannot hold alpha.
+JPEG = (".jpg", ".jpeg")
+_OPAQUE = (*JPEG, ".hdr", ".rgbe", ".pfm")
 #: Least and greatest exposure, and value at which a photograph is clipped.
 MEASURABLE = (1e-12, 1e12)
 _MEANT = {
@@ -321,20 +322,59 @@ def fitted_pixels(view: View, background: str) -> np.ndarray | None:
         UserError: as in `read_photograph`, but for negative pixels.
     """
     counted: np.ndarray | None
-    if background == "hidden" and _may_be_transparent(view.image):
-        counted = fitted(*read_masked(view, clip_negative=True), background)
+    if may_ring(view) or (background == "hidden" and _may_be_transparent(view.image)):
+        counted = fitted(*read_masked(view, clip_negative=True), background, view)
     else:
         counted = read_mask(view)
     return None if counted is None or counted.all() else counted
 
 
-def fitted(pixels: np.ndarray, mask: np.ndarray | None, background: str) -> np.ndarray:
-    """Which pixels of a photograph are fitted, (H, W) bool; arguments as of `read_masked`.
+def fitted(
+    pixels: np.ndarray, mask: np.ndarray | None, background: str, view: View | None = None
+) -> np.ndarray:
+    """Which pixels of a photograph are fitted, (H, W) bool.
 
     They are not masked and, where the background is hidden, have alpha > 0.
+
+    Args:
+        pixels, mask: as of `read_masked`.
+        background: of the data set.
+        view: whose photograph may ring, so that pixels that do are not fitted; None: it does not.
     """
     counted = np.ones(pixels.shape[:2], bool) if mask is None else mask
-    return counted & (pixels[..., 3] > 0) if background == "hidden" else counted
+    if background == "hidden":
+        counted = counted & (pixels[..., 3] > 0)
+    if view is not None and may_ring(view):
+        counted = counted & ~_ringing(pixels[..., :3], view.clipped)
+    return counted
+
+
+def may_ring(view: View) -> bool:
+    """Whether a photograph may be wrong beside what is clipped in it: JPEG files may."""
+    return view.clipped is not None and view.image.suffix.lower() in JPEG
+
+
+def _ringing(photograph: np.ndarray, limit: float | None) -> np.ndarray:
+    """Pixels with a channel that is below the limit beside a pixel where it is not, (H, W) bool.
+
+    JPEG files ring there: a lamp that is many times as bright as the limit may read as half of it,
+    which nothing tells from light that is as bright as that.
+
+    Args:
+        photograph: as decoded, shape (H, W, 3).
+        limit: value from which on channels are clipped.
+    """
+    clipped = photograph >= np.float32(np.inf if limit is None else limit)
+    if not clipped.any():
+        return np.zeros(photograph.shape[:2], bool)
+    near = clipped.copy()
+    for axis in range(2):
+        wide = near.copy()
+        for to, of in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+            at = (slice(None),) * axis
+            wide[(*at, to)] |= near[(*at, of)]
+        near = wide
+    return (near & ~clipped).any(axis=2)
 
 
 def _may_be_transparent(image: Path) -> bool:

@@ -82,8 +82,9 @@ def _doubts(
         if finding.level == "error" and not allow_doubtful:
             remedy = f"{finding.remedy}, or pass --allow-doubtful"
             raise UserError(finding.what, finding.where or dataset.folder, remedy)
-    # Exposures that are fitted may differ.
-    fitted = problem.camera is not None and problem.camera.has_exposures
+    # Exposures that are fitted may differ, and so may what an unknown response makes of them.
+    camera = problem.camera
+    fitted = camera is not None and (camera.has_exposures or camera.has_response)
     found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
     return found
 
