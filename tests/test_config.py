@@ -30,7 +30,7 @@ from unbake.config import (
     to_toml,
 )
 from unbake.config.light import LightConfig
-from unbake.config.migration import as_before
+from unbake.config.migration import FORMAT, as_before
 from unbake.errors import UserError
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings
 from unbake.fields.settings import LEAK, PieceConfig
@@ -358,7 +358,9 @@ roughness_smoothness = 2.0
 def test_settings_of_format_1_mean_the_same_today(number):
     old = from_toml(number + FORMAT_1)
     # What a user gives has the defaults of today, and what a run has those of its time.
-    assert old == from_toml(FORMAT_2 if number else FORMAT_2.replace("format = 2", "format = 7"))
+    assert old == from_toml(
+        FORMAT_2 if number else FORMAT_2.replace("format = 2", f"format = {FORMAT}")
+    )
     assert old.materials["albedo"]["neural"] == NetworkConfig(
         dataclasses.replace(preset("paper").materials["albedo"]["neural"].grid, levels=3),
         width=11,
@@ -371,7 +373,7 @@ def test_settings_of_format_1_mean_the_same_today(number):
 
 
 def test_keys_that_are_absent_today_are_those_of_the_preset():
-    assert from_toml("format = 7\n") == preset("cpu") != from_toml("format = 2\n")
+    assert from_toml(f"format = {FORMAT}\n") == preset("cpu") != from_toml("format = 2\n")
 
 
 def test_the_radiance_field_has_no_pieces():
@@ -417,8 +419,8 @@ def test_a_file_without_a_format_may_have_keys_of_today():
     ("text", "message"),
     [
         (
-            "format = 8",
-            r"format: was written by a newer unbake \(format 8; .* up to 7\). Update unbake",
+            "format = 9",
+            r"format: was written by a newer unbake \(format 9; .* up to 8\). Update unbake",
         ),
         ("format = true", "format: 'format' is True, not a positive whole number"),
         ("format = 2\nlearning_rate = 1.0", "learning_rate: unknown key"),

@@ -139,7 +139,7 @@ def assert_told_alike(old, new):
 
 def test_newer_settings_are_refused_by_a_fit_and_a_report(run, tmp_path):
     run.config_file.write_text("format = 9\n" + run.config_file.read_text())
-    said = NEWER.format(file="config.toml: format", version=9, known=7)
+    said = NEWER.format(file="config.toml: format", version=9, known=8)
     for use in (load_run, lambda path: write_report([path], tmp_path / "report.html")):
         with pytest.raises(UserError, match=said):
             use(run.path)

@@ -147,7 +147,7 @@ def test_what_is_written_is_plain_json(truth, tmp_path):
     )
     write_true_lighting(path, truth.parent)
     assert json.loads((truth / "emission.json").read_text()) == [
-        {"name": "area light", "strength": None}
+        {"name": "area light", "strength": [1.0, 1.0, 1.0], "varies": True}
     ]
 
 

@@ -10,6 +10,7 @@ from support import losses_of_light, pixel_rays, seeded
 
 from unbake.dataset.camera import Camera
 from unbake.fields.emission import BOUND, Emission, emission_textures
+from unbake.scene.emitters import Picture
 from unbake.transport.operator import attach_material, bounce
 from unbake.transport.vertex import SceneView, find_vertex
 
@@ -162,3 +163,41 @@ def test_direct_light_is_linear_in_strengths():
     dr.backward(total)
     assert np.array(dr.grad(log)).min() > 0
     assert np.array(dr.grad(log)).sum() == pytest.approx(np.array(total)[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("mean", [(0.5, 1.0, 2.0), (0.5, 0.0, 2.0)])
+def test_a_lamp_with_a_picture_is_its_strength_times_that(mean):
+    pixels = np.random.default_rng(3).uniform(0.2, 1.8, (4, 8, 3))
+    pixels *= np.array(mean) / pixels.mean((0, 1))
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)), "raw": True}
+    texture["filter_type"] = "nearest"
+    strength = np.array([3.0, 1.5, 0.5])
+
+    def screen(radiance):
+        room = {"type": "scene", "wall": {"type": "rectangle"}}
+        place = mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.7)
+        light = {"type": "area", "radiance": radiance}
+        room["screen"] = {"type": "rectangle", "to_world": place, "emitter": light}
+        film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+        to_world = mi.ScalarTransform4f().look_at([2.5, 0, 0.4], [0, 0, 0.4], [0, 0, 1])
+        room["sensor"] = {"type": "perspective", "to_world": to_world, "fov": 50.0, "film": film}
+        return mi.load_dict(room)
+
+    pattern = Picture(mi.load_dict(texture), mean)
+    emission = Emission(1, scale=1.0, patterns=[pattern])
+    log = mi.Float(np.log(strength).astype(np.float32))
+    dr.enable_grad(log)
+    emission.assign({"log": log})
+    emission.prepare()
+    ours = mi.render(screen(emission_textures(emission)[0]), integrator=stock(), spp=4096, seed=1)
+    shown = np.where(np.array(mean) > 0, pixels / np.maximum(mean, 1e-9), 1) * strength
+    texture["bitmap"] = mi.Bitmap(shown.astype(np.float32))
+    theirs = np.array(mi.render(screen(texture), integrator=stock(), spp=4096, seed=2))
+    assert np.abs(np.array(ours) - theirs).mean() < 0.02 * theirs.mean()
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.uv = mi.Point2f([1.5 / 8, 6.5 / 8], [0.5 / 4, 2.5 / 4])
+    (texture,) = emission_textures(emission)
+    value = texture.eval(si)
+    np.testing.assert_allclose(np.array(value), shown[[0, 2], [1, 6]].T, rtol=1e-5)
+    dr.backward(value)  # it is linear in the strength
+    np.testing.assert_allclose(np.array(dr.grad(log)), np.array(value).sum(1), rtol=1e-5)

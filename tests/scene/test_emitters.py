@@ -7,6 +7,7 @@ from scene_texts import BALL, DIFFUSE
 
 from unbake.errors import UserError
 from unbake.fields.emission import Emission, emission_textures
+from unbake.imaging.pictures import write_exr
 from unbake.scene import edit, emitters
 from unbake.scene import parse as scenes
 
@@ -28,6 +29,8 @@ LAMP = (
     '<shape type="sphere" id="lamp"><point name="center" value="3,0,0"/>'
     '<emitter type="area"><rgb name="radiance" value="4 5 6"/></emitter></shape>'
 )
+#: The mean of the picture that the scenes here have.
+PICTURE = tuple(np.random.default_rng(5).random((8, 16, 3)).mean((0, 1)).tolist())
 #: Every kind of light, with the name and the strength that are told of it.
 LIGHTS = {
     ("point light", (1, 2, 3)): '<emitter type="point">'
@@ -39,7 +42,7 @@ LIGHTS = {
     '<rgb name="irradiance" value="5 4 3"/></emitter>',
     ("constant light", (1, 1, 1)): '<emitter type="constant"/>',
     ("lamp", (4, 5, 6)): LAMP,
-    ("screen", None): '<shape type="rectangle" id="screen"><emitter type="area">'
+    ("screen", PICTURE): '<shape type="rectangle" id="screen"><emitter type="area">'
     '<texture type="bitmap" name="radiance"><string name="filename" value="bump.exr"/></texture>'
     '</emitter></shape>',
     ("panel", (2, 2, 2)): '<shape type="rectangle"><emitter type="area" id="panel">'
@@ -87,7 +90,27 @@ def test_lights_are_told_by_name_and_strength(parse_lit):
     found = emitters.named_emitters(parse_lit("".join(LIGHTS.values())))
     assert len(found) == len(LIGHTS)
     told = {light.name: light.strength for light in found}
-    assert told == {n: s if s is None else pytest.approx(s) for n, s in LIGHTS}
+    assert told == {n: pytest.approx(s, rel=1e-3) for n, s in LIGHTS}
+    assert [light.name for light in found if light.varies] == ["screen"]
+
+
+def test_pictures_of_lamps_are_told_by_their_mean(parse_lit, tmp_path):
+    parsed = parse_lit("".join(LIGHTS.values()))
+    found = emitters.pictures(parsed)
+    names = [light.name for light in emitters.named_emitters(parsed)]
+    (picture,) = (p for p in found if p is not None)
+    assert found.index(picture) == names.index("screen")
+    pixels = np.random.default_rng(5).random((8, 16, 3))
+    np.testing.assert_allclose(picture.sampled(), pixels / PICTURE, rtol=2e-3)
+    # A channel that is black has no picture; one that is black all over is no picture.
+    for factors in ((1, 0, 1), (0, 0, 0)):
+        parsed = parse_lit("".join(LIGHTS.values()))
+        write_exr(tmp_path / "bump.exr", pixels * factors)
+        shown = [p for p in emitters.pictures(parsed) if p is not None]
+        assert len(shown) == (sum(factors) > 0)
+        for p in shown:
+            np.testing.assert_allclose(p.sampled()[..., 1], 1)
+            np.testing.assert_allclose(p.sampled()[..., 0], pixels[..., 0] / p.mean[0], rtol=1e-5)
 
 
 def test_intensities_are_of_the_order_of_a_squared_distance(parse_lit):

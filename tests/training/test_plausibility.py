@@ -104,10 +104,14 @@ def test_lamps_with_pictures_are_told_where_their_strength_is_fitted(tmp_path):
         </shape></scene>"""
     )
     dataset = Dataset(tmp_path, scene, "visible", (), {}, None)
-    for unknown in ("emission", "materials"):
-        problem = make_problem(scene, "visible", update(TINY_FIT, {"unknown": unknown}), 0.5)
-        line = plausibility._pictures(dataset, problem)
-        assert line is None if unknown == "materials" else line.endswith("spectra of screen")
+    for unknown, pictures, told in (
+        ("emission", "known", False),
+        ("emission", "ignored", True),
+        ("materials", "ignored", False),
+    ):
+        settings = update(TINY_FIT, {"unknown": unknown, "lamp_pictures": pictures})
+        line = plausibility._pictures(dataset, make_problem(scene, "visible", settings, 0.5))
+        assert line is None if not told else line.startswith("screen will have one colour")
 
 
 @pytest.mark.parametrize(("unknown", "open_"), [("emission", True), ("materials", False)])

@@ -36,6 +36,7 @@ PixelSampling = Literal["all-views", "one-view-crop"]
 PriorName = Literal["one-bounce", "extra-bounce"]
 Unknown = Literal["auto", "materials", "lighting", "materials+lighting", "emission"]
 Lamps = Literal["known", "fitted"]
+LampPictures = Literal["known", "ignored"]
 ScaleToldBy = Literal["pixels", "background"]
 Precision = Literal["single", "half"]
 PresetName = Literal["cpu", "paper", "release", "release-lighting"]
@@ -353,6 +354,9 @@ class FitConfig:
 
     #: Whether materials that lamps alone have stay as the scene gives them (ours).
     lamps: Lamps = "known"
+    #: Whether lamps whose strength is fitted keep the picture that the scene gives them (ours):
+    #: their strength is its mean. ignored: they have one colour.
+    lamp_pictures: LampPictures = "known"
     #: Of the fields, by quantity and representation (Sec. 5.3); what is not given has its default.
     materials: Mapping[str, Mapping[str, FieldSettings]] = field(default_factory=dict)
     #: Lower bound on the slope of albedo's sigmoid in gradients (ours; `fields/arrays.py`). With

@@ -10,7 +10,7 @@ from ..fields.settings import GridConfig
 from ..formats import check_format
 
 #: Version of the settings file. Keys that are absent in earlier ones have the values of `_BEFORE`.
-FORMAT = 7
+FORMAT = 8
 
 #: Where keys of format 1, which knew albedo and roughness alone, are now.
 _MOVED = {
@@ -37,6 +37,7 @@ _NEURAL_ROUGHNESS = "materials.roughness.neural"
 _NEURAL_ALBEDO = "materials.albedo.neural"
 #: Settings that came with a format, at their value before: a run of an earlier version goes on as
 #: it began. By the table that they are in, where there is one.
+_BEFORE_8: dict[str, dict[str, Any]] = {"": {"lamp_pictures": "ignored"}}
 _BEFORE_7: dict[str, dict[str, Any]] = {_NEURAL_ROUGHNESS: {"pieces.places": 0}}
 _BEFORE_6: dict[str, dict[str, Any]] = {_NEURAL_ROUGHNESS: {"pieces.own_colours": 0}}
 _BEFORE_5: dict[str, dict[str, Any]] = {
@@ -70,7 +71,7 @@ _BEFORE_3: dict[str, dict[str, Any]] = {
     },
 }
 #: All of these, by the format that they came with.
-_BEFORE = {7: _BEFORE_7, 6: _BEFORE_6, 5: _BEFORE_5, 4: _BEFORE_4, 3: _BEFORE_3}
+_BEFORE = {8: _BEFORE_8, 7: _BEFORE_7, 6: _BEFORE_6, 5: _BEFORE_5, 4: _BEFORE_4, 3: _BEFORE_3}
 #: Keys that are no more.
 _GONE = (("camera", "smoothness"),)
 #: Keys that tell the settings of a run of 0.1, which has no number, from what a user gives.

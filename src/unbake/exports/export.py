@@ -447,9 +447,13 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
             coarse.setdefault(name, []).append(one.atlas.name)
     for name, of in coarse.items():
         notes.append(f"{name} is coarser than in the scene in {named(of)}; {remedy}")
-    varying = [light.name for light in lights if light.strength is None]
+    varying = [light.name for light in lights if light.varies and light.strength is not None]
     if varying:
-        notes.append(f"lights of varying strength are dark in glTF and usd: {', '.join(varying)}")
+        what = "lights with a picture have its mean in glTF and usd"
+        notes.append(f"{what}: {', '.join(varying)}")
+    dark = [light.name for light in lights if light.strength is None]
+    if dark:
+        notes.append(f"lights of unknown strength are dark in glTF and usd: {', '.join(dark)}")
     if not any(one.learned for one in baked):
         what = "the run learned no materials: all textures are the scene's own"
         notes.append(f"{what}, sampled anew")

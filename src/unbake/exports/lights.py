@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from ..fields.emission import Pattern
 from ..scene.emitters import (
     ENVIRONMENTS,
     emitter_nodes,
@@ -29,7 +30,9 @@ class Light:
     name: str
     node: int
     plugin: str
-    strength: tuple[float, float, float] | None  #: linear RGB; None: it varies
+    strength: tuple[float, float, float] | None  #: linear RGB, maybe a mean; None: unknown
+    varies: bool  #: over its surface
+    pattern: Pattern | None  #: how, where it was recovered
     recovered: bool
     to_world: np.ndarray  #: (4, 4); lights look along +z
     angles: tuple[float, float]  #: of the cone of a spot, to its full and to no light, radians
@@ -56,8 +59,10 @@ def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
         props = scene.state.nodes[node].props
         if problem.environment is not None and props.plugin_name() in ENVIRONMENTS:
             continue
-        strength = named.strength
-        if recovered is not None:
+        strength, varies, pattern = named.strength, named.varies, None
+        if recovered is not None and problem.emission is not None:
+            pattern = problem.emission.patterns[i]
+            varies = pattern is not None
             red, green, blue = (float(x) for x in recovered[i])
             strength = (red, green, blue)
         found.append(
@@ -66,6 +71,8 @@ def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
                 node,
                 props.plugin_name(),
                 strength,
+                varies,
+                pattern,
                 recovered is not None,
                 placement(props),
                 _cone(props),

@@ -23,7 +23,9 @@ from .tessellate import Triangles
 from .textures import as_image, file_names
 from .unwrap import Placed
 
-_TEXTURES, _MESHES, _ENVIRONMENT = "textures", "meshes", "environment"
+#: How bitmaps are looked up that do not say it.
+_LOOKED_UP = {"wrap_mode": "repeat", "filter_type": "bilinear"}
+_TEXTURES, _MESHES, _ENVIRONMENT, _LIGHTS = "textures", "meshes", "environment", "lights"
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,20 @@ def write_scene(
     """
     folder = folder.resolve()
     notes: list[str] = []
-    for light in lights:
-        if light.recovered:
-            props = scene.state.nodes[light.node].props
-            props[STRENGTHS[light.plugin]] = mi.ScalarColor3d(list(light.strength or (0, 0, 0)))
+    recovered = [light for light in lights if light.recovered]
+    names_of_lights = file_names([light.name for light in recovered])
+    for light, stem in zip(recovered, names_of_lights, strict=True):
+        props, strength = scene.state.nodes[light.node].props, light.strength or (0.0, 0.0, 0.0)
+        if light.pattern is None:
+            props[STRENGTHS[light.plugin]] = mi.ScalarColor3d(list(strength))
+            continue
+        picture = np.array(strength, np.float32) * light.pattern.sampled()
+        own = referenced(scene, props[STRENGTHS[light.plugin]])
+        texture = _bitmap(scene, folder / _LIGHTS / f"{stem}.exr", picture, colour=True)
+        for key in ("wrap_mode", "filter_type"):  # it is looked up as the lamp's own one
+            said = None if own is None else own.props.get(key, None)
+            scene.state.nodes[texture].props[key] = said or _LOOKED_UP[key]
+        props[STRENGTHS[light.plugin]] = mi.Properties.ResolvedReference(texture)
     stems = file_names([one.atlas.name for one in baked])
     copies = _own_bsdfs(scene, baked)
     for stem, one, copied in zip(stems, baked, copies, strict=True):

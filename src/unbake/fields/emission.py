@@ -1,8 +1,9 @@
-"""The unknown strength of lights (Sec. 5.1): one colour for each light."""
+"""The unknown strength of lights (Sec. 5.1): one colour for each light, or for its picture."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,21 @@ import numpy as np
 from .arrays import from_numpy
 
 BOUND = 20.0  #: of the log of strength over that at the start, so that nothing overflows
+
+
+class Pattern(Protocol):
+    """How a lamp differs over its surface; `scene.emitters.Picture` is one."""
+
+    @property
+    def texture(self) -> mi.Texture:
+        """What it looks into."""
+
+    def relative(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
+        """Factors of the strength at points, linear RGB; their mean is 1."""
+
+    def sampled(self) -> np.ndarray:
+        """The same as a picture, float32, shape (rows, columns, 3)."""
+        ...
 
 
 class Emission:
@@ -23,12 +39,17 @@ class Emission:
         scale: strength at the start, unless `start` says another: radiance in W·sr⁻¹·m⁻² for area
             lights and constant environments, intensity in W·sr⁻¹ for point and spot lights,
             irradiance in W·m⁻² for directional ones.
+        patterns: how lights differ over their surface, of each light; None: it has one colour, as
+            all have without any. The strength is the mean of what differs.
 
     Paper: Sec. 5.1.
     """
 
-    def __init__(self, count: int, *, scale: float) -> None:
+    def __init__(
+        self, count: int, *, scale: float, patterns: Sequence[Pattern | None] = ()
+    ) -> None:
         self.count = count
+        self.patterns = list(patterns) or [None] * count
         self.scale = scale
         self._log = dr.zeros(mi.Float, 3 * count)
         dr.make_opaque(self._log)
@@ -75,7 +96,7 @@ class Emission:
 
 
 def emission_textures(emission: Emission) -> list[mi.Texture]:
-    """A texture for each light, of one colour, to stand where its strength is given.
+    """A texture for each light, to stand where its strength is given.
 
     Paper: Sec. 5.1.
     """
@@ -88,9 +109,12 @@ def emission_textures(emission: Emission) -> list[mi.Texture]:
             # A frozen function calls all textures that there are, those of other scenes too. What
             # they read it finds in their attributes alone.
             self.tables = emission.tables
+            self.pattern: Pattern | None = None
+            self.texture: mi.Texture | None = None
 
         def eval(self, si, active=True):
-            return dr.gather(mi.Color3f, emission.values, mi.UInt32(self.number), active)
+            found = dr.gather(mi.Color3f, emission.values, mi.UInt32(self.number), active)
+            return found if self.pattern is None else found * self.pattern.relative(si, active)
 
         def eval_1(self, si, active=True):
             return mi.luminance(self.eval(si, active))
@@ -99,17 +123,21 @@ def emission_textures(emission: Emission) -> list[mi.Texture]:
             return self.eval(si, active)
 
         def mean(self):
-            return self.eval_1(None)
+            return mi.luminance(dr.gather(mi.Color3f, emission.values, mi.UInt32(self.number)))
 
         def is_spatially_varying(self):
-            return False
+            return self.texture is not None
 
         def to_string(self):
             return f"Strength[{self.number}]"
 
     textures = []
-    for number in range(emission.count):
+    for number, pattern in enumerate(emission.patterns):
         props = mi.Properties()
         props["number"] = number
-        textures.append(Strength(props))
+        texture = Strength(props)
+        if pattern is not None:
+            # By this attribute a frozen function knows of its arrays
+            texture.pattern, texture.texture = pattern, pattern.texture
+        textures.append(texture)
     return textures

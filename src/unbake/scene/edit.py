@@ -376,10 +376,10 @@ def set_environment(scene: ParsedScene, emitter: mi.Emitter) -> None:
 def set_emission(
     scene: ParsedScene, make: Callable[[int], Sequence[mi.Texture]]
 ) -> list[NamedEmitter]:
-    """Give every emitter of `STRENGTHS` a texture as its strength, also where it had a bitmap.
+    """Give every emitter of `STRENGTHS` a texture as its strength, also where it had a picture.
 
     Args:
-        make: returns as many textures as it is asked for, each of one colour.
+        make: returns as many textures as it is asked for.
 
     Returns:
         The emitters before the edit, in the order of their textures.

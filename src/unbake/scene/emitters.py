@@ -32,6 +32,8 @@ STRENGTHS = {
 
 #: Rows of directions in which an environment is looked at: with a sun, and at most.
 _SUN_ROWS, _MOST_ROWS = 4096, 8192
+#: Rows and columns in which pictures of lamps are looked at that have no texels.
+_ROWS = 512
 #: In which surfaces are looked for from a point or a spot.
 _DIRECTIONS = 256
 
@@ -41,14 +43,58 @@ class NamedEmitter:
     """An emitter whose strength can be optimized."""
 
     name: str  #: unique: its id, else its shape's id or file name, else its plugin and a number
-    strength: tuple[float, float, float] | None  #: linear RGB; None: a bitmap or a spectrum
+    #: Linear RGB, the mean where it is a picture; None where that is not known, as of colours of
+    #: vertices.
+    strength: tuple[float, float, float] | None
+    varies: bool = False  #: whether it differs from place to place
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The strength of a lamp that differs over its surface.
+
+    Args:
+        texture: of linear RGB.
+        mean: over texture coordinates from 0 to 1, linear RGB.
+    """
+
+    texture: mi.Texture
+    mean: tuple[float, float, float]
+
+    def relative(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
+        """What it is at points, over its mean; 1 in channels whose mean is 0."""
+        known = mi.Color3f(self.mean) > 0
+        found = dr.detach(self.texture.eval(si, active)) * dr.rcp(
+            dr.select(known, mi.Color3f(self.mean), 1)
+        )
+        return dr.select(known, found, 1)
+
+    def sampled(self) -> np.ndarray:
+        """The relative picture, float32, shape (rows, columns, 3), as bitmaps have it."""
+        data = mi.traverse(self.texture)
+        rows, columns = data["data"].shape[:2] if "data" in data else (_ROWS, _ROWS)
+        found = self.relative(_at_texels(rows, columns), mi.Bool(True))
+        return np.array(found).T.reshape(rows, columns, 3).astype(np.float32)
 
 
 def named_emitters(scene: ParsedScene) -> list[NamedEmitter]:
     """The emitters of `STRENGTHS` with the strength that the scene gives them."""
-    nodes = emitter_nodes(scene)
-    pairs = zip(_names(scene, nodes), nodes, strict=True)
-    return [NamedEmitter(name, _strength(scene, scene.state.nodes[i].props)) for name, i in pairs]
+    nodes, found = emitter_nodes(scene), []
+    for name, i in zip(_names(scene, nodes), nodes, strict=True):
+        texture = _texture(scene, scene.state.nodes[i].props)
+        if texture.is_spatially_varying():
+            picture = _picture(texture)
+            found.append(NamedEmitter(name, None if picture is None else picture.mean, True))
+        else:
+            value = texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+            found.append(NamedEmitter(name, tuple(np.ravel(value).tolist())))
+    return found
+
+
+def pictures(scene: ParsedScene) -> list[Picture | None]:
+    """The pictures of emitters, in the order of `named_emitters`; None: one colour, or unknown."""
+    textures = (_texture(scene, scene.state.nodes[i].props) for i in emitter_nodes(scene))
+    return [_picture(texture) if texture.is_spatially_varying() else None for texture in textures]
 
 
 def emitter_nodes(scene: ParsedScene) -> list[int]:
@@ -195,8 +241,25 @@ def _names(scene: ParsedScene, emitters: list[int]) -> list[str]:
     ]
 
 
-def _strength(scene: ParsedScene, props: mi.Properties) -> tuple[float, float, float] | None:
-    """The strength of an emitter, linear RGB; None if it is not one colour."""
+def _picture(texture: mi.Texture) -> Picture | None:
+    """A texture with its mean; None where that is black."""
+    values = np.array(texture.eval(_at_texels(_ROWS, _ROWS))).reshape(-1, _ROWS**2)
+    red, green, blue = np.broadcast_to(values.mean(1, dtype=np.float64), 3).tolist()
+    mean = (red, green, blue)
+    return Picture(texture, mean) if max(mean) > 0 and np.isfinite(mean).all() else None
+
+
+def _at_texels(rows: int, columns: int) -> mi.SurfaceInteraction3f:
+    """The middles of the texels of an image, row by row."""
+    si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
+    number = dr.arange(mi.UInt32, rows * columns)
+    x, y = mi.Float(number % columns) + 0.5, mi.Float(number // columns) + 0.5
+    si.uv = mi.Point2f(x / columns, y / rows)
+    return si
+
+
+def _texture(scene: ParsedScene, props: mi.Properties) -> mi.Texture:
+    """The strength of an emitter."""
     key = STRENGTHS[props.plugin_name()]
     node = referenced(scene, props[key]) if key in props else None
     try:
@@ -209,6 +272,4 @@ def _strength(scene: ParsedScene, props: mi.Properties) -> tuple[float, float, f
         raise UserError(
             f"{key!r} of {props.plugin_name()} is no strength: {reason(error)}", scene.path
         ) from None
-    if texture.is_spatially_varying():
-        return None
-    return tuple(np.ravel(texture.eval(dr.zeros(mi.SurfaceInteraction3f))).tolist())
+    return texture

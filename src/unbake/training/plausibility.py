@@ -117,16 +117,17 @@ def _open_colour(dataset: Dataset, problem: Problem) -> str | None:
 
 
 def _pictures(dataset: Dataset, problem: Problem) -> str | None:
-    """A line if lamps whose strength is fitted have no strength that is one colour."""
+    """A line if lamps whose strength is fitted differ over their surface, and no fit knows how."""
     if problem.emission is None:
         return None
     known = named_emitters(parse(dataset.scene, dataset.root))
-    names = [emitter.name for emitter in known if emitter.strength is None]
+    pairs = zip(known, problem.emission.patterns, strict=True)
+    names = [emitter.name for emitter, pattern in pairs if emitter.varies and pattern is None]
     if not names:
         return None
     return (
-        "a fit finds one colour and strength for each lamp, and nothing of the pictures or "
-        f"spectra of {', '.join(names)}"
+        f"{', '.join(names)} will have one colour: pictures of lamps are left out, which spoils "
+        "the strength of these lamps, and of others"
     )
 
 

@@ -173,7 +173,7 @@ def make_problem(
         edit.set_environment(parsed, environment_emitter(environment))
     if config.unknown == "emission":
         places = emitters.places(parsed)
-        emission, emitter_names = _unknown_emission(parsed, scale)
+        emission, emitter_names = _unknown_emission(parsed, scale, config)
     if change is not None:
         change(parsed)
     loaded = parsed.instantiate()
@@ -351,11 +351,14 @@ def _pieces(scene: mi.Scene, config: FitConfig) -> Pieces | None:
     return Pieces(scene, most, across_slivers=across) if most else None
 
 
-def _unknown_emission(parsed: ParsedScene, scale: float) -> tuple[Emission, list[str]]:
+def _unknown_emission(
+    parsed: ParsedScene, scale: float, config: FitConfig
+) -> tuple[Emission, list[str]]:
     made: list[Emission] = []
+    patterns = emitters.pictures(parsed) if config.lamp_pictures == "known" else []
 
     def textures(count: int) -> list[mi.Texture]:
-        made.append(Emission(count, scale=scale))
+        made.append(Emission(count, scale=scale, patterns=patterns))
         return emission_textures(made[0])
 
     named = edit.set_emission(parsed, textures)
