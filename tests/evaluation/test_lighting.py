@@ -11,6 +11,7 @@ from support import TINY_FIT
 
 from unbake.evaluation import lighting
 from unbake.evaluation.lighting import (
+    DEFINITIONS,
     compare_environments,
     environment_scale,
     recovered_emitters,
@@ -243,3 +244,14 @@ def test_every_number_has_a_definition():
     told = " ".join(lighting.DEFINITIONS)
     for name in ("sh_error", "relight_psnr", "aligned", "emission_error"):
         assert name in told
+
+
+def test_directions_that_are_not_seen_have_no_part_in_the_scores_of_seen_ones(sky):
+    seen = np.zeros(sky.shape[:2], bool)
+    seen[: len(sky) // 2] = True
+    wrong = np.where(seen[..., None], sky, 5 * sky + 1)
+    found = compare_environments(wrong, sky, seen)
+    assert found["sh_error"] > 0.3 and found["sh_error_seen"] == pytest.approx(0, abs=1e-6)
+    assert found["relight_psnr_seen"] > 60 > found["relight_psnr"]
+    assert "sh_error_seen" not in compare_environments(wrong, sky)
+    assert set(found) < set(DEFINITIONS) | {"sh_error_aligned", "relight_psnr_aligned"}

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from support import random_values, tiny_fields
 
 import unbake
@@ -2094,10 +2095,16 @@ def test_the_command_tells_what_it_wrote(exported, tmp_path, unbake, monkeypatch
     assert lines[-1] == f"wrote {out}: scene.glb, export.json" and max(map(len, lines[:-1])) < 80
     assert sorted(p.name for p in out.iterdir()) == sorted(
         [
-            *("environment.exr", "environment_upright.exr"),
+            *("environment.exr", "environment_upright.exr", "environment_unobserved.png"),
             *("export.json", "scene.glb", "unobserved"),
         ]
     )
+    # The two cameras look down: what is below lights nothing that they show.
+    mask = np.array(Image.open(out / "environment_unobserved.png")) > 127
+    assert mask.shape == read_exr(out / "environment.exr").shape[:2]
+    assert 0.05 < mask.mean() < 0.9
+    part = re.search(r"note: nothing is known of (\d+) % of the environment: (\S+)", outcome.out)
+    assert part is not None and part[2] == "environment_unobserved.png"
     # A file of glTF has no place for the masks of what no view saw.
     told = json.loads((out / "export.json").read_text())
     masks = {row["name"]: row["unobserved"] for row in told["materials"]}

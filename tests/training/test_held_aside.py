@@ -324,6 +324,19 @@ def test_a_fit_of_a_few_steps_is_at_no_plateau_and_no_ratio_is_told_within_noise
     assert "getting worse; error rose by more than its noise in the last quarter" in told
 
 
+def test_an_error_below_zero_has_a_verdict_too():
+    """Errors have no bias, so that those of a fit that explains photographs well lie about zero."""
+    lines = log_of_rises(np.array([0.02, -0.01] * 8))
+    for line in lines:
+        if "held_aside" in line:
+            line["held_aside"] -= 1.01
+            line["held_aside_groups"] = [x - 1.01 for x in line["held_aside_groups"]]
+    found = convergence(lines)
+    assert found is not None and found.before < 0 and found.trend == "unclear"
+    assert found.noise == pytest.approx(1)
+    assert "too noisy; error changed by" in found.told() or "error rose by more" in found.told()
+
+
 def test_too_few_errors_say_nothing():
     assert convergence([]) is None
     assert convergence(log_of([1.0])) is None

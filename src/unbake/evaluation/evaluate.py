@@ -30,6 +30,7 @@ from ..training.held_aside import convergence
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import METRICS_FORMAT, EvaluationFolder, RunFolder
 from ..training.run_lock import RunLock
+from ..training.surroundings import surroundings
 from ..training.validation import (
     MaterialBuffers,
     albedos,
@@ -424,10 +425,15 @@ def _evaluate_lighting(
         write_exr(out.environment(), map_)
         tiles = [[tonemap(map_)]] if truth is None else [[tonemap(map_)], [tonemap(truth)]]
         write_png(out.environment(".png"), montage(tiles))
+        told = surroundings(recovered, ROWS)
         found["environment"] = None
+        found["environment_seen_share"] = told.share
         if truth is not None:
-            found["environment"] = numbers = lighting.compare_environments(map_, truth)
+            seen = told.lit if told.note else None
+            found["environment"] = numbers = lighting.compare_environments(map_, truth, seen)
             tell(", ".join(f"environment {k} {v:.3g}" for k, v in numbers.items()))
+        if told.note:
+            tell(f"note: {told.note}, which lights nothing in view")
     if problem.emission is not None:
         found["emission"] = [
             asdict(x)

@@ -29,6 +29,11 @@ DEFINITIONS = {
     "to [0,1]",
     "aligned": "the same after each channel of the recovered map has been multiplied by the number "
     "that brings its coefficients nearest to the true ones in the least squares sense",
+    "sh_error_seen": "the same, with the true map in directions from which no light reaches what "
+    "training views show",
+    "relight_psnr_seen": "the same of the picture",
+    "environment_seen_share": "share of all directions from which light reaches surfaces "
+    "that training views show, or from which they show the environment itself",
     "emission_error": "|c - c*| / |c*| of a light's radiance, RGB; none of a light that is black",
 }
 
@@ -73,16 +78,28 @@ def recovered_emitters(
     return recovered
 
 
-def compare_environments(found: np.ndarray, truth: np.ndarray) -> dict:
+def compare_environments(
+    found: np.ndarray, truth: np.ndarray, seen: np.ndarray | None = None
+) -> dict:
     """Errors of a map against the true one, as it is and with its scale aligned.
 
     Args:
         found, truth: linear RGB radiance in the layout of `latlong`, shape (h, 2 h, 3).
+        seen: the directions that tell of it, shape (h, 2 h); None: they are not asked for.
+
+    Returns:
+        Scores by their names in `DEFINITIONS`.
 
     Paper: Sec. 6.4, Fig. 8.
     """
-    aligned = found * environment_scale(found, truth)
-    return {
+    aligned, of_seen = found * environment_scale(found, truth), {}
+    if seen is not None:
+        mixed = np.where(seen[..., None], found, truth)
+        of_seen = {
+            "sh_error_seen": sh_error(mixed, truth),
+            "relight_psnr_seen": relight_psnr(mixed, truth),
+        }
+    return of_seen | {
         "sh_error": sh_error(found, truth),
         "sh_error_aligned": sh_error(aligned, truth),
         "relight_psnr": relight_psnr(found, truth),

@@ -9,6 +9,7 @@ DIR/
   usd/scene.usdc          the scene as OpenUSD, with its own textures
   environment.exr         the environment, recovered or that of the scene
   environment_upright.exr the same in the axes of scene.glb, where these are others
+  environment_unobserved.png  where nothing is known of a recovered one
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..dataset.camera import Camera
 from ..errors import UserError, collected, named, raise_together
-from ..imaging.pictures import write_exr
+from ..imaging.pictures import to_bytes, write_exr, write_png
 from ..io import filled_folder, require_new_folder, write_json
 from ..scene import free_space
 from ..scene.emitters import ENVIRONMENTS, STRENGTHS, names_besides
@@ -33,6 +34,7 @@ from ..training.grid_sizes import surface_seen
 from ..training.problem import known_materials
 from ..training.recovered import Recovered, load_run
 from ..training.run_folder import RunFolder
+from ..training.surroundings import surroundings
 from ..transport.render import path_integrator
 from ..version import VERSION
 from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
@@ -52,6 +54,8 @@ from .usd import require_usd, write_usd
 _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 #: The same in the axes of `scene.glb`.
 _UPRIGHT = Path("environment_upright").with_suffix(".exr").name
+#: Where nothing is known of the environment.
+_UNOBSERVED = Path("environment_unobserved").with_suffix(".png").name
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
 #: Materials that are told one by one.
@@ -84,6 +88,8 @@ _CONVENTIONS = {
     "the first row, -y the last one, +z the middle column, -z the left and right border, +x at a "
     "quarter of the width; linear RGB; in axes of the scene, and environment_upright in those of "
     "scene.glb, where these are others",
+    "environment_unobserved": "white where no light of the environment reaches what training views "
+    "show, in the pixels of environment; not written where that is less than 5 %",
     "texels_per_unit": "at least, but for textures of the smallest and the largest size; where "
     "nobody chose it, textures have more that need it",
     "near": "by quantity, the share of the surface seen by training views where the texture "
@@ -226,6 +232,7 @@ def _export(
         ],
         "environment": None if environment is None else _ENVIRONMENT,
         "environment_upright": _UPRIGHT if (out / _UPRIGHT).exists() else None,
+        "environment_unobserved": _UNOBSERVED if (out / _UNOBSERVED).exists() else None,
         "colour_spaces": COLOUR_SPACES,
         "conventions": _CONVENTIONS,
         "notes": [
@@ -288,6 +295,11 @@ def _write(
             masks[one.atlas.name] = f"unobserved/{write_mask(out / 'unobserved', stem, one)}"
     if environment is not None:
         write_exr(out / _ENVIRONMENT, environment)
+    if environment is not None and recovered.problem.environment is not None:
+        told = surroundings(recovered, len(environment))
+        if told.note:
+            write_png(out / _UNOBSERVED, to_bytes(~told.lit))
+            notes.append(f"{told.note}: {_UNOBSERVED}")
     visible = [part for part in found.parts if part.is_shown]
     others = [name for name in formats if name in ("gltf", "usd")]
     if others and len(visible) < len(found.parts):

@@ -316,8 +316,10 @@ class Convergence:
     trend: Trend
     error: float  #: at the end
     before: float  #: when the last quarter began
-    change: float  #: relative; below 0: it fell
-    noise: float  #: standard error of the change, relative
+    change: (
+        float  #: relative, or in standard errors where `before` is not above 0; below 0: it fell
+    )
+    noise: float  #: standard error of the change, in the same unit
     share: float  #: of the fit, over which the change is told
 
     def told(self) -> str:
@@ -361,11 +363,13 @@ def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergen
         return None
     start = earlier[-1]
     before, error = start[ERROR], end[ERROR]
-    if not before > 0:
-        return None
     rises = np.subtract(end[GROUPS], start[GROUPS])
-    change = (error - before) / before
-    noise = float(rises.std(ddof=1) / math.sqrt(len(rises)) / before)
+    sigma = float(rises.std(ddof=1) / math.sqrt(len(rises)))
+    # Errors have no bias: that of a good fit may be below 0, and changes are told by their noise.
+    unit = before if before > 0 else sigma
+    if not unit > 0:
+        return None
+    change, noise = (error - before) / unit, sigma / unit
     still = max(change, _SURE * noise) <= _SEEN and end.get("step", _FEWEST_STEPS) >= _FEWEST_STEPS
     trend: Trend = "plateau" if still else "unclear"
     if -change > max(_LEAST, _SURE * noise):

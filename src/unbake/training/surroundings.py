@@ -1,0 +1,122 @@
+"""Which directions of an environment light what training views show (ours).
+
+A room with a window has light from a part of the sky alone. Of the rest a fit learns nothing: there
+the recovered map is what it began with, and what its network makes of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..dataset.pixels import CameraRays
+from ..fields.arrays import from_numpy
+from ..fields.envmap import to_square
+from .recovered import Recovered
+
+#: Cells along an edge of the square that stands for all directions, each of the same solid angle.
+_CELLS = 48
+#: Rays through random pixels of a pass; passes, at most; and rays that leave, which are enough.
+_RAYS, _MOST_PASSES, _ENOUGH = 1 << 17, 64, 1 << 17
+#: Directions that light less than this part of the mean tell next to nothing; and fewer rays than
+#: that leave through the joints of walls.
+_LEAST, _FEWEST = 0.02, 3
+#: The share of directions that are told, beyond which nothing is said of the others.
+_MOST_OF_IT = 0.95
+#: Surfaces that a ray goes through, at most.
+_PASSED = 8
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What training views tell of an environment.
+
+    Args:
+        lit: whether light from a direction reaches what they show, or they show the environment
+            there; bool, shape (rows, 2 rows), in the layout of `latlong`.
+    """
+
+    lit: np.ndarray
+
+    @property
+    def share(self) -> float:
+        """Of all directions, those that are told, by solid angle."""
+        rows = len(self.lit)
+        edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0, 1))
+        return float(np.average(self.lit.mean(1), weights=edges[:-1] - edges[1:]))
+
+    @property
+    def note(self) -> str | None:
+        """A line where a part of the environment is not known."""
+        if self.share > _MOST_OF_IT:
+            return None
+        return f"nothing is known of {100 * (1 - self.share):.0f} % of the environment"
+
+
+def surroundings(recovered: Recovered, rows: int) -> Surroundings:
+    """What the training views of a run tell of the environment.
+
+    Panes and cut-outs hide nothing here. What reaches surfaces over others alone does not count.
+
+    Args:
+        recovered: of a scene with an environment.
+        rows: of its picture.
+    """
+    problem = recovered.problem
+    scene, rays = problem.scene_view.scene, CameraRays.of(recovered.cameras)
+    sampler = mi.load_dict({"type": "independent"})
+    counts = np.zeros(_CELLS**2)
+    with dr.suspend_grad():
+        for number in range(_MOST_PASSES):
+            sampler.seed(number, _RAYS)
+            pixel = mi.UInt32(dr.minimum(sampler.next_1d() * rays.pixels, rays.pixels - 1))
+            ray = rays.through(pixel, sampler.next_2d())
+            met = scene.ray_intersect(ray)
+            outside = ~met.is_valid()
+            if problem.hide_emitters:  # photographs do not show it
+                outside = mi.Bool(False)
+            local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+            local.z = dr.mulsign(local.z, mi.Frame3f.cos_theta(met.wi))
+            bounced = met.spawn_ray(met.to_world(local))
+            free = outside | _leaves(scene, bounced, met.is_valid())
+            d = dr.select(outside, ray.d, bounced.d)
+            cell = np.array(_cell(d))[np.array(free)]
+            counts += np.bincount(cell, minlength=len(counts))
+            if counts.sum() >= _ENOUGH:
+                break
+    lit = counts >= max(_FEWEST, _LEAST * counts.mean())
+    lane = np.arange(2 * rows * rows)
+    φ = (lane % (2 * rows) + 0.5) * (np.pi / rows)
+    θ = lane // (2 * rows) * (np.pi / (rows - 1))
+    d = np.stack([np.sin(φ) * np.sin(θ), np.cos(θ), -np.cos(φ) * np.sin(θ)])
+    found = np.array(_cell(mi.Vector3f(*(from_numpy(mi.Float, x.astype(np.float32)) for x in d))))
+    return Surroundings(lit[found].reshape(rows, 2 * rows))
+
+
+def _cell(d: mi.Vector3f) -> mi.UInt32:
+    """The cell of unit directions."""
+    place = mi.Point2u(dr.clip(to_square(d) * _CELLS, 0, _CELLS - 1))
+    return place.y * _CELLS + place.x
+
+
+def _leaves(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    """Whether rays leave the scene, straight through what lets light pass."""
+    free, active = mi.Bool(False), mi.Bool(active)
+    for _ in range(_PASSED):
+        hit = scene.ray_intersect(ray, active)
+        met = active & hit.is_valid()
+        free |= active & ~met
+        flags = hit.bsdf().flags()
+        passes = mi.has_flag(flags, mi.BSDFFlags.Null)
+        passes |= mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+        active = met & passes
+        ray = hit.spawn_ray(ray.d)
+        dr.eval(free, active, ray)
+        if not dr.any(active):
+            break
+    return free
