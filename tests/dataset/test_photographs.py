@@ -753,3 +753,25 @@ def test_a_limit_beyond_32_bits_is_none():
     """NumPy would warn of an overflow, with a line of our source."""
     pixels = np.full((4096, 4), 3e37, np.float32)
     assert without_hot_pixels(pixels, np.ones(4096, bool), "a", 64)[1] is None
+
+
+def test_what_rings_in_jpeg_files_is_left_out_of_mapped_photographs_too(tmp_path, monkeypatch):
+    codes = np.full((24, 24, 3), 40, np.uint8)
+    codes[8:14, 8:14] = 255
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40, 24, 24)
+    views = []
+    for name in ("a", "b"):
+        Image.fromarray(codes).save(tmp_path / f"{name}.jpg", quality=80)
+        file = tmp_path / f"{name}.jpg"
+        views.append(View(name, "train", camera, file, {}, encoding="srgb", clipped=0.95))
+    dataset = Dataset(tmp_path, tmp_path / "scene.xml", "visible", tuple(views), {}, None)
+    whole = Photographs.load(dataset, clip_negative=False)
+    assert whole.masked and 0 < whole.count < 2 * 24 * 24
+    monkeypatch.setattr(module, "IN_MEMORY", 0)
+    for _ in range(2):
+        mapped = Photographs.load(dataset, clip_negative=False)
+        np.testing.assert_array_equal(mapped.chosen, whole.chosen)
+        assert mapped.count == whole.count and mapped.masked
+    with monkeypatch.context() as patch:  # it is found again, and not made anew
+        patch.setattr(decoded_file, "_write_cache", None)
+        assert Photographs.load(dataset, clip_negative=False).count == whole.count

@@ -1724,33 +1724,57 @@ SCREENS = f"""<scene version="3.0.0">
     <ref id="paint"/>{LIGHT}</shape></scene>"""
 
 
-def test_recovered_screens_keep_their_pictures(tmp_path, monkeypatch):
+@pytest.mark.parametrize("method", ["ours", "prb"])
+def test_screens_of_meshes_keep_their_pictures_in_steps_that_are_replayed(method, tmp_path):
+    folder = tmp_path / "scene"
+    write_exr(folder / "picture.exr", np.random.default_rng(5).uniform(0.5, 4, (4, 6, 3)))
+    corners = np.array([(0.1, -0.5, 0), (1.1, -0.5, 0), (1.1, 0.5, 0), (0.1, 0.5, 0)])
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    write_mesh(folder / "folded.ply", corners, np.array([(0, 1, 2), (0, 2, 3)]), uv=uv)
+    (folder / "scene.xml").write_text(SCREENS)
+    data = grey_data(folder / "scene.xml", tmp_path / "data")
+    config = replace(tiny_fields("grid"), method=method, unknown="emission", steps=4)
+    progress = fit(data, tmp_path / "run", config)
+    assert progress.step == 4
+    emission = load_run(tmp_path / "run").problem.emission
+    assert all(pattern is not None for pattern in emission.patterns)
+    assert [pattern.sampled_by_it for pattern in emission.patterns] == [True, False]
+
+
+@pytest.mark.parametrize("more", [0, 1, 2, 5])
+def test_recovered_screens_keep_their_pictures(more, tmp_path, monkeypatch):
     folder, rng = tmp_path / "scene", np.random.default_rng(5)
     picture = rng.uniform(0.5, 4, (4, 6, 3)).astype(np.float32)
     write_exr(folder / "picture.exr", picture)
     screen = SCREENS[SCREENS.index('  <shape type="rectangle" id="screen">') :]
     screen = screen[: screen.index("</shape>")] + "</shape>"
     floor = SCREENS[: SCREENS.index('  <shape type="rectangle" id="screen">')]
-    (folder / "scene.xml").write_text(floor + screen + "</scene>")
+    tiled = '<transform name="to_uv"><scale value="2"/></transform></texture>'
+    other = screen.replace('"screen"', '"other"').replace("-0.6", "0.6")
+    screens = screen + other.replace("</texture>", tiled)
+    balls = '<shape type="sphere"><ref id="paint"/><point name="center" value="0,0,-3"/></shape>'
+    (folder / "scene.xml").write_text(floor + screens + more * balls + "</scene>")
     data = grey_data(folder / "scene.xml", tmp_path / "data")
     config = replace(tiny_fields("grid"), method="direct", unknown="emission", steps=0)
     fit(data, tmp_path / "run", config)
     recovered, strength = load_run(tmp_path / "run"), np.array([3.0, 1.0, 0.5])
     emission = recovered.problem.emission
     logs = np.log(strength / emission.scale).astype(np.float32)
-    emission.assign({"log": mi.Float(logs)})
+    emission.assign({"log": mi.Float(np.tile(logs, 2))})
     emission.prepare()
     monkeypatch.setattr(exporting, "load_run", lambda *_, **__: recovered)
     as_if_seen(monkeypatch)
     options = {"texels": 10.0, "tell": lambda line: None}
     manifest = exporting.export(tmp_path / "run", tmp_path / "out", ["mitsuba", "gltf"], **options)
     assert manifest["lights"][0]["strength"] == pytest.approx(list(strength), rel=1e-5)
-    assert "lights with a picture have its mean in glTF and usd: screen" in manifest["notes"]
+    note = "lights with a picture have its mean in glTF and usd: screen, other"
+    assert note in manifest["notes"]
     shown = picture / picture.mean((0, 1)) * strength
     written = read_exr(tmp_path / "out" / "mitsuba" / "lights" / "screen.exr")
     np.testing.assert_allclose(written[..., :3], shown, rtol=1e-4)
     scene = mi.load_file(str(tmp_path / "out" / "mitsuba" / "scene.xml"))
-    x = np.ascontiguousarray(rng.uniform((-1.1, -0.5), (-0.1, 0.5), (500, 2)).T, np.float32)
+    x = rng.uniform((-1.1, -0.5), (-0.1, 0.5), (500, 2)).T
+    x = np.concatenate([x, x + np.array([[1.2], [0]])], 1).astype(np.float32)
     ray = mi.Ray3f(mi.Point3f(*x, 1), mi.Vector3f(0, 0, -1))
     ours = recovered.problem.scene_view.scene
     a, b = (s.ray_intersect(ray).emitter(s).eval(s.ray_intersect(ray)) for s in (ours, scene))

@@ -165,25 +165,49 @@ def test_direct_light_is_linear_in_strengths():
     assert np.array(dr.grad(log)).sum() == pytest.approx(np.array(total)[0], rel=1e-4)
 
 
+#: Lamps with texture coordinates: how they stand, and whether these tell where they are sampled.
+SCREENS = {
+    "rectangle": ({"type": "rectangle"}, True),
+    "disk": ({"type": "disk"}, True),
+    "sphere": ({"type": "sphere", "center": [0, 0, 0.3], "radius": 0.6}, True),
+    "ply": ({"type": "ply"}, False),
+}
+
+
+def two_triangles(file):
+    """A square with texture coordinates, as a file."""
+    mesh = mi.Mesh("square", 4, 2, has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [-1.0, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]
+    params["faces"] = [0, 1, 2, 0, 2, 3]
+    params["vertex_texcoords"] = [0.0, 0, 1, 0, 1, 1, 0, 1]
+    params.update()
+    mesh.write_ply(str(file))
+    return str(file)
+
+
+@pytest.mark.parametrize("kind", SCREENS)
 @pytest.mark.parametrize("mean", [(0.5, 1.0, 2.0), (0.5, 0.0, 2.0)])
-def test_a_lamp_with_a_picture_is_its_strength_times_that(mean):
+def test_a_lamp_with_a_picture_is_its_strength_times_that(mean, kind, tmp_path):
     pixels = np.random.default_rng(3).uniform(0.2, 1.8, (4, 8, 3))
     pixels *= np.array(mean) / pixels.mean((0, 1))
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)), "raw": True}
     texture["filter_type"] = "nearest"
-    strength = np.array([3.0, 1.5, 0.5])
+    strength, (shape, by_it) = np.array([3.0, 1.5, 0.5]), SCREENS[kind]
+    if kind == "ply":
+        shape = shape | {"filename": two_triangles(tmp_path / "square.ply")}
 
     def screen(radiance):
         room = {"type": "scene", "wall": {"type": "rectangle"}}
         place = mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.7)
         light = {"type": "area", "radiance": radiance}
-        room["screen"] = {"type": "rectangle", "to_world": place, "emitter": light}
+        room["screen"] = shape | {"to_world": place, "emitter": light}
         film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
         to_world = mi.ScalarTransform4f().look_at([2.5, 0, 0.4], [0, 0, 0.4], [0, 0, 1])
         room["sensor"] = {"type": "perspective", "to_world": to_world, "fov": 50.0, "film": film}
         return mi.load_dict(room)
 
-    pattern = Picture(mi.load_dict(texture), mean)
+    pattern = Picture(mi.load_dict(texture), mean, by_it)
     emission = Emission(1, scale=1.0, patterns=[pattern])
     log = mi.Float(np.log(strength).astype(np.float32))
     dr.enable_grad(log)

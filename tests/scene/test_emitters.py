@@ -102,6 +102,18 @@ def test_pictures_of_lamps_are_told_by_their_mean(parse_lit, tmp_path):
     assert found.index(picture) == names.index("screen")
     pixels = np.random.default_rng(5).random((8, 16, 3))
     np.testing.assert_allclose(picture.sampled(), pixels / PICTURE, rtol=2e-3)
+    # Texels are all counted, of large pictures too; and what a lamp shows of one that is placed.
+    large = np.zeros((8, 2048, 3), np.float32)
+    large[:, ::1024] = 1024
+    write_exr(tmp_path / "large.exr", large)
+    more = '<transform name="to_uv"><scale value="{}"/></transform>'
+    # A quarter of it begins within the first bright texel, of which it has seven eighths.
+    for placed, mean in (("", 1.0), (more.format("3"), 1.0), (more.format("0.25"), 1.75)):
+        text = LIGHTS["screen", PICTURE].replace("bump.exr", str(tmp_path / "large.exr"))
+        text = text.replace("</texture>", placed + "</texture>")
+        (only,) = emitters.pictures(parse_lit(text))
+        assert only.mean == pytest.approx((mean,) * 3, rel=0.02)
+        assert only.sampled_by_it  # a rectangle
     # A channel that is black has no picture; one that is black all over is no picture.
     for factors in ((1, 0, 1), (0, 0, 0)):
         parsed = parse_lit("".join(LIGHTS.values()))

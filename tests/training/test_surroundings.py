@@ -16,7 +16,9 @@ def told(shapes, *cameras, hidden=False):
     scene = mi.load_dict({"type": "scene", **shapes})
     view = SimpleNamespace(scene=scene)
     problem = SimpleNamespace(scene_view=view, hide_emitters=hidden)
-    return surroundings(SimpleNamespace(problem=problem, cameras=list(cameras)), 32)
+    dataset = SimpleNamespace(train=(), background="visible")
+    run = SimpleNamespace(problem=problem, cameras=list(cameras), dataset=dataset)
+    return surroundings(run, 32)
 
 
 def wall(to, up=None, **more):
@@ -64,6 +66,16 @@ def test_what_photographs_show_of_it_is_known(hidden):
     assert told(floor, below, hidden=hidden).share == (
         0 if hidden else pytest.approx((1 - np.cos(np.radians(65))) / 2, abs=0.08)
     )
+
+
+def test_what_is_seen_through_a_pane_or_a_hole_is_known():
+    below = Camera.look_at((0, -1.2, 0), (0, -5, 0), (0, 0, 1), 120.0, 16, 16)
+    hole = {"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}
+    floor = {"floor": wall([0, -1, 0], [0, 0, 1])}
+    open_ = told(floor, below)
+    for bsdf in ({"type": "thindielectric"}, hole, {"type": "null"}):
+        pane = wall([0, -1.4, 0], [0, 0, 1], bsdf=bsdf)
+        assert told(floor | {"pane": pane}, below).share == pytest.approx(open_.share, abs=0.02)
 
 
 def test_all_is_known_around_a_ball():

@@ -373,7 +373,7 @@ def _without_attributes(parsed: ParsedScene) -> None:
         for key in list(node.props):
             texture = referenced(parsed, node.props[key])
             if texture is not None and texture.props.plugin_name() == "mesh_attribute":
-                node.props[key] = _LOST
+                node.props[key] = 1.0 if key == "opacity" else _LOST
 
 
 def _displace(mesh: mi.Mesh, settings: DegradeSettings, diagonal: float) -> None:

@@ -93,7 +93,8 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     better = [other for other in tried if _clearly_better(other.scores, given)]
     if not better:
         return result
-    if not any(view.of_mesh for view in views) and not all(s.all() for s in shown):
+    cut_out = min(float(s.mean()) for s in shown) < 1 - _UNCOVERED
+    if cut_out and not any(view.of_mesh for view in views):
         # Poses as they are may cover more of what is shown than any others
         most = max(_share(hits, shown), *(other.covered for other in better))
         better = [other for other in better if other.covered >= most - _UNCOVERED]

@@ -29,6 +29,8 @@ from .views import JPEG, may_ring
 
 #: Share of the free memory up to which the system is to read ahead in a mapped file.
 _FITTING = 0.5
+#: Key of what is left out of JPEG files; see `views.may_ring`.
+_RINGING = "beside clipped values of JPEG"
 
 
 class Unwritable(Exception):
@@ -98,7 +100,7 @@ def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
     if any(view.image.suffix.lower() in JPEG for view in views):
         key["colour of JPEG"] = "by regression"
     if any(may_ring(view) for view in views):
-        key["beside clipped values of JPEG"] = [view.clipped for view in views]
+        key[_RINGING] = [view.clipped for view in views]
     if any(view.exposure != 1 for view in views):
         key["exposures"] = [view.exposure for view in views]
     if any(view.noise is not None for view in views):
@@ -123,7 +125,7 @@ def _stamps(files: Sequence[Path], folder: Path) -> list[list[Any]]:
 
 def _chooses(key: dict[str, Any]) -> bool:
     """Whether there are pixels that are not trained on."""
-    return key["foreground_only"] or "masks" in key
+    return key["foreground_only"] or "masks" in key or _RINGING in key
 
 
 def _find_cache(data: DataFolder, key: dict[str, Any]) -> Decoded | None:

@@ -78,8 +78,9 @@ DEFINITIONS = {
     "colour_space": "linear RGB; roughness is perceptual (GGX alpha = roughness squared)",
     "albedo_psnr_aligned": "the same after each channel of the recovered albedo was multiplied by "
     "one number for all views, which brings it nearest to the truth in the least squares sense",
-    "convergence": "of the photometric error on training pixels that no step drew, relative: its "
-    "change over the last part of the fit (share), and the standard error of that (noise)",
+    "convergence": "of the photometric error on training pixels that no step drew: its "
+    "relative change over the last part of the fit (share), and the standard error of that "
+    "(noise); both in standard errors where the error was not above zero before",
     "samples": "camera samples traced in training, those of searches of roughness included; of an "
     "estimator with two passes, both count",
     "data_changed": "parts of the data set that differ from those that the run was fit to",

@@ -90,13 +90,18 @@ def write_scene(
         if light.pattern is None:
             props[STRENGTHS[light.plugin]] = mi.ScalarColor3d(list(strength))
             continue
-        picture = np.array(strength, np.float32) * light.pattern.sampled()
         own = referenced(scene, props[STRENGTHS[light.plugin]])
+        looked_up = dict(_LOOKED_UP)  # as the lamp's own picture is
+        if own is not None and own.props.plugin_name() == "bitmap":
+            names = (*_LOOKED_UP, "to_uv")
+            looked_up |= {key: own.props[key] for key in names if key in own.props}
+        picture = np.array(strength, np.float32) * light.pattern.sampled()
         texture = _bitmap(scene, folder / _LIGHTS / f"{stem}.exr", picture, colour=True)
-        for key in ("wrap_mode", "filter_type"):  # it is looked up as the lamp's own one
-            said = None if own is None else own.props.get(key, None)
-            scene.state.nodes[texture].props[key] = said or _LOOKED_UP[key]
-        props[STRENGTHS[light.plugin]] = mi.Properties.ResolvedReference(texture)
+        # Nodes are others once one was appended
+        for key, value in looked_up.items():
+            scene.state.nodes[texture].props[key] = value
+        lit = scene.state.nodes[light.node].props
+        lit[STRENGTHS[light.plugin]] = mi.Properties.ResolvedReference(texture)
     stems = file_names([one.atlas.name for one in baked])
     copies = _own_bsdfs(scene, baked)
     for stem, one, copied in zip(stems, baked, copies, strict=True):

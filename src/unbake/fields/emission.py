@@ -21,6 +21,11 @@ class Pattern(Protocol):
     def texture(self) -> mi.Texture:
         """What it looks into."""
 
+    @property
+    def sampled_by_it(self) -> bool:
+        """Whether the lamp is sampled by texture coordinates."""
+        ...
+
     def relative(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """Factors of the strength at points, linear RGB; their mean is 1."""
 
@@ -126,7 +131,8 @@ def emission_textures(emission: Emission) -> list[mi.Texture]:
             return mi.luminance(dr.gather(mi.Color3f, emission.values, mi.UInt32(self.number)))
 
         def is_spatially_varying(self):
-            return self.texture is not None
+            # A mesh would be looked up in a scene of its own, of which no frozen function knows.
+            return self.pattern is not None and self.pattern.sampled_by_it
 
         def to_string(self):
             return f"Strength[{self.number}]"

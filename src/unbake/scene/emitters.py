@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import drjit as dr
@@ -32,6 +32,8 @@ STRENGTHS = {
 
 #: Rows of directions in which an environment is looked at: with a sun, and at most.
 _SUN_ROWS, _MOST_ROWS = 4096, 8192
+#: Shapes with texture coordinates that are no meshes.
+_NO_MESHES = ("rectangle", "disk", "sphere", "cylinder")
 #: Rows and columns in which pictures of lamps are looked at that have no texels.
 _ROWS = 512
 #: In which surfaces are looked for from a point or a spot.
@@ -56,10 +58,13 @@ class Picture:
     Args:
         texture: of linear RGB.
         mean: over texture coordinates from 0 to 1, linear RGB.
+        sampled_by_it: whether the lamp is sampled by its texture coordinates. Samples of a mesh
+            know them anyway, those of spheres and cylinders do not.
     """
 
     texture: mi.Texture
     mean: tuple[float, float, float]
+    sampled_by_it: bool = True
 
     def relative(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """What it is at points, over its mean; 1 in channels whose mean is 0."""
@@ -70,11 +75,17 @@ class Picture:
         return dr.select(known, found, 1)
 
     def sampled(self) -> np.ndarray:
-        """The relative picture, float32, shape (rows, columns, 3), as bitmaps have it."""
-        data = mi.traverse(self.texture)
-        rows, columns = data["data"].shape[:2] if "data" in data else (_ROWS, _ROWS)
-        found = self.relative(_at_texels(rows, columns), mi.Bool(True))
-        return np.array(found).T.reshape(rows, columns, 3).astype(np.float32)
+        """The relative picture, float32, shape (rows, columns, 3).
+
+        Of a bitmap they are its own texels, before it is placed by `to_uv`.
+        """
+        texels = _texels(self.texture)
+        if texels is None:
+            found = np.array(self.relative(_at_texels(_ROWS, _ROWS), mi.Bool(True)))
+            return found.T.reshape(_ROWS, _ROWS, 3).astype(np.float32)
+        mean = np.array(self.mean)
+        found = np.where(mean > 0, texels / np.where(mean > 0, mean, 1), 1)
+        return found.astype(np.float32)
 
 
 def named_emitters(scene: ParsedScene) -> list[NamedEmitter]:
@@ -93,8 +104,21 @@ def named_emitters(scene: ParsedScene) -> list[NamedEmitter]:
 
 def pictures(scene: ParsedScene) -> list[Picture | None]:
     """The pictures of emitters, in the order of `named_emitters`; None: one colour, or unknown."""
-    textures = (_texture(scene, scene.state.nodes[i].props) for i in emitter_nodes(scene))
-    return [_picture(texture) if texture.is_spatially_varying() else None for texture in textures]
+    carriers = {
+        shape.props[key].index(): shape.props.plugin_name()
+        for shape in scene.state.nodes
+        if shape.type == mi.ObjectType.Shape
+        for key in list(shape.props)
+        if is_reference(shape.props[key])
+    }
+    found: list[Picture | None] = []
+    for i in emitter_nodes(scene):
+        texture = _texture(scene, scene.state.nodes[i].props)
+        picture = _picture(texture) if texture.is_spatially_varying() else None
+        if picture is not None and carriers.get(i) not in _NO_MESHES:
+            picture = replace(picture, sampled_by_it=False)
+        found.append(picture)
+    return found
 
 
 def emitter_nodes(scene: ParsedScene) -> list[int]:
@@ -243,10 +267,25 @@ def _names(scene: ParsedScene, emitters: list[int]) -> list[str]:
 
 def _picture(texture: mi.Texture) -> Picture | None:
     """A texture with its mean; None where that is black."""
-    values = np.array(texture.eval(_at_texels(_ROWS, _ROWS))).reshape(-1, _ROWS**2)
-    red, green, blue = np.broadcast_to(values.mean(1, dtype=np.float64), 3).tolist()
+    texels, params = _texels(texture), mi.traverse(texture)
+    placed = "to_uv" in params and not np.allclose(np.array(params["to_uv"].matrix), np.eye(3))
+    if texels is None or placed:
+        side = _ROWS if texels is None else min(max(_ROWS, *texels.shape[:2]), _MOST_ROWS)
+        values = np.array(texture.eval(_at_texels(side, side))).reshape(-1, side**2).T
+    else:
+        values = texels.reshape(-1, 3)
+    red, green, blue = np.broadcast_to(values.mean(0, dtype=np.float64), 3).tolist()
     mean = (red, green, blue)
     return Picture(texture, mean) if max(mean) > 0 and np.isfinite(mean).all() else None
+
+
+def _texels(texture: mi.Texture) -> np.ndarray | None:
+    """The texels of a bitmap, linear RGB, shape (rows, columns, 3); None of other textures."""
+    params = mi.traverse(texture)
+    if "data" not in params:
+        return None
+    data = np.array(params["data"])
+    return np.broadcast_to(data[..., :3], (*data.shape[:2], 3))
 
 
 def _at_texels(rows: int, columns: int) -> mi.SurfaceInteraction3f:

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..dataset.pixels import CameraRays
+from ..dataset.views import fitted_pixels
 from ..fields.arrays import from_numpy
 from ..fields.envmap import to_square
 from .recovered import Recovered
@@ -69,21 +70,24 @@ def surroundings(recovered: Recovered, rows: int) -> Surroundings:
     """
     problem = recovered.problem
     scene, rays = problem.scene_view.scene, CameraRays.of(recovered.cameras)
+    counted = _counted(recovered)
     sampler = mi.load_dict({"type": "independent"})
     counts = np.zeros(_CELLS**2)
     with dr.suspend_grad():
         for number in range(_MOST_PASSES):
             sampler.seed(number, _RAYS)
-            pixel = mi.UInt32(dr.minimum(sampler.next_1d() * rays.pixels, rays.pixels - 1))
+            count = rays.pixels if counted is None else dr.width(counted)
+            pixel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
+            if counted is not None:
+                pixel = dr.gather(mi.UInt32, counted, pixel)
             ray = rays.through(pixel, sampler.next_2d())
-            met = scene.ray_intersect(ray)
-            outside = ~met.is_valid()
+            met, outside = _followed(scene, ray, mi.Bool(True))
             if problem.hide_emitters:  # photographs do not show it
                 outside = mi.Bool(False)
             local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
             local.z = dr.mulsign(local.z, mi.Frame3f.cos_theta(met.wi))
             bounced = met.spawn_ray(met.to_world(local))
-            free = outside | _leaves(scene, bounced, met.is_valid())
+            free = outside | _followed(scene, bounced, met.is_valid())[1]
             d = dr.select(outside, ray.d, bounced.d)
             cell = np.array(_cell(d))[np.array(free)]
             counts += np.bincount(cell, minlength=len(counts))
@@ -104,9 +108,27 @@ def _cell(d: mi.Vector3f) -> mi.UInt32:
     return place.y * _CELLS + place.x
 
 
-def _leaves(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Whether rays leave the scene, straight through what lets light pass."""
+def _counted(recovered: Recovered) -> mi.UInt32 | None:
+    """The numbers of the pixels that were fitted, of all training views; None: all."""
+    views, background = recovered.dataset.train, recovered.dataset.background
+    fitted = [fitted_pixels(view, background) for view in views]
+    if all(counted is None for counted in fitted):
+        return None
+    numbers, first = [], 0
+    for view, counted in zip(views, fitted, strict=True):
+        size = view.camera.width * view.camera.height
+        own = np.arange(size) if counted is None else np.flatnonzero(counted)
+        numbers.append(first + own)
+        first += size
+    return from_numpy(mi.UInt32, np.concatenate(numbers).astype(np.uint32))
+
+
+def _followed(
+    scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Bool]:
+    """Where rays end, straight through what lets light pass, and whether they leave the scene."""
     free, active = mi.Bool(False), mi.Bool(active)
+    end = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
     for _ in range(_PASSED):
         hit = scene.ray_intersect(ray, active)
         met = active & hit.is_valid()
@@ -114,9 +136,10 @@ def _leaves(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
         flags = hit.bsdf().flags()
         passes = mi.has_flag(flags, mi.BSDFFlags.Null)
         passes |= mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+        end = dr.select(met & ~passes, hit, end)
         active = met & passes
         ray = hit.spawn_ray(ray.d)
-        dr.eval(free, active, ray)
+        dr.eval(free, active, ray, end)
         if not dr.any(active):
             break
-    return free
+    return end, free
