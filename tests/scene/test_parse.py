@@ -13,6 +13,7 @@ from unbake.scene import parse as scenes
 from unbake.scene.edit import material_names, require_optimized
 from unbake.scene.emitters import named_emitters
 from unbake.scene.free_space import surface_area
+from unbake.transport.vertex import rays_behind_area_emitters
 
 
 @pytest.fixture
@@ -368,3 +369,18 @@ def test_spectra_in_parts_that_nothing_uses_do_not_matter(parse):
     bands = '<spectrum type="regular" name="band"/>'
     film = f'<sensor type="perspective"><film type="specfilm">{bands}</film></sensor>'
     parse(BALL.format(DIFFUSE) + film).instantiate()
+
+
+def test_a_scene_of_rectangles_alone_has_no_shape_that_no_ray_knows(tmp_path):
+    """What was merged is empty then; where lamps are hidden, its surface was asked for."""
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><shape type="rectangle" id="floor"><bsdf type="diffuse"/></shape>'
+        '<shape type="rectangle" id="lamp"><transform name="to_world"><translate z="1"/>'
+        '</transform><emitter type="area"/></shape></scene>'
+    )
+    scene = scenes.parse(path).instantiate()
+    assert len(scene.shapes()) == 2
+    ray = mi.Ray3f(mi.Point3f([0, 0.5], 0, 5), mi.Vector3f(0, 0, -1))
+    moved = rays_behind_area_emitters(scene, ray)
+    np.testing.assert_allclose(np.array(moved.o)[2], 1, atol=1e-3)

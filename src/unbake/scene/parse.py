@@ -129,6 +129,11 @@ class ParsedScene:
                 root[f"rectangle {key}"] = merged[key]
                 del merged[key]
         every = list(merged)
+        if not every:  # a shape of its own would stay, of which no ray knows
+            for key in list(root):
+                if is_reference(root[key]) and root[key].index() == len(nodes) - 1:
+                    del root[key]
+            return
         inward = [k for k in every if nodes[merged[k].index()].props.get("flip_normals", False)]
         if not 0 < len(inward) < len(every):
             return
