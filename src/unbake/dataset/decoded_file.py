@@ -25,7 +25,8 @@ from .clipped_noise import BRIGHT
 from .clipped_noise import RADIUS as BLACK_RADIUS
 from .data_folder import DataFolder
 from .decoding import PEAK, RADIUS, WITH_BLURRED, Decoded, Plan, Totals
-from .views import JPEG, may_ring
+from .image_files import JPEG
+from .views import may_ring
 
 #: Share of the free memory up to which the system is to read ahead in a mapped file.
 _FITTING = 0.5

@@ -17,7 +17,7 @@ from .clipped_noise import without_clipped_noise
 from .hot_pixels import without_hot_pixels
 from .image_files import PIXEL_BYTES
 from .shares import dealt
-from .views import Dataset, SensorNoise, View, fitted, may_ring, read_masked
+from .views import Dataset, SensorNoise, View, fitted, leaves_out, read_masked
 
 #: Linear RGB; and the same of the photograph blurred, where a fit asks for it.
 COLUMNS, WITH_BLURRED = 3, 6
@@ -112,8 +112,7 @@ class Plan:
     @property
     def chooses(self) -> bool:
         """Whether there are pixels that are not trained on, in any view."""
-        views = self.dataset.train
-        return self.hidden or any(view.mask is not None or may_ring(view) for view in views)
+        return self.hidden or any(leaves_out(view) for view in self.dataset.train)
 
     def decode_into(
         self,

@@ -19,8 +19,8 @@ ENCODINGS = ("linear", "srgb")
 
 _LDR_SUFFIXES = (*CODED_SUFFIXES, ".bmp", ".tga", ".webp", ".gif", ".ppm")
 _MOST_CHANNELS = 4
-#: Suffixes of formats that change pixels.
-_LOSSY = (".jpg", ".jpeg")
+#: Suffixes of JPEG files, which change pixels.
+JPEG = (".jpg", ".jpeg")
 _OTHER_CHANNELS = "the image has other channels than RGB and alpha"
 #: Memory in bytes that takes part in decoding a pixel, blurring it included.
 PIXEL_BYTES = 100
@@ -97,7 +97,7 @@ def counted_in(path: Path, remedy: str = REPLACE) -> np.ndarray:
         UserError: it cannot be read.
     """
     codes = read_codes(path, remedy)
-    if path.suffix.lower() in _LOSSY:
+    if path.suffix.lower() in JPEG:
         codes = np.where(codes > np.iinfo(codes.dtype).max // 2, codes, 0)
     return counted_by(codes)
 

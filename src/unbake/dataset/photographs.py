@@ -26,7 +26,7 @@ from .image_files import PIXEL_BYTES
 from .noise_at_black import found_noise
 from .shares import Share
 from .spread import places
-from .views import Dataset, SensorNoise, may_ring
+from .views import Dataset, SensorNoise, leaves_out
 
 #: Photographs of a process that take more than this, in bytes, are not held in memory but in a file
 #: of the data set's folder, of which the system keeps in memory what it has room for.
@@ -218,7 +218,7 @@ class Photographs:
             dataset = replace(dataset, views=tuple(views))
         plan = Plan.of(dataset, clip_negative, WITH_BLURRED if smoothed else COLUMNS, ranks.size)
         found = ranks.together(lambda: _loaded(plan, ranks.rank, ranks.here), math.inf)
-        masked = any(view.mask is not None or may_ring(view) for view in dataset.train)
+        masked = any(leaves_out(view) for view in dataset.train)
         if ranks.size == 1:
             return _with_level(replace(_made(found, noise), masked=masked))
         every = [Totals(**own) for own in ranks.gather(asdict(found.totals))]

@@ -13,10 +13,11 @@ import numpy as np
 from unbake.dataset.camera import Camera
 from unbake.dataset.camera_files import camera_from_frame, frame_of, read_split
 from unbake.dataset.data_folder import DataFolder
-from unbake.dataset.image_files import ENCODINGS, check_header, counted_in, read_image
+from unbake.dataset.image_files import ENCODINGS, JPEG, check_header, counted_in, read_image
 from unbake.dataset.scene_kind import SceneKind, scene_kind
 from unbake.errors import UserError, collected, raise_together
 from unbake.imaging.headers import CODED_SUFFIXES, HeaderError, read_header
+from unbake.imaging.windows import along
 from unbake.io import number, require_file, text
 from unbake.quantities import QUANTITIES
 from unbake.transport.light_by_depth import depth_of_light, light_of_depth
@@ -27,8 +28,7 @@ LIGHTS = ("known", "unknown")
 #: A key of `render`: false where the scene has lost the materials that it was rendered with.
 TRUE_MATERIALS = "true_materials"
 
-#: Suffixes of JPEG files, and of all images that cannot hold alpha.
-JPEG = (".jpg", ".jpeg")
+#: Suffixes of images that cannot hold alpha.
 _OPAQUE = (*JPEG, ".hdr", ".rgbe", ".pfm")
 #: Least and greatest exposure, and value at which a photograph is clipped.
 MEASURABLE = (1e-12, 1e12)
@@ -349,6 +349,11 @@ def fitted(
     return counted
 
 
+def leaves_out(view: View) -> bool:
+    """Whether pixels of a photograph may not be fitted, whatever the background is."""
+    return view.mask is not None or may_ring(view)
+
+
 def may_ring(view: View) -> bool:
     """Whether a photograph may be wrong beside what is clipped in it: JPEG files may."""
     return view.clipped is not None and view.image.suffix.lower() in JPEG
@@ -367,13 +372,9 @@ def _ringing(photograph: np.ndarray, limit: float | None) -> np.ndarray:
     clipped = photograph >= np.float32(np.inf if limit is None else limit)
     if not clipped.any():
         return np.zeros(photograph.shape[:2], bool)
-    near = clipped.copy()
-    for axis in range(2):
-        wide = near.copy()
-        for to, of in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
-            at = (slice(None),) * axis
-            wide[(*at, to)] |= near[(*at, of)]
-        near = wide
+    near = clipped
+    for axis in (0, 1):
+        near = np.logical_or.reduce(list(along(near, axis, 1)))
     return (near & ~clipped).any(axis=2)
 
 

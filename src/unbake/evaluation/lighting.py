@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..dataset.lighting import true_emission
+from ..fields.envmap import solid_angles
 from ..imaging.metrics import psnr
 from ..training.problem import Problem
 
@@ -123,7 +124,7 @@ def sh_coefficients(image: np.ndarray) -> np.ndarray:
 
     θ is measured from the image's top, φ from its left edge; no Condon–Shortley phase.
     """
-    weighted = image * _solid_angles(len(image))[..., None]
+    weighted = image * solid_angles(len(image))[..., None]
     return np.einsum("khw,hwc->kc", _sh_basis(len(image)), weighted)
 
 
@@ -169,12 +170,6 @@ def relit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _relative_error(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(found - truth) / max(np.linalg.norm(truth), DARK))
-
-
-def _solid_angles(rows: int) -> np.ndarray:
-    """Solid angles of a map's texels, (rows, 2 rows); the first and the last row are the poles."""
-    edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0, 1))
-    return np.repeat((edges[:-1] - edges[1:])[:, None] * np.pi / rows, 2 * rows, 1)
 
 
 def _sh_basis(rows: int) -> np.ndarray:

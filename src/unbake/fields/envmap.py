@@ -235,6 +235,12 @@ def latlong(radiance: Callable[[mi.Vector3f], mi.Color3f], height: int, samples:
     return (picture / samples**2).astype(np.float32).reshape(height, 2 * height, 3)
 
 
+def solid_angles(rows: int) -> np.ndarray:
+    """Those of pixels of `latlong`, (rows, 2 rows); the first and the last row are the poles."""
+    edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0, 1))
+    return np.repeat((edges[:-1] - edges[1:])[:, None] * np.pi / rows, 2 * rows, 1)
+
+
 # --------------------------------------------------------------------------------- the square
 
 

@@ -104,18 +104,13 @@ def named_emitters(scene: ParsedScene) -> list[NamedEmitter]:
 
 def pictures(scene: ParsedScene) -> list[Picture | None]:
     """The pictures of emitters, in the order of `named_emitters`; None: one colour, or unknown."""
-    carriers = {
-        shape.props[key].index(): shape.props.plugin_name()
-        for shape in scene.state.nodes
-        if shape.type == mi.ObjectType.Shape
-        for key in list(shape.props)
-        if is_reference(shape.props[key])
-    }
+    carriers = _carriers(scene)
     found: list[Picture | None] = []
     for i in emitter_nodes(scene):
         texture = _texture(scene, scene.state.nodes[i].props)
         picture = _picture(texture) if texture.is_spatially_varying() else None
-        if picture is not None and carriers.get(i) not in _NO_MESHES:
+        shape = carriers.get(i)
+        if picture is not None and (shape is None or shape.plugin_name() not in _NO_MESHES):
             picture = replace(picture, sampled_by_it=False)
         found.append(picture)
     return found
@@ -248,13 +243,12 @@ def require_emitters(scene: mi.Scene, path: Path) -> None:
 
 def _names(scene: ParsedScene, emitters: list[int]) -> list[str]:
     """A unique name for each of these nodes."""
-    nodes, shapes = scene.state.nodes, {}
-    for shape in (n for n in nodes if n.type == mi.ObjectType.Shape):
-        for key in list(shape.props):
-            if is_reference(shape.props[key]):
-                # Shapes need no id, and data sets of earlier versions have lost theirs.
-                file = str(shape.props.get("filename", ""))
-                shapes[shape.props[key].index()] = shape.props.id() or Path(file).stem
+    nodes = scene.state.nodes
+    # Shapes need no id, and data sets of earlier versions have lost theirs.
+    shapes = {
+        i: props.id() or Path(str(props.get("filename", ""))).stem
+        for i, props in _carriers(scene).items()
+    }
     names = [
         nodes[i].props.id() or shapes.get(i) or f"{nodes[i].props.plugin_name()} light"
         for i in emitters
@@ -263,6 +257,17 @@ def _names(scene: ParsedScene, emitters: list[int]) -> list[str]:
         name if names.count(name) == 1 else f"{name} {names[: i + 1].count(name)}"
         for i, name in enumerate(names)
     ]
+
+
+def _carriers(scene: ParsedScene) -> dict[int, mi.Properties]:
+    """The shapes that refer to nodes, such as to emitters, by the indices of these."""
+    return {
+        shape.props[key].index(): shape.props
+        for shape in scene.state.nodes
+        if shape.type == mi.ObjectType.Shape
+        for key in list(shape.props)
+        if is_reference(shape.props[key])
+    }
 
 
 def _picture(texture: mi.Texture) -> Picture | None:

@@ -16,7 +16,7 @@ import numpy as np
 from ..dataset.pixels import CameraRays
 from ..dataset.views import fitted_pixels
 from ..fields.arrays import from_numpy
-from ..fields.envmap import to_square
+from ..fields.envmap import latlong, solid_angles, to_square
 from .recovered import Recovered
 
 #: Cells along an edge of the square that stands for all directions, each of the same solid angle.
@@ -47,9 +47,7 @@ class Surroundings:
     @property
     def share(self) -> float:
         """Of all directions, those that are told, by solid angle."""
-        rows = len(self.lit)
-        edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0, 1))
-        return float(np.average(self.lit.mean(1), weights=edges[:-1] - edges[1:]))
+        return float(np.average(self.lit, weights=solid_angles(len(self.lit))))
 
     @property
     def note(self) -> str | None:
@@ -71,12 +69,12 @@ def surroundings(recovered: Recovered, rows: int) -> Surroundings:
     problem = recovered.problem
     scene, rays = problem.scene_view.scene, CameraRays.of(recovered.cameras)
     counted = _counted(recovered)
+    count = rays.pixels if counted is None else dr.width(counted)
     sampler = mi.load_dict({"type": "independent"})
     counts = np.zeros(_CELLS**2)
     with dr.suspend_grad():
         for number in range(_MOST_PASSES):
             sampler.seed(number, _RAYS)
-            count = rays.pixels if counted is None else dr.width(counted)
             pixel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
             if counted is not None:
                 pixel = dr.gather(mi.UInt32, counted, pixel)
@@ -94,12 +92,9 @@ def surroundings(recovered: Recovered, rows: int) -> Surroundings:
             if counts.sum() >= _ENOUGH:
                 break
     lit = counts >= max(_FEWEST, _LEAST * counts.mean())
-    lane = np.arange(2 * rows * rows)
-    φ = (lane % (2 * rows) + 0.5) * (np.pi / rows)
-    θ = lane // (2 * rows) * (np.pi / (rows - 1))
-    d = np.stack([np.sin(φ) * np.sin(θ), np.cos(θ), -np.cos(φ) * np.sin(θ)])
-    found = np.array(_cell(mi.Vector3f(*(from_numpy(mi.Float, x.astype(np.float32)) for x in d))))
-    return Surroundings(lit[found].reshape(rows, 2 * rows))
+    table = from_numpy(mi.Float, lit.astype(np.float32))
+    picture = latlong(lambda d: mi.Color3f(dr.gather(mi.Float, table, _cell(d))), rows, 1)
+    return Surroundings(picture[..., 0] > 0)
 
 
 def _cell(d: mi.Vector3f) -> mi.UInt32:
