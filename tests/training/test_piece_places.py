@@ -3,22 +3,32 @@
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from searches import SEARCH, SMALL, made_up
 from support import of_format
 
 from unbake.config import FitConfig, from_toml, to_toml
-from unbake.fields.field import FieldSpec, holding
+from unbake.fields.arrays import from_numpy
+from unbake.fields.field import FieldSpec, PlaceNumbers, holding
 from unbake.fields.network import Network
 from unbake.training import piece_places
-from unbake.training.piece_places import SHIFTS, _Cells, _first_half, expected_places
+from unbake.training.piece_places import (
+    SHIFTS,
+    _Cells,
+    _first_half,
+    _shares,
+    _solved,
+    expected_places,
+)
 from unbake.training.piece_variation import with_all_variation
-from unbake.training.roughness_curves import Curves, points, roughness_of
+from unbake.training.roughness_curves import Curves, of_roughness, points, roughness_of
 from unbake.training.roughness_search import averaged, searched
 
 PLACED = replace(SMALL, pieces=replace(SMALL.pieces, places=4, variation=True))
 NOISE = 0.02
+GENTLE_NOISE = 0.06
 #: The test has less noise than photographs: pixels count one by one, and albedo is as it should be.
 SURE = replace(SEARCH, pixels_as_one=1.0, place_cells=1, cells=1)
 
@@ -119,9 +129,82 @@ def test_the_smallest_error_is_found_beyond_a_hump():
     curve = 100 - 60 * np.exp(-(((SHIFTS - valley) / 0.3) ** 2))
     curve += 20 * np.exp(-(((SHIFTS - valley / 2) / 0.3) ** 2))
     of_cell = cells.sums(list(curve.T), np.ones(400, bool))
-    _, shifts = cells.solved([of_cell])
+    _, shifts = _solved(cells.lattices, [of_cell])
     far = shifts[0, -1, cells.of_pixel]
     assert np.mean(np.abs(far - valley[:, 0]) < 0.4) > 0.8
+
+
+def test_a_gentle_change_is_found_that_lattices_would_lose_in_noise():
+    """Roughness rises from one end of a piece to the other, seen by few noisy pixels."""
+    rows, rng = made_up(1500), np.random.default_rng(0)
+    rows["piece"], rows["position"][:, 1] = 0, 0.3
+    rows["position"][:, [0, 2]] = 0.2 + 0.5 * rng.uniform(0, 1, (len(rows), 2))
+    true = 0.1 + 0.8 * rows["position"][:, 0]
+    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
+    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] += GENTLE_NOISE * rng.standard_normal((len(rows), 3))
+    rows["weight"] = GENTLE_NOISE**-2
+    field = field_of()
+    roughness = values(field, found_of(field, rows), rows)
+    assert np.std(true) > 0.1
+    # With numbers on lattices alone it is 0.025.
+    assert np.std(roughness - true) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [((0, 0, 0), (1, 1, 1)), ((0.1, 0.3, 0.2), (0.8, 0.3, 0.7))]
+)
+def test_what_is_told_around_a_piece_is_the_same_on_the_finest_lattice(low, high):
+    """Whether the piece fills the scene or is flat; and so it is read from the field."""
+    rng, rows = np.random.default_rng(0), made_up(3000)
+    rows["position"], rows["piece"] = rng.uniform(low, high, (len(rows), 3)), 0
+    cells = _Cells.of(np.zeros(len(rows), int), rows["position"].astype(float), (4, 8, 16))
+    numbers = rng.standard_normal((3, len(cells.around.piece)))
+    around = (numbers[:, cells.around.place] * cells.around.share).sum(2)
+    *others, finest = cells.as_lattices(numbers)
+    lattice = cells.lattices[-1]
+    np.testing.assert_allclose((finest[:, lattice.place] * lattice.share).sum(2), around, atol=1e-9)
+    assert around.std() > 0.1 and not any(x.any() for x in others)
+    field = field_of()
+    levels = [
+        PlaceNumbers(
+            dr.zeros(mi.UInt32, len(x.piece)),
+            mi.Point3u([from_numpy(mi.UInt32, c.astype(np.uint32)) for c in x.corner.T]),
+            [
+                from_numpy(
+                    mi.Float, (0 * x.piece if x is not lattice else finest[0]).astype(np.float32)
+                )
+            ],
+        )
+        for x in cells.lattices
+    ]
+    where = (rows["position"] - cells.low[0]) / cells.size[0]
+    expected = _shares(where) @ numbers[0]
+    changed = logits(values(field, field.placed(levels), rows)) - logits(values(field, {}, rows))
+    # Corners that share a place in the table have no number: more of them where there are more.
+    wrong = np.abs(changed - expected) > 1e-3
+    assert wrong.mean() < (0.02 if low[1] == high[1] else 0.15)
+    assert np.median(np.abs(changed - expected)) < 1e-5
+
+
+def logits(roughness):
+    inside = np.array(of_roughness(np.array(roughness)))
+    return np.log(inside / (1 - inside))
+
+
+def test_small_pieces_have_one_roughness_from_end_to_end():
+    """Numbers of corners far away would be large: no way around a small piece is probable."""
+    rng = np.random.default_rng(0)
+    where = np.concatenate([rng.uniform(0.4, 0.45, (300, 3)), rng.uniform(0, 1, (300, 3))])
+    cells = _Cells.of(np.repeat([0, 1], 300), where, (4, 8))
+    rows = made_up(600)
+    rows["piece"], rows["position"] = np.repeat([0, 1], 300), where
+    rows["target"], rows["weight"] = rows["plain"][:, 4] + rows["coloured"][:, 4], 1.0
+    half = np.arange(600) % 2 == 0
+    parts = [(x, Curves.of(rows[x], 4, 6, True)) for x in (half, ~half, np.ones(600, bool))]
+    numbers, changes = cells.told(parts, np.zeros(600), np.ones(2))
+    assert [len(x) for x in numbers] == [6, 6] and changes.shape == (2, 6)
+    assert np.isinf(changes[0, 3:]).all() and np.isfinite(changes[1]).all()
 
 
 def test_colours_leave_to_places_what_is_theirs():

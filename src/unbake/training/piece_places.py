@@ -3,14 +3,16 @@
 Most pieces have one roughness, or one for each of their colours. Where a texture of roughness has
 a pattern of its own, photographs tell it in patches of many pixels. So after a descent each piece
 gets numbers on lattices over the scene's cube: those that are most probable where they are expected
-to differ by some spread, and less on finer lattices.
+to differ by some spread, and less on finer lattices. Or roughness goes gently from one end of a
+piece to the other. Many pixels tell such a change by few numbers: those at the corners of a cube
+around the piece.
 
 Noise of the photographs looks like such a pattern, too. So the pixels are dealt into two halves,
-and what one half says of a piece, with each spread, is asked of the other one, and held against no
-change and against one shift of the whole piece, whichever is better. A pixel that was drawn twice
-is in one half, with the noise of its photograph; factors of albedo are of each half by itself. With
-this evidence, and with `no_places`, follows how probable each spread is, and the numbers that are
-to be expected. Few pieces need numbers; the others have none.
+and what one half says of a piece, in each way and with each spread, is asked of the other one, and
+held against no change and against one shift of the whole piece, whichever is better. A pixel that
+was drawn twice is in one half, with the noise of its photograph; factors of albedo are of each half
+by itself. With this evidence, and with `no_places`, follows how probable each of them is, and the
+numbers that are to be expected. Few pieces need numbers; the others have none.
 
 Within a patch roughness may be what it is in no other one, and albedo has adapted to it: so it has
 its factors in smaller cells here than for the descent (`place_cells`).
@@ -41,6 +43,8 @@ SHIFTS = np.linspace(-3, 3, 25)
 SPREADS, _FINER = np.array([0.25, 0.6, 1.5]), 0.6
 #: Cells along the cube, in each of which pixels of a piece are taken together.
 _CELLS = 32
+#: A smaller piece, by the edge of the cube around it, has one roughness from end to end.
+_LEAST_SIZE = 1 / 8
 #: Steps of Adam, their rate, and the part of it that is left at the end.
 _STEPS, _RATE, _FINAL_RATE = 60, 0.2, 0.05
 #: Pieces whose numbers are less probable than that have none.
@@ -80,31 +84,19 @@ def expected_places(
     (outputs,) = seen.outputs
     where = rows["position"].astype(np.float64)
     cells = _Cells.of(seen.piece_of, where, field.place_cells)
-
-    def errors(chosen: np.ndarray) -> np.ndarray:
-        curves = Curves.of(rows[chosen], settings.place_cells, settings.colours, albedo)
-        here = outputs[chosen]
-        return cells.sums([errors_of(curves, here + shift) for shift in SHIFTS], chosen)
-
     # Factors of albedo are of each half by itself, or one would know of the other.
-    *halves, both = (errors(chosen) for chosen in (first, ~first, np.ones_like(first)))
-    less = as_one(seen.pixels, settings)[cells.piece, None]
-    numbers, shifts = cells.solved([table / less for table in (*halves, both)])
-    # What one half has found is asked of the other one.
-    asked = np.zeros((len(seen.pixels), len(SPREADS)))  # `chances` has them in units of `as_one`
-    for own, other, shift in zip(halves, halves[::-1], shifts[:2], strict=True):
-        by_place, alike, none = (
-            cells.of_pieces(_at(other, by))
-            for by in (shift, cells.level(own)[None], np.zeros((1, len(other))))
-        )
-        asked += by_place - np.minimum(alike, none)
-    prior = np.full(1 + len(SPREADS), (1 - settings.no_places) / len(SPREADS))
+    parts = [
+        (chosen, Curves.of(rows[chosen], settings.place_cells, settings.colours, albedo))
+        for chosen in (first, ~first, np.ones_like(first))
+    ]
+    numbers, changes = cells.told(parts, outputs, as_one(seen.pixels, settings))
+    prior = np.full(1 + changes.shape[1], (1 - settings.no_places) / changes.shape[1])
     prior[0] = settings.no_places
-    evidence = np.concatenate([np.zeros((len(asked), 1)), asked], 1)
+    evidence = np.concatenate([np.zeros((len(changes), 1)), changes], 1)  # in units of `as_one`
     probable = normalized(chances(evidence, seen.pixels, settings) * prior)[:, 1:]
     # A number that pieces share stands for none of them.
     sure = (probable.sum(1) > _SURE) & (np.array(seen.pieces.strength) > 0)
-    sure &= cells.fitting(np.where(sure, asked.min(1), np.inf))
+    sure &= cells.fitting(np.where(sure, changes.min(1), np.inf))
     if not sure.any():
         return field.placed(())
     number = np.array(seen.pieces.number)
@@ -127,6 +119,12 @@ def _first_half(rows: np.ndarray) -> np.ndarray:
     """
     pixels, of_pixel = np.unique(rows["target"], axis=0, return_inverse=True)
     return np.random.default_rng(_SEED).random(len(pixels))[of_pixel.ravel()] < 1 / 2
+
+
+def _shares(part: np.ndarray) -> np.ndarray:
+    """How much each corner of a cell has of points in it (n, 3), from 0 to 1, shape (n, 8)."""
+    corners = np.array(list(product((0, 1), repeat=3)))
+    return np.where(corners, part[:, None], 1 - part[:, None]).prod(2)
 
 
 def _at(table: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -157,15 +155,12 @@ class _Lattice:
         at = np.clip(where, 0, 1) * cells
         below = np.minimum(np.floor(at), cells - 1)
         part = at - below
-        keys, share = [], []
-        for offset in product((0, 1), repeat=3):
-            corner = below + np.array(offset)
-            keys.append(np.concatenate([piece[:, None], corner], 1).astype(np.int64))
-            share.append(np.where(offset, part, 1 - part).prod(1))
+        keys = [
+            np.concatenate([piece[:, None], below + np.array(offset)], 1).astype(np.int64)
+            for offset in product((0, 1), repeat=3)
+        ]
         every, place = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
-        return _Lattice(
-            every[:, 0], every[:, 1:], place.reshape(len(share), -1).T, np.stack(share, 1)
-        )
+        return _Lattice(every[:, 0], every[:, 1:], place.reshape(len(keys), -1).T, _shares(part))
 
 
 @dataclass(frozen=True)
@@ -175,12 +170,19 @@ class _Cells:
     Args:
         piece: of each cell, from 0.
         of_pixel: the cell of each pixel.
-        lattices: coarsest first.
+        lattices: of the field, coarsest first.
+        counts: cells along the cube of each of them.
+        around: the corners of a cube around each piece.
+        low, size: where that cube is, shape (pieces, 3), and how large, shape (pieces, 1).
     """
 
     piece: np.ndarray
     of_pixel: np.ndarray
     lattices: list[_Lattice]
+    counts: tuple[int, ...]
+    around: _Lattice
+    low: np.ndarray
+    size: np.ndarray
 
     @staticmethod
     def of(piece: np.ndarray, where: np.ndarray, lattices: tuple[int, ...]) -> _Cells:
@@ -192,7 +194,16 @@ class _Cells:
         middle = np.stack([np.bincount(of_pixel, x) for x in where.T], 1)
         middle /= np.bincount(of_pixel)[:, None]
         own = every[:, 0]
-        return _Cells(own, of_pixel, [_Lattice.of(own, middle, n) for n in lattices])
+        low = np.full((own[-1] + 1, 3), np.inf)
+        high = -low
+        np.minimum.at(low, own, middle)
+        np.maximum.at(high, own, middle)
+        # Its edges are equal, or noise across a flat piece would look like a change along it.
+        size = np.maximum((high - low).max(1, keepdims=True), 1 / _CELLS)
+        low = (low + high - size) / 2
+        around = _Lattice.of(own, (middle - low[own]) / size[own], 1)
+        of_field = [_Lattice.of(own, middle, n) for n in lattices]
+        return _Cells(own, of_pixel, of_field, lattices, around, low, size)
 
     def sums(self, columns: list[np.ndarray], chosen: np.ndarray) -> np.ndarray:
         """Sums over the chosen pixels of each cell, of columns of these pixels."""
@@ -202,6 +213,76 @@ class _Cells:
     def of_pieces(self, columns: np.ndarray) -> np.ndarray:
         """Sums over the cells of each piece, shape (pieces, columns); columns (columns, cells)."""
         return np.stack([np.bincount(self.piece, column) for column in columns], 1)
+
+    def told(
+        self,
+        parts: list[tuple[np.ndarray, Curves]],
+        outputs: np.ndarray,
+        pixels_as_one: np.ndarray,
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """What two halves of the pixels tell of places, and how well.
+
+        Args:
+            parts: the first half, the other one, and all pixels: which they are, and their curves.
+            outputs: of pixels before their bounds as nothing differs by place, shape (n,).
+            pixels_as_one: of each piece.
+
+        Returns:
+            Of each of the field's lattices the numbers by all pixels, shape (ways, corners), and
+            by how much each way changes the error of each piece, shape (pieces, ways). A way is one
+            of two kinds of corners, those of the lattices or those of `around`, and one of
+            `SPREADS`.
+        """
+        *halves, both = (
+            self.sums([errors_of(curves, outputs[chosen] + shift) for shift in SHIFTS], chosen)
+            for chosen, curves in parts
+        )
+        scaled = [table / pixels_as_one[self.piece, None] for table in (*halves, both)]
+        without = self.without(halves)
+
+        def changed(shifts: np.ndarray) -> np.ndarray:
+            # What one half has found is asked of the other one.
+            asked = [_at(*pair) for pair in zip(halves[::-1], shifts[:2], strict=True)]
+            return self.of_pieces(np.sum(asked, axis=0)) - without
+
+        by_lattices, shifts = _solved(self.lattices, scaled)
+        (around,), gentle = _solved([self.around], scaled)
+        numbers = [
+            np.concatenate(each) for each in zip(by_lattices, self.as_lattices(around), strict=True)
+        ]
+        # Beside what is small, corners of lattices are far away.
+        gently = np.where(self.size < _LEAST_SIZE, np.inf, changed(gentle))
+        return numbers, np.concatenate([changed(shifts), gently], 1)
+
+    def without(self, halves: list[np.ndarray]) -> np.ndarray:
+        """Errors of pieces that differ by no place, shape (pieces, 1).
+
+        Each half is asked of no change, and of the shift of the whole piece that the other one has
+        found. The better one counts.
+
+        Args:
+            halves: errors of cells at `SHIFTS`, shape (cells, shifts).
+        """
+        pairs = zip(halves, halves[::-1], strict=True)
+        shifts = [(other, self.level(own)) for own, other in pairs]
+        errors = [(_at(other, by), _at(other, np.zeros_like(by))) for other, by in shifts]
+        better = [self.of_pieces(np.array(each)).min(1, keepdims=True) for each in errors]
+        return np.sum(better, axis=0)
+
+    def as_lattices(self, numbers: np.ndarray) -> list[np.ndarray]:
+        """Numbers at the corners of `around` as such of the field's lattices.
+
+        What is trilinear over the whole of a piece is so between corners of any lattice. The finest
+        one has it all: where two of its corners share a place in the table, little is lost.
+
+        Args:
+            numbers: shape (spreads, corners).
+        """
+        finest = self.lattices[-1]
+        where = finest.corner / self.counts[-1]
+        share = _shares((where - self.low[finest.piece]) / self.size[finest.piece])
+        found = (share * numbers.reshape(len(numbers), -1, 8)[:, finest.piece]).sum(2)
+        return [*(np.zeros((len(numbers), len(x.piece))) for x in self.lattices[:-1]), found]
 
     def level(self, table: np.ndarray) -> np.ndarray:
         """By how much each cell is shifted if all of a piece are shifted alike, shape (cells,).
@@ -221,97 +302,77 @@ class _Cells:
         found = np.where(best == inner, SHIFTS[inner] + step * np.clip(part, -1, 1), SHIFTS[best])
         return found[self.piece]
 
-    def fitting(self, gains: np.ndarray) -> np.ndarray:
+    def fitting(self, changes: np.ndarray) -> np.ndarray:
         """Which pieces a table of numbers has room for, those first that tell the most of places.
 
         Args:
-            gains: the error of each piece with numbers less that with none, or one shift of it.
+            changes: of the error of each piece, by numbers instead of none or one shift of it.
         """
         every = np.concatenate([lattice.piece for lattice in self.lattices])
-        count = np.bincount(every, minlength=len(gains))
-        order = np.argsort(gains, kind="stable")
-        fits = np.zeros(len(gains), bool)
+        count = np.bincount(every, minlength=len(changes))
+        order = np.argsort(changes, kind="stable")
+        fits = np.zeros(len(changes), bool)
         fits[order[np.cumsum(count[order]) <= _MOST_CORNERS]] = True
         return fits
 
-    def solved(self, tables: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-        """The most probable numbers by errors of cells at `SHIFTS`, for each of `SPREADS`.
 
-        Args:
-            tables: shape (cells, shifts), each of other pixels, in units of their variance.
+def _solved(
+    lattices: list[_Lattice], tables: list[np.ndarray]
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """The most probable numbers by errors of cells at `SHIFTS`, for each of `SPREADS`.
 
-        Returns:
-            Of the last table, the numbers of each lattice, shape (spreads, corners); and how far
-            cells are shifted, shape (tables, spreads, cells).
-        """
-        jobs, count = len(tables) * len(SPREADS), len(self.piece)
-        every = np.concatenate(tables)
-        table = [
-            from_numpy(mi.Float, x.astype(np.float32)) for x in (every, np.gradient(every, axis=1))
-        ]
-        number = np.arange(jobs)[:, None]
-        row = number // len(SPREADS) * count + np.arange(count)
-        first = from_numpy(mi.UInt32, (row * len(SHIFTS)).astype(np.uint32))
-        starts = [self._one_by_one(table, spread) for table, spread in product(tables, SPREADS)]
-        corners, weights, places, shares = [], [], [], []
-        for level, lattice in enumerate(self.lattices):
-            size = len(lattice.piece)
-            start = np.concatenate([found[level] for found in starts])
-            corners.append(from_numpy(mi.Float, start.astype(np.float32)))
-            spread = np.tile(SPREADS * _FINER**level, len(tables))
-            weights.append(from_numpy(mi.Float, np.repeat(spread**-2.0, size).astype(np.float32)))
-            place = [number * size + k for k in lattice.place.T]
-            places.append([from_numpy(mi.UInt32, k.astype(np.uint32)) for k in place])
-            share = [np.tile(k, jobs) for k in lattice.share.T]
-            shares.append([from_numpy(mi.Float, k.astype(np.float32)) for k in share])
-        optimizer = mi.ad.Adam(_RATE, {str(i): x for i, x in enumerate(corners)})
+    Args:
+        lattices: whose corners have numbers, coarsest first.
+        tables: shape (cells, shifts), each of other pixels, in units of their variance.
 
-        def shift(numbers: Any) -> mi.Float:
-            found = mi.Float(0)
-            for level, (place, share) in enumerate(zip(places, shares, strict=True)):
-                for k, part in zip(place, share, strict=True):
-                    found = dr.fma(part, dr.gather(mi.Float, numbers[str(level)], k), found)
-            return found
+    Returns:
+        Of the last table, the numbers of each lattice, shape (spreads, corners); and how far
+        cells are shifted, shape (tables, spreads, cells).
+    """
+    jobs, count = len(tables) * len(SPREADS), len(tables[0])
+    every = np.concatenate(tables)
+    table = [
+        from_numpy(mi.Float, x.astype(np.float32)) for x in (every, np.gradient(every, axis=1))
+    ]
+    number = np.arange(jobs)[:, None]
+    row = number // len(SPREADS) * count + np.arange(count)
+    first = from_numpy(mi.UInt32, (row * len(SHIFTS)).astype(np.uint32))
+    starts = [_one_by_one(lattices, *job) for job in product(tables, SPREADS)]
+    corners, weights, places, shares = [], [], [], []
+    for level, lattice in enumerate(lattices):
+        size = len(lattice.piece)
+        start = np.concatenate([found[level] for found in starts])
+        corners.append(from_numpy(mi.Float, start.astype(np.float32)))
+        spread = np.tile(SPREADS * _FINER**level, len(tables))
+        weights.append(from_numpy(mi.Float, np.repeat(spread**-2.0, size).astype(np.float32)))
+        place = [number * size + k for k in lattice.place.T]
+        places.append([from_numpy(mi.UInt32, k.astype(np.uint32)) for k in place])
+        share = [np.tile(k, jobs) for k in lattice.share.T]
+        shares.append([from_numpy(mi.Float, k.astype(np.float32)) for k in share])
+    optimizer = mi.ad.Adam(_RATE, {str(i): x for i, x in enumerate(corners)})
 
-        for step in range(_STEPS):
-            rate = _RATE * _FINAL_RATE ** (step / _STEPS)
-            optimizer.set_learning_rate({key: dr.opaque(mi.Float, rate) for key in optimizer})
-            loss = dr.sum(_between(table, first, shift(optimizer)))
-            for level, weight in enumerate(weights):
-                loss += dr.sum(weight * dr.square(optimizer[str(level)]))
-            dr.backward(loss)
-            optimizer.step()
-        numbers = {key: dr.detach(x) for key, x in optimizer.items()}
-        shifts = np.array(shift(numbers)).reshape(len(tables), len(SPREADS), count)
-        last = [
-            np.array(numbers[str(i)]).reshape(len(tables), len(SPREADS), -1)[-1]
-            for i in range(len(corners))
-        ]
-        return last, shifts
-
-    def _one_by_one(self, table: np.ndarray, spread: float) -> list[np.ndarray]:
-        """Numbers that a descent starts from, one lattice after the other, coarsest first.
-
-        Curves may have several minima, and a descent ends at the nearest one. So each corner gets
-        the best number of all, by the cells around it and what coarser lattices say of them.
-
-        Args:
-            table: errors of cells at `SHIFTS`, shape (cells, shifts).
-            spread: of the coarsest lattice; that of each further one is `_FINER` times as large.
-        """
-        shift, found = np.zeros(len(table)), []
-        for level, lattice in enumerate(self.lattices):
-            errors = np.empty((len(lattice.piece), len(SHIFTS)))
-            for number, more in enumerate(SHIFTS):
-                share = lattice.share * _at(table, shift + more)[:, None]
-                errors[:, number] = np.bincount(
-                    lattice.place.ravel(), share.ravel(), len(lattice.piece)
-                )
-            prior = np.square(SHIFTS / (spread * _FINER**level))
-            best = SHIFTS[(errors + prior).argmin(1)]
-            shift = shift + (lattice.share * best[lattice.place]).sum(1)
-            found.append(best)
+    def shift(numbers: Any) -> mi.Float:
+        found = mi.Float(0)
+        for level, (place, share) in enumerate(zip(places, shares, strict=True)):
+            for k, part in zip(place, share, strict=True):
+                found = dr.fma(part, dr.gather(mi.Float, numbers[str(level)], k), found)
         return found
+
+    for step in range(_STEPS):
+        rate = _RATE * _FINAL_RATE ** (step / _STEPS)
+        optimizer.set_learning_rate({key: dr.opaque(mi.Float, rate) for key in optimizer})
+        loss = dr.sum(_between(table, first, shift(optimizer)))
+        for level, weight in enumerate(weights):
+            loss += dr.sum(weight * dr.square(optimizer[str(level)]))
+        dr.backward(loss)
+        optimizer.step()
+    numbers = {key: dr.detach(x) for key, x in optimizer.items()}
+    shifts = np.array(shift(numbers)).reshape(len(tables), len(SPREADS), count)
+    last = [
+        np.array(numbers[str(i)]).reshape(len(tables), len(SPREADS), -1)[-1]
+        for i in range(len(corners))
+    ]
+    return last, shifts
 
 
 def _between(table: list[mi.Float], first: mi.UInt32, shift: mi.Float) -> mi.Float:
@@ -329,3 +390,29 @@ def _between(table: list[mi.Float], first: mi.UInt32, shift: mi.Float) -> mi.Flo
         [dr.gather(mi.Float, values, first + left + i) for i in (0, 1)] for values in table
     )
     return cubic(a, b, p, q, t)
+
+
+def _one_by_one(lattices: list[_Lattice], table: np.ndarray, spread: float) -> list[np.ndarray]:
+    """Numbers that a descent starts from, one lattice after the other, coarsest first.
+
+    Curves may have several minima, and a descent ends at the nearest one. So each corner gets
+    the best number of all, by the cells around it and what coarser lattices say of them.
+
+    Args:
+        lattices: whose corners have numbers, coarsest first.
+        table: errors of cells at `SHIFTS`, shape (cells, shifts).
+        spread: of the coarsest lattice; that of each further one is `_FINER` times as large.
+    """
+    shift, found = np.zeros(len(table)), []
+    for level, lattice in enumerate(lattices):
+        errors = np.empty((len(lattice.piece), len(SHIFTS)))
+        for number, more in enumerate(SHIFTS):
+            share = lattice.share * _at(table, shift + more)[:, None]
+            errors[:, number] = np.bincount(
+                lattice.place.ravel(), share.ravel(), len(lattice.piece)
+            )
+        prior = np.square(SHIFTS / (spread * _FINER**level))
+        best = SHIFTS[(errors + prior).argmin(1)]
+        shift = shift + (lattice.share * best[lattice.place]).sum(1)
+        found.append(best)
+    return found
