@@ -23,7 +23,7 @@ from unbake.training.piece_places import (
     expected_places,
 )
 from unbake.training.piece_variation import with_all_variation
-from unbake.training.roughness_curves import Curves, of_roughness, points, roughness_of
+from unbake.training.roughness_curves import NODES, Curves, of_roughness, points, roughness_of
 from unbake.training.roughness_search import averaged, searched
 
 PLACED = replace(SMALL, pieces=replace(SMALL.pieces, places=4, variation=True))
@@ -202,9 +202,52 @@ def test_small_pieces_have_one_roughness_from_end_to_end():
     rows["target"], rows["weight"] = rows["plain"][:, 4] + rows["coloured"][:, 4], 1.0
     half = np.arange(600) % 2 == 0
     parts = [(x, Curves.of(rows[x], 4, 6, True)) for x in (half, ~half, np.ones(600, bool))]
-    numbers, changes = cells.told(parts, np.zeros(600), np.ones(2))
+    numbers, changes = cells.told(parts, [np.zeros(600)], np.ones(2))
     assert [len(x) for x in numbers] == [6, 6] and changes.shape == (2, 6)
     assert np.isinf(changes[0, 3:]).all() and np.isfinite(changes[1]).all()
+
+
+def test_wrong_colours_alone_do_not_tell_places():
+    """The mean over a piece is better than what colours say of it: by itself, not by place."""
+    rows, rng = made_up(4000), np.random.default_rng(0)
+    rows["piece"], rows["weight"] = 0, NOISE**-2
+    rows["target"] = rows["plain"][:, 4] + rows["coloured"][:, 4]
+    rows["target"] += NOISE * rng.standard_normal((len(rows), 3))
+    level = logits(NODES[4])
+    astray = level + 0.5 * rng.choice([-1, 1], len(rows))
+    cells = _Cells.of(np.zeros(4000, int), rows["position"].astype(float), (4, 8))
+    half = rng.random(4000) < 0.5
+    parts = [(x, Curves.of(rows[x], 1, 6, True)) for x in (half, ~half, half | ~half)]
+    _, of_mean = cells.told(parts, [cells.means(astray)], np.ones(1))
+    _, of_both = cells.told(parts, [astray, cells.means(astray)], np.ones(1))
+    np.testing.assert_allclose(of_both[0, 6:], of_mean[0], atol=1e-3)
+    assert of_both.min() > -10 and of_both[0, :6].min() > 100
+
+
+@pytest.mark.parametrize("variation", [True, False])
+def test_what_steps_have_learned_of_a_pattern_is_not_counted_twice(variation):
+    """The network has half of the slope, which numbers beside the mean have as well."""
+    rows, rng = made_up(8000), np.random.default_rng(0)
+    rows["piece"], rows["albedo"] = 0, 0.5
+    along = rows["position"][:, 0]
+    true = 0.25 + 0.5 * along
+    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
+    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] += 0.03 * rng.standard_normal((len(rows), 3))
+    rows["weight"] = 0.03**-2
+    field = field_of(replace(PLACED, pieces=replace(PLACED.pieces, variation=variation)))
+    own = {k: x for k, x in field.parameters().items() if k not in field.shared()}
+    optimizer = mi.ad.Adam(0.02, {k: x for k, x in own.items() if not k.startswith("place")})
+    learned = from_numpy(mi.Float, (0.375 + 0.25 * along).astype(np.float32))
+    for _ in range(100):
+        field.assign(field.parameters() | dict(optimizer.items()))
+        there = roughness_of(field, points(rows, albedo=True))
+        dr.backward(dr.mean(dr.square(there - learned)))
+        optimizer.step()
+    field.assign(field.parameters() | {k: dr.detach(x) for k, x in optimizer.items()})
+    assert 0.06 < np.std(values(field, {}, rows) - true) < 0.08
+    roughness = values(field, found_of(field, rows, SEARCH), rows)
+    assert np.sqrt(np.mean((roughness - true) ** 2)) < (0.02 if variation else 0.05)
 
 
 def test_colours_leave_to_places_what_is_theirs():

@@ -5,7 +5,8 @@ a pattern of its own, photographs tell it in patches of many pixels. So after a 
 gets numbers on lattices over the scene's cube: those that are most probable where they are expected
 to differ by some spread, and less on finer lattices. Or roughness goes gently from one end of a
 piece to the other. Many pixels tell such a change by few numbers: those at the corners of a cube
-around the piece.
+around the piece. Both kinds are sought beside what the descent has found, and beside its mean over
+the piece: colours have taken up what they could of the pattern.
 
 Noise of the photographs looks like such a pattern, too. So the pixels are dealt into two halves,
 and what one half says of a piece, in each way and with each spread, is asked of the other one, and
@@ -89,7 +90,10 @@ def expected_places(
         (chosen, Curves.of(rows[chosen], settings.place_cells, settings.colours, albedo))
         for chosen in (first, ~first, np.ones_like(first))
     ]
-    numbers, changes = cells.told(parts, outputs, as_one(seen.pixels, settings))
+    bases = [outputs]
+    if "variation" in found:  # what is beside the mean can be taken away
+        bases.append(cells.means(outputs))
+    numbers, changes = cells.told(parts, bases, as_one(seen.pixels, settings))
     prior = np.full(1 + changes.shape[1], (1 - settings.no_places) / changes.shape[1])
     prior[0] = settings.no_places
     evidence = np.concatenate([np.zeros((len(changes), 1)), changes], 1)  # in units of `as_one`
@@ -217,42 +221,53 @@ class _Cells:
     def told(
         self,
         parts: list[tuple[np.ndarray, Curves]],
-        outputs: np.ndarray,
+        bases: list[np.ndarray],
         pixels_as_one: np.ndarray,
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """What two halves of the pixels tell of places, and how well.
 
         Args:
             parts: the first half, the other one, and all pixels: which they are, and their curves.
-            outputs: of pixels before their bounds as nothing differs by place, shape (n,).
+            bases: outputs of pixels before their bounds that numbers are beside, shape (n,) each.
             pixels_as_one: of each piece.
 
         Returns:
             Of each of the field's lattices the numbers by all pixels, shape (ways, corners), and
             by how much each way changes the error of each piece, shape (pieces, ways). A way is one
-            of two kinds of corners, those of the lattices or those of `around`, and one of
-            `SPREADS`.
+            of the bases, one of two kinds of corners, those of the lattices or those of `around`,
+            and one of `SPREADS`. It is held against the best base with nothing by place.
         """
-        *halves, both = (
-            self.sums([errors_of(curves, outputs[chosen] + shift) for shift in SHIFTS], chosen)
-            for chosen, curves in parts
-        )
-        scaled = [table / pixels_as_one[self.piece, None] for table in (*halves, both)]
-        without = self.without(halves)
+        numbers, errors, without = [], [], []
+        for base in bases:
+            *halves, both = (
+                self.sums([errors_of(curves, base[chosen] + shift) for shift in SHIFTS], chosen)
+                for chosen, curves in parts
+            )
+            without.append(self.without(halves))
+            scaled = [table / pixels_as_one[self.piece, None] for table in (*halves, both)]
+            by_lattices, shifts = _solved(self.lattices, scaled)
+            (around,), gentle = _solved([self.around], scaled)
+            numbers += [by_lattices, self.as_lattices(around)]
+            # Beside what is small, corners of lattices are far away.
+            small = np.where(self.size < _LEAST_SIZE, np.inf, 0)
+            errors += [self.asked(halves, shifts), self.asked(halves, gentle) + small]
+        every = [np.concatenate(each) for each in zip(*numbers, strict=True)]
+        return every, np.concatenate(errors, 1) - np.min(without, 0)
 
-        def changed(shifts: np.ndarray) -> np.ndarray:
-            # What one half has found is asked of the other one.
-            asked = [_at(*pair) for pair in zip(halves[::-1], shifts[:2], strict=True)]
-            return self.of_pieces(np.sum(asked, axis=0)) - without
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Of each pixel the mean over its piece, shape (n,)."""
+        piece = self.piece[self.of_pixel]
+        return (np.bincount(piece, values) / np.bincount(piece))[piece]
 
-        by_lattices, shifts = _solved(self.lattices, scaled)
-        (around,), gentle = _solved([self.around], scaled)
-        numbers = [
-            np.concatenate(each) for each in zip(by_lattices, self.as_lattices(around), strict=True)
-        ]
-        # Beside what is small, corners of lattices are far away.
-        gently = np.where(self.size < _LEAST_SIZE, np.inf, changed(gentle))
-        return numbers, np.concatenate([changed(shifts), gently], 1)
+    def asked(self, halves: list[np.ndarray], shifts: np.ndarray) -> np.ndarray:
+        """Errors of pieces in each half, by what the other one has found, shape (pieces, spreads).
+
+        Args:
+            halves: errors of cells at `SHIFTS`, shape (cells, shifts).
+            shifts: that halves have found, the first two of (tables, spreads, cells).
+        """
+        pairs = zip(halves[::-1], shifts[:2], strict=True)
+        return self.of_pieces(np.sum([_at(other, by) for other, by in pairs], axis=0))
 
     def without(self, halves: list[np.ndarray]) -> np.ndarray:
         """Errors of pieces that differ by no place, shape (pieces, 1).

@@ -17,7 +17,6 @@ they ask for more than there is. What is taken away is that of which even they s
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,8 @@ from .seen_pieces import SeenPieces, chances, differ_by_place, normalized, value
 
 #: Parts of the variation. Of the least one, which stands for none, all can be had back.
 PARTS = np.array([1 / 64, *np.arange(1, 9) / 8])
+#: By how much levels may move where something differs by place, of outputs before their bounds.
+SHIFTS = np.arange(-4, 5) / 5
 #: The same of albedo, of what it has by now: steps go on to learn it, its level by what is left.
 ALBEDO_PARTS = np.arange(1, 9) / 8
 #: A piece whose albedo has less of its variation keeps that: two searches have taken away the rest,
@@ -55,12 +56,17 @@ def with_expected_variation(
     everywhere = found | field.placed(())
     seen = SeenPieces(field, curves.point, curves.pieces, everywhere, ranks)
     (outputs,), about = seen.outputs, seen.middles(curves.shown)
-    here, apart = about[0, seen.piece_of], 0.0
-    # No factor is of what differs from place to place.
-    if differ_by_place(found):
-        apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
-    errors = (errors_of(curves, here + part * (outputs - here) + apart) for part in PARTS)
-    parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
+    here = about[0, seen.piece_of]
+    varied = [here + part * (outputs - here) for part in PARTS]
+    if not differ_by_place(found):
+        errors = seen.sums(errors_of(curves, x) for x in varied)
+        parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
+        return found | seen.varied(about, parts)
+    # No factor is of what differs from place to place. That may stand for what is taken away: each
+    # part counts with the level that suits it, to which pieces are moved later on.
+    apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
+    errors = [seen.sums(errors_of(curves, x + apart + by) for by in SHIFTS).min(1) for x in varied]
+    parts = _expected(seen, np.stack(errors, 1), PARTS, settings.one_roughness, settings)
     return found | seen.varied(about, parts)
 
 
@@ -112,14 +118,14 @@ def expected_albedo(
         albedo_errors(rows, roughness, values_of(here + part * (seen.outputs - here)).T)
         for part in ALBEDO_PARTS
     )
-    parts = _expected(seen, errors, ALBEDO_PARTS, settings.one_albedo, settings)
+    parts = _expected(seen, seen.sums(errors), ALBEDO_PARTS, settings.one_albedo, settings)
     present = np.array(factors)[np.array(seen.pieces.number)]
     return seen.varied(about, np.where(present < _LITTLE, present, parts * present))
 
 
 def _expected(
     seen: SeenPieces,
-    errors: Iterable[np.ndarray],
+    errors: np.ndarray,
     parts: np.ndarray,
     none: float,
     settings: RoughnessSearchConfig,
@@ -127,10 +133,10 @@ def _expected(
     """The part of its variation that is to be expected of each piece, shape (pieces,).
 
     Args:
-        errors: of pixels with each part, shape (n,) each.
+        errors: of pieces with each part, shape (pieces, parts).
         none: how probable the first part is beforehand.
         settings: how many pixels tell as much as one.
     """
     prior = np.full(len(parts), (1 - none) / (len(parts) - 1))
     prior[0] = none
-    return normalized(chances(seen.sums(errors), seen.pixels, settings) * prior) @ parts
+    return normalized(chances(errors, seen.pixels, settings) * prior) @ parts
