@@ -82,7 +82,8 @@ def told(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     scores["no noise of samples, either"] = score(
         with_target(exact, made_up(exact, truth, exact["albedo"]))
     )
-    found = evidence(rows, truth, {k: curves(x)[1].at for k, x in ((0, rows), (1, made[1.0]))})
+    both = {"photographs": rows, "made_up": made[1.0]}
+    found = evidence(rows, truth, {key: curves(x)[1].at for key, x in both.items()})
     name = run.dataset.folder.name
     for key, value in scores.items():
         print(f"{name}: {key}: {value:.2f} dB", flush=True)
@@ -100,14 +101,14 @@ def with_target(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def evidence(
-    rows: np.ndarray, truth: np.ndarray, curves: dict[int, Callable[[Any], Any]]
+    rows: np.ndarray, truth: np.ndarray, curves: dict[str, Callable[[Any], Any]]
 ) -> list[dict[str, float]]:
     """What large pieces have less of error with their true roughness than with one alone.
 
     Args:
         rows: of `row_type`.
         truth: roughness of the pixels, shape (n,).
-        curves: errors of pixels at their roughness, with the photographs (0) and made-up ones (1).
+        curves: errors of pixels at their roughness, by the name of what they were compared with.
     """
     import mitsuba as mi
 
@@ -119,17 +120,16 @@ def evidence(
         errors = at(from_numpy(mi.Float, roughness.astype(np.float32))).numpy()
         return np.bincount(number.ravel(), errors)
 
-    gains = []
-    for at in curves.values():
+    gains = {}
+    for name, at in curves.items():
         single = [of_pieces(at, np.full(len(truth), one)) for one in SINGLE]
-        gains.append(np.min(single, 0) - of_pieces(at, truth))
+        gains[name] = np.min(single, 0) - of_pieces(at, truth)
     return [
         {
             "piece": int(piece[i]),
             "pixels": int(pixels[i]),
             "deviation": float(truth[rows["piece"] == piece[i]].std()),
-            "photographs": float(gains[0][i]),
-            "made_up": float(gains[1][i]),
+            **{name: float(less[i]) for name, less in gains.items()},
         }
         for i in np.flatnonzero(pixels >= LARGE)
     ]

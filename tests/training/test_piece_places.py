@@ -11,7 +11,7 @@ from support import of_format
 
 from unbake.config import FitConfig, from_toml, to_toml
 from unbake.fields.arrays import from_numpy
-from unbake.fields.field import FieldSpec, PlaceNumbers, holding
+from unbake.fields.field import FieldSpec, holding
 from unbake.fields.network import Network
 from unbake.training import piece_places
 from unbake.training.piece_places import (
@@ -25,6 +25,7 @@ from unbake.training.piece_places import (
 from unbake.training.piece_variation import with_all_variation
 from unbake.training.roughness_curves import NODES, Curves, of_roughness, points, roughness_of
 from unbake.training.roughness_search import averaged, searched
+from unbake.training.seen_pieces import outputs_of
 
 PLACED = replace(SMALL, pieces=replace(SMALL.pieces, places=4, variation=True))
 NOISE = 0.02
@@ -37,13 +38,18 @@ def roughness_by_place(position):
     return 0.4 + 0.2 * np.sin(2 * np.pi * position[:, 0]) * np.cos(2 * np.pi * position[:, 1])
 
 
+def light_of(rows, roughness):
+    """What pixels of `made_up` show at a roughness, shape (n, 3)."""
+    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
+    return (sharp * np.exp(-3 * roughness)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+
+
 def photographed(count=20_000, seed=2):
     """Rows of two pieces, of which the first differs from place to place, and the truth."""
     rows = made_up(count)
     rng = np.random.default_rng(seed)
     true = np.where(rows["piece"] == 0, roughness_by_place(rows["position"]), 0.55)
-    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
-    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] = light_of(rows, true)
     rows["target"] += NOISE * rng.standard_normal((count, 3))
     rows["weight"] = NOISE**-2
     return rows, true
@@ -100,9 +106,7 @@ def test_noise_differs_from_place_to_place_and_is_not_found():
         rows, _ = photographed(4000, seed)
         rows["piece"] = 1
         noisy = np.random.default_rng(seed).standard_normal((len(rows), 3))
-        sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
-        clean = (sharp * np.exp(-3 * 0.55) + rows["coloured"][:, :1])[:, 0]
-        rows["target"] = clean + 0.3 * noisy
+        rows["target"] = light_of(rows, np.full(len(rows), 0.55)) + 0.3 * noisy
         rows["weight"] = 0.3**-2
         # Every pixel is there four times, each time with the noise of its photograph.
         rows = np.concatenate([rows] * 4)
@@ -140,8 +144,7 @@ def test_a_gentle_change_is_found_that_lattices_would_lose_in_noise():
     rows["piece"], rows["position"][:, 1] = 0, 0.3
     rows["position"][:, [0, 2]] = 0.2 + 0.5 * rng.uniform(0, 1, (len(rows), 2))
     true = 0.1 + 0.8 * rows["position"][:, 0]
-    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
-    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] = light_of(rows, true)
     rows["target"] += GENTLE_NOISE * rng.standard_normal((len(rows), 3))
     rows["weight"] = GENTLE_NOISE**-2
     field = field_of()
@@ -167,29 +170,17 @@ def test_what_is_told_around_a_piece_is_the_same_on_the_finest_lattice(low, high
     assert around.std() > 0.1 and not any(x.any() for x in others)
     field = field_of()
     levels = [
-        PlaceNumbers(
-            dr.zeros(mi.UInt32, len(x.piece)),
-            mi.Point3u([from_numpy(mi.UInt32, c.astype(np.uint32)) for c in x.corner.T]),
-            [
-                from_numpy(
-                    mi.Float, (0 * x.piece if x is not lattice else finest[0]).astype(np.float32)
-                )
-            ],
-        )
-        for x in cells.lattices
+        lattice.told(told[0], np.zeros(1), np.ones(1, bool))
+        for lattice, told in zip(cells.lattices, (*others, finest), strict=True)
     ]
     where = (rows["position"] - cells.low[0]) / cells.size[0]
     expected = _shares(where) @ numbers[0]
-    changed = logits(values(field, field.placed(levels), rows)) - logits(values(field, {}, rows))
+    after, before = (values(field, x, rows) for x in (field.placed(levels), {}))
+    changed = outputs_of(of_roughness(after)) - outputs_of(of_roughness(before))
     # Corners that share a place in the table have no number: more of them where there are more.
     wrong = np.abs(changed - expected) > 1e-3
     assert wrong.mean() < (0.02 if low[1] == high[1] else 0.15)
     assert np.median(np.abs(changed - expected)) < 1e-5
-
-
-def logits(roughness):
-    inside = np.array(of_roughness(np.array(roughness)))
-    return np.log(inside / (1 - inside))
 
 
 def test_small_pieces_have_one_roughness_from_end_to_end():
@@ -213,7 +204,7 @@ def test_wrong_colours_alone_do_not_tell_places():
     rows["piece"], rows["weight"] = 0, NOISE**-2
     rows["target"] = rows["plain"][:, 4] + rows["coloured"][:, 4]
     rows["target"] += NOISE * rng.standard_normal((len(rows), 3))
-    level = logits(NODES[4])
+    level = outputs_of(of_roughness(NODES[4]))
     astray = level + 0.5 * rng.choice([-1, 1], len(rows))
     cells = _Cells.of(np.zeros(4000, int), rows["position"].astype(float), (4, 8))
     half = rng.random(4000) < 0.5
@@ -231,8 +222,7 @@ def test_what_steps_have_learned_of_a_pattern_is_not_counted_twice(variation):
     rows["piece"], rows["albedo"] = 0, 0.5
     along = rows["position"][:, 0]
     true = 0.25 + 0.5 * along
-    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
-    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] = light_of(rows, true)
     rows["target"] += 0.03 * rng.standard_normal((len(rows), 3))
     rows["weight"] = 0.03**-2
     field = field_of(replace(PLACED, pieces=replace(PLACED.pieces, variation=variation)))
@@ -257,8 +247,7 @@ def test_colours_leave_to_places_what_is_theirs():
     rows["piece"] = 0
     rows["albedo"] = np.where(rng.uniform(0, 1, len(rows)) < along, 0.7, 0.2)[:, None]
     true = 0.25 + 0.5 * along
-    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
-    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] = light_of(rows, true)
     rows["target"] += NOISE * rng.standard_normal((len(rows), 3))
     field = field_of()
     found = found_of(field, rows)
@@ -273,8 +262,7 @@ def test_pieces_that_show_most_come_first_where_there_is_no_room(monkeypatch):
     rows, _ = photographed(5000)
     rows["piece"] = np.where(rows["position"][:, 2] > 0.5, rows["piece"], 2 + rows["piece"])
     true = np.where(rows["piece"] % 2 == 0, roughness_by_place(rows["position"]), 0.55)
-    sharp = rows["plain"][:, :1] / np.exp(-3 * 0.1)
-    rows["target"] = (sharp * np.exp(-3 * true)[:, None, None] + rows["coloured"][:, :1])[:, 0]
+    rows["target"] = light_of(rows, true)
     rows["target"][rows["piece"] == 2] += 0.05 * np.random.default_rng(0).standard_normal(3)
     field = field_of()
     found = with_all_variation(field, Curves.of(rows, 1, 6, albedo=True))

@@ -10,10 +10,11 @@ the piece: colours have taken up what they could of the pattern.
 
 Noise of the photographs looks like such a pattern, too. So the pixels are dealt into two halves,
 and what one half says of a piece, in each way and with each spread, is asked of the other one, and
-held against no change and against one shift of the whole piece, whichever is better. A pixel that
-was drawn twice is in one half, with the noise of its photograph; factors of albedo are of each half
-by itself. With this evidence, and with `no_places`, follows how probable each of them is, and the
-numbers that are to be expected. Few pieces need numbers; the others have none.
+held against no change and against one shift of the whole piece, beside either of the two, whichever
+is best. A pixel that was drawn twice is in one half, with the noise of its photograph; factors of
+albedo are of each half by itself. With this evidence, and with `no_places`, follows how probable
+each of them is, and the numbers that are to be expected. Few pieces need numbers; the others have
+none.
 
 Within a patch roughness may be what it is in no other one, and albedo has adapted to it: so it has
 its factors in smaller cells here than for the descent (`place_cells`).
@@ -46,6 +47,8 @@ SPREADS, _FINER = np.array([0.25, 0.6, 1.5]), 0.6
 _CELLS = 32
 #: A smaller piece, by the edge of the cube around it, has one roughness from end to end.
 _LEAST_SIZE = 1 / 8
+#: Corners of a cell.
+_CORNERS = np.array(list(product((0, 1), repeat=3)))
 #: Steps of Adam, their rate, and the part of it that is left at the end.
 _STEPS, _RATE, _FINAL_RATE = 60, 0.2, 0.05
 #: Pieces whose numbers are less probable than that have none.
@@ -104,16 +107,12 @@ def expected_places(
     if not sure.any():
         return field.placed(())
     number = np.array(seen.pieces.number)
-    levels = []
-    for lattice, values in zip(cells.lattices, numbers, strict=True):
-        here = np.flatnonzero(sure[lattice.piece])
-        own = lattice.piece[here]
-        expected = (probable[own] * values[:, here].T).sum(1)
-        corner = [from_numpy(mi.UInt32, x.astype(np.uint32)) for x in lattice.corner[here].T]
-        of_piece = from_numpy(mi.UInt32, number[own].astype(np.uint32))
-        one = from_numpy(mi.Float, expected.astype(np.float32))
-        levels.append(PlaceNumbers(of_piece, mi.Point3u(corner), [one]))
-    return field.placed(levels)
+    expected = [
+        (probable[lattice.piece] * values.T).sum(1)
+        for lattice, values in zip(cells.lattices, numbers, strict=True)
+    ]
+    told = zip(cells.lattices, expected, strict=True)
+    return field.placed([lattice.told(values, number, sure) for lattice, values in told])
 
 
 def _first_half(rows: np.ndarray) -> np.ndarray:
@@ -127,8 +126,7 @@ def _first_half(rows: np.ndarray) -> np.ndarray:
 
 def _shares(part: np.ndarray) -> np.ndarray:
     """How much each corner of a cell has of points in it (n, 3), from 0 to 1, shape (n, 8)."""
-    corners = np.array(list(product((0, 1), repeat=3)))
-    return np.where(corners, part[:, None], 1 - part[:, None]).prod(2)
+    return np.where(_CORNERS, part[:, None], 1 - part[:, None]).prod(2)
 
 
 def _at(table: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -142,12 +140,13 @@ def _at(table: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Lattice:
-    """The corners of a lattice that cells of pieces are between.
+    """The corners of a lattice of so many cells along the cube that cells of pieces are between.
 
     `piece` and `corner` are of each corner; `place` and `share`, both (cells, 8), tell by which
     corners a cell is, and how much of each it has.
     """
 
+    cells: int
     piece: np.ndarray
     corner: np.ndarray
     place: np.ndarray
@@ -160,11 +159,25 @@ class _Lattice:
         below = np.minimum(np.floor(at), cells - 1)
         part = at - below
         keys = [
-            np.concatenate([piece[:, None], below + np.array(offset)], 1).astype(np.int64)
-            for offset in product((0, 1), repeat=3)
+            np.concatenate([piece[:, None], below + offset], 1).astype(np.int64)
+            for offset in _CORNERS
         ]
         every, place = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
-        return _Lattice(every[:, 0], every[:, 1:], place.reshape(len(keys), -1).T, _shares(part))
+        place = place.reshape(len(keys), -1).T
+        return _Lattice(cells, every[:, 0], every[:, 1:], place, _shares(part))
+
+    def told(self, values: np.ndarray, number: np.ndarray, chosen: np.ndarray) -> PlaceNumbers:
+        """Numbers of its corners (n,), of the chosen pieces, for `Field.placed`.
+
+        Args:
+            number: of each piece in the field.
+            chosen: whether a piece has numbers.
+        """
+        here = chosen[self.piece]
+        corner = [from_numpy(mi.UInt32, x.astype(np.uint32)) for x in self.corner[here].T]
+        of_piece = from_numpy(mi.UInt32, number[self.piece[here]].astype(np.uint32))
+        one = from_numpy(mi.Float, values[here].astype(np.float32))
+        return PlaceNumbers(of_piece, mi.Point3u(corner), [one])
 
 
 @dataclass(frozen=True)
@@ -175,7 +188,6 @@ class _Cells:
         piece: of each cell, from 0.
         of_pixel: the cell of each pixel.
         lattices: of the field, coarsest first.
-        counts: cells along the cube of each of them.
         around: the corners of a cube around each piece.
         low, size: where that cube is, shape (pieces, 3), and how large, shape (pieces, 1).
     """
@@ -183,7 +195,6 @@ class _Cells:
     piece: np.ndarray
     of_pixel: np.ndarray
     lattices: list[_Lattice]
-    counts: tuple[int, ...]
     around: _Lattice
     low: np.ndarray
     size: np.ndarray
@@ -207,7 +218,7 @@ class _Cells:
         low = (low + high - size) / 2
         around = _Lattice.of(own, (middle - low[own]) / size[own], 1)
         of_field = [_Lattice.of(own, middle, n) for n in lattices]
-        return _Cells(own, of_pixel, of_field, lattices, around, low, size)
+        return _Cells(own, of_pixel, of_field, around, low, size)
 
     def sums(self, columns: list[np.ndarray], chosen: np.ndarray) -> np.ndarray:
         """Sums over the chosen pixels of each cell, of columns of these pixels."""
@@ -294,7 +305,7 @@ class _Cells:
             numbers: shape (spreads, corners).
         """
         finest = self.lattices[-1]
-        where = finest.corner / self.counts[-1]
+        where = finest.corner / finest.cells
         share = _shares((where - self.low[finest.piece]) / self.size[finest.piece])
         found = (share * numbers.reshape(len(numbers), -1, 8)[:, finest.piece]).sum(2)
         return [*(np.zeros((len(numbers), len(x.piece))) for x in self.lattices[:-1]), found]

@@ -56,17 +56,16 @@ def with_expected_variation(
     everywhere = found | field.placed(())
     seen = SeenPieces(field, curves.point, curves.pieces, everywhere, ranks)
     (outputs,), about = seen.outputs, seen.middles(curves.shown)
-    here = about[0, seen.piece_of]
-    varied = [here + part * (outputs - here) for part in PARTS]
-    if not differ_by_place(found):
-        errors = seen.sums(errors_of(curves, x) for x in varied)
-        parts = _expected(seen, errors, PARTS, settings.one_roughness, settings)
-        return found | seen.varied(about, parts)
+    here, apart, shifts = about[0, seen.piece_of], 0.0, np.zeros(1)
     # No factor is of what differs from place to place. That may stand for what is taken away: each
     # part counts with the level that suits it, to which pieces are moved later on.
-    apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
-    errors = [seen.sums(errors_of(curves, x + apart + by) for by in SHIFTS).min(1) for x in varied]
-    parts = _expected(seen, np.stack(errors, 1), PARTS, settings.one_roughness, settings)
+    if differ_by_place(found):
+        apart = SeenPieces(field, curves.point, curves.pieces, found, ranks).outputs[0] - outputs
+        shifts = SHIFTS
+    varied = (here + part * (outputs - here) + apart for part in PARTS)
+    errors = seen.sums(errors_of(curves, x + shift) for x in varied for shift in shifts)
+    best = errors.reshape(-1, len(PARTS), len(shifts)).min(2)
+    parts = _expected(seen, best, PARTS, settings.one_roughness, settings)
     return found | seen.varied(about, parts)
 
 
