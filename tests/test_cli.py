@@ -376,6 +376,20 @@ def test_the_help_of_fit_tells_what_the_presets_say(unbake):
         (("--method", "ad-pt", "--max-depth", "10000"), "--max-depth: must be 256 or less for the"),
         (("--steps", "3", "--seconds", "4"), "--steps: cannot be given together with --seconds"),
         (("--pose-sigma", "2"), "--pose-sigma: no pose or lens is refined that could be uncertain"),
+        (
+            ("--unknown", "emission", "--quantities", "metallic"),
+            "--quantities: no material is unknown with --unknown emission. Leave it out, or",
+        ),
+        (
+            ("--preset", "release-lighting", "--representation", "grid"),
+            "--representation: no material is unknown with --unknown lighting",
+        ),
+        (
+            ("--method", "prb", "--radiance", "grid"),
+            "--radiance: the method prb has no radiance field. Leave it out, or give --method ours",
+        ),
+        (("--method", "direct", "--radiance", "grid"), "--radiance: the method direct has no"),
+        (("--max-depth", "5"), "--max-depth: the method ours does not follow paths to their end"),
         (("--preset", "cpu", "--settings", "a.toml"), "--preset: cannot be given together"),
         (("--settings", "none.toml"), "none.toml: the file does not exist"),
     ],

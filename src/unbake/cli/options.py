@@ -12,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from .. import config, experiments, exports
 from ..config.light import LightConfig
-from ..errors import UserError
+from ..errors import UserError, raise_together
 from .flags import flags, one_of, with_options
 
 Scene = Annotated[str, arg(metavar="SCENE")]
@@ -100,7 +100,8 @@ def with_length(settings: config.FitConfig, values: dict[str, Any]) -> config.Fi
     """Settings with the options that were given; steps or seconds take the place of each other.
 
     Raises:
-        UserError: options do not fit together, or the settings refuse them.
+        UserError: options do not fit together, or say something about what is not unknown, or the
+            settings refuse them.
     """
     if "steps" in values:
         exclude("seconds", {"steps": values["steps"]} if "seconds" in values else {})
@@ -112,7 +113,33 @@ def with_length(settings: config.FitConfig, values: dict[str, Any]) -> config.Fi
         what = "no pose or lens is refined that could be uncertain"
         remedy = "Give --poses refined or --intrinsics refined, too"
         raise UserError(what, "--pose-sigma", remedy)
+    of_materials = [name for name in ("quantities", "representation") if name in values]
+    if of_materials and not chosen.learns_materials:
+        what = f"no material is unknown with --unknown {chosen.unknown}"
+        remedy = "Leave it out, or give --unknown materials"
+        raise_together([UserError(what, f"--{name}", remedy) for name in of_materials], most=None)
     return chosen
+
+
+def require_of_method(settings: config.FitConfig, values: dict[str, Any]) -> None:
+    """Refuse options that say something about what the method of a fit does not have.
+
+    Args:
+        values: of the options that were given. Files may name what only other methods have.
+
+    Raises:
+        UserError: it tells all such options.
+    """
+    from ..transport.objective import has_radiance
+
+    faults = []
+    if "radiance" in values and not has_radiance(settings.chosen_method):
+        what = f"the method {settings.method} has no radiance field"
+        faults.append(UserError(what, "--radiance", "Leave it out, or give --method ours"))
+    if "max-depth" in values and not settings.follows_paths:
+        what = f"the method {settings.method} does not follow paths to their end"
+        faults.append(UserError(what, "--max-depth", "Leave it out, or give --method prb"))
+    raise_together(faults, most=None)
 
 
 def exclude(option: str, others: dict[str, object]) -> None:

@@ -37,6 +37,7 @@ from .options import (
     exclude,
     exclude_changed,
     require,
+    require_of_method,
     with_length,
 )
 from .processes import sharing_ranks
@@ -115,6 +116,7 @@ def fit(
         chosen = with_quality(chosen_settings(preset, settings), quality or "normal")
     chosen = with_length(chosen, changes)
     backend.activate()
+    require_of_method(chosen, changes)
     from ..training.loop import fit as run_fit
 
     console = Console(highlight=False)
