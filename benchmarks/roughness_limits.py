@@ -235,6 +235,8 @@ class Shared:
         rows: np.ndarray,
         faster: float = 1,
         settings: RoughnessSearchConfig | None = None,
+        *,
+        places: bool = False,
     ) -> dict[str, Any]:
         """What a search finds; the variance of errors, times weight, is 1.
 
@@ -242,13 +244,15 @@ class Shared:
             rows: of `row_type`.
             faster: the rate of its descent, as a multiple of the usual one.
             settings: None: the default ones, but that pieces stay where they are most probable.
+            places: whether what differs from place to place is sought, too; not without settings.
         """
         from unbake.training.roughness_curves import Curves
         from unbake.training.roughness_search import searched
 
         settings = settings or self._settings
         curves = Curves.of(rows, settings.cells, settings.colours, albedo=True)
-        found = searched(self.field, curves, settings, faster * self._rate)
+        of_places = rows if places else None
+        found = searched(self.field, curves, settings, faster * self._rate, rows=of_places)
         self.field.assign(self.fitted)
         return found
 
