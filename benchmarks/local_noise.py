@@ -18,7 +18,7 @@ from typing import Any
 import here
 
 import numpy as np
-from roughness_limits import in_units_of_variance, numbered, told_of_runs
+from roughness_limits import in_units_of_variance, numbered, print_scores, told_of_runs
 
 from unbake.config import RoughnessSearchConfig
 
@@ -53,8 +53,7 @@ def with_local_noise(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         rows["weight"] = weight / local_variance(rows, errors, cells)[:, None]
         told[f"{cells} cells"] = searched()
     name = run.dataset.folder.name
-    for key, value in told.items():
-        print(f"{name}: {key}: {value:.2f} dB", flush=True)
+    print_scores(name, told)
     return {"data": name, "steps": steps, "pixels": len(rows), "roughness_psnr": told}
 
 

@@ -78,6 +78,12 @@ def told_of_runs(
     write_json(args.out, {"machine": machine(), "spp": args.spp, "rows": found})
 
 
+def print_scores(name: str, scores: dict[str, float]) -> None:
+    """Print PSNRs in dB of a data set, a line each."""
+    for key, value in scores.items():
+        print(f"{name}: {key}: {value:.2f} dB", flush=True)
+
+
 def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     """The PSNRs of a run's variants in dB, by name, and what the run is.
 
@@ -118,8 +124,7 @@ def limits_of(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
         exact["target"] = made_up(exact, roughness, albedo)
         told[name] = shared.score(shared.searched(exact))
     name = run.dataset.folder.name
-    for key, value in told.items():
-        print(f"{name}: {key}: {value:.2f} dB", flush=True)
+    print_scores(name, told)
     about = {"data": name, "steps": steps, "pixels": len(rows)}
     return about | {"roughness_psnr": told}
 

@@ -24,7 +24,7 @@ import here
 
 import numpy as np
 from roughness_curves import opened
-from roughness_limits import made_up, psnr, sampled, told_of_runs, without_noise
+from roughness_limits import made_up, print_scores, psnr, sampled, told_of_runs, without_noise
 
 #: Pieces of fewer pixels are left out of the evidence.
 LARGE = 1500
@@ -85,8 +85,7 @@ def told(folder: Path, pixels: int, spp: int) -> dict[str, Any]:
     both = {"photographs": rows, "made_up": made[1.0]}
     found = evidence(rows, truth, {key: curves(x)[1].at for key, x in both.items()})
     name = run.dataset.folder.name
-    for key, value in scores.items():
-        print(f"{name}: {key}: {value:.2f} dB", flush=True)
+    print_scores(name, scores)
     for piece in found:
         print(name, " ".join(f"{key} {value:.4g}" for key, value in piece.items()), flush=True)
     about = {"data": name, "steps": steps, "pixels": len(rows)}
