@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 import os
@@ -17,6 +19,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from PIL import Image
 from support import BROWSERS, found_browser
 
 from unbake.dataset.views import Dataset
@@ -271,6 +274,10 @@ def test_whether_a_fit_was_still_improving_is_told(made, tmp_path: Path):
     told = "still improving (the error on held-aside pixels fell by 3.1 ± 0.4 % over the last 25 %"
     assert text.count(told) == 1
     assert "<title>Photometric loss, held-aside pixels over" in text
+    found |= {"change": -1.55, "noise": 0.7}  # below zero
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"convergence": found}))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    assert "fell by 2.2 times its noise over the last 25 %" in text
 
 
 def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
@@ -536,6 +543,42 @@ def test_environment_maps_are_shown_beside_the_truth(made, tmp_path: Path):
     assert "|c - c*|" in light and "balls" in light
     assert "|c - c*|" not in _section(text, "numbers")
     assert "albedo, roughness and light recovered" in _words(text)
+
+
+def test_of_an_environment_that_is_seen_in_part_the_other_part_is_no_error(made, tmp_path: Path):
+    """What lights nothing in view is not known. A column of scores says how good the rest is."""
+    truth = _environment()
+    _save(made[0] / "truth" / "environment.exr", truth, np.ones((128, 256)))
+    _optimize_environment(made[1][0], 0.04)
+    _optimize_environment(made[1][1], 0.2, "lighting")
+    seen, folder = {"sh_error_seen": 0.031, "relight_psnr_seen": 40.9}, made[1][0] / "evaluation"
+
+    def tell(metrics: dict) -> None:
+        metrics["environment"] |= seen
+        metrics["environment_seen_share"] = 0.49
+        metrics["definitions"]["sh_error_seen"] = "what is seen"
+
+    _edit(made[1][0], tell)
+    found = truth.copy()
+    found[64:] += 100
+    _save(folder / "environment.exr", found)
+    hidden = np.zeros((128, 256), np.uint8)
+    hidden[64:] = 255
+    Image.fromarray(hidden).save(folder / "environment_unobserved.png")
+    light = _section(write_report(made[1], tmp_path / "report.html").read_text(), "light")
+    assert [row[2] for row in _cells(light)] == [("n", "3.10"), ("n", display.DASH)]
+    assert [row[5] for row in _cells(light)] == [("n", "40.90"), ("n", display.DASH)]
+    assert "what is seen" in light
+    assert "ours: Nothing is known of 51 % of the environment" in _words(light)
+    embedded = re.findall(r'data-kind="error".*?src="[^,]*,(.*?)"', light, re.S)
+    files = (io.BytesIO(base64.b64decode(text)) for text in embedded)
+    ours, direct = (np.array(Image.open(file).convert("RGB")) for file in files)
+    middle = len(ours) // 2
+    assert (ours[middle + 1 :] == ours[-1, 0]).all() and np.ptp(ours[-1, 0]) == 0  # grey
+    assert (direct[middle + 1 :] != ours[-1, 0]).any()
+    Image.fromarray(hidden[:64]).save(folder / "environment_unobserved.png")
+    with pytest.raises(UserError, match="environment_unobserved.png.*another size"):
+        write_report(made[1], tmp_path / "report.html")
 
 
 def test_all_maps_have_the_exposure_that_suits_the_truth(made, tmp_path: Path):

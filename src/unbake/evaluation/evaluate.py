@@ -19,7 +19,7 @@ from ..dataset.spread import evenly
 from ..dataset.views import Dataset, View, read_photograph
 from ..errors import UserError, require_kind
 from ..imaging.metrics import HIGHEST
-from ..imaging.pictures import montage, shown, tonemap, write_exr, write_png
+from ..imaging.pictures import montage, shown, to_bytes, tonemap, write_exr, write_png
 from ..io import read_object
 from ..memory import require_memory, size
 from ..quantities import ALIGNED, QUANTITIES
@@ -434,6 +434,7 @@ def _evaluate_lighting(
             found["environment"] = numbers = lighting.compare_environments(map_, truth, seen)
             tell(", ".join(f"environment {k} {v:.3g}" for k, v in numbers.items()))
         if told.note:
+            write_png(out.unobserved_environment(), to_bytes(~told.lit))
             tell(f"note: {told.note}, which lights nothing in view")
     if problem.emission is not None:
         found["emission"] = [

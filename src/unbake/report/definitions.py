@@ -23,6 +23,7 @@ LIGHT_DEFINED = {
         "sh_error": "SH error",
         "relight_psnr": "Relighting PSNR",
         "aligned": "Aligned",
+        "sh_error_seen": "Seen",
     },
     "emission": {"emission_error": "Error"},
 }
@@ -34,7 +35,7 @@ def definitions(runs: list[EvaluatedRun]) -> dict[str, list[dict[str, Any]]]:
     told = {k: v for k, v in DEFINED.items() if k in psnrs or k != "albedo_psnr_aligned"}
     numbers = [_told(run, told) | _rendering(run) for run in runs]
     lighting = {
-        kind: [_told(run, words) if run.optimizes(kind) else {} for run in runs]
+        kind: [_told(run, _of_light(run, words)) if run.optimizes(kind) else {} for run in runs]
         for kind, words in LIGHT_DEFINED.items()
     }
     cameras = [_told(run, {"camera": "Cameras"}) for run in runs]
@@ -46,6 +47,12 @@ def definitions(runs: list[EvaluatedRun]) -> dict[str, list[dict[str, Any]]]:
 def _told(run: EvaluatedRun, names: dict[str, str]) -> dict[str, str]:
     said = run.metrics.get("definitions") or {}
     return {name: str(said[key]) for key, name in names.items() if said.get(key)}
+
+
+def _of_light(run: EvaluatedRun, names: dict[str, str]) -> dict[str, str]:
+    """Names of definitions; those of what is seen only where something is not."""
+    numbers = run.metrics.get("environment") or {}
+    return {key: name for key, name in names.items() if name != "Seen" or key in numbers}
 
 
 def _rendering(run: EvaluatedRun) -> dict[str, str]:

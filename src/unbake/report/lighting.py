@@ -9,17 +9,19 @@ import numpy as np
 
 from unbake.dataset.lighting import true_environment
 from unbake.dataset.views import Dataset
+from unbake.errors import UserError
 from unbake.imaging import pictures
+from unbake.imaging.coded import read_picture
 from unbake.report import display
 from unbake.report.runs import EvaluatedRun
 
-#: Scores of an environment map: their format, and which is best.
-NUMBERS = {
-    "sh_error": (display.percent, min),
-    "sh_error_aligned": (display.percent, min),
-    "relight_psnr": (display.decibels, max),
-    "relight_psnr_aligned": (display.decibels, max),
+#: Headings of the scores of an environment map: their unit, how they are written, which is best.
+SCORES = {
+    "sh_error": ("SH error", "%", display.percent, min),
+    "relight_psnr": ("Relighting PSNR", "dB", display.decibels, max),
 }
+#: Columns of each: what is added to its name.
+KINDS = {"Plain": "", "Aligned": "_aligned", "Seen": "_seen"}
 
 
 def lighting_section(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any] | None:
@@ -39,7 +41,7 @@ def _maps(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any] | None:
         return None
     truth = true_environment(dataset.folder, allow_outside=dataset.allow_outside)
     found: list[np.ndarray | None] = []
-    errors: list[np.ndarray | None] = []
+    errors: list[tuple[np.ndarray, np.ndarray] | None] = []  # and where the map is known
     for run in runs:
         optimized = run.optimizes("environment")
         path = display.evaluated(run, run.folder.environment()) if optimized else None
@@ -49,22 +51,25 @@ def _maps(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any] | None:
             continue
         map_ = display.rgb(path)[0]
         found.append(map_)
-        errors.append(None if truth is None else display.error(map_, truth, path))
+        off = None if truth is None else display.error(map_, truth, path)
+        errors.append(None if off is None else (off, ~_unobserved(run, map_)))
     lit = [map_ for map_ in found if map_ is not None] if truth is None else [truth]
     exposure = pictures.fitting_exposure([pictures.sample(map_.mean(axis=2)) for map_ in lit])
-    scale = display.error_scale([[pictures.sample(e)] for e in errors if e is not None])
+    told = [off[known] for off, known in filter(None, errors) if known.any()]
+    scale = display.error_scale([[pictures.sample(values)] for values in told])
 
-    numbers = _numbers(runs)
+    scores = _columns(runs)
+    plain = scores[0]["columns"]["Plain"]
     cells = [
         {
             "picture": None if map_ is None else display.tonemapped(map_, exposure),
-            "error": None if off is None else display.painted(off, scale, np.ones(off.shape, bool)),
+            "error": None if pair is None else display.painted(pair[0], scale, pair[1]),
             "empty": "known, not optimized",
             "number": f"SH error {low['text']} %" if low["text"] != display.DASH else display.DASH,
             "best": low["best"],
             "more": "",
         }
-        for map_, off, low in zip(found, errors, numbers["sh_error"], strict=True)
+        for map_, pair, low in zip(found, errors, plain, strict=True)
     ]
     height, width = lit[0].shape[:2]
     return {
@@ -75,18 +80,56 @@ def _maps(runs: list[EvaluatedRun], dataset: Dataset) -> dict[str, Any] | None:
         "width": width,
         "height": height,
         "exposure": exposure,
-        "rows": list(zip(*numbers.values(), strict=True)),
+        "scores": scores,
+        "notes": _notes(runs),
         "compared": any(run.metrics.get("environment") for run in runs),
     }
 
 
-def _numbers(runs: list[EvaluatedRun]) -> dict[str, list[dict[str, Any]]]:
-    """By score, a cell a run."""
+def _unobserved(run: EvaluatedRun, like: np.ndarray) -> np.ndarray:
+    """Where nothing is known of a map, bool, shape (h, w)."""
+    path = run.folder.unobserved_environment()
+    if not path.is_file():
+        return np.zeros(like.shape[:2], bool)
+    found = read_picture(path)[..., 0] > 0
+    if found.shape != like.shape[:2]:
+        what = "has another size than the map beside it"
+        raise UserError(what, path, f"{run.folder.evaluate_again} again")
+    return found
+
+
+def _notes(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
+    """Of which share of the environment nothing is known, a line a run that says so."""
+    found = []
+    for number, run in enumerate(runs):
+        share = display.number(run.metrics.get("environment_seen_share"))
+        if share is not None and run.folder.unobserved_environment().is_file():
+            told = f"Nothing is known of {100 * (1 - share):.0f} % of the environment"
+            found.append({"run": number, "text": f"{told}, which lights nothing in view"})
+    return found
+
+
+def _columns(runs: list[EvaluatedRun]) -> list[dict[str, Any]]:
+    """By score, its heading and its columns: names, and a cell a run."""
     said = [run.metrics.get("environment") or {} for run in runs]
-    return {
-        key: display.marked([display.number(numbers.get(key)) for numbers in said], write, choose)
-        for key, (write, choose) in NUMBERS.items()
+    kinds = {
+        name: end
+        for name, end in KINDS.items()
+        if name != "Seen" or any(f"{key}{end}" in numbers for key in SCORES for numbers in said)
     }
+    return [
+        {
+            "title": title,
+            "unit": unit,
+            "columns": {
+                name: display.marked(
+                    [display.number(numbers.get(f"{key}{end}")) for numbers in said], write, choose
+                )
+                for name, end in kinds.items()
+            },
+        }
+        for key, (title, unit, write, choose) in SCORES.items()
+    ]
 
 
 def _emitters(runs: list[EvaluatedRun]) -> list[dict[str, Any]] | None:

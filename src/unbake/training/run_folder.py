@@ -9,6 +9,7 @@
       evaluation/metrics.json          what `unbake evaluate` measured
       evaluation/SPLIT/VIEW_QUANTITY.exr, .png
       evaluation/environment.exr, .png
+      evaluation/environment_unobserved.png  where nothing is known of it
       tensorboard/                     the numbers of the log for TensorBoard, if wanted
       .lock                            the process that fits (`run_lock.py`)
 
@@ -151,6 +152,10 @@ class EvaluationFolder:
     def environment(self, suffix: str = ".exr") -> Path:
         """The picture of the recovered environment map; `suffix` as in `picture`."""
         return self.path / f"environment{suffix}"
+
+    def unobserved_environment(self) -> Path:
+        """White where nothing is known of the map; there is no such picture of a known one."""
+        return self.path / "environment_unobserved.png"
 
 
 @final
@@ -449,6 +454,10 @@ class RunFolder:
         """The environment map of the evaluation; see `EvaluationFolder.environment`."""
         return EvaluationFolder(self.evaluation).environment(suffix)
 
+    def unobserved_environment(self) -> Path:
+        """Where nothing is known of it; see `EvaluationFolder.unobserved_environment`."""
+        return EvaluationFolder(self.evaluation).unobserved_environment()
+
     @contextmanager
     def new_evaluation(self) -> Iterator[EvaluationFolder]:
         """A folder for the pictures of a further evaluation, which `replace_evaluation` takes.
@@ -471,6 +480,7 @@ class RunFolder:
         self.metrics_file.unlink(missing_ok=True)  # of no other pictures than its own
         _remove(*(self.evaluation / split for split in ("train", "heldout")))
         _remove(*(self.environment(suffix) for suffix in (".exr", ".png")))
+        _remove(self.unobserved_environment())
         for path in new.path.glob("*"):
             path.rename(self.evaluation / path.name)
         write_json(self.metrics_file, metrics)
