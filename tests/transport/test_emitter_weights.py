@@ -6,14 +6,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import TINY_FIT, assert_same_expectation, pixel_rays, whole_and_in_parts
+from support import (
+    TINY_FIT,
+    assert_same_expectation,
+    pixel_rays,
+    tiny_fields,
+    whole_and_in_parts,
+)
 
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config import read_toml
 from unbake.dataset.camera import Camera
 from unbake.dataset.views import Dataset
+from unbake.training.loop import fit
 from unbake.training.problem import problem_of
+from unbake.training.recovered import load_run
 from unbake.transport.emitter_weights import chosen_alike, weigh_emitters
 from unbake.transport.path_tracer import path_traced
 from unbake.transport.vertex import SceneView
@@ -140,3 +148,11 @@ def test_a_fit_with_weighed_lights_is_replayed_and_goes_on_bit_for_bit(
     assert 1 <= step.recordings() <= 3
     for key, value in whole.items():
         assert np.array_equal(value, parts[key]), key
+
+
+def test_a_recovered_scene_weighs_lights_by_the_strengths_that_were_found(lit, tmp_path):
+    """The fit itself samples them alike: it does not know yet."""
+    config = dataclasses.replace(tiny_fields("grid"), method="direct", unknown="emission", steps=1)
+    fit(lit, tmp_path / "run", config)
+    found = weights(load_run(tmp_path / "run").problem.scene_view.scene)
+    assert min(found) < 0.9 and sum(found) == pytest.approx(2, rel=1e-4)

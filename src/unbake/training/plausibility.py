@@ -105,7 +105,7 @@ def _open_colour(dataset: Dataset, problem: Problem) -> str | None:
     """A line if one white balance of all photographs is fitted, and no light is known."""
     if problem.camera is None or problem.camera.white_balance != "common":
         return None
-    if problem.environment is None and problem.emission is None:
+    if not problem.light_is_unknown:
         return None
     fitted = ENVIRONMENTS if problem.emission is None else tuple(STRENGTHS)
     if lights_besides(parse(dataset.scene, dataset.root), fitted):
@@ -133,7 +133,7 @@ def _pictures(dataset: Dataset, problem: Problem) -> str | None:
 
 def _other_units(pixels: PixelSource, problem: Problem) -> str | None:
     """A line if the photographs are too bright or too dark for lights that are known."""
-    if problem.environment is not None or problem.emission is not None:
+    if problem.light_is_unknown:
         return None
     photographs = pixels.photographs
     places = np.random.default_rng(0).integers(0, photographs.count, _PIXELS)

@@ -75,6 +75,11 @@ class Problem:
         """The pieces of surface that its materials tell apart, if they do."""
         return None if self.materials is None else self.materials.pieces
 
+    @property
+    def light_is_unknown(self) -> bool:
+        """Whether the environment is optimized, or the strengths of lights are."""
+        return self.environment is not None or self.emission is not None
+
     def parameters(self) -> dict[str, mi.Float | mi.TensorXf]:
         """The trainable arrays φ by name; the first word is the unknown's."""
         named: dict[str, mi.Float | mi.TensorXf] = {}
@@ -248,10 +253,15 @@ def problem_of(
         views=dataset.train,
         change=change,
     )
-    known = problem.environment is None and problem.emission is None
-    if known and dataset.train and chosen_alike(problem.scene_view.scene):
-        weigh_lights(problem.scene_view, dataset.train, hide_emitters=problem.hide_emitters)
+    if not problem.light_is_unknown:
+        weigh_lights_alike(problem, dataset)
     return problem
+
+
+def weigh_lights_alike(problem: Problem, dataset: Dataset) -> None:
+    """Let lights that are sampled alike be sampled as often as suits the training views."""
+    if dataset.train and chosen_alike(problem.scene_view.scene):
+        weigh_lights(problem.scene_view, dataset.train, hide_emitters=problem.hide_emitters)
 
 
 def weigh_lights(scene_view: SceneView, views: Sequence[View], *, hide_emitters: bool) -> None:

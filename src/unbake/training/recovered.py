@@ -13,7 +13,7 @@ from ..errors import UserError, quoted
 from ..scene.parse import ParsedScene
 from .checkpoint import Progress, load_checkpoint
 from .poses import refined_view
-from .problem import Problem, problem_of
+from .problem import Problem, problem_of, weigh_lights_alike
 from .run_folder import RunFolder
 from .state import State, initial_state
 
@@ -119,4 +119,6 @@ def load_run(
     if progress is None:
         raise UserError("no readable checkpoint", where=run, remedy="Fit again, or wait for one")
     opened.state.publish(opened.problem)
+    if opened.problem.light_is_unknown:  # only now it is known how strong it is
+        weigh_lights_alike(opened.problem, opened.dataset)
     return Recovered(opened.problem, opened.dataset, opened.config, progress, opened.clip_negative)
