@@ -321,7 +321,16 @@ def test_a_fit_of_a_few_steps_is_at_no_plateau_and_no_ratio_is_told_within_noise
     rises = np.linspace(0.3, 0.5, HELD_GROUPS) * np.tile([1, 4], HELD_GROUPS // 2)
     lines[-1] |= {"held_aside": 0.001 + rises.mean(), "held_aside_groups": list(0.001 + rises)}
     told = convergence(lines).told()
-    assert "getting worse; error rose by more than its noise in the last quarter" in told
+    assert "getting worse; error rose by 6.1 times its noise in the last quarter" in told
+    # No error falls by more than all of it: below zero, noise says how far it fell
+    falls = log_of_rises(np.linspace(-2.4, -2.2, HELD_GROUPS))
+    assert "still improving; error fell by 144.9 times its noise" in convergence(falls).told()
+
+
+def test_of_a_fit_of_lights_nothing_is_said_of_materials():
+    found = convergence(log_of([8, 4, 2, 1, 1, 1, 1, 1.002]))
+    gain = "materials may still gain"
+    assert gain in found.told() and gain not in found.told(materials=False)
 
 
 def test_an_error_below_zero_has_a_verdict_too():
@@ -334,7 +343,7 @@ def test_an_error_below_zero_has_a_verdict_too():
     found = convergence(lines)
     assert found is not None and found.before < 0 and found.trend == "unclear"
     assert found.noise == pytest.approx(1)
-    assert "too noisy; error changed by" in found.told() or "error rose by more" in found.told()
+    assert "too noisy; error rose by 1.3 times its noise" in found.told()
 
 
 def test_too_few_errors_say_nothing():

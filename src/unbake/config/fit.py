@@ -229,8 +229,9 @@ class FitConfig:
         Unknown,
         Flag(
             "What to recover: materials (the --quantities), lighting (the environment map), "
-            "materials+lighting, emission (colour and strength of the lights), or auto: materials, "
-            "and lighting with them where the data set says that its light is unknown",
+            "materials+lighting, emission (colour and strength of the lights, where the "
+            "environment is known), or auto: materials, and lighting with them where the data "
+            "set says that its light is unknown",
             metavar="WHAT",
         ),
     ] = "auto"

@@ -97,10 +97,10 @@ def _trend(run: EvaluatedRun) -> list[str]:
         return []
     spread = "" if noise is None else f" ± {100 * noise:.1f}"
     moved = f"{'rose' if change > 0 else 'fell'} by {100 * abs(change):.1f}{spread} %"
-    if noise is not None and noise >= 1:
-        verb = "rose" if change > 0 else "fell"
-        less = abs(change) <= noise
-        moved = "changed by less than its noise" if less else f"{verb} by more than its noise"
+    if noise is not None and (noise >= 1 or change < -1):
+        verb, times = "rose" if change > 0 else "fell", abs(change) / max(noise, 1e-9)
+        less = "changed by less than its noise"
+        moved = less if times <= 1 else f"{verb} by {times:.1f} times its noise"
     told = f"the error on held-aside pixels {moved} over the last {100 * share:.0f} % of the fit"
     return [f"{word[found['trend']]} ({told})"]
 

@@ -186,6 +186,7 @@ class ErrorCurve:
     ) -> None:
         self._aside = aside
         self._by = "seconds" if config.seconds else "step"
+        self._materials = config.learns_materials
         self._total = config.seconds or config.steps or 1
         self._lines: list[Mapping[str, Any]] = list(before)
         self._next = self._after(progress)
@@ -214,7 +215,7 @@ class ErrorCurve:
     def told(self) -> list[str]:
         """What it says of a fit that has ended, if it says anything; lines for a terminal."""
         found = convergence(self._lines, self._by)
-        return [] if found is None else found.told().splitlines()
+        return [] if found is None else found.told(materials=self._materials).splitlines()
 
     def _after(self, progress: Progress) -> int:
         """The number of the part that begins now, from 1."""
@@ -322,19 +323,26 @@ class Convergence:
     noise: float  #: standard error of the change, in the same unit
     share: float  #: of the fit, over which the change is told
 
-    def told(self) -> str:
-        """Two lines for a terminal: what happened, and what can be done."""
+    def told(self, *, materials: bool = True) -> str:
+        """Two lines for a terminal: what happened, and what can be done.
+
+        Args:
+            materials: whether any are unknown.
+        """
+        may_gain = "; materials may still gain" if materials else ""
         verb = "rose" if self.change > 0 else "fell"
         part = "the last quarter" if abs(self.share - LAST) < 0.05 else f"the last {self.share:.0%}"
         sizes = f"{verb} {100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
-        if self.noise >= 1:  # errors have no bias, and those of a good fit may be about zero
-            more = abs(self.change) > self.noise
-            sizes = f"{verb} by more than its noise" if more else "changed by less than its noise"
+        # Errors have no bias, and those of a good fit may be about zero.
+        if self.noise >= 1 or self.change < -1:
+            times = abs(self.change) / max(self.noise, 1e-9)
+            less = "changed by less than its noise"
+            sizes = less if times <= 1 else f"{verb} by {times:.1f} times its noise"
         word, advice = {
             "improving": ("still improving", "a longer fit may be better: --quality high"),
             "plateau": (
                 "at a plateau",
-                "a longer fit explains photographs no better; materials may still gain",
+                f"a longer fit explains photographs no better{may_gain}",
             ),
             "rising": ("getting worse", "more views would help, or a shorter fit"),
             "unclear": (
