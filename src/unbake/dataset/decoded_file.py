@@ -96,7 +96,12 @@ def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
         "foreground_only": plan.hidden,
         **({"masks": masks, "alpha of masks": "counts"} if any(masks) else {}),
         # What the blurred copy is; files that do not say it blurred across the foreground's edge.
-        "blur": {"radius": RADIUS, "within": "pixels to train on", "with": "noise and peaks"},
+        "blur": {
+            "radius": RADIUS,
+            "within": "other pixels to train on",
+            "with": "their noise, and peaks",
+            "peaks": PEAK,
+        },
     }
     if any(view.image.suffix.lower() in JPEG for view in views):
         key["colour of JPEG"] = "by regression"
@@ -107,7 +112,6 @@ def _key(plan: Plan, data: DataFolder) -> dict[str, Any]:
     if any(view.noise is not None for view in views):
         key["noise"] = [None if view.noise is None else asdict(view.noise) for view in views]
         key["black"] = {"radius": BLACK_RADIUS, "bright": BRIGHT, "less": "what noise adds"}
-        key["reference"] = {"of": "others", "peaks": PEAK}
         if any(view.clipped is not None for view in views):
             key["clipped"] = [view.clipped for view in views]
     return key

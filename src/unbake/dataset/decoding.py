@@ -31,8 +31,8 @@ _REACH = 2 * RADIUS + 1
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32) / 6
 #: Share of the free memory that views may take which are decoded at once.
 _OF_FREE = 0.5
-#: So many standard deviations of known noise are no peak.
-PEAK = 3.0
+#: So many standard deviations of noise are no peak.
+PEAK = 5.0
 #: An image with its camera: linear RGB, shape (pixels, 3), and whether pixels count, (pixels,);
 #: then its noise, if that is known.
 Image = tuple[Camera, np.ndarray, np.ndarray, SensorNoise | None]
@@ -297,12 +297,11 @@ def _reference(image: np.ndarray, weight: np.ndarray, sensor: SensorNoise | None
     """The radiance that errors of a pixel are relative to (ours).
 
     √(mean² + noise² + peak²): the mean of those of the 5 x 5 pixels around each one that count; the
-    standard deviation of their noise; and how much brighter the pixel is than every other of the
-    3 x 3, as fireflies are. The first two have next to nothing of the pixel's own noise in them, so
-    that errors are not weighed by their sign. Where photographs are noisy they weigh less.
+    standard deviation of their noise; and by how much the pixel is brighter than every other of the
+    3 x 3 and than noise may make it, as fireflies are. Where photographs are noisy they weigh less.
 
-    Noise that is known may be larger than the light. Then the mean is that of the others alone, and
-    a peak is what exceeds them by more than noise does: one pixel of nine is the brightest.
+    Neither mean nor noise knows the pixel itself: where its own noise made it brighter it would
+    weigh less, and the scene would come out too dark.
 
     Args:
         image: linear RGB of one view, or of some of its rows, shape (rows, columns, 3).
@@ -313,25 +312,21 @@ def _reference(image: np.ndarray, weight: np.ndarray, sensor: SensorNoise | None
     Returns:
         Of the shape of the image; right where `_REACH` rows above and below are known, too.
     """
-    mean = mean_of_counted(image, weight, RADIUS, others=sensor is not None)
+    mean = mean_of_counted(image, weight, RADIUS, without=0)
     mean = np.where(np.isnan(mean), image, mean)
     # Pixels that do not count are no peaks, and no noise is told from them.
     known = np.where(weight > 0, image, mean)
+    noise = _noise_around(known, weight) if sensor is None else sensor.variance(mean)
     first, second = (np.full_like(known, -np.inf) for _ in range(2))
     for there in around(known, 1):
         np.maximum(second, np.minimum(first, there), out=second)
         np.maximum(first, there, out=first)
-    if sensor is None:
-        noise = _noise_around(known, weight)
-    else:
-        noise = sensor.variance(mean)
-        second += PEAK * np.sqrt(noise)
-    peak = np.maximum(known - second, 0)
+    peak = np.maximum(known - second - PEAK * np.sqrt(noise), 0)
     return np.sqrt(mean**2 + noise + peak**2)
 
 
 def _noise_around(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The variance of the noise of the 5 x 5 pixels around each one, as far as neighbours tell it.
+    """The variance of the noise around each pixel, as far as those that do not see it tell it.
 
     Args:
         image: shape (height, width, channels).
@@ -343,4 +338,4 @@ def _noise_around(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
     ):
         response += share * there
         inside *= counted
-    return np.nan_to_num(mean_of_counted(response**2, inside, RADIUS))
+    return np.nan_to_num(mean_of_counted(response**2, inside, RADIUS, without=1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import reduce
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -31,7 +32,7 @@ def bands(height: int, reach: int, rows: int = _ROWS) -> Iterator[tuple[slice, s
 
 
 def mean_of_counted(
-    image: np.ndarray, weight: np.ndarray, radius: int, *, others: bool = False
+    image: np.ndarray, weight: np.ndarray, radius: int, *, without: int | None = None
 ) -> np.ndarray:
     """The mean of those pixels of a window around each one that have weight 1.
 
@@ -39,18 +40,16 @@ def mean_of_counted(
         image: shape (height, width, channels).
         weight: 0 or 1, shape (height, width, 1).
         radius: of the window, whose edge has 2 radius + 1 pixels.
-        others: leave the pixel in the middle out; beyond edges there is nothing. Else edges are
+        without: radius of a smaller window in its middle that does not count, 0 for the pixel
+            alone; beyond edges there is nothing then. None: all of it counts, and edges are
             repeated.
 
     Returns:
         Of the shape of the image; NaN where no pixel has weight.
     """
-    if weight.all() and not others:
+    if weight.all() and without is None:
         return _sums(image, radius) / np.float32((2 * radius + 1) ** 2)
-    beyond = "constant" if others else "edge"
-    share, total = _sums(weight, radius, beyond), _sums(image * weight, radius, beyond)
-    if others:
-        share, total = share - weight, total - image * weight
+    share, total = (_sums(x, radius, without) for x in (weight, image * weight))
     return total / np.where(share > 0, share, np.nan)
 
 
@@ -70,7 +69,19 @@ def along(
         yield padded[part] if axis == 0 else padded[:, part]
 
 
-def _sums(image: np.ndarray, radius: int, beyond: Beyond = "edge") -> np.ndarray:
-    for axis in (0, 1):
-        image = reduce(np.add, along(image, axis, radius, beyond))
-    return image
+def _sums(image: np.ndarray, radius: int, without: int | None = None) -> np.ndarray:
+    """Sums over windows, as of `mean_of_counted`.
+
+    What does not count is never added: taken away again it would leave the rounding errors of a
+    pixel that is far brighter than all others.
+    """
+    if without is None:
+        for axis in (0, 1):
+            image = reduce(np.add, along(image, axis, radius))
+        return image
+    places = [abs(place) > without for place in range(-radius, radius + 1)]
+    columns = list(along(image, 1, radius, "constant"))
+    whole = reduce(np.add, columns)
+    beside = reduce(np.add, compress(columns, places))
+    every = zip(*(along(rows, 0, radius, "constant") for rows in (whole, beside)), strict=True)
+    return reduce(np.add, (rows[not beyond] for beyond, rows in zip(places, every, strict=True)))
