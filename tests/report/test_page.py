@@ -577,7 +577,7 @@ def test_of_an_environment_that_is_seen_in_part_the_other_part_is_no_error(made,
     assert (ours[middle + 1 :] == ours[-1, 0]).all() and np.ptp(ours[-1, 0]) == 0  # grey
     assert (direct[middle + 1 :] != ours[-1, 0]).any()
     Image.fromarray(hidden[:64]).save(folder / "environment_unobserved.png")
-    with pytest.raises(UserError, match="environment_unobserved.png.*another size"):
+    with pytest.raises(UserError, match=r"environment_unobserved\.png.*another size"):
         write_report(made[1], tmp_path / "report.html")
 
 

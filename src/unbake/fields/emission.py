@@ -63,15 +63,16 @@ class Emission:
         dr.make_opaque(self.tables)
         self.prepare()
 
-    def start(self, factors: Sequence[float]) -> None:
+    def start(self, factors: Sequence[float] | np.ndarray) -> None:
         """Begin with other strengths than the scale.
 
         Args:
-            factors: of each light, on the scale.
+            factors: of each light, on the scale, or of each of its channels, shape (lights, 3).
         """
         if len(factors) != self.count:
             raise ValueError(f"{len(factors)} factors for {self.count} lights")
-        logs = np.repeat(np.log(factors), 3).astype(np.float32)
+        each = np.reshape(factors, (self.count, -1)).repeat(3 // np.size(factors[0]), 1)
+        logs = np.log(each).ravel().astype(np.float32)
         self._log = from_numpy(mi.Float, logs)
         self.tables["start"] = dr.unravel(mi.Color3f, from_numpy(mi.Float, logs))
         dr.make_opaque(self.tables)

@@ -24,6 +24,7 @@ from ..ranks import Ranks
 from .checkpoint import Progress, load_checkpoint
 from .defaults import told_unknown, with_defaults
 from .first_gains import begin_cameras
+from .first_lights import begin_lights
 from .held_aside import HeldAside, HeldOutPhotographs
 from .path_depth import told_depth, with_path_depth
 from .plausibility import data_warnings
@@ -127,6 +128,7 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
         pixels = pixels.at_level(origin.photographs_level)
     problem = problem_of(dataset, config, origin.photographs_level)
     untold = begin_cameras(problem, dataset, pixels, ranks)
+    begin_lights(problem, pixels, ranks)
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
     odd = [] if solved is None else start_radiance(problem, solved)

@@ -13,6 +13,7 @@ from ..dataset.pixels import PixelSource
 from ..dataset.views import Dataset
 from .defaults import with_defaults
 from .first_gains import begin_cameras
+from .first_lights import begin_lights
 from .problem import Problem, pixels_of, problem_of
 from .schedule import learning_rates
 from .state import State, initial_state
@@ -39,6 +40,7 @@ def begin_fit(dataset: Dataset, config: FitConfig, *, clip_negative: bool = Fals
     pixels = pixels_of(dataset, config, clip_negative=clip_negative)
     problem = problem_of(dataset, config, pixels.photographs.level)
     begin_cameras(problem, dataset, pixels)
+    begin_lights(problem, pixels)
     step = TrainingStep(problem, pixels, config)
     return FreshFit(config, problem, pixels, step, initial_state(problem))
 
