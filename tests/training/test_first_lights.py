@@ -9,9 +9,11 @@ from support import TINY_FIT
 from unbake.acquisition.capture import capture
 from unbake.acquisition.settings import CaptureSettings
 from unbake.config import CameraConfig
+from unbake.dataset.photographs import Photographs
 from unbake.dataset.views import Dataset
 from unbake.imaging.pictures import write_exr
 from unbake.training.fresh_fit import begin_fit
+from unbake.training.problem import problem_of
 
 LAMPS = {
     "bright": ("-0.9 0 0.5", "30 20 10"),
@@ -44,7 +46,7 @@ def data(tmp_path_factory):
     """Photographs of a room with four lamps and a screen; one lamp is inside of a box."""
     folder = tmp_path_factory.mktemp("lamps")
     lamps = [LAMP.format(*place.split(), name, rgb) for name, (place, rgb) in LAMPS.items()]
-    write_exr(folder / "screen.exr", np.float32([[[1, 2, 3], [3, 4, 5]]]).repeat(2, 0))
+    write_exr(folder / "screen.exr", np.float32([[[0, 0, 0]] * 3 + [[8, 12, 16]]]).repeat(4, 0))
     (folder / "scene.xml").write_text(SCENE.format(lamps="\n".join(lamps)))
     small = CaptureSettings(views=8, held_out=1, resolution=48, spp=16, max_depth=4)
     capture(folder / "scene.xml", folder / "data", small, tell=lambda line: None)
@@ -62,11 +64,31 @@ def test_lights_in_view_begin_at_what_photographs_show(data):
     for name in ("bright", "dim"):
         true = np.array(LAMPS[name][1].split(), float)
         np.testing.assert_allclose(found[name], true, rtol=0.1)  # with what it reflects
-    # The mean of its picture
+    # The mean of its picture, most of which is dark
     np.testing.assert_allclose(found["screen"], (2, 3, 4), rtol=0.1)
     # One that is black may still become brighter, and of one that nobody sees nothing is known.
     assert (found["black"] >= 0.999e-3 * scale).all() and (found["black"] < 0.1 * scale).all()
     np.testing.assert_allclose(found["inside"], scale, rtol=1e-4)
+
+
+def test_what_is_known_is_no_light_that_begins(data, tmp_path):
+    """A known environment in view stays as it is, and a point that nobody sees begins as before."""
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    point = """<emitter type="point" id="point"><point name="position" x="0" y="0" z="3"/>
+      <rgb name="intensity" value="5"/></emitter>"""
+    floor = """<shape type="rectangle"><transform name="to_world"><scale value="0.5"/></transform>
+      <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>"""
+    write_exr(tmp_path / "sky.exr", np.full((8, 16, 3), 0.7, np.float32))
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{sky}{point}{floor}</scene>')
+    small = CaptureSettings(views=2, held_out=1, resolution=16, spp=4, max_depth=3)
+    capture(tmp_path / "scene.xml", tmp_path / "data", small, tell=lambda line: None)
+    made = dataclasses.replace(Dataset.load(tmp_path / "data"), background="visible")
+    problem = problem_of(made, UNKNOWN, 0.5)
+    before = np.array(problem.emission.values)
+    found, _ = begun(made, UNKNOWN)
+    assert list(found) == ["point"]
+    level = Photographs.load(made, False).level
+    np.testing.assert_allclose(found["point"], before[:, 0] * level / 0.5, rtol=1e-4)
 
 
 def test_they_begin_alike_where_photographs_do_not_tell(data):

@@ -110,7 +110,7 @@ def shared_points(scene: mi.Scene, views: Sequence[View], pixels: PixelSource) -
     wanted = max(_PIXELS, _OF_EACH * len(views))
     places = rng.integers(0, pixels.photographs.count, wanted)
     numbers = np.unique(pixels.photographs.numbers(places)).astype(np.uint32)
-    numbers, source, target, place = _of_first(
+    numbers, source, target, place = of_first(
         ranks, lambda: _matches(scene, views, pixels, numbers, rng)
     )
     numbers = numbers.astype(np.uint32)
@@ -174,7 +174,7 @@ def _matches(
     return numbers, source[clear], target[clear], place[clear]
 
 
-def _of_first(ranks: Ranks, look: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
+def of_first(ranks: Ranks, look: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
     """Whole numbers that the first process finds, on all: rays may differ between machines."""
     if ranks.size == 1:
         return look()

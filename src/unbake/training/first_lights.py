@@ -7,18 +7,21 @@ import mitsuba as mi
 import numpy as np
 
 from ..dataset.pixels import PixelSource
+from ..dataset.spread import places
 from ..fields.arrays import from_numpy
 from ..fields.emission import Emission
 from ..fields.materials import carrying
 from ..ranks import Ranks
+from .first_gains import of_first
 from .problem import Problem
 
-#: Random pixels of all views that are looked at, at most.
+#: Pixels of all views that are looked at, at most, evenly spread.
 _PIXELS = 1 << 18
 #: Places in a pixel that must all show the same light: its middle, and near its corners.
 _PLACES = ((0.5, 0.5), (0.05, 0.05), (0.05, 0.95), (0.95, 0.05), (0.95, 0.95))
-#: Pixels that must show a light.
-_FEWEST = 1
+#: Pixels that must show a light as a whole; and where poses are not known, so that some of them
+#: show what is beside it.
+_FEWEST, _FEWEST_OF_POSES = 1, 16
 #: A light begins no darker than this part of what it would have begun with: black ones could not
 #: become brighter.
 _DARKEST = 1e-3
@@ -30,11 +33,12 @@ def begin_lights(problem: Problem, pixels: PixelSource, ranks: Ranks | None = No
     All others begin as they would, at the level of the photographs. Steps change a strength by a
     few percent: a lamp that is a thousandth of its neighbour would not get there. What a lamp
     reflects is in its pixels, too, and where they are clipped it is brighter: steps find that.
+    Behind panes no light is found.
 
     Args:
         problem: of a fit that has not begun. Nothing happens where no strengths are unknown, where
-            photographs do not show lights, or where something of the cameras is unknown that
-            changes how bright they are.
+            lights are hidden in photographs, or where exposures, white balances, vignetting or
+            a response are unknown.
         pixels: of the training views.
         ranks: that begin together; None: there is one.
     """
@@ -42,7 +46,7 @@ def begin_lights(problem: Problem, pixels: PixelSource, ranks: Ranks | None = No
     if emission is None or problem.hide_emitters or problem.camera is not None:
         return
     ranks, begun = ranks or Ranks(), np.array(emission.values).T
-    found = ranks.together(lambda: _seen(problem, emission, pixels))
+    found = _seen(problem, emission, pixels)
     strengths = np.where(np.isfinite(found), np.maximum(found, _DARKEST * begun), begun)
     emission.start(ranks.as_first((strengths / emission.scale).astype(np.float32)))
 
@@ -50,30 +54,54 @@ def begin_lights(problem: Problem, pixels: PixelSource, ranks: Ranks | None = No
 def _seen(problem: Problem, emission: Emission, pixels: PixelSource) -> np.ndarray:
     """The strengths that photographs show, linear RGB, shape (lights, 3); NaN of no light in view.
 
-    It leaves the strengths at something else.
+    Processes that share the photographs all call this together. It leaves the strengths at
+    something else.
     """
-    count = pixels.photographs.count
-    places = np.arange(count)
-    if count > _PIXELS:
-        places = np.unique(np.random.default_rng(0).integers(0, count, _PIXELS))
-    numbers = pixels.photographs.numbers(places)
-    codes = np.stack([np.ones(emission.count), np.arange(1, emission.count + 1)])
-    shown = np.array([_shown(problem, emission, pixels, numbers, code) for code in codes])
-    patterns, coded = shown  # (places, pixels, 3)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        which = np.rint(np.nanmax(coded / patterns, axis=2, initial=0, where=patterns > 0))
-    whole = (which[0] > 0) & (which == which[0]).all(0)
-    light, pattern = which[0, whole].astype(np.int64) - 1, patterns.mean(0)[whole]
-    radiance = pixels.photographs.radiance(numbers)[whole]
+    photographs = pixels.photographs
+    ranks = Ranks() if photographs.share is None else photographs.share.ranks
+    numbers = photographs.numbers(places(photographs.count, _PIXELS)).astype(np.uint32)
+    whole, light = of_first(ranks, lambda: _lights(problem, emission, pixels, numbers))
+    numbers = numbers[whole]
+    radiance = photographs.radiance(numbers)
+    if not len(numbers):
+        return np.full((emission.count, 3), np.nan)
+    pattern = _shown(problem, emission, pixels, numbers, np.ones(emission.count)).mean(0)
+    fewest = _FEWEST if problem.poses is None else _FEWEST_OF_POSES
     found = np.full((emission.count, 3), np.nan)
-    for number in np.flatnonzero(np.bincount(light, minlength=emission.count) >= _FEWEST):
-        chosen = light == number
+    for number in np.flatnonzero(np.bincount(light, minlength=emission.count) >= fewest):
         for channel in range(3):
-            told = chosen & (pattern[:, channel] > 0)
+            weight = pattern[light == number, channel]
+            # Where a picture is dark, pixels show what the lamp reflects.
+            told = weight > 0
             if told.any():
-                ratios = radiance[told, channel] / pattern[told, channel]
-                found[number, channel] = np.median(ratios)
+                ratios = radiance[light == number, channel][told] / weight[told]
+                found[number, channel] = _median(ratios, weight[told])
     return found
+
+
+def _median(values: np.ndarray, weights: np.ndarray) -> float:
+    """The value below and above which there is as much weight."""
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order][np.searchsorted(sums, sums[-1] / 2)])
+
+
+def _lights(
+    problem: Problem, emission: Emission, pixels: PixelSource, numbers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels show nothing but an unknown light, as places among them, and which one.
+
+    Light that is known is the same, however strong the unknown ones are.
+    """
+    ones = np.ones(emission.count)
+    once, coded = (
+        _shown(problem, emission, pixels, numbers, strengths)
+        for strengths in (ones, ones + 1 + np.arange(emission.count))
+    )
+    ratios = np.divide(coded, once, out=np.zeros_like(coded), where=once > 0)
+    which = np.rint(ratios.max(2)).astype(np.int64) - 2
+    whole = np.flatnonzero((which[0] >= 0) & (which == which[0]).all(0))
+    return whole, which[0, whole]
 
 
 @carrying()
@@ -93,11 +121,9 @@ def _shown(
     Returns:
         Linear RGB, shape (places, n, 3).
     """
-    logs = np.repeat(np.log(strengths / emission.scale), 3).astype(np.float32)
-    emission.assign({"log": from_numpy(mi.Float, logs)})
-    emission.prepare()
+    emission.start(strengths / emission.scale)
     scene, found = problem.scene_view.scene, []
-    pixel = from_numpy(mi.UInt32, numbers.astype(np.uint32))
+    pixel = from_numpy(mi.UInt32, numbers)
     with dr.suspend_grad():
         for place in _PLACES:
             ray = pixels.rays.through(pixel, mi.Point2f(*place))
