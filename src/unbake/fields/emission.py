@@ -71,7 +71,7 @@ class Emission:
         """
         if len(factors) != self.count:
             raise ValueError(f"{len(factors)} factors for {self.count} lights")
-        each = np.reshape(factors, (self.count, -1)).repeat(3 // np.size(factors[0]), 1)
+        each = np.broadcast_to(np.reshape(factors, (self.count, -1)), (self.count, 3))
         logs = np.log(each).ravel().astype(np.float32)
         self._log = from_numpy(mi.Float, logs)
         self.tables["start"] = dr.unravel(mi.Color3f, from_numpy(mi.Float, logs))

@@ -10,6 +10,7 @@ from unbake.fields.registry import representation, representations
 from unbake.quantities import QUANTITIES
 from unbake.report import display
 from unbake.report.runs import EvaluatedRun
+from unbake.training.verdicts import WORDS, in_units_of_noise
 
 #: How notes of fits that learned nothing begin.
 _LEARNED_NOTHING = ("nothing was learned", "nothing useful was learned")
@@ -87,22 +88,15 @@ def _trend(run: EvaluatedRun) -> list[str]:
     found = run.metrics.get("convergence") or {}
     keys = ("change", "share", "noise")
     change, share, noise = (display.number(found.get(key)) for key in keys)
-    word = {
-        "improving": "still improving",
-        "plateau": "at a plateau",
-        "rising": "getting worse",
-        "unclear": "too noisy",
-    }
-    if change is None or share is None or found.get("trend") not in word:
+    word = WORDS.get(str(found.get("trend")))
+    if change is None or share is None or word is None:
         return []
     spread = "" if noise is None else f" ± {100 * noise:.1f}"
     moved = f"{'rose' if change > 0 else 'fell'} by {100 * abs(change):.1f}{spread} %"
-    if noise is not None and (noise >= 1 or change < -1):
-        verb, times = "rose" if change > 0 else "fell", abs(change) / max(noise, 1e-9)
-        less = "changed by less than its noise"
-        moved = less if times <= 1 else f"{verb} by {times:.1f} times its noise"
+    if noise is not None:
+        moved = in_units_of_noise(change, noise) or moved
     told = f"the error on held-aside pixels {moved} over the last {100 * share:.0f} % of the fit"
-    return [f"{word[found['trend']]} ({told})"]
+    return [f"{word} ({told})"]
 
 
 def _warnings(run: EvaluatedRun) -> list[str]:

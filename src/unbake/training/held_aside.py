@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, final
 
 import mitsuba as mi
 import numpy as np
@@ -21,6 +21,7 @@ from .checkpoint import Progress
 from .poses import PoseModel, refined_view
 from .state import State
 from .step import TrainingStep
+from .verdicts import WORDS, Trend, in_units_of_noise
 
 #: The error is measured after each quarter of a fit. In between it is after each of so many parts,
 #: as long as all of it takes less than this share of the training time.
@@ -41,8 +42,6 @@ _FEWEST_TO_RISE = 500
 _SEEN = 0.05
 #: Keys of a line of the log: the error, and those of groups of the pixels.
 ERROR, GROUPS = "held_aside", "held_aside_groups"
-
-Trend = Literal["improving", "plateau", "rising", "unclear"]
 
 
 class _Probe:
@@ -333,24 +332,14 @@ class Convergence:
         verb = "rose" if self.change > 0 else "fell"
         part = "the last quarter" if abs(self.share - LAST) < 0.05 else f"the last {self.share:.0%}"
         sizes = f"{verb} {100 * abs(self.change):.1f} ± {100 * self.noise:.1f} %"
-        # Errors have no bias, and those of a good fit may be about zero.
-        if self.noise >= 1 or self.change < -1:
-            times = abs(self.change) / max(self.noise, 1e-9)
-            less = "changed by less than its noise"
-            sizes = less if times <= 1 else f"{verb} by {times:.1f} times its noise"
-        word, advice = {
-            "improving": ("still improving", "a longer fit may be better: --quality high"),
-            "plateau": (
-                "at a plateau",
-                f"a longer fit explains photographs no better{may_gain}",
-            ),
-            "rising": ("getting worse", "more views would help, or a shorter fit"),
-            "unclear": (
-                "too noisy",
-                "held-out views of a longer fit would show whether it is better",
-            ),
+        sizes = in_units_of_noise(self.change, self.noise) or sizes
+        advice = {
+            "improving": "a longer fit may be better: --quality high",
+            "plateau": f"a longer fit explains photographs no better{may_gain}",
+            "rising": "more views would help, or a shorter fit",
+            "unclear": "held-out views of a longer fit would show whether it is better",
         }[self.trend]
-        return f"held-aside pixels: {word}; error {sizes} in {part}\n  {advice}"
+        return f"held-aside pixels: {WORDS[self.trend]}; error {sizes} in {part}\n  {advice}"
 
 
 def convergence(log: Sequence[Mapping[str, Any]], by: str = "step") -> Convergence | None:
