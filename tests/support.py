@@ -131,6 +131,13 @@ def built_in_cameras(name: str, size: int, views: int = 1) -> list[Camera]:
     ]
 
 
+def with_more(scene: Path, text: str) -> Path:
+    """The scene with something at its end, in a file beside it."""
+    more = scene.with_name("more.xml")
+    more.write_text(scene.read_text().replace("</scene>", f"{text}</scene>"))
+    return more
+
+
 def pixel_rays(cameras: list[Camera], spp: int, seed: int) -> mi.Ray3f:
     """Jittered rays through every pixel, `spp` consecutive lanes a pixel."""
     rays = CameraRays.of(cameras)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from support import random_values, tiny_fields
+from support import random_values, tiny_fields, with_more
 
 import unbake
 from unbake.dataset.camera import Camera, LookAt
@@ -37,7 +37,7 @@ from unbake.exports.bake import (
 )
 from unbake.exports.constants import Constants, material_constants
 from unbake.exports.gltf import Document
-from unbake.exports.lights import environment_picture
+from unbake.exports.lights import environment_picture, read_lights
 from unbake.exports.mitsuba import write_scene
 from unbake.exports.observed import Views, filled, training_views
 from unbake.exports.parts import parsed_principled, read_parts
@@ -49,8 +49,10 @@ from unbake.exports.usd import write_usd
 from unbake.imaging.metrics import psnr
 from unbake.imaging.pictures import read_exr, tonemap, write_exr, write_png
 from unbake.quantities import QUANTITIES
+from unbake.scene.parse import parse
 from unbake.scene.triangles import write_mesh
 from unbake.training.loop import fit
+from unbake.training.problem import make_problem
 from unbake.training.recovered import Recovered, load_run
 from unbake.transport.render import render_materials
 
@@ -1018,6 +1020,18 @@ def test_recovered_strengths_are_numbers_of_the_scene(data, tmp_path, monkeypatc
         (start,) = set(light["strength"])
         assert f"{start:.6g}"[:6] in text
     assert any("learned no materials" in note for note in manifest["notes"])
+
+
+def test_strengths_stay_with_their_lights_where_the_environment_is_recovered_too(mixed):
+    scene = with_more(mixed, '<emitter type="point" id="last"/>')
+    config = replace(tiny_fields("grid"), unknown="lighting+emission")
+    problem = make_problem(scene, "visible", config, 0.2)
+    strengths = 1 + np.arange(len(problem.emitter_names))
+    problem.emission.start(strengths / problem.emission.scale)
+    found = read_lights(parse(scene, scene.parent), problem)
+    assert len(found) > 1 and problem.environment is not None
+    assert [light.name for light in found] == problem.emitter_names
+    np.testing.assert_allclose([light.strength[0] for light in found], strengths, rtol=1e-5)
 
 
 #: A lamp whose enamel no other shape has.

@@ -165,7 +165,7 @@ def in_parts_and_whole(data, config, folder, monkeypatch, threads=nullcontext):
 
 FORMS = [(form, "neural") for form in representations()]
 FORMS += [("neural", form) for form in representations(radiance=True) if form != "neural"]
-UNKNOWNS = ("lighting", "materials+lighting", "emission")
+UNKNOWNS = ("lighting", "materials+lighting", "emission", "materials+emission")
 MATRIX = [
     *({"method": method} for method in METHODS),
     *({"unknown": unknown} for unknown in UNKNOWNS),

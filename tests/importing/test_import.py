@@ -624,7 +624,7 @@ def test_light_that_nobody_gave_is_unknown_and_every_command_says_so(
 ):
     data = tmp_path / "data"
     given = [word for mesh in meshes for word in ("--mesh", mesh)]
-    command = f"next: unbake fit {data} --unknown materials+lighting --out RUN"
+    command = f"next: unbake fit {data} --out RUN"
     assert command in unbake("import", nerfstudio, *given, "--out", data).out
     assert Dataset.load(data).light == "unknown"
     assert command in unbake("data", "check", data).out
@@ -1017,7 +1017,7 @@ def test_the_command_leads_to_a_fit(nerfstudio, meshes, tmp_path, unbake):
     words = [word for mesh in meshes for word in ("--mesh", mesh)]
     outcome = unbake("import", nerfstudio, *words, "-o", tmp_path / "data")
     assert outcome.status == 0 and outcome.err == ""
-    assert outcome.out.rstrip().endswith("--unknown materials+lighting --out RUN")
+    assert outcome.out.rstrip().endswith(f"next: unbake fit {tmp_path / 'data'} --out RUN")
     assert Path(tmp_path / "data").is_dir()
 
 

@@ -83,7 +83,6 @@ def test_lights_besides_an_environment_are_counted_unless_they_are_black(kind, p
     assert emitters.lights_besides(alone, emitters.ENVIRONMENTS) == 0
     assert emitters.lights_besides(lit, emitters.ENVIRONMENTS) == 1
     assert emitters.lights_besides(lit, tuple(emitters.STRENGTHS)) == (kind != "constant")
-    assert emitters.fits_environment(lit) == (kind == "constant")
 
 
 def test_lights_are_told_by_name_and_strength(parse_lit):

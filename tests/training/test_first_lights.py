@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import drjit as dr
 import numpy as np
 import pytest
 from support import TINY_FIT
@@ -12,6 +13,7 @@ from unbake.config import CameraConfig
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.views import Dataset
 from unbake.imaging.pictures import write_exr
+from unbake.training.first_lights import WAITS, release_lights
 from unbake.training.fresh_fit import begin_fit
 from unbake.training.problem import problem_of
 
@@ -98,3 +100,37 @@ def test_they_begin_alike_where_photographs_do_not_tell(data):
         found, scale = begun(views, config)
         for strength in found.values():
             np.testing.assert_allclose(strength, scale, rtol=1e-4)
+
+
+def gradients(problem):
+    """What a gradient of all strengths does to each of them, (lights, 3)."""
+    array = problem.emission.parameters()["log"]
+    dr.enable_grad(array)
+    problem.assign(problem.parameters())
+    dr.backward(dr.sum(problem.emission.values, axis=None))
+    return np.array(dr.grad(array)).reshape(-1, 3)
+
+
+def test_lights_in_view_are_held_until_albedo_is_near(data):
+    """Bright ones to the end: what they reflect is nothing beside what they are."""
+    problem = begin_fit(data, dataclasses.replace(UNKNOWN, unknown="materials+emission")).problem
+    names, free = problem.emitter_names, {"inside"}
+    assert {names[i] for i in problem.emission.held} == {*names} - free
+    release_lights(problem, 0.9 * WAITS)
+    assert {names[i] for i in problem.emission.held} == {*names} - free
+    release_lights(problem, WAITS)
+    sure = {"bright", "screen"}
+    assert {names[i] for i in problem.emission.held} == sure
+    for name, moved in zip(names, gradients(problem), strict=True):
+        assert (moved == 0).all() if name in sure else (moved > 0).all()
+    release_lights(problem, 1.0)
+    assert {names[i] for i in problem.emission.held} == sure
+
+
+def test_lights_alone_are_free_and_so_are_clipped_ones(data):
+    assert not begin_fit(data, UNKNOWN).problem.emission.held
+    views = tuple(dataclasses.replace(view, clipped=1.0) for view in data.views)
+    both = dataclasses.replace(UNKNOWN, unknown="materials+emission")
+    problem = begin_fit(dataclasses.replace(data, views=views), both).problem
+    held = {problem.emitter_names[i] for i in problem.emission.held}
+    assert "bright" not in held and "dim" in held

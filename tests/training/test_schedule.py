@@ -1,9 +1,10 @@
 """Learning rates: they decay, those of the unknowns first rise, and every unknown has one."""
 
 import dataclasses
+from typing import get_args
 
 import pytest
-from support import TINY_FIT
+from support import TINY_FIT, with_more
 
 from unbake.config import (
     BitmapConfig,
@@ -12,6 +13,7 @@ from unbake.config import (
     FitConfig,
     LightingConfig,
     NetworkConfig,
+    Unknown,
     update,
 )
 from unbake.training.problem import make_problem
@@ -97,27 +99,36 @@ def test_each_representation_has_its_rates(settings, albedo, roughness, radiance
     assert learning_rates(changed(**settings), 0, 0) == expected
 
 
+#: The first words of parameters' names, by what is unknown.
+WORDS = {
+    "materials": {"albedo", "roughness"},
+    "lighting": {"environment"},
+    "emission": {"emission"},
+    "materials+lighting": {"albedo", "roughness", "environment"},
+    "materials+emission": {"albedo", "roughness", "emission"},
+    "lighting+emission": {"environment", "emission"},
+    "materials+lighting+emission": {"albedo", "roughness", "environment", "emission"},
+}
+
+
+def test_all_that_may_be_unknown_is_known_here():
+    assert {*WORDS, "auto"} == {*get_args(Unknown)}
+
+
 @pytest.mark.parametrize("representation", ["neural", "grid", "bitmap", "triplane"])
-@pytest.mark.parametrize("unknown", ["materials", "lighting", "materials+lighting", "emission"])
+@pytest.mark.parametrize("unknown", WORDS)
 def test_every_parameter_has_a_rate(unknown, representation, built_in):
     small = {"grid": {"cells": 4}, "bitmap": {"resolution": 4}, "triplane": {"levels": 1}}
     config = dataclasses.replace(TINY_FIT, unknown=unknown, representation=representation)
     config = update(config, {"materials": {"albedo": small, "roughness": small}})
-    scene = "cornell" if unknown in ("materials", "emission") else "still"
-    problem = make_problem(built_in(scene), "visible", config, 0.2)
+    scene = built_in("still" if "lighting" in unknown else "cornell")
+    if {"environment", "emission"} <= WORDS[unknown]:
+        scene = with_more(scene, '<emitter type="point"/>')
+    problem = make_problem(scene, "visible", config, 0.2)
     state, rates = initial_state(problem), learning_rates(config, 0, 0)
     state.set_learning_rates(rates)
     assert len(state.phi) > 0
     for name in state.phi:
         word = name.partition(".")[0]
         assert float(state.phi.learning_rate(name)[0]) == pytest.approx(rates[word])
-    words = {name.partition(".")[0] for name in state.phi}
-    assert (
-        words
-        == {
-            "materials": {"albedo", "roughness"},
-            "lighting": {"environment"},
-            "materials+lighting": {"albedo", "roughness", "environment"},
-            "emission": {"emission"},
-        }[unknown]
-    )
+    assert {name.partition(".")[0] for name in state.phi} == WORDS[unknown]

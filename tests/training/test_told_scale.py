@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import TINY_FIT, built_in_cameras, on_ranks, tiny_fields
+from support import TINY_FIT, built_in_cameras, on_ranks, tiny_fields, with_more
 
 from unbake.config import LightingConfig
+from unbake.dataset.camera import Camera
 from unbake.dataset.pixels import PixelSource
 from unbake.dataset.views import Dataset, View
 from unbake.imaging.pictures import write_exr, write_png
@@ -16,25 +17,18 @@ from unbake.training.problem import make_problem, pixels_of
 from unbake.training.regularizers import is_anchored
 from unbake.training.sharing import kept_whole
 from unbake.training.step import TrainingStep
-from unbake.training.told_scale import shows_environment
+from unbake.training.told_scale import shows_light
 
 SIZE = 8
 BOTH = replace(TINY_FIT, unknown="materials+lighting")
-LAMP = '<emitter type="point"><rgb name="intensity" value="1"/></emitter></scene>'
+LAMP = '<emitter type="point"><rgb name="intensity" value="1"/></emitter>'
 MIRROR = """<shape type="sphere"><point name="center" value="0,0,0.9"/>
-    <float name="radius" value="0.3"/><bsdf type="conductor"/></shape></scene>"""
+    <float name="radius" value="0.3"/><bsdf type="conductor"/></shape>"""
 
 
 @pytest.fixture
 def still(built_in):
     return built_in("still")
-
-
-def with_more(scene, text):
-    """The scene with something at its end."""
-    more = scene.with_name("more.xml")
-    more.write_text(scene.read_text().replace("</scene>", text))
-    return more
 
 
 def lighting(**settings):
@@ -78,7 +72,7 @@ def test_the_scale_is_told_where_counted_pixels_show_the_environment(
     scene = with_more(still, MIRROR) if mirror else still
     config = replace(BOTH, lighting=lighting())
     problem = begun(scene, background, config, masked=masked)
-    assert problem.shows_environment is told
+    assert problem.shows_light is told
     assert is_anchored(problem, config) is not told
 
 
@@ -86,7 +80,7 @@ def test_the_scale_is_told_where_counted_pixels_show_the_environment(
 def test_earlier_fits_go_by_the_background(background, anchored, still):
     config = replace(BOTH, lighting=lighting(scale_told_by="background"))
     problem = begun(still, background, config, masked=True)
-    assert problem.shows_environment is None
+    assert problem.shows_light is None
     assert is_anchored(problem, config) is anchored
 
 
@@ -94,18 +88,18 @@ def test_earlier_fits_go_by_the_background(background, anchored, still):
 def test_nobody_looks_where_no_scale_is_open(unknown, still):
     config = replace(BOTH, unknown=unknown, lighting=lighting())
     problem = begun(still, "visible", config, masked=False)
-    assert problem.shows_environment is None and not is_anchored(problem, config)
+    assert problem.shows_light is None and not is_anchored(problem, config)
 
 
 @pytest.mark.parametrize(
     ("background", "masked", "more", "change", "whole"),
     [
-        ("visible", False, "</scene>", {}, False),
-        ("visible", True, "</scene>", {}, True),
+        ("visible", False, "", {}, False),
+        ("visible", True, "", {}, True),
         ("visible", True, LAMP, {}, False),
-        ("visible", True, "</scene>", {"anchor": 0.0}, False),
-        ("visible", True, "</scene>", {"scale_told_by": "background"}, False),
-        ("hidden", True, "</scene>", {}, True),
+        ("visible", True, "", {"anchor": 0.0}, False),
+        ("visible", True, "", {"scale_told_by": "background"}, False),
+        ("hidden", True, "", {}, True),
     ],
 )
 def test_processes_that_may_hold_the_mean_albedo_read_all_photographs(
@@ -164,7 +158,7 @@ def test_processes_learn_what_the_views_of_others_show(still, tmp_path):
 
         def look(ranks):
             pixels = pixels_of(dataset, config, clip_negative=False, ranks=ranks)
-            return shows_environment(problem, config, pixels)
+            return shows_light(problem, config, pixels)
 
         return on_ranks(len(chosen), look)
 
@@ -175,4 +169,38 @@ def test_processes_learn_what_the_views_of_others_show(still, tmp_path):
 def test_a_known_lamp_tells_the_scale(still):
     config = replace(BOTH, lighting=lighting())
     problem = begun(with_more(still, LAMP), "visible", config, masked=True)
-    assert problem.shows_environment is None and not is_anchored(problem, config)
+    assert problem.shows_light is None and not is_anchored(problem, config)
+
+
+PANEL = """<shape type="rectangle"><transform name="to_world"><scale value="0.5"/>
+    <translate z="0.9"/></transform><emitter type="area"/></shape>"""
+
+
+@pytest.mark.parametrize(
+    ("unknown", "sky", "lamp", "told"),
+    [
+        ("materials+emission", "", PANEL, True),
+        ("materials+emission", "", LAMP, False),
+        ("materials+emission", "<emitter type='constant'/>", PANEL, True),
+        ("materials+emission", "<emitter type='sunsky'/>", PANEL, None),
+        ("materials+lighting", "<emitter type='constant'/>", PANEL, None),
+        ("materials+lighting+emission", "<emitter type='constant'/>", PANEL, True),
+        ("lighting+emission", "<emitter type='constant'/>", PANEL, None),
+    ],
+)
+@pytest.mark.parametrize("clipped", [False, True])
+def test_lamps_in_view_tell_the_scale_where_they_are_not_clipped(
+    unknown, sky, lamp, told, clipped, tmp_path
+):
+    """Asked, that is, where they and albedo are unknown, and no light is known."""
+    floor = '<shape type="rectangle"><transform name="to_world"><scale value="4"/></transform>'
+    (tmp_path / "scene.xml").write_text(
+        f"""<scene version="3.0.0">{floor}<bsdf type="principled"/></shape>{sky}{lamp}</scene>"""
+    )
+    camera = Camera.look_at([0, 0, 2.5], [0, 0, 0], [0, 1, 0], 60, SIZE, SIZE)
+    config = replace(TINY_FIT, unknown=unknown, lighting=lighting())
+    problem = make_problem(tmp_path / "scene.xml", "visible", config, 0.2)
+    rgb = np.full((SIZE * SIZE, 3), 0.2)
+    pixels = PixelSource.of([camera], rgb, np.ones(len(rgb)), foreground_only=False)
+    pixels = replace(pixels, limits=np.array([0.05 if clipped else 0.3], np.float32))
+    assert shows_light(problem, config, pixels) is (told and not clipped)

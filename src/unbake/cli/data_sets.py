@@ -153,7 +153,7 @@ def import_(
             print(f"  {printable(fault, LONGEST)}", file=sys.stderr)
         raise UserError(f"{error.count}, listed above", source, error.remedy) from None
     took = f"{time.perf_counter() - start:.0f} s"
-    say(f"wrote {out} in {took}; next: {_fit_of(out, light_known=known is not None)}")
+    say(f"wrote {out} in {took}; next: {_fit_of(out)}")
 
 
 def data(
@@ -201,8 +201,7 @@ def data(
         say(f"wrote {write_check(result, out, clip_negative=clip_negative)}")
     kinds = {kind: result.count(kind) for kind in ("error", "warning", "hint")}
     told = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in kinds.items() if n)
-    known = result.dataset is None or result.dataset.light == "known"
-    ready = f"next: {_fit_of(folder, light_known=known)}"
+    ready = f"next: {_fit_of(folder)}"
     say(f"{told or 'nothing is wrong'}; {ready if result.usable else 'a fit makes no sense yet'}")
     return 0 if result.usable else 2
 
@@ -245,7 +244,6 @@ def degrade(
     say(f"wrote {out}; next: unbake data check {quoted(out)}")
 
 
-def _fit_of(data: Path, *, light_known: bool) -> str:
-    """The command that fits a data set."""
-    unknown = "" if light_known else " --unknown materials+lighting"
-    return f"unbake fit {quoted(data)}{unknown} --out RUN"
+def _fit_of(data: Path) -> str:
+    """The command that fits a data set, which says itself whether its light is unknown."""
+    return f"unbake fit {quoted(data)} --out RUN"

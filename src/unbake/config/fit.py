@@ -5,7 +5,7 @@ Fields cite the section of the paper, or say that the choice is ours, where one 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -34,7 +34,16 @@ Estimator = Literal["auto", ChosenEstimator]
 Reference = Literal["smoothed", "photograph"]
 PixelSampling = Literal["all-views", "one-view-crop"]
 PriorName = Literal["one-bounce", "extra-bounce"]
-Unknown = Literal["auto", "materials", "lighting", "materials+lighting", "emission"]
+Unknown = Literal[
+    "auto",
+    "materials",
+    "lighting",
+    "emission",
+    "materials+lighting",
+    "materials+emission",
+    "lighting+emission",
+    "materials+lighting+emission",
+]
 Lamps = Literal["known", "fitted"]
 LampPictures = Literal["known", "ignored"]
 ScaleToldBy = Literal["pixels", "background"]
@@ -110,7 +119,7 @@ class PathConfig:
 class LightingConfig:
     """The unknown environment map and the unknown strength of lights (Sec. 5.1, Fig. 8).
 
-    Where materials are unknown as well, no photograph shows the environment and no other light is
+    Where materials are unknown as well, no photograph shows unknown light and no other light is
     known, albedo and light are known up to one factor a channel. It is then chosen such that the
     mean albedo of what the training views see is `mean_albedo`.
     """
@@ -123,8 +132,9 @@ class LightingConfig:
     initial_radiance: float = 0.0
     mean_albedo: float = 0.5  #: the convention, each channel (ours)
     anchor: float = 1.0  #: weight of the squared deviation from it
-    #: What tells the factor instead. pixels: those to train on that show the environment, directly
-    #: or in mirrors and glass; background: any that is visible, and no mirror (ours).
+    #: What tells the factor instead. pixels: those to train on that show unknown light, directly or
+    #: in mirrors and glass, and are not clipped; background: any that is visible, and no mirror
+    #: (ours).
     scale_told_by: ScaleToldBy = "pixels"
 
     def __post_init__(self) -> None:
@@ -229,9 +239,9 @@ class FitConfig:
         Unknown,
         Flag(
             "What to recover: materials (the --quantities), lighting (the environment map), "
-            "materials+lighting, emission (colour and strength of the lights, where the "
-            "environment is known), or auto: materials, and lighting with them where the data "
-            "set says that its light is unknown",
+            "emission (colour and strength of the lights), several of them, as in "
+            "materials+lighting or materials+emission, or auto: materials, and lighting with them "
+            "where the data set says that its light is unknown",
             metavar="WHAT",
         ),
     ] = "auto"
@@ -566,23 +576,33 @@ class FitConfig:
         So they are with `unknown = "auto"`, which a fit that starts replaces by what the data set
         says.
         """
-        return self.unknown in ("auto", "materials", "materials+lighting")
+        return self.unknown == "auto" or "materials" in self._unknown_parts
 
     @property
     def learns_environment(self) -> bool:
         """Whether the environment map is unknown."""
-        return self.unknown in ("lighting", "materials+lighting")
+        return "lighting" in self._unknown_parts
+
+    @property
+    def learns_emission(self) -> bool:
+        """Whether the strengths of lights are unknown."""
+        return "emission" in self._unknown_parts
+
+    @property
+    def _unknown_parts(self) -> Sequence[str]:
+        return self.unknown.split("+")
 
     @property
     def shares_scale(self) -> bool:
-        """Whether albedo and the environment are both unknown, and may share an open factor."""
-        return self.unknown == "materials+lighting" and "albedo" in self.quantities
+        """Whether albedo and light are both unknown, and may share an open factor."""
+        light = self.learns_environment or self.learns_emission
+        return light and self.learns_materials and "albedo" in self.quantities
 
     @property
     def unknowns(self) -> tuple[str, ...]:
         """What is recovered: names of `UNKNOWNS`."""
         found = self.quantities if self.learns_materials else ()
-        lights = {"environment": self.learns_environment, "emission": self.unknown == "emission"}
+        lights = {"environment": self.learns_environment, "emission": self.learns_emission}
         return (*found, *(name for name, learned in lights.items() if learned))
 
     @property

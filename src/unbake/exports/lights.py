@@ -54,11 +54,12 @@ def read_lights(scene: ParsedScene, problem: Problem) -> list[Light]:
     """
     found = []
     recovered = None if problem.emission is None else np.array(problem.emission.values).T
-    pairs = zip(named_emitters(scene), emitter_nodes(scene), strict=True)
-    for i, (named, node) in enumerate(pairs):
-        props = scene.state.nodes[node].props
-        if problem.environment is not None and props.plugin_name() in ENVIRONMENTS:
-            continue
+    nodes = scene.state.nodes
+    there = [*zip(named_emitters(scene), emitter_nodes(scene), strict=True)]
+    if problem.environment is not None:  # the fit has no lamp in the place of the scene's own
+        there = [x for x in there if nodes[x[1]].props.plugin_name() not in ENVIRONMENTS]
+    for i, (named, node) in enumerate(there):
+        props = nodes[node].props
         strength, varies, pattern = named.strength, named.varies, None
         if recovered is not None and problem.emission is not None:
             pattern = problem.emission.patterns[i]

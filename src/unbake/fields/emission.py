@@ -56,10 +56,15 @@ class Emission:
         self.count = count
         self.patterns = list(patterns) or [None] * count
         self.scale = scale
+        self._lastly: np.ndarray | None = None  # what is held after `release`
         self._log = dr.zeros(mi.Float, 3 * count)
         dr.make_opaque(self._log)
-        #: The logs at the start, and what `prepare` computes; textures hold it too.
-        self.tables = {"start": dr.zeros(mi.Color3f, count)}
+        #: The logs at the start, which of them are held, and what `prepare` computes; textures
+        #: hold it too.
+        self.tables = {
+            "start": dr.zeros(mi.Color3f, count),
+            "held": dr.zeros(mi.Color3f, count),
+        }
         dr.make_opaque(self.tables)
         self.prepare()
 
@@ -78,6 +83,30 @@ class Emission:
         dr.make_opaque(self.tables)
         self.prepare()
 
+    def hold(self, which: np.ndarray, *, lastly: np.ndarray | None = None) -> None:
+        """Let no gradient reach some strengths, which then stay as they are.
+
+        Args:
+            which: of the lights, shape (lights, 3) bool.
+            lastly: those that are held after `release`, too; None: none are.
+        """
+        self._lastly = np.zeros_like(which) if lastly is None else lastly
+        held = from_numpy(mi.Float, which.astype(np.float32).ravel())
+        self.tables["held"] = dr.unravel(mi.Color3f, held)
+        dr.make_opaque(self.tables)
+
+    def release(self) -> None:
+        """Let gradients reach what `hold` held, but for what is held to the last."""
+        if self._lastly is not None:
+            self.hold(self._lastly)
+            self._lastly = None
+
+    @property
+    def held(self) -> list[int]:
+        """The lights of which no gradient reaches some channel."""
+        held = np.array(self.tables["held"]).reshape(3, -1)
+        return np.flatnonzero(held.any(0)).tolist()
+
     def parameters(self) -> dict[str, mi.Float]:
         """The trainable array, RGB of one light after the other; `assign` takes it back."""
         return {"log": self._log}
@@ -92,6 +121,7 @@ class Emission:
         moved = log - self.tables["start"]
         # Clipped entries keep a gradient, which brings them back.
         log += dr.detach(dr.clip(moved, -BOUND, BOUND) - moved)
+        log = dr.select(self.tables["held"] > 0, dr.detach(log), log)
         self.tables["values"] = self.scale * dr.exp(log)
         dr.eval(self.tables)
 

@@ -16,7 +16,7 @@ from ..acquisition.new_light import put_light, tell_tilt
 from ..config.light import LightConfig
 from ..dataset.data_folder import TRANSFORMS, DataFolder
 from ..dataset.photographs import MOST_PIXELS
-from ..dataset.views import LONGEST_NAME
+from ..dataset.views import LONGEST_NAME, Dataset
 from ..errors import UserError, named, printable
 from ..imaging.headers import CODED_SUFFIXES
 from ..io import filled_folder, require_new_folder, require_utf8
@@ -26,6 +26,7 @@ from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
+from .lamps import Lamp, find_lamps, with_lamps
 from .lens import WIDEST
 from .meshes import TO_Z_UP, Part, check_place, read_parts, write_scene
 from .photographs import Pictures, check_cameras, check_pictures
@@ -121,6 +122,8 @@ def import_data(
         with faults.collected():
             known, told = read_table(Path(exposures), found.shots, faults)
     _check_light(light, allow_outside, faults)
+    if light is not None and settings.lamps == "found":
+        faults.add("lamps are found where the light is unknown: leave out --lamps, or the light")
     names = _names(found.shots, faults)
     check_cameras(found.shots, faults)
     splits = _splits(found.shots, settings.holdout)
@@ -135,7 +138,7 @@ def import_data(
         file, scene = _write_scene(data, parts, found.shots, light, allow_outside, tell)
         # Before photographs are decoded, which may take long
         seen = _shares_seen(scene, found, parts, settings, turnable=mesh_matrix is None)
-        dark = light is None and _enclosed(scene, found.shots)
+        enclosed = light is None and _enclosed(scene, found.shots)
         require_disk(folder.parent, found.shots, settings.longest)
         pictures = check_pictures(found.shots, faults, tell)
         faults.require_none(source)
@@ -150,16 +153,18 @@ def import_data(
             | ({"light": "unknown"} if light is None else {})
             | {"frames": frames}
         )
+        lamps = _put_lamps(data, parts, settings, enclosed, tell) if light is None else []
     sizes = _sizes(found.shots, splits, settings.longest)
     changes = (*_straightening(found.shots), *pictures.told(), *sizes)
     found = replace(found, notes=(*found.notes, *changes))
     told_of = [told, *_background(background, pictures, names, stray)]
-    for line in _summary(found, splits, seen, parts, told_of):
+    for line in (
+        *_summary(found, splits, seen, parts, told_of),
+        *pictures.warnings(names, background, blank),
+        *_told_lamps(lamps, settings.lamps),
+        *([_dark(parts, found.shots)] if enclosed and not lamps else []),
+    ):
         tell(line)
-    for line in pictures.warnings(names, background, blank):
-        tell(line)
-    if dark:
-        tell(_dark(parts, found.shots))
     return DataFolder(out)
 
 
@@ -419,6 +424,32 @@ def _write_scene(
     return file, parse(file).instantiate()
 
 
+def _put_lamps(
+    data: DataFolder,
+    parts: Sequence[Part],
+    settings: ImportSettings,
+    enclosed: bool,
+    tell: Callable[[str], None],
+) -> list[Lamp]:
+    """Find lamps in a data set that is written, and let them shine in its scene.
+
+    Args:
+        data: whose scene is written again if there are any.
+        parts: of its mesh.
+        settings: whether they are looked for.
+        enclosed: whether the mesh keeps an environment out.
+        tell: called now and then.
+    """
+    if settings.lamps == "none" or (settings.lamps == "auto" and not enclosed):
+        return []
+    lamps = find_lamps(parts, Dataset.load(data.path).train, tell)
+    if lamps:
+        rest, shining = with_lamps(parts, lamps)
+        strengths = {part.name: lamp.radiance for part, lamp in zip(shining, lamps, strict=True)}
+        write_scene([*rest, *shining], data.scene, environment=not enclosed, lamps=strengths)
+    return lamps
+
+
 def _write_views(
     data: DataFolder,
     scene: mi.Scene,
@@ -523,11 +554,25 @@ def _box(points: np.ndarray) -> str:
     return f"{(high - low).max():.3g} units wide around ({middle})"
 
 
+def _told_lamps(lamps: Sequence[Lamp], asked: str) -> list[str]:
+    """What was found of lamps, for people."""
+    if not lamps:
+        none = "lamps: none found, no surface is surely too bright to reflect"
+        return [none] if asked == "found" else []
+    triangles = sum(len(lamp.faces) for lamp in lamps)
+    count = "one found" if len(lamps) == 1 else f"{len(lamps)} found"
+    told = f"lamps: {count}, {triangles:,} triangles that are too bright to reflect"
+    clipped = sum(lamp.clipped for lamp in lamps)
+    if clipped:
+        told += f"; {clipped} clipped in the photographs, so that their strength is a guess"
+    return [told]
+
+
 def _dark(parts: Sequence[Part], shots: Sequence[Shot]) -> str:
     """A warning of cameras that all stand inside of the mesh."""
     warning = (
-        "warning: all cameras stand inside the mesh, which keeps an environment out, and lamps "
-        "are not found by a fit. Give the lights of the room with --lights FILE"
+        "warning: all cameras stand inside the mesh, which keeps an environment out, and no "
+        "surface is surely a lamp. Give the lights of the room with --lights FILE"
     )
     mesh, stand = (np.ptp(points, axis=0).max() for points in (_corners(parts), _origins(shots)))
     if not 0 < _LARGER * stand <= mesh:

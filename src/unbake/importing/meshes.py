@@ -7,8 +7,9 @@ import json
 import logging
 import mmap
 import re
+import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -166,15 +167,24 @@ def _steps(farthest: np.ndarray) -> np.ndarray:
         return np.spacing(np.asarray(farthest, np.float32)).astype(np.float64)
 
 
-def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Path:
+def write_scene(
+    parts: Sequence[Part],
+    folder: Path,
+    *,
+    environment: bool,
+    lamps: Mapping[str, Sequence[float]] | None = None,
+) -> Path:
     """Write `scene.xml` and a PLY file for each part; returns its path.
 
-    Every part has a material of its own, grey on both sides.
+    Every part has a material of its own, grey on both sides; that of lamps is black.
 
     Args:
-        folder: made here.
+        folder: its `meshes` are made here, and take the place of earlier ones.
         environment: add a constant one, of radiance 1.
+        lamps: radiance of the parts that shine, linear RGB, by name.
     """
+    lamps = lamps or {}
+    shutil.rmtree(folder / "meshes", ignore_errors=True)
     (folder / "meshes").mkdir(parents=True)
     root = ElementTree.Element("scene", version=_VERSION)
     if environment:
@@ -184,12 +194,19 @@ def write_scene(parts: Sequence[Part], folder: Path, *, environment: bool) -> Pa
         material, sides_of_it, shape_of_it = _ids(part.name)
         sides = _add(root, "bsdf", type="twosided", id=sides_of_it)
         bsdf = _add(sides, "bsdf", type="principled", id=material)
-        _add(bsdf, "rgb", name="base_color", value=f"{_ALBEDO:g}")
+        albedo = 0.0 if part.name in lamps else _ALBEDO
+        _add(bsdf, "rgb", name="base_color", value=f"{albedo:g}")
         _add(bsdf, "float", name="roughness", value=f"{_ROUGHNESS:g}")
+        if part.name in lamps:
+            _add(bsdf, "float", name="specular", value="0")
         part.write(folder / "meshes" / f"{part.name}.ply")
         shape = _add(root, "shape", type="ply", id=shape_of_it)
         _add(shape, "string", name="filename", value=f"meshes/{part.name}.ply")
         _add(shape, "ref", name="bsdf", id=sides_of_it)
+        if part.name in lamps:
+            emitter = _add(shape, "emitter", type="area")
+            value = " ".join(f"{x:.6g}" for x in lamps[part.name])
+            _add(emitter, "rgb", name="radiance", value=value)
     ElementTree.indent(root, space="    ")
     file = folder / "scene.xml"
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)

@@ -55,6 +55,14 @@ class ImportSettings:
             "pixels become one each, by the mean of their light; 0 leaves them as they are"
         ),
     ] = 0
+    lamps: Annotated[
+        Literal["auto", "found", "none"],
+        Flag(
+            "Lamps, where the light is unknown: found (surfaces that are too bright to reflect; a "
+            "fit finds their strength), none, or auto (found where all cameras stand inside the "
+            "mesh)"
+        ),
+    ] = "auto"
     leave_out_missing: Annotated[
         bool,
         Flag("Go on without photographs that the source names and that do not exist"),

@@ -52,7 +52,7 @@ class EvaluatedRun:
             case "environment":
                 return "lighting" in unknown
             case "emission":
-                return unknown == "emission"
+                return "emission" in unknown
             case _:
                 known = self.metrics.get("quantities", DEFAULT_QUANTITIES)
                 return "materials" in unknown and quantity in known
@@ -106,7 +106,7 @@ def read_run(path: Path, label: str) -> EvaluatedRun:
     emitters = metrics.get("emission") or ()
     if not all(isinstance(row, dict) and isinstance(row.get("name"), str) for row in emitters):
         raise UserError("a light of `emission` has no name", metrics_file, evaluate)
-    if metrics.get("unknown") == "emission" and not emitters:
+    if "emission" in str(metrics.get("unknown")) and not emitters:
         raise UserError("`emission` has no light", metrics_file, evaluate)
     settings = dict(flattened(folder.settings_table()))
     untrained = metrics.get("steps") == 0

@@ -20,8 +20,11 @@ NAMES = {"render": "Rendering"} | {name: row.title for name, row in QUANTITIES.i
 OPTIMIZED = {
     "materials": "Materials",
     "lighting": "Lighting",
-    "materials+lighting": "Materials and lighting",
     "emission": "Lights",
+    "materials+lighting": "Materials and lighting",
+    "materials+emission": "Materials and lights",
+    "lighting+emission": "Lighting and lights",
+    "materials+lighting+emission": "Materials, lighting and lights",
 }
 
 

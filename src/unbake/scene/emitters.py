@@ -117,14 +117,13 @@ def pictures(scene: ParsedScene) -> list[Picture | None]:
 
 
 def emitter_nodes(scene: ParsedScene) -> list[int]:
-    """Indices of the nodes that are emitters of `STRENGTHS`, in the order of `named_emitters`."""
-    return [i for i, n in enumerate(scene.state.nodes) if n.props.plugin_name() in STRENGTHS]
+    """Indices of the nodes that are emitters of `STRENGTHS`, in the order of `named_emitters`.
 
-
-def fits_environment(scene: ParsedScene) -> bool:
-    """Whether the environment is among the emitters whose strength can be optimized."""
+    One that was replaced stays among the nodes, but not in the scene.
+    """
     nodes = scene.state.nodes
-    return any(nodes[i].props.plugin_name() in ENVIRONMENTS for i in emitter_nodes(scene))
+    there = sorted(scene.reachable(0))
+    return [i for i in there if nodes[i].props.plugin_name() in STRENGTHS]
 
 
 def lights_besides(scene: ParsedScene, plugins: Collection[str]) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypeVar
 
-from ..config import FitConfig
+from ..config import FitConfig, Unknown
 from ..config.fit import (
     BOUNCES_OF_OBJECTS,
     FORGETFUL_BETA2,
@@ -20,6 +20,8 @@ from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
 from ..errors import require_kind
 from ..quantities import QUANTITIES
+from ..scene.emitters import ENVIRONMENTS, lights_besides, names_besides
+from ..scene.parse import parse
 from ..transport.methods import METHODS
 from ..transport.objective import has_radiance
 from .grid_sizes import with_grid_sizes
@@ -58,8 +60,22 @@ def with_unknown(config: FitConfig, dataset: Dataset) -> FitConfig:
     """
     if config.unknown != "auto":
         return config
-    known = dataset.light == "known"
-    return replace(config, unknown="materials" if known else "materials+lighting")
+    return replace(config, unknown=_unknown_of(dataset))
+
+
+def _unknown_of(dataset: Dataset) -> Unknown:
+    """What is unknown in a data set: materials, and whatever light there is if its is unknown.
+
+    Raises:
+        UserError: the scene cannot be read.
+    """
+    if dataset.light == "known":
+        return "materials"
+    scene = parse(dataset.scene, dataset.root)
+    if not lights_besides(scene, ENVIRONMENTS):
+        return "materials+lighting"
+    surrounded = len(names_besides(scene, ())) > lights_besides(scene, ENVIRONMENTS)
+    return "materials+lighting+emission" if surrounded else "materials+emission"
 
 
 def told_unknown(given: FitConfig, dataset: Dataset) -> str | None:

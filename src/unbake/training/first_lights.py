@@ -22,6 +22,10 @@ _PLACES = ((0.5, 0.5), (0.05, 0.05), (0.05, 0.95), (0.95, 0.05), (0.95, 0.95))
 #: Pixels that must show a light as a whole; and where poses are not known, so that some of them
 #: show what is beside it.
 _FEWEST, _FEWEST_OF_POSES = 1, 16
+#: Strengths that photographs show are held until this part of a fit with unknown albedo is done;
+#: and to its end where lights are so many times as bright as the photographs: what they reflect is
+#: nothing beside that.
+WAITS, SURE = 0.3, 10.0
 #: A light begins no darker than this part of what it would have begun with: black ones could not
 #: become brighter.
 _DARKEST = 1e-3
@@ -35,6 +39,11 @@ def begin_lights(problem: Problem, pixels: PixelSource, ranks: Ranks | None = No
     reflects is in its pixels, too, and where they are clipped it is brighter: steps find that.
     Behind panes no light is found.
 
+    Where albedo is unknown as well, it is far from the truth at first, and steps would make lights
+    as much darker as it is too bright. What photographs show of lights is held meanwhile, and what
+    is surely right stays as it is: most pixels tell of lights with the noise and the error of L_θ,
+    those that show them with neither.
+
     Args:
         problem: of a fit that has not begun. Nothing happens where no strengths are unknown, where
             lights are hidden in photographs, or where exposures, white balances, vignetting or
@@ -46,16 +55,32 @@ def begin_lights(problem: Problem, pixels: PixelSource, ranks: Ranks | None = No
     if emission is None or problem.hide_emitters or problem.camera is not None:
         return
     ranks, begun = ranks or Ranks(), np.array(emission.values).T
-    found = _seen(problem, emission, pixels)
+    found, surely = _seen(problem, emission, pixels)
     strengths = np.where(np.isfinite(found), np.maximum(found, _DARKEST * begun), begun)
     emission.start(ranks.as_first((strengths / emission.scale).astype(np.float32)))
+    if "albedo" in (problem.materials or ()):
+        bright = strengths.max(1, keepdims=True) >= SURE * pixels.photographs.level
+        seen, sure = (ranks.as_first(x.astype(np.float32)) > 0 for x in (surely, surely & bright))
+        emission.hold(seen, lastly=sure)
 
 
-def _seen(problem: Problem, emission: Emission, pixels: PixelSource) -> np.ndarray:
+def release_lights(problem: Problem, done: float) -> None:
+    """Let go of strengths that `begin_lights` holds, once albedo is near where it belongs.
+
+    Args:
+        done: fraction of the fit that is done, [0,1].
+    """
+    if problem.emission is not None and done >= WAITS:
+        problem.emission.release()
+
+
+def _seen(
+    problem: Problem, emission: Emission, pixels: PixelSource
+) -> tuple[np.ndarray, np.ndarray]:
     """The strengths that photographs show, linear RGB, shape (lights, 3); NaN of no light in view.
 
-    Processes that share the photographs all call this together. It leaves the strengths at
-    something else.
+    And whether these are no mere bounds, as of pixels that are clipped. It leaves the strengths at
+    something else. Processes that share the photographs all call this together.
     """
     photographs = pixels.photographs
     ranks = Ranks() if photographs.share is None else photographs.share.ranks
@@ -64,19 +89,25 @@ def _seen(problem: Problem, emission: Emission, pixels: PixelSource) -> np.ndarr
     numbers = numbers[whole]
     radiance = photographs.radiance(numbers)
     if not len(numbers):
-        return np.full((emission.count, 3), np.nan)
+        return np.full((emission.count, 3), np.nan), np.zeros((emission.count, 3), bool)
     pattern = _shown(problem, emission, pixels, numbers, np.ones(emission.count)).mean(0)
     fewest = _FEWEST if problem.poses is None else _FEWEST_OF_POSES
     found = np.full((emission.count, 3), np.nan)
+    surely = np.zeros((emission.count, 3), bool)
+    limits = np.full(len(numbers), np.inf)
+    if pixels.limits is not None:
+        limits = pixels.limits[pixels.views_of(numbers)]
     for number in np.flatnonzero(np.bincount(light, minlength=emission.count) >= fewest):
         for channel in range(3):
             weight = pattern[light == number, channel]
             # Where a picture is dark, pixels show what the lamp reflects.
             told = weight > 0
             if told.any():
-                ratios = radiance[light == number, channel][told] / weight[told]
-                found[number, channel] = _median(ratios, weight[told])
-    return found
+                values = radiance[light == number, channel][told]
+                found[number, channel] = _median(values / weight[told], weight[told])
+                clipped = values >= limits[light == number][told]
+                surely[number, channel] = weight[told][clipped].sum() < 0.5 * weight[told].sum()
+    return found, surely
 
 
 def _median(values: np.ndarray, weights: np.ndarray) -> float:

@@ -22,6 +22,7 @@ from ..ranks import Ranks
 from ..signals import deferred
 from .beginning import Begun, FitInput, agree, begin
 from .checkpoint import Progress
+from .first_lights import release_lights
 from .held_aside import ERROR, ErrorCurve
 from .memory import memory_mb
 from .monitor import Monitor
@@ -230,10 +231,7 @@ class _Training:
                 failures = [*self._saving.save(state, progress), *self._show()]
             # `stop` may fill at any moment: looked at in one place, so that no fit ends unsaved.
             while not last:
-                # Rates depend on how much is done: on steps, or on time where time is the limit.
-                rates = learning_rates(config, progress.step, self._fraction)
-                rates = self._search.rates(rates, progress.step, self._fraction)
-                rates = self._watchdog.rates(rates)
+                rates = self._rates()
                 recent.append(begun.step(state, progress.step, rates))
                 progress.step += 1
                 progress.samples += config.samples_per_step
@@ -276,6 +274,16 @@ class _Training:
         for failure in [*failures, *monitor.failures]:
             raise failure
         return stopped
+
+    def _rates(self) -> dict[str, float]:
+        """The learning rates of the next step; lights that were held for long enough are let go.
+
+        They depend on how much is done: on steps, or on time where time is the limit.
+        """
+        step, done = self._begun.progress.step, self._fraction
+        release_lights(self._begun.problem, done)
+        rates = learning_rates(self._begun.config, step, done)
+        return self._watchdog.rates(self._search.rates(rates, step, done))
 
     @property
     def _fraction(self) -> float:
@@ -389,9 +397,11 @@ class _Training:
     def _unreached(self) -> list[str]:
         """A line if no photograph depends on the strength of a lamp, which is where it began."""
         begun = self._begun
-        if begun.problem.emission is None or not begun.progress.step:
+        emission = begun.problem.emission
+        if emission is None or not begun.progress.step:
             return []
-        names = [begun.problem.emitter_names[i] for i in begun.state.unreached("emission.log", 3)]
+        unreached = begun.state.unreached("emission.log", 3)
+        names = [begun.problem.emitter_names[i] for i in unreached if i not in emission.held]
         if not names:
             return []
         return [

@@ -18,7 +18,6 @@ from ..ranks import Ranks
 from ..scene.emitters import (
     ENVIRONMENTS,
     STRENGTHS,
-    fits_environment,
     lights_besides,
     named_emitters,
 )
@@ -93,7 +92,9 @@ def _placeholder(dataset: Dataset, problem: Problem) -> str | None:
     """A line if an environment that only stands for the unknown light is taken for the true one."""
     if dataset.light == "known" or problem.environment is not None:
         return None
-    if problem.emission is not None and fits_environment(parse(dataset.scene, dataset.root)):
+    if problem.emission is not None and not lights_besides(
+        parse(dataset.scene, dataset.root), (*STRENGTHS,)
+    ):
         return None
     return (
         "the data set says that its light is unknown, and what stands for it in the scene is taken "
@@ -107,7 +108,8 @@ def _open_colour(dataset: Dataset, problem: Problem) -> str | None:
         return None
     if not problem.light_is_unknown:
         return None
-    fitted = ENVIRONMENTS if problem.emission is None else tuple(STRENGTHS)
+    fitted = ENVIRONMENTS if problem.environment is not None else ()
+    fitted += () if problem.emission is None else tuple(STRENGTHS)
     if lights_besides(parse(dataset.scene, dataset.root), fitted):
         return None
     return (

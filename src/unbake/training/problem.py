@@ -62,8 +62,8 @@ class Problem:
     outliers: OutlierModel | None = None  #: of the training views; None: all pixels count alike
     guide: LightGuide | None = None  #: of bounces; None: BSDFs alone draw directions
     beta2: float = OWN_BETA2  #: Adam's first one, for the unknowns
-    #: Whether pixels to train on show the environment (`told_scale.py`); None: nobody looked.
-    shows_environment: bool | None = None
+    #: Whether pixels to train on show unknown light (`told_scale.py`); None: nobody looked.
+    shows_light: bool | None = None
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""
@@ -176,7 +176,7 @@ def make_problem(
         start = config.lighting.initial_radiance or scale
         environment = EnvironmentMap(config.lighting.resolution, scale=start)
         edit.set_environment(parsed, environment_emitter(environment))
-    if config.unknown == "emission":
+    if config.learns_emission:
         places = emitters.places(parsed)
         emission, emitter_names = _unknown_emission(parsed, scale, config)
     if change is not None:

@@ -94,10 +94,10 @@ def regularization_terms(
 def is_anchored(problem: Problem, config: FitConfig) -> bool:
     """Whether the scale between albedo and light is set by convention.
 
-    Photographs determine it where they show the environment itself, and where some light is known.
+    Photographs determine it where they show unknown light itself, and where some light is known.
     Where nobody has looked what they show, a visible background is taken for it.
     """
-    told = problem.shows_environment
+    told = problem.shows_light
     if told is None:
         told = not problem.hide_emitters
     return is_shared(problem) and not told and config.lighting.anchor > 0

@@ -29,7 +29,7 @@ from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
 from .problem import Problem
 from .state import State
-from .told_scale import shows_environment
+from .told_scale import shows_light
 
 #: Pixels from which the loss of all-black images is estimated.
 _OF_BLACK = 1 << 15
@@ -93,8 +93,8 @@ class TrainingStep:
         if problem.materials is not None:
             problem.materials.carried = True  # a run that was read back may stand alone
         # As the first one has it: rays may differ between machines, and terms must not.
-        shown = self._ranks.together(lambda: shows_environment(problem, config, pixels))
-        problem.shows_environment = self._ranks.gather(shown)[0]
+        shown = self._ranks.together(lambda: shows_light(problem, config, pixels))
+        problem.shows_light = self._ranks.gather(shown)[0]
         self._problem = problem
         self.pixels = pixels
         self.config = config  #: of this process, with its share of each batch

@@ -1,7 +1,8 @@
 """Whether photographs determine the scale of albedo and light, where both are unknown.
 
-They do where they show the environment itself, directly or in mirrors and glass: its radiance is
-then that of pixels. Where none shows it, the scale is a convention (`regularizers.py`).
+They do where they show unknown light itself, directly or in mirrors and glass, and are not clipped:
+its radiance is then that of pixels. Where none shows any, the scale is a convention
+(`regularizers.py`).
 """
 
 from __future__ import annotations
@@ -11,19 +12,19 @@ import mitsuba as mi
 import numpy as np
 
 from ..config import FitConfig
-from ..dataset.pixels import CameraRays, PixelSource
+from ..dataset.pixels import PixelSource
 from ..dataset.spread import places
 from ..dataset.views import Dataset, fitted_pixels
 from ..fields.arrays import from_numpy
 from ..scene import free_space
-from ..scene.emitters import ENVIRONMENTS, lights_besides
+from ..scene.emitters import ENVIRONMENTS, STRENGTHS, lights_besides
 from ..scene.parse import parse
 from ..transport.vertex import find_vertex
 from .problem import Problem
 
 #: Pixels, at most, that are looked at.
 _PIXELS = 1 << 16
-#: The part of them, at least, that must show the environment: cracks of a mesh show it as well.
+#: The part of them, at least, that must show it: cracks of a mesh show the environment as well.
 _LEAST = 1e-4
 #: How many times as much makes sure that it is so, by whatever pixels are looked at.
 _SURELY = 4
@@ -31,14 +32,16 @@ _SURELY = 4
 
 def is_shared(problem: Problem) -> bool:
     """Whether albedo and all light are unknown, so that a factor is shared between them."""
-    both = problem.environment is not None and "albedo" in (problem.materials or ())
-    return both and len(problem.scene_view.scene.emitters()) == 1
+    unknown = (problem.environment is not None) + len(problem.emitter_names)
+    both = problem.light_is_unknown and "albedo" in (problem.materials or ())
+    return both and len(problem.scene_view.scene.emitters()) == unknown
 
 
-def shows_environment(problem: Problem, config: FitConfig, pixels: PixelSource) -> bool | None:
-    """Whether pixels to train on show the environment, directly or in mirrors and glass.
+def shows_light(problem: Problem, config: FitConfig, pixels: PixelSource) -> bool | None:
+    """Whether pixels to train on show unknown light, directly or in mirrors and glass.
 
-    Processes that share the photographs all call this together.
+    Where they are clipped they tell no scale, and are left out. Processes that share the
+    photographs all call this together.
 
     Returns:
         None where that is not asked: the settings hold no mean albedo, or go by the background.
@@ -51,7 +54,7 @@ def shows_environment(problem: Problem, config: FitConfig, pixels: PixelSource) 
     found = pixels.photographs
     chosen = places(found.count, _PIXELS)
     own = chosen[(chosen >= found.places.start) & (chosen < found.places.stop)]
-    shown = found.joined(lambda: _shown(problem, pixels.rays, found.own_numbers(own)))
+    shown = found.joined(lambda: _shown(problem, pixels, found.own_numbers(own)))
     return bool(shown.mean() >= _LEAST)
 
 
@@ -69,8 +72,11 @@ def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:
     if hidden or lighting.scale_told_by == "background":
         return hidden
     parsed = parse(dataset.scene, dataset.root)
-    if lights_besides(parsed, ENVIRONMENTS):
+    unknown = ENVIRONMENTS * config.learns_environment + (*STRENGTHS,) * config.learns_emission
+    if lights_besides(parsed, unknown):
         return False
+    if config.learns_emission:  # whether lamps are seen, and not clipped, is not looked at
+        return True
     scene, looked, shown = parsed.instantiate(), 0, 0
     views = dataset.train
     each = max(1, _PIXELS // len(views))
@@ -91,14 +97,18 @@ def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:
     return shown < _SURELY * _LEAST * looked
 
 
-def _shown(problem: Problem, rays: CameraRays, numbers: np.ndarray) -> np.ndarray:
-    """Whether pixels show the environment, which is the only light, (n,) bool."""
+def _shown(problem: Problem, pixels: PixelSource, numbers: np.ndarray) -> np.ndarray:
+    """Whether pixels show light, all of which is unknown, and are not clipped, (n,) bool."""
     if not len(numbers):
         return np.zeros(0, bool)
+    clipped = np.zeros(len(numbers), bool)
+    if pixels.limits is not None:
+        colours = pixels.photographs.own_rows(numbers)[:, :3]
+        clipped = (colours >= pixels.limits[pixels.views_of(numbers)][:, None]).all(1)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(numbers))
     with dr.suspend_grad():
-        ray = rays.through(from_numpy(mi.UInt32, numbers.astype(np.uint32)), mi.Point2f(0.5))
+        ray = pixels.rays.through(from_numpy(mi.UInt32, numbers.astype(np.uint32)), mi.Point2f(0.5))
         vertex = find_vertex(
             problem.scene_view,
             ray,
@@ -106,4 +116,4 @@ def _shown(problem: Problem, rays: CameraRays, numbers: np.ndarray) -> np.ndarra
             sampler,
             hide_emitters=problem.hide_emitters,
         )
-        return np.array(dr.max(vertex.emitted) > 0)
+        return np.array(dr.max(vertex.emitted) > 0) & ~clipped

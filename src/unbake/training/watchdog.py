@@ -183,7 +183,7 @@ class Watchdog:
                 f"nothing useful was learned: the loss is {end:.3g}, and of black pictures "
                 f"{black:.3g}. Look at the strength of the lights, and the unit of the photographs"
             )
-        if self._step.config.unknown == "emission":
+        if self._step.config.learns_emission:
             # L_θ begins with the light that lamps have yet to give: the loss rises before it falls.
             return None
         # With rates that are far too high, the fields are not untrained any more after one step.
