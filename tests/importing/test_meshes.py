@@ -1,5 +1,6 @@
 """Meshes of other programs: every corner of every triangle keeps its place, normal and texture."""
 
+import base64
 import json
 import struct
 from dataclasses import replace
@@ -385,6 +386,42 @@ def test_meshes_of_ns_export_are_taken_back(captured, tmp_path):
         file.write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1} | wrong))
         with pytest.raises(ImportFaults, match=told):
             import_data(tmp_path / "nerf", tmp_path / "none", given, **more)
+
+
+def test_parts_of_a_gltf_node_are_called_by_its_materials(tmp_path):
+    """Names become those of textures, and have to be the same at each import."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    indices = np.array([0, 1, 2, 0, 2, 3], np.uint16)
+    data = corners.tobytes() + indices.tobytes()
+    buffer = base64.b64encode(data).decode()
+    parts = [{"attributes": {"POSITION": 0}, "indices": 1 + i, "material": i} for i in (0, 1)]
+    content = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "Mug", "mesh": 0}],
+        "meshes": [{"name": "shape", "primitives": parts}],
+        "materials": [{"name": "white"}, {"name": "inside"}],
+        "buffers": [
+            {"uri": f"data:application/octet-stream;base64,{buffer}", "byteLength": len(data)}
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 12},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"},
+            {"bufferView": 1, "byteOffset": 6, "componentType": 5123, "count": 3,
+             "type": "SCALAR"},
+        ],
+    }  # fmt: skip
+    content["accessors"][0] |= {"min": [0, 0, 0], "max": [1, 1, 0]}
+    (tmp_path / "mug.gltf").write_text(json.dumps(content))
+    for _ in range(2):
+        found = parts_of(tmp_path / "mug.gltf")
+        assert [part.name for part in found] == ["Mug_inside", "Mug_white"]
+    assert found[0].positions.tolist() == corners[[0, 2, 3]].tolist()
 
 
 @pytest.mark.parametrize("suffix", ["obj", "glb", "ply"])

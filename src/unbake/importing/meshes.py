@@ -305,12 +305,14 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
             warnings.simplefilter("ignore")  # of textures that are not there
             scene = trimesh.load_scene(opened, **options)
         found = []
-        for node in sorted(scene.graph.nodes_geometry):
+        for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
             mesh = scene.geometry[name]
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
                 mesh = _refilled(mesh, file, options) if suffix == ".ply" else mesh
-                found.append((str(node if of_nodes else name), mesh, np.array(transform)))
+                called = _called(scene, node, mesh) if of_nodes else str(name)
+                found.append((called, mesh, np.array(transform)))
+        found.sort(key=lambda row: (row[0], len(row[1].faces), *row[1].bounds.ravel()))
     except UserError:
         raise
     except Exception as error:  # readers of damaged files raise whatever they meet
@@ -323,6 +325,18 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     if len(found) == 1 and not of_nodes:
         return [("", *found[0][1:])]
     return found
+
+
+def _called(scene: Any, node: Any, mesh: Any) -> str:
+    """The name of a node of a glTF file; of one with several materials, with that of the part.
+
+    trimesh 5.2 gives each material of a node a node of its own, with a random name.
+    """
+    parent = scene.graph.transforms.parents.get(node)
+    if parent is None or not re.fullmatch(rf"{re.escape(str(parent))}_[0-9a-f]{{6}}", str(node)):
+        return str(node)
+    material = getattr(getattr(mesh.visual, "material", None), "name", None)
+    return f"{parent}_{material}" if material else str(parent)
 
 
 def _refilled(mesh: Any, file: Path, options: dict[str, Any]) -> Any:
