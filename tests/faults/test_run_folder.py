@@ -371,6 +371,13 @@ def test_a_fit_goes_on_with_the_same_data_only(change, part, fit, run, data, unb
     page = run.path / "page.html"
     assert unbake("report", run.path, "--out", page).status == 0
     assert f"evaluated on other {part}" in page.read_text()
+    # Photographs are not read again for what needs none.
+    told = f"warning: other {part} than the run was fit to"
+    words = (("render", "--spp", 1), ("export", "--format", "gltf", "--texels", 1))
+    for command, *options in words:
+        outcome = unbake(command, run.path, "--out", run.path / command, *options)
+        assert outcome.status == 0, outcome
+        assert (told in outcome.out) == (part != "photographs")
 
 
 # -------------------------------------------------------------------------------------- its numbers

@@ -42,7 +42,23 @@ def fingerprint(dataset: Dataset) -> dict[str, str]:
     noise = [None if view.noise is None else asdict(view.noise) for view in views]
     if any(noise):
         photographs = [photographs, noise]
-    return {"photographs": _of_values(photographs)} | _of_geometry(dataset)
+    return {"photographs": _of_values(photographs)} | geometry_fingerprint(dataset)
+
+
+def geometry_fingerprint(dataset: Dataset) -> dict[str, str]:
+    """SHA-256 of the parts that are not pictures: `poses`, `views` and `scene`.
+
+    Raises:
+        UserError: a file cannot be read, or the scene is none.
+    """
+    views = dataset.views
+    cameras = [view.camera for view in views]
+    poses = [[c.to_world.tolist(), c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height] for c in cameras]
+    return {
+        "poses": _of_values(poses),
+        "views": _of_values([dataset.background, *([view.name, view.split] for view in views)]),
+        "scene": _of_values(_of_files(_scene_files(dataset))),
+    }
 
 
 def truth_fingerprint(dataset: Dataset, quantities: Iterable[str]) -> dict[str, str]:
@@ -60,24 +76,12 @@ def truth_fingerprint(dataset: Dataset, quantities: Iterable[str]) -> dict[str, 
     masks = {view.name: view.mask for view in dataset.views if view.mask is not None}
     if masks:
         truth += [list(masks), _of_files(masks.values())]
-    return _of_geometry(dataset) | {"truth": _of_values(truth)}
+    return geometry_fingerprint(dataset) | {"truth": _of_values(truth)}
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """The parts that differ, of those that both fingerprints have."""
     return [part for part, value in before.items() if now.get(part, value) != value]
-
-
-def _of_geometry(dataset: Dataset) -> dict[str, str]:
-    """The parts that are not pictures: `poses`, `views` and `scene`."""
-    views = dataset.views
-    cameras = [view.camera for view in views]
-    poses = [[c.to_world.tolist(), c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height] for c in cameras]
-    return {
-        "poses": _of_values(poses),
-        "views": _of_values([dataset.background, *([view.name, view.split] for view in views)]),
-        "scene": _of_values(_of_files(_scene_files(dataset))),
-    }
 
 
 def _scene_files(dataset: Dataset) -> list[Path]:

@@ -27,7 +27,7 @@ from ..scene import edit
 from ..scene.parse import parse
 from ..training.cameras import Cameras
 from ..training.held_aside import convergence
-from ..training.recovered import Recovered, load_run
+from ..training.recovered import Recovered, load_run, told_changed
 from ..training.run_folder import METRICS_FORMAT, EvaluationFolder, RunFolder
 from ..training.run_lock import RunLock
 from ..training.surroundings import surroundings
@@ -157,7 +157,7 @@ def _evaluate(
     origin = folder.origin()
     data_changed = changed(origin.fingerprint, fingerprint(dataset))
     if data_changed:
-        tell(f"warning: other {', '.join(data_changed)} than the run was fit to")
+        tell(told_changed(data_changed))
     true_scene = _true_scene(recovered) if settings.truth else None
     views = [*dataset.heldout, *evenly(dataset.train, settings.train_views)]
     _require_memory(views)

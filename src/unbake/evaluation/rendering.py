@@ -31,7 +31,7 @@ from ..io import filled_folder, require_new_folder, write_json
 from ..memory import require_memory
 from ..scene.geometry import CHANGED, differing, probe
 from ..scene.parse import parse
-from ..training.recovered import Recovered, load_run
+from ..training.recovered import Recovered, load_run, tell_changed_geometry
 from ..training.run_folder import RunFolder
 from ..training.validation import known_pixels
 from ..version import VERSION
@@ -261,6 +261,7 @@ def _render(
     light: LightConfig | None,
     tell: Callable[[str], None],
 ) -> dict[str, Any]:
+    tell_changed_geometry(RunFolder(run), recovered.dataset, tell)
     tell_tilt(light, [view.camera for view in recovered.dataset.train], tell)
     shots, placed = _shots(recovered, settings, cameras, tell)
     largest = max(shot.camera.width * shot.camera.height for shot in shots)

@@ -32,7 +32,7 @@ from ..scene import free_space
 from ..scene.emitters import ENVIRONMENTS, STRENGTHS, names_besides
 from ..training.grid_sizes import surface_seen
 from ..training.problem import known_materials
-from ..training.recovered import Recovered, load_run
+from ..training.recovered import Recovered, load_run, tell_changed_geometry
 from ..training.run_folder import RunFolder
 from ..training.surroundings import surroundings
 from ..transport.render import path_integrator
@@ -176,6 +176,7 @@ def _export(
     tell: Callable[[str], None],
 ) -> dict[str, Any]:
     problem, dataset = recovered.problem, recovered.dataset
+    tell_changed_geometry(folder, dataset, tell)
     cameras = recovered.cameras
     scene = problem.scene_view.scene
     density = texels

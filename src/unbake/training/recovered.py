@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..config import FitConfig
 from ..dataset.camera import Camera
+from ..dataset.fingerprint import changed, geometry_fingerprint
 from ..dataset.views import Dataset, View
 from ..errors import UserError, quoted
 from ..scene.parse import ParsedScene
@@ -90,6 +91,24 @@ def open_run(
     if problem.radiance is not None:
         problem.radiance.scale = origin.radiance_scale
     return OpenedRun(folder, problem, dataset, config, initial_state(problem), origin.clip_negative)
+
+
+def told_changed(parts: Sequence[str]) -> str:
+    """A line of parts of a data set that are others than a run was fit to."""
+    return f"warning: other {', '.join(parts)} than the run was fit to"
+
+
+def tell_changed_geometry(folder: RunFolder, dataset: Dataset, tell: Callable[[str], None]) -> None:
+    """Tell if the scene, the poses or the views are others than the run was fit to.
+
+    Args:
+        folder: of the run.
+        dataset: as it is now.
+        tell: called with the line.
+    """
+    parts = changed(folder.origin().fingerprint, geometry_fingerprint(dataset))
+    if parts:
+        tell(told_changed(parts))
 
 
 def load_run(
