@@ -281,7 +281,12 @@ def test_o_is_short_for_out(command, unbake):
 @pytest.mark.parametrize(
     ("option", "choices"),
     [
-        ("--unknown", "'auto', 'materials', 'lighting', 'materials+lighting', 'emission'"),
+        (
+            "--unknown",
+            "'auto', 'materials', 'lighting', 'emission', "
+            "'materials+lighting', 'materials+emission', 'lighting+emission', "
+            "'materials+lighting+emission'",
+        ),
         ("--preset", "'cpu', 'paper', 'release', 'release-lighting'"),
         ("--quality", "'draft', 'normal', 'high'"),
         ("--pixel-sampling", "'all-views', 'one-view-crop'"),

@@ -483,7 +483,7 @@ def test_a_field_that_there_is_not_is_named(text, message):
         (FitConfig, {"spp": [4]}, "spp: must be int, not list"),
         (FitConfig, {"seconds": "a"}, "seconds: must be float, not str"),
         (FitConfig, {"warm_up": 1.5}, "warm_up: must be int, not float"),
-        (FitConfig, {"unknown": "light"}, "unknown: must be one of auto, materials, lighting, mat"),
+        (FitConfig, {"unknown": "light"}, "unknown: must be one of auto, materials, lighting, emi"),
         (FitConfig, {"method": 3}, "method: must be str, not int"),
         (FitConfig, {"path": {"max_depth": 3}}, "path: must be PathConfig, not dict"),
         (LightingConfig, {"mean_albedo": "a"}, "mean_albedo: must be float, not str"),

@@ -138,6 +138,9 @@ def test_light_that_is_unknown_is_recovered_unless_the_user_says_otherwise(
         assert outcome.status == 0, outcome
         assert RunFolder(run).settings().unknown == unknown
         assert (line in outcome.out) == (data == sky and not words)
+        # Its background is hidden, and no mirror shows the sky.
+        convention = "no photograph shows the light itself, unclipped: brightness and colour of"
+        assert (convention in outcome.out) == (unknown == "materials+lighting")
 
 
 def test_what_direct_light_does_not_reach_is_lit_by_whole_paths(cornell, monkeypatch):

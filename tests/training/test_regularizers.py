@@ -80,7 +80,7 @@ def test_no_lane_that_counts_is_no_division_by_zero(term):
     if term == "ties":
         value = albedo_ties_roughness(here, none, 0.1, 1)
     elif term == "mean":
-        value = mean_albedo_deviation(here, none, 0.0)
+        value = mean_albedo_deviation(here, none, (0.0, 0.0, 0.0))
     elif term == "albedo":
         value = albedo_smoothness(here["albedo"], mi.Color3f(floats([0, 0])), none)
     else:
@@ -122,11 +122,11 @@ def test_the_deviation_of_the_mean_is_exact():
     colours = mi.Color3f(floats([0.1, 0.3, 9]), floats([0.2, 0.6, 9]), floats([0.5, 0.5, 9]))
     here = {"albedo": colours, "roughness": floats([0, 0, 0])}
     dr.enable_grad(here["albedo"])
-    value = mean_albedo_deviation(here, mi.Bool([True, True, False]), 0.5)
-    assert value[0] == pytest.approx(0.3**2 + 0.1**2, rel=1e-5)
+    value = mean_albedo_deviation(here, mi.Bool([True, True, False]), (0.5, 0.5, 0.4))
+    assert value[0] == pytest.approx(0.3**2 + 0.1**2 + 0.1**2, rel=1e-5)
     dr.backward(value)
     np.testing.assert_allclose(
-        dr.grad(here["albedo"]), [[-0.3, -0.3, 0], [-0.1, -0.1, 0], [0, 0, 0]], atol=1e-6
+        dr.grad(here["albedo"]), [[-0.3, -0.3, 0], [-0.1, -0.1, 0], [0.1, 0.1, 0]], atol=1e-6
     )
 
 

@@ -17,7 +17,7 @@ from unbake.training.problem import make_problem, pixels_of
 from unbake.training.regularizers import is_anchored
 from unbake.training.sharing import kept_whole
 from unbake.training.step import TrainingStep
-from unbake.training.told_scale import shows_light
+from unbake.training.told_scale import conventional_albedo, shows_light
 
 SIZE = 8
 BOTH = replace(TINY_FIT, unknown="materials+lighting")
@@ -204,3 +204,24 @@ def test_lamps_in_view_tell_the_scale_where_they_are_not_clipped(
     pixels = PixelSource.of([camera], rgb, np.ones(len(rgb)), foreground_only=False)
     pixels = replace(pixels, limits=np.array([0.05 if clipped else 0.3], np.float32))
     assert shows_light(problem, config, pixels) is (told and not clipped)
+
+
+def test_the_mean_albedo_has_the_colour_of_the_photographs_without_highlights(still):
+    """As if light were white: a coloured object keeps its colour, and cameras their balance."""
+    cameras = built_in_cameras("still", SIZE)
+    problem = make_problem(still, "hidden", BOTH, 0.2)
+    rgb = np.tile([0.3, 0.2, 0.1], (SIZE * SIZE, 1))
+    rgb[:4] = 100.0
+    pixels = PixelSource.of(cameras, rgb, np.ones(len(rgb)), foreground_only=True)
+
+    def albedo(rgb=rgb, unknown="materials+lighting", **settings):
+        pixels = PixelSource.of(cameras, rgb, np.ones(len(rgb)), foreground_only=True)
+        config = replace(BOTH, unknown=unknown, lighting=lighting(**settings))
+        return conventional_albedo(problem, config, pixels)
+
+    assert albedo(mean_albedo=0.4) == pytest.approx((0.6, 0.4, 0.2), rel=1e-5)
+    assert albedo(mean_albedo=0.4, mean_colour="grey") == (0.4, 0.4, 0.4)
+    assert albedo(mean_albedo=0.8) == pytest.approx((0.8, 0.8 / 1.5, 0.4 / 1.5), rel=1e-5)
+    assert albedo(0 * rgb, mean_albedo=0.4) == pytest.approx((0.4, 0.4, 0.4))
+    known = make_problem(with_more(still, LAMP), "hidden", BOTH, 0.2)
+    assert conventional_albedo(known, BOTH, pixels) == (0.5, 0.5, 0.5)

@@ -47,6 +47,7 @@ Unknown = Literal[
 Lamps = Literal["known", "fitted"]
 LampPictures = Literal["known", "ignored"]
 ScaleToldBy = Literal["pixels", "background"]
+MeanColour = Literal["photographs", "grey"]
 Precision = Literal["single", "half"]
 PresetName = Literal["cpu", "paper", "release", "release-lighting"]
 
@@ -121,7 +122,7 @@ class LightingConfig:
 
     Where materials are unknown as well, no photograph shows unknown light and no other light is
     known, albedo and light are known up to one factor a channel. It is then chosen such that the
-    mean albedo of what the training views see is `mean_albedo`.
+    mean albedo of what the training views see has the mean `mean_albedo`, and the `mean_colour`.
     """
 
     #: Texels along an edge of the square that the sphere is mapped to. An edge of n has 2n texels
@@ -130,7 +131,9 @@ class LightingConfig:
     learning_rate: float = 0.02  #: Adam, log radiance
     #: Radiance of the map at the start, W·sr⁻¹·m⁻²; 0: the level of the photographs (ours).
     initial_radiance: float = 0.0
-    mean_albedo: float = 0.5  #: the convention, each channel (ours)
+    mean_albedo: float = 0.5  #: the convention, mean over channels (ours)
+    #: Its colour: of the photographs, as if light were white, or grey, as if surfaces were (ours).
+    mean_colour: MeanColour = "photographs"
     anchor: float = 1.0  #: weight of the squared deviation from it
     #: What tells the factor instead. pixels: those to train on that show unknown light, directly or
     #: in mirrors and glass, and are not clipped; background: any that is visible, and no mirror
@@ -240,8 +243,8 @@ class FitConfig:
         Flag(
             "What to recover: materials (the --quantities), lighting (the environment map), "
             "emission (colour and strength of the lights), several of them, as in "
-            "materials+lighting or materials+emission, or auto: materials, and lighting with them "
-            "where the data set says that its light is unknown",
+            "materials+lighting or materials+emission, or auto: materials, and all light with "
+            "them where the data set says that it is unknown",
             metavar="WHAT",
         ),
     ] = "auto"

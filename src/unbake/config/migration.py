@@ -37,7 +37,10 @@ _NEURAL_ROUGHNESS = "materials.roughness.neural"
 _NEURAL_ALBEDO = "materials.albedo.neural"
 #: Settings that came with a format, at their value before: a run of an earlier version goes on as
 #: it began. By the table that they are in, where there is one.
-_BEFORE_8: dict[str, dict[str, Any]] = {"": {"lamp_pictures": "ignored"}}
+_BEFORE_8: dict[str, dict[str, Any]] = {
+    "": {"lamp_pictures": "ignored"},
+    "lighting": {"mean_colour": "grey"},
+}
 _BEFORE_7: dict[str, dict[str, Any]] = {_NEURAL_ROUGHNESS: {"pieces.places": 0}}
 _BEFORE_6: dict[str, dict[str, Any]] = {_NEURAL_ROUGHNESS: {"pieces.own_colours": 0}}
 _BEFORE_5: dict[str, dict[str, Any]] = {

@@ -30,12 +30,14 @@ from .path_depth import told_depth, with_path_depth
 from .plausibility import data_warnings
 from .preview import Preview
 from .problem import Problem, pixels_of, problem_of
+from .regularizers import is_anchored
 from .run_folder import Origin, RunFolder
 from .same_on_ranks import require_same_state, what_ranks_share
 from .sharing import kept_whole
 from .solved import Solved
 from .state import State, initial_state
 from .step import TrainingStep
+from .told_scale import told_convention
 from .validation import Score
 from .warm_start import solved_again, start_radiance, told_start, warm_start, with_solved_field
 
@@ -138,13 +140,15 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
         doubts.append(untold)
     for warning in [*odd, *doubts]:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-    if recovered is not None:
-        console.print(recovered, highlight=False, soft_wrap=True)
-    if solved is not None:
-        console.print(told_start(solved, config), highlight=False, soft_wrap=True)
-    if config.follows_paths:
-        console.print(told_depth(config, dataset), highlight=False, soft_wrap=True)
     step = TrainingStep(problem, pixels, config, ranks)
+    for line in (
+        recovered,
+        None if solved is None else told_start(solved, config),
+        told_depth(config, dataset) if config.follows_paths else None,
+        told_convention(problem) if is_anchored(problem, config) and not resume else None,
+    ):
+        if line is not None:
+            console.print(line, highlight=False, soft_wrap=True)
     state, restored = _state(problem, step, asked.folder if resume else None, origin, console)
     preview = Preview(problem, dataset, asked.folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds

@@ -64,6 +64,8 @@ class Problem:
     beta2: float = OWN_BETA2  #: Adam's first one, for the unknowns
     #: Whether pixels to train on show unknown light (`told_scale.py`); None: nobody looked.
     shows_light: bool | None = None
+    #: What the mean albedo is by convention, where photographs do not tell it; linear RGB.
+    mean_albedo: tuple[float, float, float] = (0.5, 0.5, 0.5)
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""

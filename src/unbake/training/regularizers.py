@@ -86,7 +86,7 @@ def regularization_terms(
         value = albedo_ties_roughness(here, valid, r.similarity, shift=1)
         terms["albedo_ties_roughness"] = r.albedo_ties_roughness * value
     if anchored:
-        value = mean_albedo_deviation(here, valid, config.lighting.mean_albedo)
+        value = mean_albedo_deviation(here, valid, problem.mean_albedo)
         terms["mean_albedo"] = config.lighting.anchor * value
     return terms
 

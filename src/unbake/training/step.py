@@ -29,7 +29,7 @@ from .loss_scaling import gradients_are_finite, next_scale
 from .memory import MOST_BYTES_A_SAMPLE, Forecast, forecast
 from .problem import Problem
 from .state import State
-from .told_scale import shows_light
+from .told_scale import conventional_albedo, shows_light
 
 #: Pixels from which the loss of all-black images is estimated.
 _OF_BLACK = 1 << 15
@@ -95,6 +95,8 @@ class TrainingStep:
         # As the first one has it: rays may differ between machines, and terms must not.
         shown = self._ranks.together(lambda: shows_light(problem, config, pixels))
         problem.shows_light = self._ranks.gather(shown)[0]
+        albedo = self._ranks.together(lambda: conventional_albedo(problem, config, pixels))
+        problem.mean_albedo = self._ranks.gather(albedo)[0]
         self._problem = problem
         self.pixels = pixels
         self.config = config  #: of this process, with its share of each batch

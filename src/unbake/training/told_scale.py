@@ -26,6 +26,10 @@ from .problem import Problem
 _PIXELS = 1 << 16
 #: The part of them, at least, that must show it: cracks of a mesh show the environment as well.
 _LEAST = 1e-4
+#: Pixels that are more than so many times as bright as the median one may be highlights.
+_HIGHLIGHT = 8.0
+#: What no channel of the mean albedo is above.
+_MOST_ALBEDO = 0.8
 #: How many times as much makes sure that it is so, by whatever pixels are looked at.
 _SURELY = 4
 
@@ -51,11 +55,53 @@ def shows_light(problem: Problem, config: FitConfig, pixels: PixelSource) -> boo
         return None
     if not is_shared(problem):
         return None
-    found = pixels.photographs
-    chosen = places(found.count, _PIXELS)
-    own = chosen[(chosen >= found.places.start) & (chosen < found.places.stop)]
+    found, own = pixels.photographs, _own_places(pixels)
     shown = found.joined(lambda: _shown(problem, pixels, found.own_numbers(own)))
     return bool(shown.mean() >= _LEAST)
+
+
+def conventional_albedo(
+    problem: Problem, config: FitConfig, pixels: PixelSource
+) -> tuple[float, float, float]:
+    """The mean albedo where it is a convention, linear RGB.
+
+    With white light, surfaces have the colour of the photographs. So light has the colour that
+    cameras took for white, and objects keep theirs.
+
+    Args:
+        pixels: to train on. Processes that share them are not asked: where the mean is held, each
+            has all.
+    """
+    lighting = config.lighting
+    mean = lighting.mean_albedo
+    if lighting.mean_colour == "grey" or not is_shared(problem):
+        return mean, mean, mean
+    photographs = pixels.photographs
+    rgb = photographs.own_rows(photographs.own_numbers(_own_places(pixels)))[:, :3]
+    # Highlights have the colour of light.
+    level = rgb.mean(1, dtype=np.float64)
+    plain = rgb[level <= _HIGHLIGHT * np.median(level)] if len(rgb) else np.ones((1, 3))
+    colour = np.maximum(plain.mean(0, dtype=np.float64), 1e-30)
+    colour *= mean / colour.mean()
+    colour *= min(1.0, _MOST_ALBEDO / colour.max())
+    red, green, blue = (float(x) for x in colour)
+    return red, green, blue
+
+
+def told_convention(problem: Problem) -> str:
+    """A line of what the mean albedo is taken for, in a fit where it is a convention."""
+    mean = " ".join(f"{x:.2f}" for x in problem.mean_albedo)
+    return (
+        "no photograph shows the light itself, unclipped: brightness and colour of albedo are a "
+        f"convention, by which its mean is {mean}"
+    )
+
+
+def _own_places(pixels: PixelSource) -> np.ndarray:
+    """Places of pixels to look at, of those that this process holds."""
+    found = pixels.photographs
+    chosen = places(found.count, _PIXELS)
+    return chosen[(chosen >= found.places.start) & (chosen < found.places.stop)]
 
 
 def may_be_untold(config: FitConfig, dataset: Dataset) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -45,10 +47,10 @@ def albedo_ties_roughness(
     return _mean(weight * dr.square(roughness - there), both)
 
 
-def mean_albedo_deviation(here: Material, valid: mi.Bool, mean: float) -> mi.Float:
-    """Squared deviation of the mean albedo from a number, summed over channels."""
+def mean_albedo_deviation(here: Material, valid: mi.Bool, mean: Sequence[float]) -> mi.Float:
+    """Squared deviation of the mean albedo from a colour, summed over channels."""
     means = [_mean(dr.select(valid, channel, 0), valid) for channel in here["albedo"]]
-    return sum(dr.square(m - mean) for m in means)
+    return sum(dr.square(m - wanted) for m, wanted in zip(means, mean, strict=True))
 
 
 def _mean(values: mi.Float, counted: mi.Bool) -> mi.Float:
