@@ -104,6 +104,28 @@ def unbake(monkeypatch, capfd):
     return call
 
 
+@dataclass
+class Clock:
+    """The clock that lines of progress look at; it goes on by `step` seconds with each look."""
+
+    now: float = 0.0
+    step: float = 0.0
+
+    def monotonic(self) -> float:
+        self.now += self.step
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock for lines of progress that stands still until a test moves it."""
+    from unbake import progress
+
+    made = Clock()
+    monkeypatch.setattr(progress, "time", made)
+    return made
+
+
 @pytest.fixture(scope="session")
 def cornell(tmp_path_factory) -> Path:
     """A captured data set, to be read alone: two views and a held-out one, 16 x 16 pixels."""

@@ -51,6 +51,15 @@ def test_good_data_raise_no_alarm(name, captured):
     assert result.alignment is None or result.alignment.best is None
 
 
+def test_a_check_that_takes_long_tells_how_far_it_is(cornell, clock):
+    lines = []
+    check_data(cornell, tell=lines.append)
+    assert lines == []
+    clock.step = 60.0
+    check_data(cornell, tell=lines.append)
+    assert lines == ["checking photographs: 1 of 3", "checking photographs: 2 of 3"]
+
+
 def test_three_faults_are_told_in_one_go(spoilt, unbake):
     data = spoilt("cornell")
     data.poses(lambda pose: pose @ FLIP)

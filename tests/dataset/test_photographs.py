@@ -30,6 +30,7 @@ from unbake.dataset.photographs import Photographs
 from unbake.dataset.pixels import CameraRays, PixelSource
 from unbake.dataset.views import Dataset, SensorNoise, View
 from unbake.errors import UserError
+from unbake.progress import EVERY
 from unbake.transport.loss import RelativeL2
 
 WIDTH, HEIGHT = 7, 5
@@ -334,6 +335,27 @@ def test_images_are_decoded_once(dataset, on_disk, monkeypatch):
     again = Photographs.load(made, False)
     np.testing.assert_array_equal(first.table, again.table)
     assert again.mean == first.mean
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_decoding_that_takes_long_tells_how_far_it_is(dataset, where, monkeypatch, clock):
+    monkeypatch.setattr(module, "IN_MEMORY", 0 if where == "disk" else 1 << 30)
+    monkeypatch.setattr(decoded_file, "_MUCH", 0)
+    made, lines = dataset(), []
+    clock.step = 2 * EVERY
+    Photographs.load(made, False, tell=lines.append)
+    if where == "disk":
+        begin = f"decoding 3 photographs, once, into {made.folder}/.cache: "
+        assert lines.pop(0).startswith(begin)
+    assert lines == ["decoding photographs: 1 of 3", "decoding photographs: 2 of 3"]
+    Photographs.load(made, False, tell=lines.append)
+    assert len(lines) == (2 if where == "disk" else 4)  # the file is there
+
+
+def test_decoding_that_is_over_soon_tells_nothing(dataset, on_disk, clock):
+    lines = []
+    Photographs.load(dataset(), False, tell=lines.append)
+    assert lines == []
 
 
 @pytest.mark.parametrize(

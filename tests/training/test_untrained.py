@@ -1,15 +1,18 @@
 """Before the first step: all methods start from the same fields, which favour no answer."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from safetensors.numpy import load_file
 from support import built_in_cameras, pixel_rays, tiny_fields
 
-from unbake.config import FitConfig
+from unbake.config import FitConfig, read_toml
 from unbake.fields.registry import representations
 from unbake.quantities import QUANTITIES
+from unbake.training.loop import fit
 from unbake.training.problem import make_problem
 from unbake.training.run_folder import RunFolder
 from unbake.training.state import initial_state
@@ -88,3 +91,26 @@ def test_a_fit_of_no_steps_has_untrained_fields(unbake, cornell, tiny, tmp_path)
     assert unbake("fit", cornell, "--out", run.path, "--resume", "--steps", 2).status == 0
     assert [line["step"] for line in run.log() if "validation" not in line] == [2]
     assert run.settings().steps == 2
+
+
+def test_a_fit_tells_what_it_does_before_its_first_step_where_that_takes_long(
+    cornell, tiny, tmp_path, clock
+):
+    config = replace(read_toml(tiny), steps=0)
+    said = {}
+    for name, step in (("fast", 0.0), ("slow", 60.0)):
+        clock.step = step
+        console = Console(file=io.StringIO(), width=200)
+        fit(cornell, tmp_path / name, config, console=console)
+        said[name] = console.file.getvalue().splitlines()
+    doing = [
+        "choosing the sizes of fields",
+        "reading the files of the data set",
+        "reading photographs",
+        "decoding photographs: 1 of 2",
+        "making the scene",
+        "checking the data",
+        "preparing the first step, for which kernels are compiled",
+    ]
+    assert [line for line in said["slow"] if line in doing] == doing
+    assert not set(said["fast"]) & set(doing)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal, TypeVar, final
 
 import mitsuba as mi
 import numpy as np
@@ -36,11 +36,14 @@ from ..dataset.poses import check_cameras, pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
 from ..dataset.views import Dataset, View, fitted, read_masked
 from ..errors import UserError, collected, named, printable
+from ..progress import each_told, silent
 from ..scene import edit, free_space
 from ..scene.checked import checked_scene
 from ..scene.normals import turned_share
 from ..scene.parse import ParsedScene, parse
 from .pictures import PictureFacts, blurred, percentage, picture_facts
+
+Item = TypeVar("Item")
 
 #: Share of the pixels of surfaces that may be clipped, of one view and of all; and of one view
 #: where it is told from which value on they are.
@@ -131,7 +134,11 @@ class DataCheck:
 
 
 def check_data(
-    folder: str | Path, *, allow_outside: bool = False, clip_negative: bool = False
+    folder: str | Path,
+    *,
+    allow_outside: bool = False,
+    clip_negative: bool = False,
+    tell: Callable[[str], None] = silent,
 ) -> DataCheck:
     """Look for all that is wrong with a data set.
 
@@ -139,6 +146,7 @@ def check_data(
         folder: of the data set.
         allow_outside: read files that lie outside of the folder.
         clip_negative: take negative pixels as zero.
+        tell: called with lines of progress where photographs take long.
 
     Returns:
         What was found. Bad input is no exception here, but an error among the findings.
@@ -149,7 +157,7 @@ def check_data(
         result.dataset = Dataset.load(folder, allow_outside=allow_outside, faults=faults)
     result.findings += _grouped(faults, Path(folder))
     if result.dataset is not None:
-        _check_dataset(result, result.dataset, clip_negative)
+        _check_dataset(result, result.dataset, clip_negative, tell)
     order = ("error", "warning", "hint")
     result.findings.sort(key=lambda finding: order.index(finding.level))
     return result
@@ -167,7 +175,9 @@ def _grouped(faults: Sequence[UserError], folder: Path) -> list[Finding]:
     ]
 
 
-def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:
+def _check_dataset(
+    result: DataCheck, dataset: Dataset, clip_negative: bool, tell: Callable[[str], None]
+) -> None:
     faults: list[UserError] = []
     parsed = scene = lost = None
     with collected(faults):
@@ -178,7 +188,7 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         faults += found
     if parsed is None or scene is None:
         result.findings += [replace(f, check="scene") for f in _grouped(faults, dataset.folder)]
-        _check_files(result, dataset, clip_negative)
+        _check_files(result, dataset, clip_negative, tell)
         return
     _check_scene(result, dataset, parsed, scene, lost)
     count = sum(view.camera.width * view.camera.height for view in dataset.train)
@@ -187,7 +197,8 @@ def _check_dataset(result: DataCheck, dataset: Dataset, clip_negative: bool) -> 
         remedy = "Use fewer views, or smaller images: `unbake import --longest` makes them"
         result.add(Finding("error", "size", what, None, remedy))
     cameras = [small_camera(view.camera) for view in dataset.views]
-    for view, seen in zip(dataset.views, seen_by(scene, cameras), strict=True):
+    pairs = zip(dataset.views, seen_by(scene, cameras), strict=True)
+    for view, seen in _told(pairs, dataset, tell):
         with collected(faults):
             result.views.append(_checked(seen, dataset, view, result, clip_negative))
     result.findings += _grouped(faults, dataset.folder)
@@ -232,10 +243,18 @@ def _check_scene(
         result.add(Finding("hint", "scene", what, where, remedy))
 
 
-def _check_files(result: DataCheck, dataset: Dataset, clip_negative: bool) -> None:
+def _told(each: Iterable[Item], dataset: Dataset, tell: Callable[[str], None]) -> Iterator[Item]:
+    """What is checked of each view, in turn; lines tell how many photographs were read."""
+    count = len(dataset.views)
+    return each_told(each, count, lambda number: f"checking photographs: {number} of {count}", tell)
+
+
+def _check_files(
+    result: DataCheck, dataset: Dataset, clip_negative: bool, tell: Callable[[str], None]
+) -> None:
     """What can be told of photographs without the scene: whether their pixels can be used."""
     faults: list[UserError] = []
-    for view in dataset.views:
+    for view in _told(dataset.views, dataset, tell):
         with collected(faults):
             read_masked(view, clip_negative)
     result.findings += _grouped(faults, dataset.folder)

@@ -185,7 +185,7 @@ def data(
     from ..checks.told import told_rows
 
     options = {"allow_outside": allow_outside, "clip_negative": clip_negative}
-    result = check_data(folder, **options)
+    result = check_data(folder, **options, tell=say)
     marks = {"ok": "green", "warning": "yellow", "error": "bold red", "hint": "cyan", "—": "dim"}
     console = Console(highlight=False)
     for check, verdict, told in told_rows(result):

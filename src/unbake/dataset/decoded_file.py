@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import UserError, printable
 from ..io import locked, read_object, remove_unfinished, temporary_beside, write_json
-from ..memory import free_bytes
+from ..memory import free_bytes, size
+from ..progress import silent
 from .clipped_noise import BRIGHT
 from .clipped_noise import RADIUS as BLACK_RADIUS
 from .data_folder import DataFolder
@@ -30,6 +31,8 @@ from .views import may_ring
 
 #: Share of the free memory up to which the system is to read ahead in a mapped file.
 _FITTING = 0.5
+#: Bytes of files that are told before they are written.
+_MUCH = 1e9
 #: Key of what is left out of JPEG files; see `views.may_ring`.
 _RINGING = "beside clipped values of JPEG"
 
@@ -42,12 +45,17 @@ class Unwritable(Exception):
         self.why = why
 
 
-def in_file(plan: Plan, decode: Callable[..., tuple[np.ndarray | None, Totals]]) -> Decoded:
+def in_file(
+    plan: Plan,
+    decode: Callable[..., tuple[np.ndarray | None, Totals]],
+    tell: Callable[[str], None] = silent,
+) -> Decoded:
     """All views in a file that is made where it is missing, or made from other images.
 
     Args:
         plan: of all views.
         decode: called as `Plan.decode_into`, without its plan, where the file is made.
+        tell: called with where the file is and how large, if it is large and is made.
 
     Raises:
         Unwritable: there is no room for it, or the folder cannot be written to.
@@ -62,7 +70,8 @@ def in_file(plan: Plan, decode: Callable[..., tuple[np.ndarray | None, Totals]])
     try:
         with locked(data.path) as alone:
             # Another fit may have made it meanwhile
-            return _find_cache(data, key) or _write_cache(data, plan, key, decode, sweep=alone)
+            found = _find_cache(data, key)
+            return found or _write_cache(data, plan, key, decode, tell, sweep=alone)
     except OSError as error:
         why = UserError(
             f"the decoded photographs cannot be written ({error.strerror})",
@@ -190,6 +199,7 @@ def _write_cache(
     plan: Plan,
     key: dict[str, Any],
     decode: Callable[..., tuple[np.ndarray | None, Totals]],
+    tell: Callable[[str], None],
     *,
     sweep: bool,
 ) -> Decoded:
@@ -212,6 +222,10 @@ def _write_cache(
         for file in (data.cache_key, *files):
             file.unlink(missing_ok=True)
         _require_disk(data.cache, _size(key))
+        if _size(key) > _MUCH:
+            count = len(plan.dataset.train)
+            where = printable(data.cache, 1000)
+            tell(f"decoding {count} photographs, once, into {where}: {size(_size(key))}")
         shape = (key["pixels"], key["columns"])
         table = np.lib.format.open_memmap(table_file, "w+", np.float32, shape)
         _reserve(table_file)

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import UserError
 from ..imaging.windows import around, bands, mean_of_counted
 from ..memory import free_bytes
+from ..progress import each_told, silent
 from ..threads import in_order, usable_cores
 from .camera import Camera
 from .clipped_noise import without_clipped_noise
@@ -123,6 +124,7 @@ class Plan:
         processes: int = 1,
         held: int = 0,
         keep: Callable[[np.ndarray], None] | None = None,
+        tell: Callable[[str], None] = silent,
     ) -> tuple[np.ndarray | None, Totals]:
         """Put the images of views into a table, but for what is too bright in them.
 
@@ -134,6 +136,7 @@ class Plan:
             held: bytes of each that are to stay, such as of the table.
             keep: takes the numbers of the pixels to train on, view after view; None: they are
                 returned, if there are any.
+            tell: called with how many are decoded, every few seconds.
 
         Returns:
             `Decoded.chosen` and `Decoded.totals`.
@@ -158,7 +161,11 @@ class Plan:
             len(views), max(sizes, default=1), coded=coded, processes=processes, held=held
         )
         made = in_order(put, list(zip(views, starts, strict=True)), at_once)
-        return joined(made, self.chooses, keep)
+
+        def line(number: int) -> str:
+            return f"decoding photographs: {number} of {len(views)}"
+
+        return joined(each_told(made, len(views), line, tell), self.chooses, keep)
 
 
 def decoded_at_once(

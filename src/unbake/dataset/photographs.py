@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..memory import require_memory
+from ..progress import silent
 from ..ranks import Ranks
 from .camera import Camera
 from .decoded_file import Unwritable, expect_random, in_file
@@ -190,6 +191,7 @@ class Photographs:
         *,
         smoothed: bool = True,
         ranks: Ranks | None = None,
+        tell: Callable[[str], None] = silent,
     ) -> Photographs:
         """The training views of a data set.
 
@@ -200,6 +202,7 @@ class Photographs:
             smoothed: keep a blurred copy, too, which doubles the memory.
             ranks: processes that deal the views among them and all call this, no more than there
                 are views; None: this one holds all.
+            tell: called with lines of progress where decoding takes long.
 
         Raises:
             UserError: an image is bad, or there are too many for memory and the data set's folder
@@ -217,7 +220,7 @@ class Photographs:
             views = [replace(v, noise=v.noise or noise) for v in dataset.views]
             dataset = replace(dataset, views=tuple(views))
         plan = Plan.of(dataset, clip_negative, WITH_BLURRED if smoothed else COLUMNS, ranks.size)
-        found = ranks.together(lambda: _loaded(plan, ranks.rank, ranks.here), math.inf)
+        found = ranks.together(lambda: _loaded(plan, ranks.rank, ranks.here, tell), math.inf)
         masked = any(leaves_out(view) for view in dataset.train)
         if ranks.size == 1:
             return _with_level(replace(_made(found, noise), masked=masked))
@@ -227,12 +230,13 @@ class Photographs:
         return _with_level(replace(_made(found, noise, every, share), masked=masked))
 
 
-def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
+def _loaded(plan: Plan, rank: int, here: int, tell: Callable[[str], None]) -> Decoded:
     """The views of a process.
 
     Args:
         rank: its number.
         here: processes on this machine.
+        tell: called with lines of progress.
     """
     views, folder = plan.dataset.train, plan.dataset.folder
     remedy, count = "Use fewer views, or smaller images", sum(plan.sizes)
@@ -253,11 +257,11 @@ def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
 
     def decode(*args: Any, **more: Any) -> tuple[np.ndarray | None, Totals]:
         require(0)  # which nobody needs who finds the file
-        return plan.decode_into(*args, **more)
+        return plan.decode_into(*args, **more, tell=tell)
 
     if table_bytes > IN_MEMORY:
         try:
-            decoded = in_file(plan, decode)
+            decoded = in_file(plan, decode, tell)
             return decoded.part(own, pixels, {view.name for view in views[own]})
         except Unwritable as error:
             unwritable = error.why
@@ -269,7 +273,7 @@ def _loaded(plan: Plan, rank: int, here: int) -> Decoded:
     except UserError as error:
         raise unwritable or error from None
     table = np.empty((pixels.stop - pixels.start, plan.columns), np.float32)
-    found = plan.decode_into(table, views[own], pixels.start, processes=here, held=held)
+    found = plan.decode_into(table, views[own], pixels.start, processes=here, held=held, tell=tell)
     return Decoded(table, *found)
 
 

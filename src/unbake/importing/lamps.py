@@ -15,7 +15,6 @@ Then much of everything else would have to reflect more than there is, too, and 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import final
@@ -26,6 +25,7 @@ import numpy as np
 from ..dataset.spread import evenly, places
 from ..dataset.views import View, read_photograph
 from ..fields.pieces import connected
+from ..progress import Paced
 from ..scene import free_space
 from ..scene.triangles import mesh_of, numbered
 from .meshes import Part
@@ -212,11 +212,9 @@ def _seen(surface: _Surface, views: Sequence[View], tell: Callable[[str], None])
     views = evenly(views, _PHOTOGRAPHS)
     each = max(1, _PIXELS // len(views))
     columns: list[tuple[np.ndarray, ...]] = []
-    told = time.monotonic()
+    told = Paced(tell, EVERY)
     for number, view in enumerate(views):
-        if time.monotonic() - told >= EVERY:
-            told = time.monotonic()
-            tell(f"looked for lamps in {number} of {len(views)} photographs")
+        told(f"looked for lamps in {number} of {len(views)} photographs")
         pixels = read_photograph(view).reshape(-1, 4)
         chosen = np.flatnonzero(pixels[:, 3] >= 1)
         if not len(chosen):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from ..dataset.decoding import decoded_at_once
+from ..progress import each_told
 from ..threads import in_order
 from .source import Shot
 
@@ -38,9 +38,8 @@ def each_photograph(
     largest = max((shot.lens.width * shot.lens.height for shot in shots), default=1)
     coded = all(shot.coded for shot in shots)
     at_once = decoded_at_once(len(shots), largest, coded=coded)
-    told = time.monotonic()
-    for number, result in enumerate(in_order(work, arguments, at_once), 1):
-        if time.monotonic() - told >= EVERY and number < len(shots):
-            told = time.monotonic()
-            tell(f"{what} {number} of {len(shots)} photographs")
-        yield result
+
+    def line(number: int) -> str:
+        return f"{what} {number} of {len(shots)} photographs"
+
+    yield from each_told(in_order(work, arguments, at_once), len(shots), line, tell, EVERY)

@@ -17,9 +17,10 @@ from .. import backend
 from ..config import FitConfig, to_toml
 from ..dataset.fingerprint import changed, fingerprint
 from ..dataset.photographs import MOST_PIXELS
-from ..dataset.pixels import CameraRays
+from ..dataset.pixels import CameraRays, PixelSource
 from ..dataset.views import Dataset, View
 from ..errors import UserError
+from ..progress import Paced
 from ..ranks import Ranks
 from .checkpoint import Progress, load_checkpoint
 from .defaults import told_unknown, with_defaults
@@ -40,6 +41,9 @@ from .step import TrainingStep
 from .told_scale import told_convention
 from .validation import Score
 from .warm_start import solved_again, start_radiance, told_start, warm_start, with_solved_field
+
+#: Seconds after the last line from which on it is told what a fit does before its first step.
+_SOON = 3.0
 
 
 @final
@@ -91,7 +95,8 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     """Read all input, and check it; nothing is written but the cache of the data set.
 
     Args:
-        console: where warnings and what a fit has chosen are told.
+        console: where warnings and what a fit has chosen are told, and what it does where that
+            takes long.
         ranks: that begin together, in work of `Ranks.together`.
 
     Raises:
@@ -99,11 +104,15 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     """
     resume, solved = asked.resume, asked.solved
     config = asked.config if solved is None else with_solved_field(asked.config, solved)
+    doing = _doing(console)
     dataset = Dataset.load(asked.data, allow_outside=asked.allow_outside)
     before = asked.folder.origin() if resume else None
     recovered = None if resume else told_unknown(config, dataset)
+    if not resume:
+        doing("choosing the sizes of fields")
     config = with_path_depth(config, dataset) if resume else with_defaults(config, dataset)
     clip_negative = asked.clip_negative or (before is not None and before.clip_negative)
+    doing("reading the files of the data set")
     files = _require_same_input(config, dataset, ranks)
     whole = None
     if ranks.size > 1:  # as the first one has it: rays may differ between machines
@@ -112,34 +121,16 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     if whole is not None:
         console.print(f"each process reads all photographs: {whole}", highlight=False)
     dealing = None if whole is not None else ranks
-    pixels = pixels_of(dataset, config, clip_negative=clip_negative, ranks=dealing)
+    doing("reading photographs")
+    pixels = pixels_of(dataset, config, clip_negative=clip_negative, ranks=dealing, tell=doing.now)
     pixels = pixels.holding_aside(config.held_aside, config.seed)
-    origin = Origin(
-        data=str(asked.data.resolve()),
-        mean_radiance=pixels.photographs.mean,
-        level=pixels.photographs.level,
-        clip_negative=clip_negative,
-        run=uuid.uuid4().hex if before is None else before.run,
-        fingerprint=files,
-        warm_start=None if solved is None else warm_start(solved),
-    )
+    origin = _origin(asked, before, pixels, files, clip_negative=clip_negative)
     if before is not None:
-        _require_same_data(asked.folder, before, origin)
-        kept = ("mean_radiance", "level", "warm_start", "machines")
-        origin = dataclasses.replace(origin, **{name: getattr(before, name) for name in kept})
         pixels = pixels.at_level(origin.photographs_level)
-    problem = problem_of(dataset, config, origin.photographs_level)
-    untold = begin_cameras(problem, dataset, pixels, ranks)
-    begin_lights(problem, pixels, ranks)
-    if problem.radiance is not None:
-        problem.radiance.scale = origin.radiance_scale
-    odd = [] if solved is None else start_radiance(problem, solved)
-    allowed = asked.allow_doubtful or resume
-    doubts = data_warnings(dataset, pixels, problem, allow_doubtful=allowed)
-    if untold is not None and not resume:
-        doubts.append(untold)
-    for warning in [*odd, *doubts]:
+    problem, warnings = _problem(asked, config, dataset, pixels, origin, ranks, doing)
+    for warning in warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
+    doing("preparing the first step, for which kernels are compiled")
     step = TrainingStep(problem, pixels, config, ranks)
     for line in (
         recovered,
@@ -171,6 +162,84 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
         photographs=photographs,
         views=[view.name for view in dataset.train],
     )
+
+
+def _doing(console: Console) -> Paced:
+    """Tells what a fit does, unless something was told of it a moment before."""
+
+    def tell(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    return Paced(tell, _SOON)
+
+
+def _origin(
+    asked: FitInput,
+    before: Origin | None,
+    pixels: PixelSource,
+    files: dict[str, str],
+    *,
+    clip_negative: bool,
+) -> Origin:
+    """Where a run comes from; one that goes on keeps most of it.
+
+    Args:
+        before: of the run that goes on.
+        pixels: to train on.
+        files: the data set's fingerprint.
+
+    Raises:
+        UserError: the run that goes on was started with other data.
+    """
+    origin = Origin(
+        data=str(asked.data.resolve()),
+        mean_radiance=pixels.photographs.mean,
+        level=pixels.photographs.level,
+        clip_negative=clip_negative,
+        run=uuid.uuid4().hex if before is None else before.run,
+        fingerprint=files,
+        warm_start=None if asked.solved is None else warm_start(asked.solved),
+    )
+    if before is None:
+        return origin
+    _require_same_data(asked.folder, before, origin)
+    kept = ("mean_radiance", "level", "warm_start", "machines")
+    return dataclasses.replace(origin, **{name: getattr(before, name) for name in kept})
+
+
+def _problem(
+    asked: FitInput,
+    config: FitConfig,
+    dataset: Dataset,
+    pixels: PixelSource,
+    origin: Origin,
+    ranks: Ranks,
+    doing: Paced,
+) -> tuple[Problem, list[str]]:
+    """The problem as it begins, and warnings where something is odd about it or the data.
+
+    Args:
+        config: with the defaults of the method and the data.
+        doing: called with what is done.
+
+    Raises:
+        UserError: as of `begin`.
+    """
+    doing("making the scene")
+    problem = problem_of(dataset, config, origin.photographs_level)
+    if problem.camera is not None or problem.light_is_unknown:
+        doing("finding where cameras and lights begin")
+    untold = begin_cameras(problem, dataset, pixels, ranks)
+    begin_lights(problem, pixels, ranks)
+    if problem.radiance is not None:
+        problem.radiance.scale = origin.radiance_scale
+    odd = [] if asked.solved is None else start_radiance(problem, asked.solved)
+    doing("checking the data")
+    allowed = asked.allow_doubtful or asked.resume
+    doubts = data_warnings(dataset, pixels, problem, allow_doubtful=allowed)
+    if untold is not None and not asked.resume:
+        doubts.append(untold)
+    return problem, [*odd, *doubts]
 
 
 def _state(

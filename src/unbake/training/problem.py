@@ -28,6 +28,7 @@ from ..fields.radiance import RadianceField, make_radiance
 from ..fields.registry import representation
 from ..fields.settings import NetworkConfig
 from ..fields.texture import material_numbers, material_textures
+from ..progress import silent
 from ..ranks import Ranks
 from ..scene import edit, emitters
 from ..scene.parse import ParsedScene, parse
@@ -282,7 +283,12 @@ def weigh_lights(scene_view: SceneView, views: Sequence[View], *, hide_emitters:
 
 
 def pixels_of(
-    dataset: Dataset, config: FitConfig, *, clip_negative: bool, ranks: Ranks | None = None
+    dataset: Dataset,
+    config: FitConfig,
+    *,
+    clip_negative: bool,
+    ranks: Ranks | None = None,
+    tell: Callable[[str], None] = silent,
 ) -> PixelSource:
     """The training pixels with what the settings ask of them; see `training_pixels`."""
     return training_pixels(
@@ -291,6 +297,7 @@ def pixels_of(
         smoothed=config.loss_reference == "smoothed",
         slopes=bool(config.camera.of_places),
         ranks=ranks,
+        tell=tell,
     )
 
 
@@ -384,6 +391,7 @@ def training_pixels(
     smoothed: bool = True,
     slopes: bool = False,
     ranks: Ranks | None = None,
+    tell: Callable[[str], None] = silent,
 ) -> PixelSource:
     """The pixels of the training views.
 
@@ -394,6 +402,7 @@ def training_pixels(
         slopes: give batches the slopes of the photographs, which corrections of poses need.
         ranks: processes that share the photographs, see `Photographs.load`; None: this one holds
             all.
+        tell: called with lines of progress where decoding takes long.
 
     Raises:
         UserError: there is no training view, an image is bad, or all pixels are black.
@@ -403,7 +412,9 @@ def training_pixels(
         raise UserError(
             "no training view", dataset.folder, f'Give frames of {TRANSFORMS} "split": "train"'
         )
-    photographs = Photographs.load(dataset, clip_negative, smoothed=smoothed, ranks=ranks)
+    photographs = Photographs.load(
+        dataset, clip_negative, smoothed=smoothed, ranks=ranks, tell=tell
+    )
     if not photographs.count:
         remedy = "Masks are white where pixels count: see `unbake data check`"
         raise UserError("no foreground pixel in any training view", dataset.folder, remedy)
