@@ -66,3 +66,11 @@ def each_told(
         if number < count and paced.is_due:
             paced.now(line(number))
         yield result
+
+
+def duration(seconds: float) -> str:
+    """A time in a few characters: 59 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"

@@ -15,8 +15,10 @@ from unbake.dataset.data_folder import DataFolder
 from unbake.dataset.views import Dataset
 from unbake.errors import UserError
 from unbake.evaluation import evaluate as evaluate_module
+from unbake.evaluation import forecast
 from unbake.evaluation.evaluate import _require_room, evaluate, require_true_materials
 from unbake.evaluation.placing import _Errors, _solved
+from unbake.evaluation.rendering import render
 from unbake.evaluation.renderings import (
     METRICS,
     NOT_FINITE,
@@ -24,12 +26,13 @@ from unbake.evaluation.renderings import (
     render_psnr,
     render_scores,
 )
-from unbake.evaluation.settings import EvaluationSettings
+from unbake.evaluation.settings import EvaluationSettings, RenderSettings
 from unbake.evaluation.yardsticks import seen_materials
 from unbake.imaging.metrics import HIGHEST
 from unbake.report.page import write_report
 from unbake.training.loop import fit
 from unbake.training.run_folder import EvaluationFolder
+from unbake.transport import render as transport
 
 FEW = EvaluationSettings(spp=2, max_depth=3, train_views=0)
 
@@ -107,6 +110,64 @@ def test_materials_that_are_not_finite_are_told_with_their_view(untrained, monke
     monkeypatch.setattr(evaluate_module, "seen_materials", broken)
     with pytest.raises(UserError, match=r"^heldout_000: materials: .* are not finite"):
         evaluate(untrained, FEW, tell=lambda line: None)
+
+
+def test_pictures_that_take_long_tell_how_far_they_are(untrained, tmp_path, monkeypatch, clock):
+    """Pictures of 16 x 16 pixels in parts of 64, each of which takes minutes."""
+    run = shutil.copytree(untrained, tmp_path / "run")
+    evaluation, rendering = replace(FEW, truth=True), RenderSettings(spp=FEW.spp, max_depth=3)
+
+    def told(out: str) -> list[str]:
+        lines: list[str] = []
+        evaluate(run, evaluation, tell=lines.append)
+        render(run, tmp_path / out, rendering, tell=lines.append)
+        return [line for line in lines if " % rendered" in line or "--spp" in line]
+
+    assert told("fast") == []
+    monkeypatch.setattr(transport, "WAVEFRONT", 64 * FEW.spp)
+    monkeypatch.setattr(forecast, "time", clock)
+    clock.step = 60.0
+    lines = told("slow")
+    pictures = ["heldout_000", "heldout_000, true materials", "heldout_000"]
+    shares = [(line.partition(": ")[0], line.partition(": ")[2][:4]) for line in lines]
+    parts = [(name, share) for name, share in shares if not name.startswith("all")]
+    assert parts == [(name, share) for name in pictures for share in ("25 %", "50 %", "75 %")]
+    # Of `render` it is one picture, which takes less than that. Of first parts nothing is known.
+    assert sum("a smaller --spp makes that shorter" in line for line in lines) == 1
+    assert sum(" left" in line for line in lines) == len(parts) - 2
+
+
+def test_what_all_pictures_take_is_told_once_where_it_is_long(monkeypatch, clock):
+    monkeypatch.setattr(forecast, "time", clock)
+    lines: list[str] = []
+    made = forecast.Forecast(10_000, lines.append)
+    for name in "ab":
+        done = made.begin(name, 1000)
+        for part in range(1, 5):
+            # Kernels are compiled for the first part, which tells nothing of others.
+            clock.now += 300.0 if name == "a" and part == 1 else 60.0
+            done(part / 4)
+    assert lines == [
+        "a: 25 % rendered",
+        "a: 50 % rendered, about 2 min left",
+        "all pictures take about 38 min more: a smaller --spp makes that shorter",
+        "a: 75 % rendered, about 60 s left",
+        "b: 25 % rendered, about 3 min left",
+        "b: 50 % rendered, about 2 min left",
+        "b: 75 % rendered, about 60 s left",
+    ]
+
+
+def test_pictures_that_are_soon_there_are_not_told(monkeypatch, clock):
+    monkeypatch.setattr(forecast, "time", clock)
+    lines: list[str] = []
+    made = forecast.Forecast(3000, lines.append)
+    for name in "abc":
+        done = made.begin(name, 1000)
+        for part in range(1, 5):
+            clock.now += 2.0
+            done(part / 4)
+    assert lines == []
 
 
 def test_meshes_that_were_changed_are_not_those_of_the_photographs(cornell, tmp_path):

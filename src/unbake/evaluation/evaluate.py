@@ -41,6 +41,7 @@ from ..training.validation import (
 from ..transport.objective import has_radiance
 from ..transport.vertex import SceneView
 from . import lighting, outliers, renderings, yardsticks
+from .forecast import Forecast
 from .outliers import evaluate_outliers
 from .placing import placed_view, told_of_place
 from .renderings import (
@@ -48,9 +49,11 @@ from .renderings import (
     NOT_FINITE,
     exposure_of,
     mean_scores,
+    photographs_of,
     render_camera,
     render_psnr,
     render_scores,
+    samples_of,
     scored_views,
     told_not_finite,
 )
@@ -164,7 +167,9 @@ def _evaluate(
     # First, as the true lighting may be damaged, and views take long
     recovered_lighting = _evaluate_lighting(recovered, out, tell)
     clip = settings.clip_negative or recovered.clip_negative
-    exposure = exposure_of(read_photograph(view, clip) for view in views)
+    exposure = exposure_of(photographs_of(views, clip, tell))
+    samples = sum(samples_of(view.camera, settings) for view in views)
+    forecast = Forecast(samples * (1 if true_scene is None else 2), tell)
     cameras = Cameras(recovered.problem.camera, dataset.train)
     rows, gains, placed = [], [], []
     materials: list[Seen] = []  # of views with truth alone: those of many views are large
@@ -173,7 +178,7 @@ def _evaluate(
         view = placed_view(recovered, cameras, given, settings)
         placed.append(view)
         row, seen, truth, gain = _evaluate_view(
-            recovered, cameras, view, out, settings, true_scene, exposure
+            recovered, cameras, view, out, settings, true_scene, exposure, forecast
         )
         rows.append(row)
         gains.append(gain)
@@ -314,9 +319,13 @@ def _evaluate_view(
     settings: EvaluationSettings,
     true_scene: SceneView | None,
     exposure: float,
+    forecast: Forecast,
 ) -> tuple[dict, MaterialBuffers | None, GroundTruth | None, np.ndarray]:
     problem = recovered.problem
-    radiance = render_camera(problem.scene_view, view.camera, settings, problem.hide_emitters)
+    words = (view.camera, settings, problem.hide_emitters)
+    samples = samples_of(view.camera, settings)
+    done = forecast.begin(view.name, samples)
+    radiance = render_camera(problem.scene_view, *words, done=done)
     photograph = read_photograph(view, settings.clip_negative or recovered.clip_negative)
     truth, seen = GroundTruth.of(view, recovered.config.quantities), None
     if recovered.config.learns_materials:
@@ -345,7 +354,8 @@ def _evaluate_view(
         compared = view.readable(photograph[..., :3])
         row |= render_scores(radiance, compared, mask, exposure)
         if true_scene is not None:
-            limit = render_camera(true_scene, view.camera, settings, problem.hide_emitters)
+            done = forecast.begin(f"{view.name}, true materials", samples)
+            limit = render_camera(true_scene, *words, done=done)
             dimmed = cameras.dimmed(view, limit)
             own = cameras.own_gain(view, dimmed[mask], photograph[mask][:, :3])
             exposed = cameras.photographed(view, dimmed, own)

@@ -37,14 +37,17 @@ from ..training.validation import known_pixels
 from ..version import VERSION
 from . import renderings
 from .evaluate import DEFINITIONS, description
+from .forecast import Forecast
 from .renderings import (
     METRICS,
     exposure_of,
     finite_pixels,
     mean_scores,
+    photographs_of,
     render_camera,
     render_psnr,
     render_scores,
+    samples_of,
     scored_views,
     told_not_finite,
     told_unit,
@@ -276,12 +279,15 @@ def _render(
     compared = [shot.truth for shot in shots if shot.truth is not None]
     exposure = 0.0
     if compared:
-        exposure = exposure_of(read_photograph(v, recovered.clip_negative) for v in compared)
+        exposure = exposure_of(photographs_of(compared, recovered.clip_negative, tell))
     shared = bool(compared) and recovered.config.shares_scale
+    forecast = Forecast(sum(samples_of(shot.camera, settings) for shot in shots), tell)
     frames, masks, brightest = [], [], 0.0
     with filled_folder(out) as folder:
         for number, shot in enumerate(shots):
-            radiance = _picture(recovered, shot.camera, settings, hide, settings.seed + number)
+            done = forecast.begin(shot.name, samples_of(shot.camera, settings))
+            words = (settings, hide, settings.seed + number)
+            radiance = _picture(recovered, shot.camera, *words, done)
             brightest = max(brightest, float(radiance.max(initial=0, where=np.isfinite(radiance))))
             write_exr(folder / f"{shot.name}.exr", radiance)
             write_png(folder / f"{shot.name}.png", tonemap(radiance, settings.exposure))
@@ -385,9 +391,14 @@ def picture_size(camera: Camera, settings: RenderSettings) -> tuple[int, int]:
 
 
 def _picture(
-    recovered: Recovered, camera: Camera, settings: RenderSettings, hide: bool, seed: int
+    recovered: Recovered,
+    camera: Camera,
+    settings: RenderSettings,
+    hide: bool,
+    seed: int,
+    done: Callable[[float], object],
 ) -> np.ndarray:
-    seen = render_camera(recovered.problem.scene_view, camera, settings, hide, seed)
+    seen = render_camera(recovered.problem.scene_view, camera, settings, hide, seed, done)
     if not settings.denoise:
         return seen
     denoiser = mi.OptixDenoiser(mi.ScalarVector2u(camera.width, camera.height))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.pixels import CameraRays
+from ..dataset.views import View, read_photograph
 from ..imaging import perceptual
 from ..imaging.metrics import mean_psnr, psnr
 from ..imaging.pictures import encoded, fitting_exposure, sample
+from ..progress import each_told
 from ..transport.render import render_radiance
 from ..transport.vertex import SceneView
 from .settings import EvaluationSettings, RenderSettings
@@ -47,8 +49,17 @@ def render_camera(
     settings: EvaluationSettings | RenderSettings,
     hide_emitters: bool,
     seed: int = 1,
+    done: Callable[[float], object] | None = None,
 ) -> np.ndarray:
     """What a camera sees with full global illumination.
+
+    Args:
+        scene_view: what is seen.
+        camera: of the picture.
+        settings: how it is rendered.
+        hide_emitters: whether emitters that are seen directly are left out.
+        seed: of all random numbers.
+        done: called with the share of the picture that is rendered, after each wavefront.
 
     Returns:
         Linear RGB, float32, (H, W, 3).
@@ -63,7 +74,31 @@ def render_camera(
         max_depth=settings.max_depth,
         rr_depth=settings.rr_depth,
         hide_emitters=hide_emitters,
+        done=done,
     ).reshape(camera.height, camera.width, 3)
+
+
+def photographs_of(
+    views: Sequence[View], clip_negative: bool, tell: Callable[[str], None]
+) -> Iterator[np.ndarray]:
+    """The photographs of views, one after the other; linear RGB and alpha, (H, W, 4).
+
+    Args:
+        views: whose photographs are read.
+        clip_negative: take negative pixels as zero.
+        tell: called with how many were read, every few seconds.
+
+    Raises:
+        UserError: an image cannot be used.
+    """
+    count = len(views)
+    read = (read_photograph(view, clip_negative) for view in views)
+    return each_told(read, count, lambda n: f"reading photographs: {n} of {count}", tell)
+
+
+def samples_of(camera: Camera, settings: EvaluationSettings | RenderSettings) -> int:
+    """Camera samples of a picture."""
+    return camera.width * camera.height * settings.spp
 
 
 def told_unit(exposure: float | None) -> str | None:

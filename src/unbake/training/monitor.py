@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
+from ..progress import duration
 from ..transport.terms import LOGGED
 from .event_log import EventLog
 
@@ -123,7 +124,7 @@ class Monitor:
         )
         if not self._console.is_terminal and entry["seconds"] - self._last_line >= QUIET_SECONDS:
             self._last_line = entry["seconds"]
-            left = "" if ahead is None else f"  {_duration(ahead)} left"
+            left = "" if ahead is None else f"  {duration(ahead)} left"
             share = min(1.0, done / self._total) if self._total else 1.0
             start = f"{100 * share:3.0f} %  "
             self.say(f"{start}{_fitting(parts, width - len(start) - len(left))}{left}")
@@ -186,14 +187,6 @@ def _number(value: float) -> str:
     if not math.isfinite(value):
         return str(value)
     return f"{value:.{max(0, 2 - max(-2, math.floor(math.log10(abs(value) or 1))))}f}"
-
-
-def _duration(seconds: float) -> str:
-    """A time in a few characters: 59 s, 12 min, 3.5 h."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
 
 
 def _fitting(parts: list[str], columns: int) -> str:

@@ -35,8 +35,20 @@ def render_radiance(
     max_depth: int,
     rr_depth: int,
     hide_emitters: bool,
+    done: Callable[[float], object] | None = None,
 ) -> np.ndarray:
     """Path trace pixels with full global illumination (box filter).
+
+    Args:
+        scene_view: what is seen.
+        through: rays of the pixels.
+        pixels: how many there are.
+        spp: samples a pixel.
+        seed: of all random numbers.
+        max_depth: longest light path.
+        rr_depth: first bounce that Russian roulette may take away.
+        hide_emitters: whether emitters that are seen directly are left out.
+        done: called with the share of the pixels that are rendered, after each wavefront.
 
     Returns:
         Linear RGB, float32, shape (pixels, 3).
@@ -54,6 +66,8 @@ def render_radiance(
             hide_emitters=hide_emitters,
         )
         image[part] = np.stack([_pixel_means(c, spp) for c in radiance], -1)
+        if done is not None:
+            done(part.stop / pixels)
     return image
 
 
