@@ -12,17 +12,19 @@ from html.parser import HTMLParser
 from inspect import getsource, signature
 from itertools import pairwise
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from support import MPIEXEC, needs_mpi
 
 from unbake import cli
-from unbake.cli.flags import flags, options, with_options
+from unbake.cli.flags import flags, of_preset, options, with_options
 from unbake.config import (
     QUALITIES,
     FitConfig,
     NetworkConfig,
+    PresetName,
     preset,
     read_toml,
     with_quality,
@@ -561,6 +563,21 @@ def test_a_registered_representation_is_an_option_like_any_other(monkeypatch):
     assert "wide (wide net)" in str(told.type)
     chosen = with_options(FitConfig(), {"representation": "wide"})
     assert chosen.material_settings["albedo"].width == 64
+
+
+def test_the_help_makes_each_preset_once_and_leaves_it_as_it_is(monkeypatch):
+    told = {f.name: str(f.type) for f in fields(flags(FitConfig, presets=True))}
+    made = []
+
+    def counted(name):
+        made.append(name)
+        return preset(name)
+
+    of_preset.cache_clear()
+    monkeypatch.setattr("unbake.config.preset", counted)
+    again = {f.name: str(f.type) for f in fields(flags(FitConfig, presets=True))}
+    assert sorted(made) == sorted(get_args(PresetName)) and set(again) == set(told)
+    assert all(of_preset(name) == preset(name) for name in made)
 
 
 def test_options_are_taken_together():

@@ -114,7 +114,7 @@ def _help(option: Option, presets: bool) -> str:
     if presets:
         names: dict[str, list[str]] = {}
         for name in typing.get_args(config.PresetName):
-            value = _text(_value(config.preset(name), option.path))
+            value = _text(_value(of_preset(name), option.path))
             names.setdefault(value, []).append(name)
         told = [f"{', '.join(who)}: {value}" for value, who in names.items()]
         default = told[0].partition(": ")[2] if len(told) == 1 else "; ".join(told)
@@ -122,6 +122,12 @@ def _help(option: Option, presets: bool) -> str:
     else:
         default = f"default: {_text(option.default)}"
     return f"{text} ({default})."
+
+
+@cache
+def of_preset(name: config.PresetName) -> FitConfig:
+    """The settings of a preset, to be read alone: their tables of fields could be changed."""
+    return config.preset(name)
 
 
 def _metavar(kind: Any) -> str | None:
