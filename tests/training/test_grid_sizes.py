@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -14,8 +15,13 @@ from unbake.dataset.camera import Camera
 from unbake.dataset.views import Dataset
 from unbake.fields.domain import Domain
 from unbake.fields.grid_sizes import sized
+from unbake.fields.shapes import bsdf_classes, met_shapes
+from unbake.scene.edit import to_principled
+from unbake.scene.parse import parse
 from unbake.training import grid_sizes
 from unbake.training.grid_sizes import domain_seen, surface_seen, with_grid_sizes
+from unbake.transport.emitter_sampling import has_cut_outs
+from unbake.transport.optimized import optimized_shapes
 
 #: Tiny fields whose sizes are left open, but for one.
 OPEN = {
@@ -137,3 +143,74 @@ def test_a_run_goes_on_with_the_sizes_that_it_was_started_with(
     monkeypatch.setattr(grid_sizes, "surface_seen", None)
     assert unbake(*words, "--resume", "--steps", 2).status == 0
     assert sizes(read_toml(run / "config.toml")) == sizes(first)
+
+
+#: BSDFs with bitmaps in all the places where these may be; the first two differ in theirs alone.
+PAINTED = {
+    "red": '<bsdf type="principled">{base_color:red.png}{roughness:grey.png}</bsdf>',
+    "blue": '<bsdf type="principled">{base_color:blue.png}{roughness:grey.png}</bsdf>',
+    "diffuse": '<bsdf type="twosided"><bsdf type="diffuse">{reflectance:red.png}</bsdf></bsdf>',
+    "bent": '<bsdf type="normalmap">{normalmap:flat.png}'
+    '<bsdf type="principled">{base_color:red.png}</bsdf></bsdf>',
+    "bumpy": '<bsdf type="bumpmap">{arbitrary:grey.png}'
+    '<bsdf type="principled">{base_color:red.png}</bsdf></bsdf>',
+    "blend": '<bsdf type="blendbsdf">{weight:grey.png}<bsdf type="principled"/>'
+    '<bsdf type="conductor"/></bsdf>',
+    "cut": '<bsdf type="mask">{opacity:holes.png}'
+    '<bsdf type="principled">{base_color:blue.png}</bsdf></bsdf>',
+    "mirror": '<bsdf type="conductor">{specular_reflectance:grey.png}</bsdf>',
+    "lamp": '<emitter type="area">{radiance:red.png}</emitter>',
+}
+
+
+@pytest.fixture
+def painted(tmp_path):
+    """Makes the scene: cubes of these BSDFs beside each other, two of each."""
+    rng = np.random.default_rng(1)
+    pictures = {name: rng.integers(0, 256, (4, 4, 3), np.uint8) for name in ("red", "blue", "grey")}
+    pictures["flat"] = np.full((4, 4, 3), (128, 128, 255), np.uint8)
+    pictures["holes"] = np.uint8(255 * rng.integers(0, 2, (4, 4, 3)))
+    for name, pixels in pictures.items():
+        mi.Bitmap(pixels).write(str(tmp_path / f"{name}.png"))
+    mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "cube.ply"))
+    texture = (
+        r'<texture name="\1" type="bitmap"><boolean name="raw" value="true"/>'
+        r'<string name="filename" value="\2"/></texture>'
+    )
+    shapes = [
+        f'<shape type="ply"><string name="filename" value="cube.ply"/>{bsdf}'
+        f'<transform name="to_world"><scale value="0.4"/>'
+        f'<translate x="{i % 5}" y="{i // 5}"/></transform></shape>'
+        for i, bsdf in enumerate([*PAINTED.values()] * 2)
+    ]
+    text = re.sub(r"\{(\w+):([\w.]+)\}", texture, "".join(shapes))
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+
+    def made(**options):
+        parsed = parse(tmp_path / "scene.xml")
+        to_principled(parsed)
+        return parsed.instantiate(**options)
+
+    return made
+
+
+def test_sizes_are_the_same_without_the_bitmaps(painted):
+    whole, bare = painted(), painted(bitmaps=False)
+    cameras = [Camera.look_at((2, y, 6), (2, 1.5, 0), (0, 1, 0), 50.0, 64, 48) for y in (-3, 2)]
+    assert surface_seen(bare, cameras) == surface_seen(whole, cameras)
+
+    def shapes(scene):
+        textures = ("Bitmap", "Uniform", "SRGB")
+        return sorted(
+            f"{sorted(c for c in bsdf_classes(s) if not c.startswith(textures))} "
+            f"{s.primitive_count()}"
+            for s in met_shapes(scene)
+        )
+
+    def bitmaps(scene):
+        return [key for key, _ in mi.traverse(scene) if key.endswith(".data")]
+
+    assert shapes(bare) == shapes(whole) and has_cut_outs(bare)
+    assert len(optimized_shapes(bare)) == len(optimized_shapes(whole)) > 4
+    assert len(bitmaps(whole)) > len(bitmaps(bare)) > 0
+    assert {key.split(".")[-2] for key in bitmaps(bare)} == {"opacity", "radiance"}

@@ -71,13 +71,15 @@ class ParsedScene:
     #: Shapes and sensors whose participating media are left out.
     media: int = 0
 
-    def instantiate(self, *, merge: bool = True) -> mi.Scene:
+    def instantiate(self, *, merge: bool = True, bitmaps: bool = True) -> mi.Scene:
         """Make the scene, once: the nodes cannot be used again.
 
         Args:
             merge: equal materials become one, and meshes that share a material one mesh: tracing a
                 step takes longer with every object that a ray can hit. Without it, shapes keep
                 their ids.
+            bitmaps: without them, those of BSDFs are not loaded but grey, except for opacities.
+                Shapes, the kinds of their BSDFs and what rays meet are the same.
 
         Raises:
             UserError: Mitsuba cannot instantiate the scene.
@@ -88,6 +90,8 @@ class ParsedScene:
             if merge:
                 mi.parser.transform_merge_equivalent(self.config, self.state)
                 self._merge_meshes()
+            if not bitmaps:  # last, as what differs in its bitmap alone would be merged
+                self._leave_out_bitmaps()
             scene = mi.parser.instantiate(self.config, self.state)
         except (RuntimeError, ValueError, MemoryError) as error:
             # Mitsuba 3.9: emitters that were made although their shapes were not crash the process
@@ -111,6 +115,23 @@ class ParsedScene:
         for node in self.state.nodes:
             for key in list(node.props):
                 node.props.mark_queried(key, False)
+
+    def _leave_out_bitmaps(self) -> None:
+        """Make bitmaps grey that only BSDFs other than masks refer to."""
+        nodes = self.state.nodes
+        kept = {
+            inner
+            for place, node in enumerate(nodes)
+            if node.type != mi.ObjectType.BSDF or node.props.plugin_name() == "mask"
+            for inner in self.references(place)
+        }
+        for place, node in enumerate(nodes):
+            if node.props.plugin_name() != "bitmap" or place in kept:
+                continue
+            for key in list(node.props):
+                del node.props[key]
+            node.props.set_plugin_name("uniform")
+            node.props["value"] = 0.5
 
     def _merge_meshes(self) -> None:
         """Merge meshes of one material, but no rectangles; flipped normals among themselves.

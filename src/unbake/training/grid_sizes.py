@@ -55,7 +55,7 @@ def with_grid_sizes(config: FitConfig, dataset: Dataset) -> FitConfig:
     if dataset not in _SEEN:
         parsed = parse(dataset.scene, dataset.root)
         to_principled(parsed)
-        scene = parsed.instantiate()
+        scene = parsed.instantiate(bitmaps=False)
         _SEEN[dataset] = surface_seen(scene, [view.camera for view in dataset.train])
     seen = _SEEN[dataset]
     if seen is None:  # the fit warns of poses that see nothing, and has the usual sizes
