@@ -130,7 +130,6 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     problem, warnings = _problem(asked, config, dataset, pixels, origin, ranks, doing)
     for warning in warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-    doing("preparing the first step, for which kernels are compiled")
     step = TrainingStep(problem, pixels, config, ranks)
     for line in (
         recovered,
@@ -140,6 +139,7 @@ def begin(asked: FitInput, console: Console, ranks: Ranks) -> Begun:
     ):
         if line is not None:
             console.print(line, highlight=False, soft_wrap=True)
+    doing("preparing the first step, for which kernels are compiled")
     state, restored = _state(problem, step, asked.folder if resume else None, origin, console)
     preview = Preview(problem, dataset, asked.folder) if ranks.leads else None
     scored = config.learns_materials and config.score_seconds
