@@ -153,7 +153,7 @@ def import_(
             print(f"  {printable(fault, LONGEST)}", file=sys.stderr)
         raise UserError(f"{error.count}, listed above", source, error.remedy) from None
     took = f"{time.perf_counter() - start:.0f} s"
-    say(f"wrote {out} in {took}; next: {_fit_of(out)}")
+    say(f"wrote {out} in {took}; next: unbake data check {quoted(out)}")
 
 
 def data(
