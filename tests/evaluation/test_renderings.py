@@ -187,7 +187,9 @@ def test_meshes_that_were_changed_are_not_those_of_the_photographs(cornell, tmp_
 
 def test_what_is_too_large_to_be_evaluated_is_refused_before_it_is_rendered(untrained, monkeypatch):
     monkeypatch.setattr(evaluate_module, "_PIXEL_BYTES", 1e15)
-    monkeypatch.setattr(evaluate_module, "render_camera", lambda *_: pytest.fail("rendered"))
+    monkeypatch.setattr(
+        evaluate_module, "render_camera", lambda *_, **more: pytest.fail("rendered")
+    )
     with pytest.raises(UserError, match=r"of memory.*--longest"):
         evaluate(untrained, FEW, tell=lambda line: None)
 

@@ -142,10 +142,10 @@ def test_an_evaluation_takes_the_place_of_the_one_before_as_a_whole(fit, run, un
     for error, status in ((KeyboardInterrupt(), 130), (UserError("no luck"), 2)):
         count = iter(range(2))
 
-        def ended(*words, error=error, count=count):
+        def ended(*words, error=error, count=count, **more):
             if next(count, None) is None:  # after two views, whose pictures are written
                 raise error
-            return real(*words)
+            return real(*words, **more)
 
         with monkeypatch.context() as patch:
             patch.setattr(evaluation, "render_camera", ended)
