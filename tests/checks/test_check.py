@@ -5,6 +5,7 @@ import typing
 from dataclasses import replace
 from xml.etree import ElementTree
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,8 +16,9 @@ from unbake.checks.told import ROWS, told_rows
 from unbake.dataset import alignment as aligning
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
-from unbake.dataset.findings import Check
+from unbake.dataset.findings import Check, misaligned
 from unbake.dataset.mistakes import OPENCV, Mistake, all_mistakes
+from unbake.dataset.own_poses import compared
 from unbake.dataset.photographs import Photographs
 from unbake.dataset.quick_check import quick_findings
 from unbake.dataset.small_views import SmallView, seen_by, small_view
@@ -623,7 +625,7 @@ def test_of_poses_with_the_same_edges_those_count_that_cover_a_cut_out(cut_out, 
         ]
 
     monkeypatch.setattr(aligning, "photograph_edges", lambda view: view.rgb[..., 0])
-    monkeypatch.setattr(aligning, "_drawn", drawn)
+    monkeypatch.setattr(aligning, "drawn_edges", drawn)
     monkeypatch.setattr(aligning, "_likely", lambda scene, views: [wrong, right])
     found = aligning.alignment(None, views)
     assert found.mistake is (right if cut_out else wrong)
@@ -649,7 +651,7 @@ def test_no_pose_that_covers_less_is_better(monkeypatch):
         ]
 
     monkeypatch.setattr(aligning, "photograph_edges", lambda view: view.rgb[..., 0])
-    monkeypatch.setattr(aligning, "_drawn", drawn)
+    monkeypatch.setattr(aligning, "drawn_edges", drawn)
     monkeypatch.setattr(aligning, "_likely", lambda scene, views: [Mistake(("turned",))])
     found = aligning.alignment(None, views)
     assert found.mistake is None and found.share == pytest.approx(0.5)
@@ -668,6 +670,70 @@ def test_a_background_that_jpeg_made_nearly_black_hides_no_edges():
     np.testing.assert_allclose(
         aligning.photograph_edges(ringing), aligning.photograph_edges(black), atol=0.05
     )
+
+
+def test_photographs_with_the_poses_of_others_are_told(spoilt, tiny, unbake, tmp_path):
+    data = spoilt("cornell")
+    poses = [frame["transform_matrix"] for frame in data.frames]
+    for frame, pose in zip(data.frames, [*poses[1:], poses[0]], strict=True):
+        frame["transform_matrix"] = pose
+    (finding,) = found(data.save(), "alignment")
+    assert finding.level == "error"
+    assert finding.what.startswith("poses seem not to belong to the photographs: edges of the geom")
+    assert "better from the pose of another one" in finding.what
+    assert finding.remedy.startswith("Check that each 'file_path' stands beside its own pose")
+    words = ("--settings", tiny, "--steps", 0, "--out", tmp_path / "run")
+    outcome = unbake("fit", data.folder, *words)
+    assert outcome.status == 2 and "pass --allow-doubtful" in " ".join(outcome.err.split())
+
+
+def test_few_photographs_with_the_poses_of_others_are_not_told(spoilt):
+    """Chance may find a better pose for each of them."""
+    data = spoilt("cornell")
+    poses = [frame["transform_matrix"] for frame in data.frames][:5]
+    frames = data.frames[:5]
+    for frame, pose in zip(frames, [*poses[1:], poses[0]], strict=True):
+        frame["transform_matrix"] = pose
+    data.content["frames"] = frames
+    assert not found(data.save(), "alignment")
+
+
+def test_a_symmetric_object_on_a_turntable_is_not_told():
+    """All its views look alike, so that each pose is as good as any other."""
+    vase = {
+        "type": "scene",
+        "belly": {"type": "sphere", "radius": 0.6},
+        "neck": {"type": "cylinder", "p0": [0, 0, 0], "p1": [0, 0, 1.2], "radius": 0.25},
+    }
+    scene = mi.load_dict(vase)
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    places = [(3 * np.cos(a), 3 * np.sin(a), 1.0) for a in angles]
+    cameras = [Camera.look_at(p, (0, 0, 0.3), (0, 0, 1), 40.0, 48, 48) for p in places]
+    rng, views = np.random.default_rng(0), []
+    for i, (camera, seen) in enumerate(zip(cameras, seen_by(scene, cameras), strict=True)):
+        shade = 0.2 + 0.5 * np.abs(seen.normal[:, 2]) + rng.normal(0, 0.01, 48 * 48)
+        alpha = np.isfinite(seen.distance).astype(np.float32)
+        rgb = np.repeat((shade * alpha)[:, None], 3, 1).astype(np.float32)
+        views.append(small_view(str(i), camera, rgb, alpha))
+    for turned in (0, 1, 5):
+        posed = [replace(v, camera=cameras[i - turned]) for i, v in enumerate(views)]
+        result = compared(scene, posed, cameras)
+        assert result.score > 0.5 and misaligned(result) is None
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.15])
+@pytest.mark.parametrize("name", ["cornell", "still"])
+def test_wrong_focal_lengths_are_told_with_the_factor(name, factor, spoilt):
+    data = spoilt(name)
+    for frame in data.content["frames"]:
+        frame |= {key: frame[key] * factor for key in ("fl_x", "fl_y")}
+    result = check_data(data.save())
+    (finding,) = [f for f in result.findings if f.check == "alignment"]
+    assert finding.level == "error" and finding.what.startswith("focal lengths seem to be wrong")
+    assert result.alignment.focal == pytest.approx(1 / factor, rel=0.06)
+    assert f"Multiply 'fl_x' and 'fl_y' by {result.alignment.focal:.2f}, if" in finding.remedy
+    rows = {row: told for row, _, told in told_rows(result)}
+    assert f"with focal lengths times {result.alignment.focal:.2f}" in rows["alignment"]
 
 
 def test_mistakes_are_undone():

@@ -19,7 +19,7 @@ from ..dataset.agreement import (
     shared_points,
     turning_light,
 )
-from ..dataset.alignment import Alignment, alignment
+from ..dataset.alignment import Alignment
 from ..dataset.camera import Camera
 from ..dataset.findings import (
     Check,
@@ -31,6 +31,7 @@ from ..dataset.findings import (
 )
 from ..dataset.hot_pixels import told_hot_pixels, without_hot_pixels
 from ..dataset.noise_at_black import found_noise
+from ..dataset.own_poses import compared
 from ..dataset.photographs import MOST_PIXELS, Photographs
 from ..dataset.poses import check_cameras, pose_problems
 from ..dataset.small_views import Seen, SmallView, block_of, seen_by, small_camera, small_view
@@ -325,7 +326,8 @@ def _counted(view: CheckedView) -> np.ndarray | None:
 
 
 def _check_poses(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -> None:
-    found = result.alignment = alignment(scene, [v.small for v in train])
+    cameras = [v.small.camera for v in train]
+    found = result.alignment = compared(scene, [v.small for v in train], cameras)
     better = misaligned(found)
     result.add(better)
     if better is None:

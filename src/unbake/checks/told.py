@@ -79,7 +79,9 @@ def _alignment(result: DataCheck) -> str | None:
         return None
     told = f"edges agree by {found.score:.2f}"
     if found.best is None:
-        return f"{told}; no other axes or units are better"
+        return f"{told}; no other poses or lenses are better"
+    if found.focal is not None:
+        return f"{told}, by {found.best:.2f} with focal lengths times {found.focal:.2f}"
     return f"{told}, by {found.best:.2f} with other poses"
 
 

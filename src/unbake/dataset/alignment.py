@@ -49,6 +49,9 @@ class Alignment:
         mirrored: how photographs are mirrored, if they clearly are.
         best: the score without the mistake; None where there is none.
         best_share: of pixels that see a surface without the mistake.
+        elsewhere: share of the photographs that agree with poses of others, if most of them do
+            clearly better than with their own.
+        focal: factor of focal lengths with which edges agree clearly better.
     """
 
     views: int
@@ -58,6 +61,8 @@ class Alignment:
     mirrored: str | None = None
     best: float | None = None
     best_share: float | None = None
+    elsewhere: float | None = None
+    focal: float | None = None
 
 
 def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
@@ -70,31 +75,28 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     Returns:
         None where it cannot be told: too few views, too small, or without edges.
     """
-    usable = [v for v in views if min(v.rgb.shape[:2]) >= SHORTEST_SIDE]
-    usable = [v for v in usable if photograph_edges(v).std() > 1e-6]
-    if len(usable) < FEWEST_VIEWS:
+    views = with_edges(views)
+    if not views:
         return None
-    views = evenly(usable, MOST_VIEWS)
     edges = [photograph_edges(view) for view in views]
     cameras = [view.camera for view in views]
     mistakes = _likely(scene, views)
     shown = [view.alpha > 0.5 for view in views]
-    (drawn, hits), *others = _drawn(scene, cameras, [Mistake(()), *mistakes])
-    given, share = _scores(edges, drawn), _share(hits)
+    (drawn, hits), *others = drawn_edges(scene, cameras, [Mistake(()), *mistakes])
+    given, share = edge_scores(edges, drawn), _share(hits)
     result = Alignment(len(views), float(given.mean()), share)
     tried: list[_Other] = []
     for told, axis in _MIRRORED.items():
         mirrored = [np.flip(e, axis) for e in edges]
         covered = _share(hits, [np.flip(s, axis) for s in shown])
-        tried.append(_Other(_scores(mirrored, drawn), covered, share, mirrored=told))
+        tried.append(_Other(edge_scores(mirrored, drawn), covered, share, mirrored=told))
     for mistake, (found, seen) in zip(mistakes, others, strict=True):
-        scores, covered = _scores(edges, found), _share(seen, shown)
+        scores, covered = edge_scores(edges, found), _share(seen, shown)
         tried.append(_Other(scores, covered, _share(seen), mistake))
     better = [other for other in tried if _clearly_better(other.scores, given)]
     if not better:
         return result
-    cut_out = min(float(s.mean()) for s in shown) < 1 - _UNCOVERED
-    if cut_out and not any(view.of_mesh for view in views):
+    if cut_out(views):
         # Poses as they are may cover more of what is shown than any others
         most = max(_share(hits, shown), *(other.covered for other in better))
         better = [other for other in better if other.covered >= most - _UNCOVERED]
@@ -109,6 +111,19 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
         best=float(best.scores.mean()),
         best_share=best.share,
     )
+
+
+def with_edges(views: Sequence[SmallView]) -> list[SmallView]:
+    """Views that can be compared, spread evenly; none where they are too few to tell."""
+    usable = [v for v in views if min(v.rgb.shape[:2]) >= SHORTEST_SIDE]
+    usable = [v for v in usable if photograph_edges(v).std() > 1e-6]
+    return evenly(usable, MOST_VIEWS) if len(usable) >= FEWEST_VIEWS else []
+
+
+def cut_out(views: Sequence[SmallView]) -> bool:
+    """Whether alpha tells, from photographs, where surfaces are seen and where none is."""
+    least = min(float((view.alpha > 0.5).mean()) for view in views)
+    return least < 1 - _UNCOVERED and not any(view.of_mesh for view in views)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +156,8 @@ def _likely(scene: mi.Scene, views: Sequence[SmallView]) -> list[Mistake]:
     few = [_smaller(view) for view in views[:: max(1, len(views) // _FEW_VIEWS)][:_FEW_VIEWS]]
     edges = [photograph_edges(view) for view in few]
     mistakes = all_mistakes()
-    found = _drawn(scene, [view.camera for view in few], mistakes)
-    scores = [float(_scores(edges, drawn).mean()) for drawn, _ in found]
+    found = drawn_edges(scene, [view.camera for view in few], mistakes)
+    scores = [float(edge_scores(edges, drawn).mean()) for drawn, _ in found]
     kept = np.sort(np.argsort(scores)[::-1][:_LIKELY])
     return [mistakes[i] for i in kept]
 
@@ -158,7 +173,7 @@ def _clearly_better(scores: np.ndarray, given: np.ndarray) -> bool:
     return bool(min(gain.mean(), scores.mean()) > MARGIN and (gain > 0).mean() >= AGREEING)
 
 
-def _drawn(
+def drawn_edges(
     scene: mi.Scene, cameras: Sequence[Camera], mistakes: Sequence[Mistake]
 ) -> list[tuple[list[np.ndarray], list[np.ndarray]]]:
     """What cameras see without each mistake: edges, and whether pixels see a surface."""
@@ -172,7 +187,7 @@ def _drawn(
     return found
 
 
-def _scores(photographed: list[np.ndarray], drawn: list[np.ndarray]) -> np.ndarray:
+def edge_scores(photographed: list[np.ndarray], drawn: list[np.ndarray]) -> np.ndarray:
     """The correlation of edges, one number a view; 0 where the geometry has none."""
     found = []
     for picture, edges in zip(photographed, drawn, strict=True):

@@ -76,6 +76,18 @@ def misaligned(found: Alignment | None) -> Finding | None:
     if found is None or found.best is None:
         return None
     much = f"their edges agree with the photographs' by {found.score:.2f}, without that by"
+    if found.elsewhere is not None:
+        return _of_others(found, found.elsewhere, found.best)
+    if found.focal is not None:
+        what = (
+            f"focal lengths seem to be wrong: edges of the geometry agree with the photographs' by "
+            f"{found.score:.2f}, with focal lengths times {found.focal:.2f} by {found.best:.2f}"
+        )
+        remedy = (
+            f"Multiply 'fl_x' and 'fl_y' by {found.focal:.2f}, if they are of another lens or size "
+            "of photographs; or check the size of the mesh"
+        )
+        return Finding("error", "alignment", what, None, remedy)
     if found.mirrored is not None:
         what = f"photographs seem to be {found.mirrored}: {much} {found.best:.2f}"
         return Finding("error", "alignment", what, None, "Flip them, or write them again")
@@ -92,6 +104,27 @@ def misaligned(found: Alignment | None) -> Finding | None:
         None,
         f"{remedy[0].upper()}{remedy[1:]}",
     )
+
+
+def _of_others(found: Alignment, share: float, best: float) -> Finding:
+    """What is to be said of photographs that agree better with poses of others.
+
+    Args:
+        found: what was found.
+        share: of the photographs.
+        best: their mean score with the best pose of any.
+    """
+    what = (
+        "poses seem not to belong to the photographs: edges of the geometry agree with "
+        f"{100 * share:.0f} % of these better from the pose of another one ({best:.2f} at best, "
+        f"{found.score:.2f} from their own)"
+    )
+    remedy = (
+        "Check that each 'file_path' stands beside its own pose, and that mesh and poses are in "
+        "one frame and unit; of imports, check --mesh-scale, --mesh-matrix and "
+        "--keep-applied-transform"
+    )
+    return Finding("error", "alignment", what, None, remedy)
 
 
 def unequal_exposures(found: Exposures, names: Sequence[str]) -> Finding | None:

@@ -8,9 +8,10 @@ import mitsuba as mi
 import numpy as np
 
 from .agreement import exposures, shared_points, turning_light
-from .alignment import FEWEST_VIEWS, SHORTEST_SIDE, alignment
+from .alignment import FEWEST_VIEWS, SHORTEST_SIDE
 from .decoding import stretch
 from .findings import Finding, light_that_turns, misaligned, unequal_exposures
+from .own_poses import compared
 from .photographs import Photographs
 from .small_views import SmallView, seen_by, small_camera, small_view
 from .spread import evenly
@@ -40,7 +41,7 @@ def quick_findings(
     if len(large) < FEWEST_VIEWS:
         return []
     small = _small_views(views, photographs, large)
-    better = misaligned(alignment(scene, small))
+    better = misaligned(compared(scene, small, [small_camera(view.camera) for view in views]))
     if better is not None:
         return [better]
     points = shared_points(small, seen_by(scene, [view.camera for view in small]))
