@@ -355,6 +355,28 @@ def test_masked_pixels_say_nothing_of_poses(spoilt, monkeypatch):
     assert given[0].count == len(given[0].table) // 2
 
 
+def test_masks_that_are_inverted_are_told(spoilt, tiny, unbake, tmp_path):
+    """And not the poses, which put edges where photographs have them."""
+    data = spoilt("still")
+    dataset = Dataset.load(data.folder)
+    data.content["background"] = "visible"
+    (data.folder / "masks").mkdir()
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    for frame, view in zip(data.content["frames"], dataset.views, strict=True):
+        (seen,) = seen_by(scene, [view.camera])
+        mask = ~np.isfinite(seen.distance).reshape(view.camera.height, view.camera.width)
+        file = f"masks/{view.name}.png"
+        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(data.folder / file)
+        frame["mask_path"] = file
+    told = [f for f in found(data.save()) if f.check == "geometry"]
+    assert told[0].what.startswith("masks seem to be inverted: 100 % of the pixels that they leave")
+    assert told[0].remedy == "Masks are white where pixels count: invert them"
+    assert not any("axes and the units" in (f.remedy or "") for f in told)
+    words = ("--settings", tiny, "--steps", 0, "--out", tmp_path / "run")
+    outcome = unbake("fit", data.folder, *words)
+    assert "masks seem to be inverted" in " ".join((outcome.out + outcome.err).split())
+
+
 def test_a_bracket_that_clips_has_the_exposures_that_it_tells(spoilt):
     """Most surfaces of the long photographs are at the limit."""
     data = spoilt("cornell")

@@ -24,6 +24,9 @@ _DOUBTFUL, _DOUBTFUL_WITH_SKY = 0.8, 0.02
 _BLIND = 16
 #: A mistake is named if as large a share of the pixels that see nothing would see surfaces.
 _CONVINCING = 0.5
+#: Masks seem inverted if a larger share than this of the pixels that they leave out see surfaces,
+#: and a smaller one of those that count.
+_LEFT_OUT, _COUNTED = 0.75, 0.1
 
 
 def pose_warnings(
@@ -65,6 +68,14 @@ def pose_problems(
             return []
     seen = _seen(scene, cameras, numbers)
     share = float(seen.mean()) if len(seen) else 1.0
+    left_out = _seen_by_left_out(scene, views, photographs) if share < _COUNTED else 0.0
+    if left_out > _LEFT_OUT:
+        what = (
+            f"masks seem to be inverted: {100 * left_out:.0f} % of the pixels that they leave out "
+            f"see a surface of the scene, and {100 * share:.2g} % of those that count"
+        )
+        remedy = "Masks are white where pixels count: invert them"
+        return [UserError(what, where if share == 0 else None, remedy)]
     if share < (_DOUBTFUL_WITH_SKY if sky else _DOUBTFUL):
         remedy = _likely(scene, cameras, numbers, share)
         if share == 0:
@@ -123,6 +134,20 @@ def _scales(scene: mi.Scene, cameras: Sequence[Camera]) -> list[float]:
     apart = np.linalg.norm(np.ptp(origins, axis=0))
     larger = [100.0, 1000.0] if apart < 0.1 * diagonal else []
     return [1.0, *([1e-3, 1e-2] if away > 10 * diagonal else larger)]
+
+
+def _seen_by_left_out(scene: mi.Scene, views: Sequence[View], photographs: Photographs) -> float:
+    """The share of the pixels that masks leave out, and that see a surface.
+
+    Masks that were drawn from the mesh count as none: they are right for the poses as they are.
+    """
+    if all(view.mask is None or view.mask_from_mesh for view in views):
+        return 0.0
+    cameras = [view.camera for view in views]
+    count = sum(camera.width * camera.height for camera in cameras)
+    numbers = np.random.default_rng(0).integers(0, count, _PIXELS)
+    numbers = numbers[~photographs.counts(numbers)]
+    return float(_seen(scene, cameras, numbers).mean()) if len(numbers) else 0.0
 
 
 def _views_of(cameras: Sequence[Camera], numbers: np.ndarray) -> np.ndarray:
