@@ -279,6 +279,21 @@ def test_a_mesh_that_would_be_seen_when_turned_is_told(given, captured, meshes, 
     assert len(Dataset.load(tmp_path / "data").views) == 3
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_units_in_which_the_mesh_would_be_seen_are_told(given, captured, meshes, tmp_path):
+    """Alone, and with the turn."""
+    larger = np.diag([1000.0, 1000, 1000, 1]) @ (np.eye(4) if given else TO_Z_UP.T)
+    shift = behind(captured, larger)
+    source = write_turned(captured, tmp_path / "nerf", shift)
+    wrong = moved(meshes, larger @ shift, tmp_path / "wrong")
+    with pytest.raises(UserError, match="no photograph sees the mesh") as caught:
+        import_data(source, tmp_path / "data", wrong, tell=quiet)
+    told = "with --mesh-scale 0.001" + ("" if given else " --mesh-y-up")
+    assert f"; {told}, 3 of 3 photographs would see it" in caught.value.remedy
+    settings = ImportSettings(mesh_y_up=not given, mesh_scale=0.001)
+    import_data(source, tmp_path / "data", wrong, settings, tell=quiet)
+
+
 def test_scannet_is_told_where_its_model_is_missing(captured, tmp_path):
     frame = {"file_path": "images/none.png", "transform_matrix": np.eye(4).tolist()}
     lens = intrinsics(captured.views[0].camera)

@@ -6,6 +6,7 @@ import contextlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,8 +15,11 @@ import numpy as np
 
 from ..acquisition.new_light import put_light, tell_tilt
 from ..config.light import LightConfig
+from ..dataset.camera import Camera
 from ..dataset.data_folder import TRANSFORMS, DataFolder
+from ..dataset.mistakes import UNITS
 from ..dataset.photographs import MOST_PIXELS
+from ..dataset.spread import evenly
 from ..dataset.views import LONGEST_NAME, Dataset
 from ..errors import UserError, named, printable
 from ..imaging.headers import CODED_SUFFIXES
@@ -43,6 +47,8 @@ from .world import World, read_matrix
 _SAME = 1e-6
 #: A mesh that is this many times as wide as the space of the cameras may be in another unit.
 _LARGER = 20
+#: Photographs with which other units of the mesh are tried, and options that are told, at most.
+_TRIED, _TOLD = 32, 3
 #: Pixels along an edge that suit most photographs.
 _SMALL = 2048
 #: Pixels to train on from which on it is told that they are many: 4 GB when decoded.
@@ -527,14 +533,72 @@ def _shares_seen(
         remedy += (
             "; --keep-applied-transform leaves nerfstudio's cameras in the frame of their file"
         )
-    turn = TO_Z_UP if settings.mesh_y_up else TO_Z_UP.T
-    turned = shares_seen(scene, [replace(c, to_world=turn @ c.to_world) for c in cameras])
-    if turnable and turned.any():
-        which = "without --mesh-y-up" if settings.mesh_y_up else "with --mesh-y-up"
-        remedy += f"; {which}, {(turned > 0).sum()} of {len(cameras)} photographs would see it"
+    if turnable:
+        for options, count in _seen_after(scene, cameras, parts, source.shots, settings):
+            remedy += f"; {options}, {count} of {len(cameras)} photographs would see it"
     notes = "".join(f". {note}" for note in source.world.notes)
     what = f"no photograph sees the mesh, which is {mesh}; the cameras stand {stand}"
     raise UserError(what, None, remedy + notes)
+
+
+def _seen_after(
+    scene: mi.Scene,
+    cameras: Sequence[Camera],
+    parts: Sequence[Part],
+    shots: Sequence[Shot],
+    settings: ImportSettings,
+) -> list[tuple[str, int]]:
+    """Options after which photographs see the mesh, and how many: a turn, another unit, or both.
+
+    Args:
+        scene: with the mesh.
+        cameras: of all photographs.
+        parts: of the mesh.
+        shots: the photographs.
+        settings: how the mesh was moved.
+
+    Returns:
+        The likeliest first: most photographs see the mesh, and it is as large as the space of the
+        cameras. Other units only where most photographs see it.
+    """
+    mesh, stand = (np.ptp(points, axis=0).max() for points in (_corners(parts), _origins(shots)))
+    few = evenly(cameras, _TRIED)
+    back = TO_Z_UP if settings.mesh_y_up else TO_Z_UP.T
+    found = []
+    for turn, scale in product((np.eye(4), back), (1.0, *UNITS)):
+        turned = turn is back
+        larger = abs(np.log10(scale * mesh / stand)) if min(mesh, stand) > 0 else 0.0
+        if (scale == 1 and not turned) or (scale != 1 and larger > 1):
+            continue
+        count = int((shares_seen(scene, _moved(few, turn, scale)) > 0).sum())
+        if count > (0 if scale == 1 else len(few) / 2):
+            found.append((-count, float(larger), turn, scale))
+    found.sort(key=lambda each: each[:2])
+    told = []
+    for _, _, turn, scale in found[:_TOLD]:
+        scaled = "" if scale == 1 else f"with --mesh-scale {settings.mesh_scale * scale:g}"
+        if settings.mesh_y_up != (turn is back):
+            options = f"{scaled or 'with'} --mesh-y-up"
+        else:
+            options = " ".join(filter(None, (scaled, "without --mesh-y-up" * (turn is back))))
+        count = int((shares_seen(scene, _moved(cameras, turn, scale)) > 0).sum())
+        told.append((options, count))
+    return told
+
+
+def _moved(cameras: Sequence[Camera], turn: np.ndarray, scale: float) -> list[Camera]:
+    """Cameras that see the mesh as it would be seen if it were scaled, and turned back.
+
+    Args:
+        turn: of the cameras, (4, 4).
+        scale: of the mesh.
+    """
+    moved = []
+    for camera in cameras:
+        pose = turn @ camera.to_world
+        pose[:3, 3] /= scale
+        moved.append(replace(camera, to_world=pose))
+    return moved
 
 
 def _corners(parts: Sequence[Part]) -> np.ndarray:
