@@ -36,8 +36,9 @@ _AROUND = (0.96, 0.98, 1.0, 1.02, 1.04)
 #: see one, do both by such a share.
 _OUTLINED = 0.5
 #: Focal lengths are better if the score is larger by so much: where outlines of cut-outs agree
-#: better, too, and where there are none.
-_FOCAL_MARGIN, _FOCAL_MARGIN_BY_EDGES = 0.05, MARGIN
+#: better, too, and by edges alone for shorter and for longer ones. Edges of a bumpy mesh fill its
+#: outline, so that a larger one agrees better with the outline in photographs.
+_MARGIN_OF_OUTLINES, _MARGIN_SHORTER, _MARGIN_LONGER = 0.05, 0.05, MARGIN
 
 
 def compared(
@@ -123,7 +124,6 @@ def _with_other_lenses(
     shown = [view.alpha > 0.5 for view in views]
     outlines = _overlaps(hits, shown)
     clear = cut_out(views) and bool(outlines.mean() > _OUTLINED)
-    margin = _FOCAL_MARGIN if clear else _FOCAL_MARGIN_BY_EDGES
 
     def better(factors: Sequence[float]) -> list[tuple[float, float]]:
         """Mean scores and factors of those that are clearly better."""
@@ -133,6 +133,8 @@ def _with_other_lenses(
         for k, factor in enumerate(factors):
             part = slice(k * len(views), (k + 1) * len(views))
             scores = edge_scores(edges, drawn[part])
+            margin = _MARGIN_SHORTER if factor < 1 else _MARGIN_LONGER
+            margin = _MARGIN_OF_OUTLINES if clear else margin
             gains = [scores - given] + [_overlaps(seen[part], shown) - outlines] * clear
             agree = all(g.mean() > 0 and (g > 0).mean() >= AGREEING for g in gains)
             if agree and gains[0].mean() > margin:
