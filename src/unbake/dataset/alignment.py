@@ -26,6 +26,8 @@ _FEW_VIEWS, _LIKELY = 4, 20
 #: And that sees surface in so many fewer of the pixels that show some, at most: a cut-out tells
 #: two poses apart that have much the same edges.
 _UNCOVERED = 0.03
+#: The mesh may be turned about its own centre if that is so many of its diagonals from the origin.
+_OFF_ORIGIN = 0.02
 #: Relative jump of inverse depth, and jump of normals, that are a whole edge.
 _JUMP, _CREASE = 0.1, 0.5
 #: Photographs may be mirrored: what is told, and the axis of the picture that is turned round.
@@ -155,11 +157,19 @@ def _likely(scene: mi.Scene, views: Sequence[SmallView]) -> list[Mistake]:
     """The mistakes that are worth a closer look, simple ones first: by few views of few pixels."""
     few = [_smaller(view) for view in views[:: max(1, len(views) // _FEW_VIEWS)][:_FEW_VIEWS]]
     edges = [photograph_edges(view) for view in few]
-    mistakes = all_mistakes()
+    mistakes = all_mistakes(_middle(scene))
     found = drawn_edges(scene, [view.camera for view in few], mistakes)
     scores = [float(edge_scores(edges, drawn).mean()) for drawn, _ in found]
     kept = np.sort(np.argsort(scores)[::-1][:_LIKELY])
     return [mistakes[i] for i in kept]
+
+
+def _middle(scene: mi.Scene) -> np.ndarray | None:
+    """The centre of the box around all shapes, (3,); None where it is the origin."""
+    box = scene.bbox()
+    low, high = np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
+    middle, size = 0.5 * (low + high), np.linalg.norm(high - low)
+    return middle if np.linalg.norm(middle) > _OFF_ORIGIN * size else None
 
 
 def _smaller(view: SmallView) -> SmallView:

@@ -44,6 +44,7 @@ class Mistake:
         turn: (3, 3), of the world.
         flip: (3, 3), of the camera's axes.
         inverted: whether matrices lead from world to camera.
+        centre: (3,), about which the world is turned and scaled.
     """
 
     parts: tuple[str, ...]
@@ -51,6 +52,7 @@ class Mistake:
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))
     flip: np.ndarray = field(default_factory=lambda: np.eye(3))
     inverted: bool = False
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def told(self) -> str:
@@ -66,7 +68,7 @@ class Mistake:
             old[:3, 3] = -old[:3, :3] @ camera.origin
         pose = np.eye(4)
         pose[:3, :3] = self.turn @ old[:3, :3] @ self.flip
-        pose[:3, 3] = self.scale * (self.turn @ old[:3, 3])
+        pose[:3, 3] = self.centre + self.scale * (self.turn @ (old[:3, 3] - self.centre))
         return replace(camera, to_world=pose)
 
 
@@ -77,10 +79,13 @@ def usual_mistakes(scales: Sequence[float]) -> list[Mistake]:
     return _simplest_first(turns, scales, {"": np.eye(3), opencv: OPENCV})
 
 
-def all_mistakes() -> list[Mistake]:
+def all_mistakes(centre: np.ndarray | None = None) -> list[Mistake]:
     """All 24 turns of the world with all flips of the camera; usual ones in other units; inverses.
 
     Those of fewer parts come first.
+
+    Args:
+        centre: of the mesh, (3,), about which it may have been turned, too; None: it is the origin.
     """
     turns = {_turn_told(turn): turn for turn in _rotations()}
     flips = {"": np.eye(3)} | _FLIPS
@@ -90,7 +95,29 @@ def all_mistakes() -> list[Mistake]:
     ]
     axes = _simplest_first(turns, (1.0,), flips)
     units = [m for m in usual_mistakes(UNITS) if m.scale != 1]
-    return sorted([*axes, *units, *inverted], key=lambda mistake: len(mistake.parts))
+    turned = [] if centre is None else _turned_meshes(centre)
+    every = [*axes, *units, *inverted, *turned]
+    return sorted(every, key=lambda mistake: len(mistake.parts))
+
+
+def _turned_meshes(centre: np.ndarray) -> list[Mistake]:
+    """The mesh turned about its own centre (3,), in all ways that take axes to axes."""
+    found = []
+    for turn in _rotations():
+        if np.array_equal(turn, np.eye(3)):
+            continue
+        back = np.eye(4)
+        back[:3, :3], back[:3, 3] = turn.T, centre - turn.T @ centre
+        remedy = f"turn it back, about the centre of its box: import {_as_words(back)}"
+        told = f"of a mesh that is turned about its centre ({remedy})"
+        found.append(Mistake((told,), turn=turn, centre=centre))
+    return found
+
+
+def _as_words(matrix: np.ndarray) -> str:
+    """The option of an import that moves the mesh by a matrix (4, 4)."""
+    numbers = " ".join(f"{number + 0.0:.7g}" for number in matrix.ravel().tolist())
+    return f"--mesh-matrix {numbers}"
 
 
 def _simplest_first(
@@ -111,6 +138,12 @@ def _or_the_mesh(parts: tuple[str, ...], scale: float, turn: np.ndarray) -> tupl
     """The phrases, the last of which also says how to import the mesh for poses as they are."""
     known = zip(_TURNS.values(), _TURNS_OF_MESH, strict=True)
     options = [told for other, told in known if np.array_equal(turn, other)]
+    back = np.eye(4)
+    back[:3, :3] = turn.T
+    if not options and not np.array_equal(turn, np.eye(3)):
+        options = [_as_words(back)]
+    elif options == [_TURNS_OF_MESH[1]] and scale == 1:  # the mesh may not have been turned so
+        options = [f"{options[0]}, or with {_as_words(back)}"]
     if scale != 1:
         options.insert(0, f"--mesh-scale {1 / scale:g}")
     if not options:
