@@ -166,7 +166,8 @@ def imported(captured: Dataset, folder: Path, *, clipped: bool) -> Path:
         file = source / name
         file.parent.mkdir(parents=True, exist_ok=True)
         if clipped:
-            write_png(file, np.rint(255 * encode(np.minimum(rgb, LIMIT))).astype(np.uint8))
+            codes = np.round(encode(np.minimum(rgb, LIMIT)) / 257)
+            write_png(file, codes.astype(np.uint8))
         else:
             write_exr(file, rgb)
         camera = view.camera

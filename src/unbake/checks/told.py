@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..dataset.alignment import MARGIN
 from ..dataset.findings import Check
 from ..errors import printable
 from .check import CheckedView, DataCheck
@@ -79,6 +80,8 @@ def _alignment(result: DataCheck) -> str | None:
         return None
     told = f"edges agree by {found.score:.2f}"
     if found.best is None:
+        if found.score < MARGIN:
+            return f"edges hardly agree ({found.score:.2f}): they tell nothing of poses"
         return f"{told}; no other poses or lenses are better"
     if found.focal is not None:
         return f"{told}, by {found.best:.2f} with focal lengths times {found.focal:.2f}"

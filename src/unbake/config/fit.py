@@ -131,7 +131,7 @@ class LightingConfig:
     learning_rate: float = 0.02  #: Adam, log radiance
     #: Radiance of the map at the start, W·sr⁻¹·m⁻²; 0: the level of the photographs (ours).
     initial_radiance: float = 0.0
-    mean_albedo: float = 0.5  #: the convention, mean over channels (ours)
+    mean_albedo: float = 0.5  #: the convention, mean over channels, less if one is above 0.8 (ours)
     #: Its colour: of the photographs, as if light were white, or grey, as if surfaces were (ours).
     mean_colour: MeanColour = "photographs"
     anchor: float = 1.0  #: weight of the squared deviation from it

@@ -19,6 +19,8 @@ MOST_VIEWS, FEWEST_VIEWS = 8, 3
 SHORTEST_SIDE = 24
 #: Other poses are better if their score is larger by so much, and in as many of the views.
 MARGIN, AGREEING = 0.1, 0.75
+#: The least score by which other poses are better: the best of many has more than 0.1 by chance.
+LEAST = 0.2
 #: Of other poses, the simplest mistake counts whose score is nearly the best.
 _NEARLY = 0.03
 #: All mistakes are tried on so many views, of at most 36 pixels, and so many of them on all views.
@@ -180,7 +182,8 @@ def _smaller(view: SmallView) -> SmallView:
 
 def _clearly_better(scores: np.ndarray, given: np.ndarray) -> bool:
     gain = scores - given
-    return bool(min(gain.mean(), scores.mean()) > MARGIN and (gain > 0).mean() >= AGREEING)
+    agree = (gain > 0).mean() >= AGREEING
+    return bool(gain.mean() > MARGIN and scores.mean() > LEAST and agree)
 
 
 def drawn_edges(

@@ -10,6 +10,7 @@ import numpy as np
 
 from .alignment import (
     AGREEING,
+    LEAST,
     MARGIN,
     Alignment,
     alignment,
@@ -26,9 +27,9 @@ from .spread import evenly
 
 #: Poses that photographs are compared with, at most, and photographs that this needs.
 _POSES, _FEWEST = 128, 6
-#: Where nearly no pixel sees a surface, and edges do not agree at all, poses are wrong if their own
-#: is the best for no larger share of the photographs.
-_HARDLY, _BY_CHANCE = 0.05, 0.25
+#: The best of so many other poses has a score of up to 0.3 by chance, where photographs have few
+#: edges that are edges of the geometry.
+_BY_CHANCE = 0.4
 #: Factors of focal lengths that are tried, and those around the best one.
 _FACTORS = (0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.25)
 _AROUND = (0.96, 0.98, 1.0, 1.02, 1.04)
@@ -96,10 +97,8 @@ def _with_poses_of_others(
         scores = edge_scores([picture] * len(alike), alike)
         best[i] = max(given[i], scores.max(initial=given[i]))
     clearly = float((best - given > MARGIN).mean())
-    at_all = float((best > given).mean())
-    lost = max(found.share, found.score) < _HARDLY and at_all >= 1 - _BY_CHANCE
-    if lost or (clearly >= AGREEING and best.mean() > 2 * MARGIN):
-        return replace(found, elsewhere=at_all if lost else clearly, best=float(best.mean()))
+    if clearly >= AGREEING and best.mean() > _BY_CHANCE:
+        return replace(found, elsewhere=clearly, best=float(best.mean()))
     return None
 
 
@@ -137,7 +136,7 @@ def _with_other_lenses(
             margin = _MARGIN_OF_OUTLINES if clear else margin
             gains = [scores - given] + [_overlaps(seen[part], shown) - outlines] * clear
             agree = all(g.mean() > 0 and (g > 0).mean() >= AGREEING for g in gains)
-            if agree and gains[0].mean() > margin:
+            if agree and gains[0].mean() > margin and scores.mean() > LEAST:
                 told.append((float(scores.mean()), factor))
         return told
 

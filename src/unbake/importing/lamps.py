@@ -96,8 +96,10 @@ def find_lamps(
     seen = _seen(surface, views, tell)
     if seen is None:
         return []
-    shining, factor = _shining(surface, seen)
-    return _lamps(surface, seen, shining, factor)
+    lamps = _lamps(surface, seen, *_shining(surface, seen))
+    if len(lamps) > _MOST:
+        tell(f"lamps: {len(lamps) - _MOST} dim ones are left out, with {_MOST} brighter ones")
+    return lamps[:_MOST]
 
 
 def with_lamps(parts: Sequence[Part], lamps: Sequence[Lamp]) -> tuple[list[Part], list[Part]]:
@@ -254,8 +256,9 @@ def _seen(surface: _Surface, views: Sequence[View], tell: Callable[[str], None])
 
 def _shining(surface: _Surface, seen: _Seen) -> tuple[np.ndarray, float]:
     """Which triangles shine, (m,) bool, and by how much more than clipped photographs show."""
-    level = float(np.median(seen.rgb.max(1)))
-    bright = np.nan_to_num(seen.low.max(1)) >= _BRIGHT * level
+    brightest = seen.rgb.max(1)
+    level = float(np.median(brightest[brightest > 0])) if brightest.any() else 0.0
+    bright = np.nan_to_num(seen.low.max(1)) > _BRIGHT * level
     bright |= seen.at_limit
     if not bright.any() or bright[seen.face].all():
         return np.zeros_like(bright), 1.0
@@ -284,7 +287,7 @@ def _shining(surface: _Surface, seen: _Seen) -> tuple[np.ndarray, float]:
         if (found == shining).all():
             break
         shining = found
-    if (needed > _BEYOND).mean() > _UNEXPLAINED:
+    if not len(needed) or (needed > _BEYOND).mean() > _UNEXPLAINED:
         return np.zeros_like(shining), 1.0
     return shining, factor
 
@@ -389,37 +392,52 @@ def _on_triangles(corners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _lamps(surface: _Surface, seen: _Seen, shining: np.ndarray, factor: float) -> list[Lamp]:
     """Connected triangles that shine, in one part each, brightest power first."""
-    corner = surface.corners.reshape(-1, 3)
-    place = numbered(*np.round(corner / max(surface.offset, 1e-30)).T)[1].reshape(-1, 3)
     found = np.flatnonzero(shining)
     if not len(found):
         return []
-    keys = place[found] * (surface.part.max() + 1) + surface.part[found][:, None]
-    names, keys = np.unique(keys, return_inverse=True)
-    keys = keys.reshape(-1, 3) + len(found)
-    own = np.repeat(np.arange(len(found)), 3)
-    label = connected(len(found) + len(names), own, keys.ravel())[: len(found)]
+    label = np.full(len(shining), -1)
+    label[found] = _connected(surface, found)
+    pixels = np.flatnonzero(shining[seen.face])
+    own = label[seen.face[pixels]]
+    count = label.max() + 1
+    pairs = np.unique(np.stack([own, seen.view[pixels]], 1), axis=0)
+    enough = np.bincount(own, minlength=count) >= _SHOWN
+    enough &= np.bincount(pairs[:, 0], minlength=count) >= _VIEWS
     lamps = []
-    for number in np.unique(label):
-        faces = found[label == number]
-        pixels = np.flatnonzero(np.isin(seen.face, faces))
-        if len(pixels) < _SHOWN or len(np.unique(seen.view[pixels])) < _VIEWS:
-            continue
-        # Pixels at its edge show what is behind it, too.
-        bright = seen.rgb[pixels].max(1)
-        radiance = np.median(seen.rgb[pixels[bright >= np.median(bright)]], axis=0)
-        clipped = bool(seen.clipped[pixels].mean() > 0.5)
-        radiance = radiance * (factor if clipped else 1)
-        facing = np.einsum("ij,ij->i", surface.normals[seen.face[pixels]], seen.to_camera[pixels])
-        part = int(surface.part[faces[0]])
-        red, green, blue = (float(x) for x in radiance)
-        lamp = Lamp(
-            part,
-            faces - surface.first[part],
-            (red, green, blue),
-            bool((facing < 0).mean() > 0.5),
-            clipped,
-        )
-        lamps.append((float(radiance.max() * surface.areas[faces].sum()), lamp))
+    by_label, by_pixel = _groups(label[found]), _groups(own)
+    for number in np.flatnonzero(enough):
+        lamp, area = _lamp(surface, seen, found[by_label[number]], pixels[by_pixel[number]], factor)
+        lamps.append((max(lamp.radiance) * area, lamp))
     lamps.sort(key=lambda row: -row[0])
-    return [lamp for _, lamp in lamps[:_MOST]]
+    return [lamp for _, lamp in lamps]
+
+
+def _connected(surface: _Surface, found: np.ndarray) -> np.ndarray:
+    """Numbers of groups of triangles of one part that share corners, one for each of `found`."""
+    corner = surface.corners[found].reshape(-1, 3)
+    place = numbered(*np.round(corner / max(surface.offset, 1e-30)).T)[1]
+    keys = place * (surface.part.max() + 1) + np.repeat(surface.part[found], 3)
+    names, keys = np.unique(keys, return_inverse=True)
+    own = np.repeat(np.arange(len(found)), 3)
+    return connected(len(found) + len(names), own, keys.ravel() + len(found))[: len(found)]
+
+
+def _groups(label: np.ndarray) -> list[np.ndarray]:
+    """The places of each number from 0 on."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(label))[:-1])
+
+
+def _lamp(
+    surface: _Surface, seen: _Seen, faces: np.ndarray, pixels: np.ndarray, factor: float
+) -> tuple[Lamp, float]:
+    """A lamp of some triangles, as pixels show it, and its area."""
+    # Pixels at its edge show what is behind it, too.
+    bright = seen.rgb[pixels].max(1)
+    radiance = np.median(seen.rgb[pixels[bright >= np.median(bright)]], axis=0)
+    clipped = bool(seen.clipped[pixels].mean() > 0.5)
+    red, green, blue = (float(x) for x in radiance * (factor if clipped else 1))
+    facing = np.einsum("ij,ij->i", surface.normals[seen.face[pixels]], seen.to_camera[pixels])
+    turned, part = bool((facing < 0).mean() > 0.5), int(surface.part[faces[0]])
+    lamp = Lamp(part, faces - surface.first[part], (red, green, blue), turned, clipped)
+    return lamp, float(surface.areas[faces].sum())

@@ -9,7 +9,7 @@ import mmap
 import re
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -285,8 +285,7 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
         raise UserError("the mesh is of a format that is not read (PLY, OBJ, GLB)", file)
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     of_nodes = suffix in (".glb", ".gltf")
-    if of_nodes:
-        _require_plain(file)
+    own = _plain_nodes(file) if of_nodes else []
     options: dict[str, Any] = {"process": False}
     opened: Any = file
     if suffix == ".obj":
@@ -310,7 +309,7 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
             mesh = scene.geometry[name]
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
                 mesh = _refilled(mesh, file, options) if suffix == ".ply" else mesh
-                called = _called(scene, node, mesh) if of_nodes else str(name)
+                called = _called(scene, node, mesh, own) if of_nodes else str(name)
                 found.append((called, mesh, np.array(transform)))
         found.sort(key=lambda row: (row[0], len(row[1].faces), *row[1].bounds.ravel()))
     except UserError:
@@ -327,11 +326,19 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     return found
 
 
-def _called(scene: Any, node: Any, mesh: Any) -> str:
+def _called(scene: Any, node: Any, mesh: Any, own: Collection[str]) -> str:
     """The name of a node of a glTF file; of one with several materials, with that of the part.
 
     trimesh 5.2 gives each material of a node a node of its own, with a random name.
+
+    Args:
+        scene: of trimesh.
+        node: its name there.
+        mesh: of that node.
+        own: names of nodes in the file.
     """
+    if str(node) in own:
+        return str(node)
     parent = scene.graph.transforms.parents.get(node)
     if parent is None or not re.fullmatch(rf"{re.escape(str(parent))}_[0-9a-f]{{6}}", str(node)):
         return str(node)
@@ -384,8 +391,12 @@ def _lists(raw: dict[str, Any], names: Sequence[str]) -> list[np.ndarray] | None
     return None
 
 
-def _require_plain(file: Path) -> None:
-    """Refuse a glTF file whose numbers are packed: trimesh 5.2 reads some as zeros."""
+def _plain_nodes(file: Path) -> list[str]:
+    """The names of a glTF file's nodes.
+
+    Raises:
+        UserError: its numbers are packed, of which trimesh 5.2 reads some as zeros.
+    """
     try:
         with file.open("rb") as opened:
             head = opened.read(20)
@@ -395,11 +406,13 @@ def _require_plain(file: Path) -> None:
                 told = head + opened.read()
         top = json.loads(told)
         packed = [_PACKED[name] for name in top.get("extensionsRequired", ()) if name in _PACKED]
+        names = [str(node.get("name")) for node in top.get("nodes", ())]
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-        return  # trimesh tells what is wrong with it
+        return []  # trimesh tells what is wrong with it
     if packed:
         what = f"the mesh is compressed ({', '.join(packed)})"
         raise UserError(what, file, "Export it without compression")
+    return names
 
 
 def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:

@@ -22,6 +22,8 @@ _PLACES = ((0.5, 0.5), (0.05, 0.05), (0.05, 0.95), (0.95, 0.05), (0.95, 0.95))
 #: Pixels that must show a light as a whole; and where poses are not known, so that some of them
 #: show what is beside it.
 _FEWEST, _FEWEST_OF_POSES = 1, 16
+#: Pixels that must show a light whose strength is held: one alone may be blurred, or beside it.
+_FEWEST_TO_HOLD = 8
 #: Strengths that photographs show are held until this part of a fit with unknown albedo is done;
 #: and to its end where lights are so many times as bright as the photographs: what they reflect is
 #: nothing beside that.
@@ -107,6 +109,7 @@ def _seen(
                 found[number, channel] = _median(values / weight[told], weight[told])
                 clipped = values >= limits[light == number][told]
                 surely[number, channel] = weight[told][clipped].sum() < 0.5 * weight[told].sum()
+        surely[number] &= (light == number).sum() >= _FEWEST_TO_HOLD
     return found, surely
 
 

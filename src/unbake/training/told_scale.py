@@ -80,7 +80,10 @@ def conventional_albedo(
     rgb = photographs.own_rows(photographs.own_numbers(_own_places(pixels)))[:, :3]
     # Highlights have the colour of light.
     level = rgb.mean(1, dtype=np.float64)
-    plain = rgb[level <= _HIGHLIGHT * np.median(level)] if len(rgb) else np.ones((1, 3))
+    lit = level > 0
+    if not lit.any():
+        return mean, mean, mean
+    plain = rgb[lit & (level <= _HIGHLIGHT * np.median(level[lit]))]
     colour = np.maximum(plain.mean(0, dtype=np.float64), 1e-30)
     colour *= mean / colour.mean()
     colour *= min(1.0, _MOST_ALBEDO / colour.max())
@@ -91,10 +94,11 @@ def conventional_albedo(
 def told_convention(problem: Problem) -> str:
     """A line of what the mean albedo is taken for, in a fit where it is a convention."""
     mean = " ".join(f"{x:.2f}" for x in problem.mean_albedo)
-    return (
-        "no photograph shows the light itself, unclipped: brightness and colour of albedo are a "
-        f"convention, by which its mean is {mean}"
-    )
+    why = "the background is hidden"
+    if problem.shows_light is not None:
+        why = "no photograph shows the light itself, unclipped"
+    told = "brightness and colour of albedo are a convention, by which its mean is"
+    return f"{why}: {told} {mean}"
 
 
 def _own_places(pixels: PixelSource) -> np.ndarray:
@@ -150,7 +154,8 @@ def _shown(problem: Problem, pixels: PixelSource, numbers: np.ndarray) -> np.nda
     clipped = np.zeros(len(numbers), bool)
     if pixels.limits is not None:
         colours = pixels.photographs.own_rows(numbers)[:, :3]
-        clipped = (colours >= pixels.limits[pixels.views_of(numbers)][:, None]).all(1)
+        # One channel that is clipped leaves its factor open.
+        clipped = (colours >= pixels.limits[pixels.views_of(numbers)][:, None]).any(1)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(numbers))
     with dr.suspend_grad():
