@@ -11,7 +11,7 @@ clipped at 1:
 - `error_most`: of what is found, |c - c*| / |c*| of linear RGB, where photographs are not clipped.
 
 Data sets of `--fit` are fitted in four ways, PSNR in dB of linear RGB of materials as the held-out
-views see them:
+views see them; `aligned` is albedo after the factors of its channels that suit it best:
 
 - `known`: lights as the scene has them;
 - `unknown`: `--unknown materials+emission`, the shapes of lamps are known;
@@ -35,7 +35,7 @@ from typing import Any
 import here
 
 import numpy as np
-from poses import as_seen, fit  # activates a variant
+from poses import SAMPLES, as_seen, fit  # activates a variant
 
 from unbake.dataset.data_folder import TRANSFORMS
 from unbake.dataset.views import Dataset, read_photograph
@@ -49,9 +49,11 @@ from unbake.importing.lamps import find_lamps
 from unbake.importing.meshes import Part
 from unbake.io import write_json
 from unbake.machine import machine, today
+from unbake.quantities import ALIGNED
 from unbake.scene.emitters import emitter_nodes, named_emitters
-from unbake.training.recovered import load_run
+from unbake.training.recovered import Recovered, load_run
 from unbake.training.run_folder import RunFolder
+from unbake.training.validation import GroundTruth, MaterialBuffers, albedos, aligned
 
 #: Value from which on photographs are clipped.
 LIMIT = 1.0
@@ -143,11 +145,19 @@ def fitted(captured: Dataset, runs: Path, seeds: list[int], steps: int) -> list[
             run = runs / f"run-{data.name}-{way.replace(', ', '-')}-{seed}"
             fit(folder, run, ["--unknown", unknown.get(way, "auto"), "--seed", seed,
                               "--steps", steps])  # fmt: skip
-            scores = as_seen(load_run(run), captured)
+            scores = as_seen(load_run(run), captured) | aligned_albedo(load_run(run), captured)
             found.append(scores | {"seconds": RunFolder(run).metrics()["seconds"]})
         rows.append({"data": data.name, "way": way} | across_seeds(found, found[0]))
         print(rows[-1], flush=True)
     return rows
+
+
+def aligned_albedo(recovered: Recovered, captured: Dataset) -> dict[str, float]:
+    """The score of albedo after the factors of its channels that suit it best."""
+    seen = MaterialBuffers.of(recovered.problem, captured.heldout, SAMPLES, 0)
+    truths = [GroundTruth.of(view) for view in captured.heldout]
+    _, scores = aligned([albedos(s, t) for s, t in zip(seen, truths, strict=True)])
+    return {ALIGNED: float(np.mean([score for score in scores if score is not None]))}
 
 
 def imported(captured: Dataset, folder: Path, *, clipped: bool) -> Path:
