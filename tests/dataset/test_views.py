@@ -451,7 +451,7 @@ def test_the_fingerprint_knows_masks(folder):
     def of_photographs():
         dataset = Dataset.load(folder)
         files = [view.image for view in dataset.views]
-        with patch("unbake.dataset.fingerprint._of_geometry", return_value={}):
+        with patch("unbake.dataset.fingerprint.geometry_fingerprint", return_value={}):
             return files and fingerprint(dataset)["photographs"]
 
     before = of_photographs()
