@@ -33,6 +33,8 @@ _BY_CHANCE = 0.4
 #: Factors of focal lengths that are tried, and those around the best one.
 _FACTORS = (0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.25)
 _AROUND = (0.96, 0.98, 1.0, 1.02, 1.04)
+#: The least error that is told: a smaller one moves edges of small pictures by less than a pixel.
+_LEAST_ERROR = 0.07
 #: Alpha shows outlines of the geometry, and not what masks hide, if pixels that show a surface, or
 #: see one, do both by such a share.
 _OUTLINED = 0.5
@@ -145,7 +147,7 @@ def _with_other_lenses(
         return None
     near = max(coarse)[1]
     score, factor = max(better([near * step for step in _AROUND]))
-    return replace(found, focal=factor, best=score)
+    return None if abs(factor - 1) < _LEAST_ERROR else replace(found, focal=factor, best=score)
 
 
 def _overlaps(hits: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
