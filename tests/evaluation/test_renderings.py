@@ -137,16 +137,20 @@ def test_pictures_that_take_long_tell_how_far_they_are(untrained, tmp_path, monk
     assert sum(" left" in line for line in lines) == len(parts) - 2
 
 
+def rendered(made, names, clock, seconds, *, first):
+    """Pictures of 1000 samples in four parts, of `seconds` each, and the very first of `first`."""
+    for name in names:
+        done = made.begin(name, 1000)
+        for part in range(1, 5):
+            clock.now += first if name == names[0] and part == 1 else seconds
+            done(part / 4)
+
+
 def test_what_all_pictures_take_is_told_once_where_it_is_long(monkeypatch, clock):
     monkeypatch.setattr(forecast, "time", clock)
     lines: list[str] = []
-    made = forecast.Forecast(10_000, lines.append)
-    for name in "ab":
-        done = made.begin(name, 1000)
-        for part in range(1, 5):
-            # Kernels are compiled for the first part, which tells nothing of others.
-            clock.now += 300.0 if name == "a" and part == 1 else 60.0
-            done(part / 4)
+    # Kernels are compiled for the first part, which tells nothing of others.
+    rendered(forecast.Forecast(10_000, lines.append), "ab", clock, 60.0, first=300.0)
     assert lines == [
         "a: 25 % rendered",
         "a: 50 % rendered, about 2 min left",
@@ -161,12 +165,7 @@ def test_what_all_pictures_take_is_told_once_where_it_is_long(monkeypatch, clock
 def test_pictures_that_are_soon_there_are_not_told(monkeypatch, clock):
     monkeypatch.setattr(forecast, "time", clock)
     lines: list[str] = []
-    made = forecast.Forecast(3000, lines.append)
-    for name in "abc":
-        done = made.begin(name, 1000)
-        for part in range(1, 5):
-            clock.now += 2.0
-            done(part / 4)
+    rendered(forecast.Forecast(3000, lines.append), "abc", clock, 2.0, first=2.0)
     assert lines == []
 
 

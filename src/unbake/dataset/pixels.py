@@ -461,8 +461,7 @@ class PixelSource:
     def _batch(
         self, numbers: np.ndarray, colours: np.ndarray, slopes: np.ndarray | None
     ) -> PixelBatch:
-        limits = None if self.limits is None else self.limits[self.views_of(numbers)]
-        return PixelBatch.of(numbers, colours, limits, slopes)
+        return PixelBatch.of(numbers, colours, self.limits_of(numbers), slopes)
 
     def _slopes(self, numbers: np.ndarray) -> np.ndarray:
         """How photographs change across and down, linear RGB a pixel, shape (n, 6).
@@ -525,6 +524,10 @@ class PixelSource:
         assert self._counted is not None
         place = numbers - self.photographs.pixels.start
         return (self._counted[place >> 3] >> (7 - (place & 7)).astype(np.uint8) & 1).astype(bool)
+
+    def limits_of(self, numbers: np.ndarray) -> np.ndarray | None:
+        """Radiance from which on pixels are clipped, (n,); None where none is."""
+        return None if self.limits is None else self.limits[self.views_of(numbers)]
 
     def views_of(self, numbers: np.ndarray) -> np.ndarray:
         """The views of pixels, from 0."""

@@ -20,7 +20,7 @@ from ..dataset.scene_kind import SceneKind
 from ..dataset.views import Dataset
 from ..errors import require_kind
 from ..quantities import QUANTITIES
-from ..scene.emitters import ENVIRONMENTS, lights_besides, names_besides
+from ..scene.emitters import ENVIRONMENTS, lights_besides
 from ..scene.parse import parse
 from ..transport.methods import METHODS
 from ..transport.objective import has_radiance
@@ -72,9 +72,10 @@ def _unknown_of(dataset: Dataset) -> Unknown:
     if dataset.light == "known":
         return "materials"
     scene = parse(dataset.scene, dataset.root)
-    if not lights_besides(scene, ENVIRONMENTS):
+    lamps = lights_besides(scene, ENVIRONMENTS)
+    if not lamps:
         return "materials+lighting"
-    surrounded = len(names_besides(scene, ())) > lights_besides(scene, ENVIRONMENTS)
+    surrounded = lights_besides(scene, ()) > lamps
     return "materials+lighting+emission" if surrounded else "materials+emission"
 
 

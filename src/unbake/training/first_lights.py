@@ -96,9 +96,8 @@ def _seen(
     fewest = _FEWEST if problem.poses is None else _FEWEST_OF_POSES
     found = np.full((emission.count, 3), np.nan)
     surely = np.zeros((emission.count, 3), bool)
-    limits = np.full(len(numbers), np.inf)
-    if pixels.limits is not None:
-        limits = pixels.limits[pixels.views_of(numbers)]
+    limits = pixels.limits_of(numbers)
+    limits = np.full(len(numbers), np.inf) if limits is None else limits
     for number in np.flatnonzero(np.bincount(light, minlength=emission.count) >= fewest):
         for channel in range(3):
             weight = pattern[light == number, channel]

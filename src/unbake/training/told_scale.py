@@ -152,10 +152,10 @@ def _shown(problem: Problem, pixels: PixelSource, numbers: np.ndarray) -> np.nda
     if not len(numbers):
         return np.zeros(0, bool)
     clipped = np.zeros(len(numbers), bool)
-    if pixels.limits is not None:
+    if (limits := pixels.limits_of(numbers)) is not None:
         colours = pixels.photographs.own_rows(numbers)[:, :3]
         # One channel that is clipped leaves its factor open.
-        clipped = (colours >= pixels.limits[pixels.views_of(numbers)][:, None]).any(1)
+        clipped = (colours >= limits[:, None]).any(1)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(numbers))
     with dr.suspend_grad():
