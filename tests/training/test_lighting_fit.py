@@ -31,6 +31,7 @@ from unbake.training.regularizers import is_anchored
 from unbake.training.schedule import learning_rates
 from unbake.training.state import initial_state
 from unbake.training.step import TrainingStep
+from unbake.training.told_scale import weigh_convention
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
 from unbake.transport.wavefront import PathLimits, path_light, plan_widths
 
@@ -62,10 +63,11 @@ def fitted(dataset, unknown, *, steps=200, **settings):
     begin_lights(problem, pixels)
     step, state = TrainingStep(problem, pixels, config), initial_state(problem)
     for i in range(steps):
+        weigh_convention(problem, config, i / steps)
         terms = step(state, i, learning_rates(config, i, i / steps))
         if i % 50 == 0:
             assert np.isfinite(sum(float(v[0]) for v in terms.values()))
-    assert float(terms["skipped"][0]) == 0
+    assert float(terms["skipped"][0]) == 0 and step.recordings() <= 3
     state.publish(problem)
     return problem, mean
 
@@ -183,6 +185,30 @@ def test_the_mean_albedo_is_the_convention_where_nothing_else_tells_it(photograp
     assert means[0.0].min() > 0.35
     visible = dataclasses.replace(problem, hide_emitters=False)
     assert not is_anchored(visible, dataclasses.replace(TINY_FIT, unknown="materials+lighting"))
+
+
+def test_light_between_surfaces_tells_of_the_scale_that_begins_at_a_convention(tmp_path):
+    """Of a closed room whose lamp no photograph shows."""
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0"><sensor type="perspective">
+          <float name="fov" value="70"/><transform name="to_world">
+            <lookat origin="0.5,-2.5,0.5" target="0,0,0" up="0,0,1"/></transform></sensor>
+          <shape type="cube"><transform name="to_world"><scale value="3"/></transform>
+            <boolean name="flip_normals" value="true"/>
+            <bsdf type="principled"><rgb name="base_color" value="0.2, 0.3, 0.1"/></bsdf></shape>
+          <emitter type="point" id="lamp"><point name="position" value="0,1,1"/>
+            <rgb name="intensity" value="4"/></emitter></scene>"""
+    )
+    small = CaptureSettings(views=4, held_out=1, resolution=24, spp=64, max_depth=8)
+    dataset = capture(tmp_path / "scene.xml", tmp_path / "data", small, tell=lambda line: None)
+    errors = {}
+    for final_anchor in (1.0, 0.003):
+        lighting = dataclasses.replace(FAST, final_anchor=final_anchor)
+        problem, _ = fitted(dataset, "materials+emission", steps=400, lighting=lighting)
+        assert problem.shows_light is False and problem.anchor == pytest.approx(final_anchor)
+        errors[final_anchor] = np.abs(mean_albedo(problem, dataset) - [0.2, 0.3, 0.1])
+    print(errors)
+    assert (errors[0.003] < errors[1.0] - 0.03).all()
 
 
 def test_a_mirror_tells_the_scale_that_is_a_convention_without_it(tmp_path):

@@ -17,7 +17,7 @@ from unbake.training.problem import make_problem, pixels_of
 from unbake.training.regularizers import is_anchored
 from unbake.training.sharing import kept_whole
 from unbake.training.step import TrainingStep
-from unbake.training.told_scale import conventional_albedo, shows_light
+from unbake.training.told_scale import conventional_albedo, shows_light, weigh_convention
 
 SIZE = 8
 BOTH = replace(TINY_FIT, unknown="materials+lighting")
@@ -74,6 +74,19 @@ def test_the_scale_is_told_where_counted_pixels_show_the_environment(
     problem = begun(scene, background, config, masked=masked)
     assert problem.shows_light is told
     assert is_anchored(problem, config) is not told
+
+
+@pytest.mark.parametrize(
+    ("done", "weight"), [(0.0, 2.0), (0.1, 2.0), (0.3, 0.2), (0.5, 0.02), (0.7, 0.02), (1.0, 0.02)]
+)
+def test_the_convention_loses_its_weight_in_the_first_half_of_a_fit(done, weight, still):
+    config = replace(BOTH, lighting=lighting(anchor=2.0, final_anchor=0.02))
+    problem = make_problem(still, "hidden", config, 0.2)
+    weigh_convention(problem, config, done)
+    assert problem.anchor == pytest.approx(weight)
+    known = make_problem(still, "hidden", replace(config, unknown="materials"), 0.2)
+    weigh_convention(known, replace(config, unknown="materials"), done)
+    assert known.anchor is None
 
 
 @pytest.mark.parametrize(("background", "anchored"), [("visible", False), ("hidden", True)])

@@ -121,8 +121,9 @@ class LightingConfig:
     """The unknown environment map and the unknown strength of lights (Sec. 5.1, Fig. 8).
 
     Where materials are unknown as well, no photograph shows unknown light and no other light is
-    known, albedo and light are known up to one factor a channel. It is then chosen such that the
-    mean albedo of what the training views see has the mean `mean_albedo`, and the `mean_colour`.
+    known, albedo and light are known up to one factor a channel, but for what light between
+    surfaces tells. A fit then begins such that the mean albedo of what the training views see has
+    the mean `mean_albedo`, and the `mean_colour`, and keeps to it as far as nothing else tells.
     """
 
     #: Texels along an edge of the square that the sphere is mapped to. An edge of n has 2n texels
@@ -134,7 +135,10 @@ class LightingConfig:
     mean_albedo: float = 0.5  #: the convention, mean over channels, less if one is above 0.8 (ours)
     #: Its colour: of the photographs, as if light were white, or grey, as if surfaces were (ours).
     mean_colour: MeanColour = "photographs"
-    anchor: float = 1.0  #: weight of the squared deviation from it
+    anchor: float = 1.0  #: weight of the squared deviation from it, in the first tenth of a fit
+    #: The same in its second half. In between it falls: light between surfaces tells of the factor
+    #: as well, and is heard once materials are near where they belong (ours).
+    final_anchor: float = 0.003
     #: What tells the factor instead. pixels: those to train on that show unknown light, directly or
     #: in mirrors and glass, and are not clipped; background: any that is visible, and no mirror
     #: (ours).
@@ -142,8 +146,8 @@ class LightingConfig:
 
     def __post_init__(self) -> None:
         # The map is up to e^20 times as bright as it starts: `fields/envmap.py`.
-        ranges = {"initial_radiance": (0, 1e20), "anchor": (0, 1e6), "learning_rate": RATES}
-        require_ranges(self, ranges)
+        ranges = {"initial_radiance": (0, 1e20), "learning_rate": RATES}
+        require_ranges(self, ranges | dict.fromkeys(("anchor", "final_anchor"), (0, 1e6)))
         known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
         require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)
         require(0 < self.mean_albedo < 1, "mean_albedo", "between 0 and 1", self.mean_albedo)

@@ -43,6 +43,7 @@ class Inputs:
     exposures: mi.Float | None = None  # of the views, as the data set has them, if they are read
     units: PoseUnits | None = None  # of corrections of poses, if there are any
     blocks: Blocks | None = None  # of pixels that lose their weight together, if they are to
+    anchor: mi.Float | None = None  # weight of the deviation of the mean albedo; None: the first
 
 
 @final
@@ -99,6 +100,7 @@ class BatchLoss:
         entropy = [self._config.seed, number]
         entropy += [self._rank] if self._rank else []
         seeds = np.random.SeedSequence(entropy).generate_state(2)
+        anchor = self._problem.anchor
         return Inputs(
             scene=self._problem.scene_view.scene,
             rays=self.pixels.rays,
@@ -110,6 +112,7 @@ class BatchLoss:
             exposures=self._exposures,
             units=self._units,
             blocks=None if self._problem.outliers is None else self._problem.outliers.blocks,
+            anchor=None if anchor is None else dr.opaque(mi.Float, anchor),
         )
 
     def _drawn(self, seed: int, probe: int | None) -> PixelBatch:
@@ -257,7 +260,9 @@ class BatchLoss:
         chosen = _first_samples(inputs.pixels.count, config.spp, 1)
         inputs.single.seed(inputs.seed + 2, inputs.pixels.count)
         ray = dr.gather(mi.Ray3f, ray, chosen)
-        return regularization_terms(problem, config, inputs.scene, ray, inputs.single, photometric)
+        return regularization_terms(
+            problem, config, inputs.scene, ray, inputs.single, photometric, inputs.anchor
+        )
 
     def _through_camera(
         self,

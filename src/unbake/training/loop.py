@@ -33,6 +33,7 @@ from .same_on_ranks import require_same_state
 from .saving import Saving
 from .schedule import learning_rates
 from .solved import read_solved
+from .told_scale import weigh_convention
 from .warm_start import OPTION
 from .watchdog import Watchdog
 
@@ -276,12 +277,13 @@ class _Training:
         return stopped
 
     def _rates(self) -> dict[str, float]:
-        """The learning rates of the next step; lights that were held for long enough are let go.
+        """The learning rates of the next step, for which lights and their scale are let go in time.
 
         They depend on how much is done: on steps, or on time where time is the limit.
         """
         step, done = self._begun.progress.step, self._fraction
         release_lights(self._begun.problem, done)
+        weigh_convention(self._begun.problem, self._begun.config, done)
         rates = learning_rates(self._begun.config, step, done)
         return self._watchdog.rates(self._search.rates(rates, step, done))
 

@@ -67,6 +67,8 @@ class Problem:
     shows_light: bool | None = None
     #: What the mean albedo is by convention, where photographs do not tell it; linear RGB.
     mean_albedo: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    #: Weight of the deviation from it at present; None: that of the beginning.
+    anchor: float | None = None
 
     def fields(self) -> list[Field]:
         """The fields of the materials, and the one of L_θ."""

@@ -41,6 +41,7 @@ def regularization_terms(
     ray: mi.Ray3f,
     sampler: mi.Sampler,
     photometric: mi.Float | None,
+    anchor: mi.Float | None = None,
 ) -> dict[str, mi.Float]:
     """Weighted terms, at the points of optimized material that camera rays hit.
 
@@ -57,6 +58,7 @@ def regularization_terms(
         sampler: of as many lanes.
         photometric: the photometric loss of the batch. Where it is None, because a method has no
             such term, differences of albedo have no weight.
+        anchor: weight of the deviation of the mean albedo; None: that of the beginning of a fit.
     """
     materials, r = problem.materials, config.regularization
     if materials is None:
@@ -87,7 +89,7 @@ def regularization_terms(
         terms["albedo_ties_roughness"] = r.albedo_ties_roughness * value
     if anchored:
         value = mean_albedo_deviation(here, valid, problem.mean_albedo)
-        terms["mean_albedo"] = config.lighting.anchor * value
+        terms["mean_albedo"] = (config.lighting.anchor if anchor is None else anchor) * value
     return terms
 
 

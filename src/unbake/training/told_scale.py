@@ -32,6 +32,9 @@ _HIGHLIGHT = 8.0
 _MOST_ALBEDO = 0.8
 #: How many times as much makes sure that it is so, by whatever pixels are looked at.
 _SURELY = 4
+#: Parts of a fit: until the first one is done, the mean albedo has its first weight, and from the
+#: second one on, its last.
+_HELD, _FREE = 0.1, 0.5
 
 
 def is_shared(problem: Problem) -> bool:
@@ -91,14 +94,30 @@ def conventional_albedo(
     return red, green, blue
 
 
+def weigh_convention(problem: Problem, config: FitConfig, done: float) -> None:
+    """Give the mean albedo the weight that it has at a point of a fit.
+
+    At first it alone keeps albedo from running into its bounds. Later, light between surfaces
+    tells the scale, if weakly: bright ones return more of it to each other.
+
+    Args:
+        done: fraction of the fit that is done, [0,1].
+    """
+    if not config.shares_scale:
+        return
+    first, last = config.lighting.anchor, config.lighting.final_anchor
+    part = min(1.0, max(0.0, (done - _HELD) / (_FREE - _HELD)))
+    problem.anchor = first ** (1 - part) * last**part
+
+
 def told_convention(problem: Problem) -> str:
     """A line of what the mean albedo is taken for, in a fit where it is a convention."""
     mean = " ".join(f"{x:.2f}" for x in problem.mean_albedo)
     why = "the background is hidden"
     if problem.shows_light is not None:
         why = "no photograph shows the light itself, unclipped"
-    told = "brightness and colour of albedo are a convention, by which its mean is"
-    return f"{why}: {told} {mean}"
+    told = "brightness and colour of albedo begin at a convention, a mean of"
+    return f"{why}: {told} {mean}, and only light between surfaces tells more"
 
 
 def _own_places(pixels: PixelSource) -> np.ndarray:
