@@ -604,6 +604,16 @@ def test_relit_pictures_that_are_far_from_white_are_told(folder, tmp_path):
     assert note.startswith("photographs are far brighter than white")
 
 
+def test_evaluate_tells_the_factors_that_albedo_is_aligned_by(unbake, folder):
+    outcome = unbake("evaluate", folder / "run", "--spp", 2, "--max-depth", 3, "--train-views", 0)
+    (line,) = [line for line in outcome.out.splitlines() if "is aligned by the factors" in line]
+    scale = RunFolder(folder / "run").metrics()["albedo_scale"]
+    # Grids have the materials of the scene, which are grey.
+    assert scale == pytest.approx([1, 1, 1], abs=0.01)
+    told = "albedo is aligned by the factors 1.00 1.00 1.00 (red, green, blue)"
+    assert line.strip() == told, line
+
+
 def mask_all(data, name):
     """Mask all of a view, so that no pixel of it is scored."""
     write_png(data / "black.png", np.zeros((SIZE, SIZE, 3), np.uint8))

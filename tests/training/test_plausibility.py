@@ -138,8 +138,7 @@ def test_light_that_is_unknown_is_recovered_unless_the_user_says_otherwise(
         assert outcome.status == 0, outcome
         assert RunFolder(run).settings().unknown == unknown
         assert (line in outcome.out) == (data == sky and not words)
-        # Its background is hidden, and no mirror shows the sky.
-        convention = "no photograph shows the light itself, unclipped: brightness and colour of"
+        convention = "the data set hides the background, and no mirror shows the light: brightness"
         assert (convention in outcome.out) == (unknown == "materials+lighting")
 
 

@@ -67,6 +67,9 @@ def evaluate(
         say("untrained: after 0 steps the fields have their initial values")
     found = metrics.get("yardsticks")
     told = told_yardsticks(metrics["heldout"], found) if found else []
+    if scale := metrics.get("albedo_scale"):
+        factors = " ".join(f"{factor:.2f}" for factor in scale)
+        told.insert(0, f"albedo is aligned by the factors {factors} (red, green, blue)")
     for split in ("heldout", "train"):
         values = {k: v for k, v in metrics[split].items() if k != "views"}
         if not metrics["quantities"]:  # of known materials there are no scores

@@ -113,9 +113,9 @@ def weigh_convention(problem: Problem, config: FitConfig, done: float) -> None:
 def told_convention(problem: Problem) -> str:
     """A line of what the mean albedo is taken for, in a fit where it is a convention."""
     mean = " ".join(f"{x:.2f}" for x in problem.mean_albedo)
-    why = "the background is hidden"
-    if problem.shows_light is not None:
-        why = "no photograph shows the light itself, unclipped"
+    why = "no photograph shows the light itself, unclipped"
+    if problem.hide_emitters:
+        why = "the data set hides the background, and no mirror shows the light"
     told = "brightness and colour of albedo begin at a convention, a mean of"
     return f"{why}: {told} {mean}, and only light between surfaces tells more"
 
